@@ -479,8 +479,7 @@ def in_order(robot: Robot, data: Measurements) -> tuple[Measurements, tuple[Faul
     rows, source = misplaced(robot, data)
     if not len(rows):
         return data, ()
-    lines = ", ".join(str(data.line[row]) for row in rows[:8])
-    text = f"{data.source}: rows hold each other's points: lines {lines}"
+    text = f"{data.source}: rows hold each other's points: {data.list_rows(rows)}"
     fault = Fault("swapped_rows", "all", text, data.line[rows])
     return put_right(data, rows, source), (fault,)
 

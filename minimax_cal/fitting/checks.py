@@ -9,7 +9,6 @@ from minimax_cal.fitting.common_scale import LEAST_SHARE, scale_of
 from minimax_cal.fitting.start import BaseFit, fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.checks import best_orders, swapped
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.slips import (
@@ -239,10 +238,9 @@ def check_names(robot: Robot, data: Measurements, given: BaseFit) -> None:
     """Raise DataError where targets stand under each other's names.  given: see `fitted`."""
     rows = misnamed(robot, data, given) if len(data.target_names) > 1 else NO_ROWS
     if len(rows):
-        lines = name_first([str(line) for line in data.line[rows]])
         raise DataError(
             f"{data.source}:{data.line[rows[0]]}: targets look swapped in {len(rows)} rows: "
-            f"lines {lines}; put their columns right or delete them"
+            f"{data.list_rows(rows)}; put their columns right or delete them"
         )
 
 

@@ -31,7 +31,7 @@ from minimax_cal.robots.robot import Robot
 MAX_MISS_OF_REACH = 0.01  # of the reach: a fit that misses by more contradicts its own data
 MAX_MISS_OF_FLOOR = 50.0  # times the floor, likewise
 YIELDS = 0.001  # of the reach: so much a sound arm may bend, however well it comes back
-MAX_NAMED = 5  # lines that a notice names
+MAX_NAMED = 5  # poses that a notice names
 
 
 def unseen_suspects(
@@ -48,14 +48,14 @@ def unseen_suspects(
     return held_suspects(model, state, weights, held, spread, data.line)
 
 
-def bad_rows(suspects: Sequence[Suspect], source: str) -> Iterator[str]:
+def bad_rows(suspects: Sequence[Suspect], data: Measurements) -> Iterator[str]:
     """Notice of held-out points that stand out: they judge the fit."""
     held = [one for one in suspects if one.held]
     if held:
-        named = [one.text for one in held]
+        named = [one.text(data) for one in held]
         yield (
-            f"{source}: outliers among the held-out points: {name_first(named, MAX_NAMED)}; they "
-            "count in the held-out accuracy, which is also given without them"
+            f"{data.source}: outliers among the held-out points: {name_first(named, MAX_NAMED)}; "
+            "they count in the held-out accuracy, which is also given without them"
         )
 
 
@@ -67,10 +67,10 @@ def unjudged(data: Measurements, crossed: Array) -> Iterator[str]:
     if crossed.size:
         lost = data.seen.any(axis=1) & ~np.isfinite(crossed).any(axis=(0, 2))
         if lost.any():
-            named = name_first([str(line) for line in data.line[lost]], MAX_NAMED)
+            named = data.list_rows(np.flatnonzero(lost), MAX_NAMED)
             yield (
                 f"{data.source}: {lost.sum()} of {data.poses} poses are needed for the fit, so "
-                f"that none without them judges them: line {named}"
+                f"that none without them judges them: {named}"
             )
 
 

@@ -1,8 +1,7 @@
 """The file of a fit: what `Fit.to_dict` writes and `Fit.from_dict` reads.
 
-People read millimetres there.  What a change of unit takes of the last digit, and what no person
-asks for, stands in `arrays`, in SI.  Files of earlier versions lack some parts; these are then
-worked out from the others, or missing.
+Each number is there once: in millimetres what people read, in SI, under `arrays`, what no person
+asks for.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -34,10 +32,10 @@ from minimax_cal.fitting.intervals import Interval
 from minimax_cal.fitting.options import read_options
 from minimax_cal.fitting.set_aside import WithThem
 from minimax_cal.fitting.suspects import Suspect
-from minimax_cal.fitting.uncertainty import Uncertainty, uncertainty_from_dict
+from minimax_cal.fitting.uncertainty import uncertainty_from_dict
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, said
-from minimax_cal.ground.files import finite, numbers
+from minimax_cal.ground.files import finite, numbers, plain
 from minimax_cal.ground.records import (
     AGAIN,
     FAULTS,
@@ -46,15 +44,12 @@ from minimax_cal.ground.records import (
     Ends,
     Gaps,
     Number,
-    Packed,
     Part,
     Recorded,
     Square,
+    Values,
     check_schema,
     checked,
-    packed,
-    restored,
-    unpacked,
 )
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.aside import SetAside
@@ -69,7 +64,7 @@ from minimax_cal.solvers.status import Status
 
 SCHEMA = 1
 NO_KKT = Kkt(math.nan, math.nan, math.nan)
-POSE_BY_POSE = ("weights", "share", "measured", "crossed", "drawn crossed")
+POSE_BY_POSE = ("weights", "share", "crossed", "drawn crossed")
 EARLIER = "an earlier version wrote this file"
 NEAR = 1e-6  # a file's own errors come back to this, or it lacks columns of the measurements [m]
 
@@ -224,7 +219,7 @@ class FitPart(Part):
     loss: str = "square"
     widening: float = 1.0
     provenance: Provenance
-    arrays: dict[str, Packed] = Field(default_factory=dict)
+    arrays: dict[str, Values]
 
 
 # ---- writing -----------------------------------------------------------------------------------
@@ -325,47 +320,20 @@ def minimax_to_dict(worst: WorstCase) -> dict[str, Any]:
 
 
 def arrays_of(fit: Fit, *, poses: bool) -> dict[str, Any]:
-    """What is kept to the last digit, by name.  poses: whether with what is told pose by pose."""
+    """What later work rests on, in SI.  poses: whether with what is told pose by pose."""
     out = {
-        "value": fit.parameters.value,
-        "nominal": fit.parameters.nominal,
-        "sigma": fit.parameters.sigma,
         "singular": fit.identification.singular,
         "sensitivity": fit.identification.scale,
         "weights": fit.weights,
         "share": fit.share,
         "prior": fit.prior,
-        "trace": np.array(fit.trace),
-        "intervals": np.array(
-            [[(i.low, i.high) for i in fit.intervals[key]] for key in ("nominal", "holdout")]
-        ),
-        **cell_arrays(fit.cell, "cell"),
-        **(cell_arrays(fit.kept, "geometric") if fit.kept not in (fit.cell, fit.nominal) else {}),
-        **(cell_arrays(fit.nominal, "nominal") if fit.nominal else {}),
     }
-    if fit.uncertainty:
-        out["covariance"] = fit.uncertainty.covariance
-        out["noise"] = np.array([fit.uncertainty.noise.variance])
-    if fit.data.poses:
-        out["measured"] = fit.data.y
     if fit.error_crossed.size:
         out["crossed"], out["drawn crossed"] = fit.error_crossed, fit.error_drawn_crossed
     if not poses:
         out = {name: values for name, values in out.items() if name not in POSE_BY_POSE}
         out |= {"share": fit.share} if fit.share.ndim == 1 else {}
-    return {name: packed(values) for name, values in out.items()}
-
-
-def cell_arrays(cell: Cell, name: str) -> dict[str, Array]:
-    """What predictions rest on."""
-    return {
-        f"{name}.mdh": cell.robot.mdh,
-        f"{name}.com": cell.robot.com,
-        f"{name}.up": cell.robot.up,
-        f"{name}.base": cell.base,
-        f"{name}.targets": cell.target_positions,
-        **{f"{name}.session {label}": frame for label, frame in cell.sessions.frames.items()},
-    }
+    return {name: plain(values) for name, values in out.items()}
 
 
 # ---- reading -----------------------------------------------------------------------------------
@@ -376,27 +344,19 @@ def read(content: Mapping[str, Any], source: str) -> Fit:
     check_schema(content, source, SCHEMA)
     cell = cell_from_dict(content, source)
     part = checked(FitPart, content, source)
-    try:
-        arrays = {name: unpacked(array) for name, array in part.arrays.items()}
-    except ValueError as error:
-        raise CalibrationError(
-            f"{source}: its arrays cannot be read ({said(error)}); {AGAIN}"
-        ) from error
-    cell, geometric = refined(cell, arrays, "cell"), None
+    geometric = None
     if cell.effects.causes and part.status is not Status.NO_BETTER:
-        alone = cell_from_dict({**content, "cell": {}}, source)
-        geometric = refined(alone, arrays, "geometric")
+        geometric = cell_from_dict({**content, "cell": {}}, source)
     for name, scores in part.accuracy.told():
         if not len(scores.sse_mm2) == len(scores.points) == len(cell.target_names):
             raise CalibrationError(
                 f"{source}: accuracy.{name} is not of {len(cell.target_names)} targets; {AGAIN}"
             )
     data, held, told = measured_poses(content, source, cell, "nominal")
-    exact = restored(data.y, arrays.get("measured"))
-    data = replace(data, y=exact, digest=part.provenance.data_sha256)
-    nominal = nominal_of(content, source, arrays)
+    data = replace(data, digest=part.provenance.data_sha256)
+    nominal = nominal_of(content, source)
     before, after = errors_of(nominal, data, told[0]), errors_of(cell, data, told[1])
-    made = assembled(content, source, part, arrays, cell, nominal, data, held, before, after)
+    made = assembled(content, source, part, cell, nominal, data, held, before, after)
     return replace(made, stated_geometric=geometric)
 
 
@@ -404,7 +364,6 @@ def assembled(
     content: Mapping[str, Any],
     source: str,
     part: FitPart,
-    arrays: Mapping[str, Array],
     cell: Cell,
     nominal: Cell | None,
     data: Measurements,
@@ -414,10 +373,14 @@ def assembled(
 ) -> Fit:
     """The fit from what was read.  Raises one of FAULTS."""
     read_options(part.provenance.settings)  # what later work rests on
-    known = uncertainty_of(content, source, cell, arrays)
-    parameters = Parameters(parameters_of(part, arrays), known.dof if known else math.nan)
+    known = uncertainty_from_dict(content, cell, source) if "covariance" in content else None
+    parameters = Parameters(
+        tuple(in_si(p) for p in part.parameters), known.dof if known else math.nan
+    )
     train = data.take(~held)
     k, names = len(cell.target_names), parameter_names(parameters, cell)
+    arrays = part.arrays
+    check_shapes(arrays, names.count, train, data)
     if missing := set(names.all) - {p.name for p in parameters}:
         raise ValueError(f"parameters: {min(missing)} is missing, of {len(missing)}")
     return Fit(
@@ -430,11 +393,11 @@ def assembled(
         seconds=part.seconds,
         parameters=parameters,
         accuracy={key: scores.accuracy() for key, scores in part.accuracy.told()},
-        identification=identification_of(part, parameters, names, arrays),
+        identification=identification_of(part, parameters, names),
         uncertainty=known,
         minimax=minimax_of(part),
         certificate=certificate_of(part.certificate),
-        trace=tuple(exactly(1e-6 * np.array(part.trace_mm2), arrays.get("trace")).tolist()),
+        trace=tuple(1e-6 * value for value in part.trace_mm2),
         data=data,
         held=held,
         error_nominal=before,
@@ -444,11 +407,11 @@ def assembled(
         suspects=tuple(suspect_of(suspect, data, held) for suspect in part.suspects),
         weights=arrays.get("weights", train.seen.T.astype(float)),
         share=arrays.get("share", np.ones(k)),
-        prior=arrays.get("prior", np.zeros(names.count)),
+        prior=arrays["prior"],
         widening=part.widening,
         provenance=part.provenance,
         claim=part.accuracy.beyond.beyond,
-        stated=intervals_of(part, arrays),
+        stated=intervals_of(part),
         error_crossed=arrays.get("crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
         set_aside=part.set_aside,
         with_them=with_them_of(part.accuracy.holdout_with_them),
@@ -460,6 +423,22 @@ def assembled(
     )
 
 
+def check_shapes(
+    arrays: Mapping[str, Array], count: int, train: Measurements, data: Measurements
+) -> None:
+    """Raise ValueError for arrays that are not of these parameters and poses."""
+    k, m = len(data.target_names), train.poses
+    every = (k, data.poses, 3)
+    shapes: dict[str, tuple[tuple[int, ...], ...]] = {
+        "sensitivity": ((count,),), "prior": ((count,),), "weights": ((k, m),),
+        "share": ((k,), (k, m)), "crossed": (every,), "drawn crossed": (every,)
+    }  # fmt: skip
+    for name, values in arrays.items():
+        known = shapes.get(name, (values.shape,))
+        if values.shape not in known and data.poses:
+            raise ValueError(f"{name} is not of these parameters and poses")
+
+
 def with_them_of(scores: ScoresPart | None) -> WithThem | None:
     """How it does with the points that were set aside, where there were any."""
     if scores is None:
@@ -467,42 +446,12 @@ def with_them_of(scores: ScoresPart | None) -> WithThem | None:
     return WithThem(scores.accuracy(), scores.rms_ci95_mm, scores.max_ci95_mm)
 
 
-def refined(cell: Cell, arrays: Mapping[str, Array], name: str) -> Cell:
-    """A cell with the digits that millimetres and a rotation vector took."""
-    robot, exact = cell.robot, {key: arrays.get(f"{name}.{key}") for key in CELL}
-    base = refined_pose(cell.base, exact["base"])
-    frames = {
-        label: refined_pose(frame, arrays.get(f"{name}.session {label}"))
-        for label, frame in cell.sessions.frames.items()
-    }
-    robot = replace(
-        robot,
-        mdh=restored(robot.mdh, exact["mdh"]),
-        com=restored(robot.com, exact["com"]),
-        up=restored(robot.up, exact["up"]),
-    )
-    positions = restored(cell.target_positions, exact["targets"])
-    sessions = replace(cell.sessions, frames=frames)
-    return replace(cell, robot=robot, base=base, target_positions=positions, sessions=sessions)
-
-
-def refined_pose(pose: Array, exact: Array | None) -> Array:
-    """A pose with its last digits; a rotation is taken whole or not at all."""
-    out = restored(pose, exact)
-    if exact is not None and not np.array_equal(out[:3, :3], exact[:3, :3]):
-        out[:3, :3] = pose[:3, :3]
-    return out
-
-
-CELL = ("mdh", "com", "up", "base", "targets")
-
-
-def nominal_of(content: Mapping[str, Any], source: str, arrays: Mapping[str, Array]) -> Cell | None:
+def nominal_of(content: Mapping[str, Any], source: str) -> Cell | None:
     """The nominal robot in its place; None where the file tells none."""
     if "nominal_robot" not in content:
         return None
     whole = {"robot": content["nominal_robot"], **content["nominal_cell"]}
-    return refined(cell_from_dict(whole, f"{source}: nominal_cell"), arrays, "nominal")
+    return cell_from_dict(whole, f"{source}: nominal_cell")
 
 
 def measured_poses(
@@ -554,30 +503,6 @@ def errors_of(cell: Cell | None, data: Measurements, told: Array) -> Array:
     return exact if same else told
 
 
-def uncertainty_of(
-    content: Mapping[str, Any], source: str, cell: Cell, arrays: Mapping[str, Array]
-) -> Uncertainty | None:
-    """How sure the parameters are; None in an old file."""
-    if "covariance" not in content:
-        return None
-    known = uncertainty_from_dict(content, cell, source)
-    noise = known.noise
-    variance = restored(np.array([noise.variance]), arrays.get("noise"))
-    return replace(
-        known,
-        covariance=exactly(known.covariance, arrays.get("covariance")),
-        listen=partial(replace, noise, variance=float(variance[0])),
-    )
-
-
-def exactly(read: Array, exact: Array | None) -> Array:
-    """As `restored`, of a matrix whose entries are as small as they please."""
-    if exact is None or exact.shape != read.shape:
-        return read
-    same = np.isclose(exact, read, rtol=1e-12, atol=0.0, equal_nan=True)
-    return np.where(same, exact, read)
-
-
 def in_si(p: Parameter) -> Parameter:
     """A parameter of a file, its millimetres as metres."""
     if p.unit != "mm":
@@ -587,25 +512,13 @@ def in_si(p: Parameter) -> Parameter:
     )
 
 
-def parameters_of(part: FitPart, arrays: Mapping[str, Array]) -> tuple[Parameter, ...]:
-    """The parameters in SI."""
-    every, keys = [in_si(p) for p in part.parameters], ("value", "nominal", "sigma")
-    read = {
-        key: exactly(np.array([getattr(p, key) for p in every]), arrays.get(key)).tolist()
-        for key in keys
-    }
-    return tuple(replace(p, **{key: read[key][i] for key in keys}) for i, p in enumerate(every))
-
-
 def parameter_names(parameters: Parameters, cell: Cell) -> Names:
     """All names in their order."""
     effects = tuple(p.name for p in parameters if p.of_effect)
     return Names.of(cell.robot, cell.target_names, effects)
 
 
-def identification_of(
-    part: FitPart, parameters: Parameters, names: Names, arrays: Mapping[str, Array]
-) -> Identification:
+def identification_of(part: FitPart, parameters: Parameters, names: Names) -> Identification:
     """What was identified, and why the rest was not."""
     active = np.zeros(names.count, dtype=bool)
     for p in parameters:
@@ -613,21 +526,20 @@ def identification_of(
     return Identification(
         active=active,
         reasons={p.name: p.reason for p in parameters if p.reason},
-        singular=arrays.get("singular", np.array([part.condition, 1.0])),
-        scale=arrays.get("sensitivity", np.zeros(names.count)),
+        singular=part.arrays["singular"],
+        scale=part.arrays["sensitivity"],
     )
 
 
-def intervals_of(
-    part: FitPart, arrays: Mapping[str, Array]
-) -> dict[str, tuple[Interval, Interval]]:
+def intervals_of(part: FitPart) -> dict[str, tuple[Interval, Interval]]:
     """Of RMS and largest error on poses like those held out [m]."""
-    told = (part.accuracy.nominal, part.accuracy.holdout)
-    read = 1e-3 * np.array([[scores.rms_ci95_mm, scores.max_ci95_mm] for scores in told])
-    (a, b), (c, d) = exactly(read, arrays.get("intervals")).tolist()
+
+    def in_metres(ends: tuple[float, float]) -> Interval:
+        return Interval(1e-3 * ends[0], 1e-3 * ends[1])
+
     return {
-        "nominal": (Interval(*a), Interval(*b)),
-        "holdout": (Interval(*c), Interval(*d)),
+        name: (in_metres(scores.rms_ci95_mm), in_metres(scores.max_ci95_mm))
+        for name, scores in (("nominal", part.accuracy.nominal), ("holdout", part.accuracy.holdout))
     }
 
 

@@ -110,9 +110,9 @@ def points_of(data: Measurements, which: Array, error: Array) -> str:
     return name_first(shown, MAX_NAMED)
 
 
-def no_better(found: Improvement, suspects: Sequence[Suspect]) -> str:
+def no_better(found: Improvement, suspects: Sequence[Suspect], data: Measurements) -> str:
     """The sentence for an arm that is no better than the drawn one, and what to do."""
-    off = [one.text for one in suspects]
+    off = [one.text(data) for one in suspects]
     rows = f"; check the outliers ({name_first(off, MAX_NAMED)})" if off else ""
     return (
         f"The calibrated arm is no better than the drawn one ({found.numbers} on new poses): keep "

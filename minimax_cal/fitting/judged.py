@@ -159,7 +159,7 @@ class Judged:
         if self.wrong:
             return Status.FAILED, self.wrong
         if better and not better.is_better and status in ENDED:
-            return Status.NO_BETTER, no_better(better, self.suspects)
+            return Status.NO_BETTER, no_better(better, self.suspects, self.data)
         return status, ""
 
     @cached_property
@@ -188,7 +188,7 @@ class Judged:
             *(fault.text for fault in faults.session_jumps(data, after)),
             *(change.sentence for change in self.moved),
             *self.alarming,
-            *bad_rows(self.suspects, data.source),
+            *bad_rows(self.suspects, data),
             *unjudged(data, self.crossed[1]),
             *([said_of_exchanged(data, self.swapped)] if swapped else []),
             *([said_without(better, rms_of(*self.unseen))] if better and better.wrong else []),

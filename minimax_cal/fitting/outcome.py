@@ -16,7 +16,6 @@ from minimax_cal.fitting.same_arm import too_changed
 from minimax_cal.fitting.solve import Solved
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.grouping import grouped
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots.robot import Robot
@@ -33,10 +32,9 @@ def exchanged_rows(robot: Robot, data: Measurements, before: Array) -> Array:
 
 
 def said_of_exchanged(data: Measurements, rows: Array) -> str:
-    """That rows hold each other's points, by the lines of the file."""
-    named = name_first([str(line) for line in data.line[rows]])
+    """That rows hold each other's points, by their names or lines."""
     return (
-        f"{data.source}: rows hold each other's points: lines {named}; put their joint "
+        f"{data.source}: rows hold each other's points: {data.list_rows(rows)}; put their joint "
         "values and points right, or delete them"
     )
 

@@ -50,10 +50,10 @@ def contradictions(data: Measurements, error: Array) -> Iterator[str]:
     told: dict[tuple[int, int, int], str] = {}
     for target, row in sorted(np.argwhere(far), key=lambda at: -apart[tuple(at)]):
         pair = sorted((row, other[target, row]), key=lambda i: size[target, i])
-        right, wrong = (int(data.line[i]) for i in pair)
+        right, wrong = (data.called(data.line[i]) for i in pair)
         name, off = data.target_names[target], 1e3 * apart[target, row]
         guilty = size[target, pair[1]] > MIN_GUILTY_RATIO * size[target, pair[0]]
-        text = f"line {wrong} {name} is {off:.2g} mm from line {right}"
+        text = f"{wrong} {name} is {off:.2g} mm from {right}"
         told.setdefault((*sorted(pair), target), text + (", which fits" if guilty else ""))
     yield (
         f"{data.source}: visits to one pose that contradict each other; of each pair one point is "

@@ -256,10 +256,9 @@ class Suspect:
     together: bool
     held: bool = False
 
-    @property
-    def text(self) -> str:
+    def text(self, data: Measurements) -> str:
         """Which, and how far off, for people."""
-        return f"line {self.line} {self.target} {1e3 * self.distance:.3g} mm"
+        return f"{data.called(self.line)} {self.target} {1e3 * self.distance:.3g} mm"
 
     def to_dict(self) -> dict[str, object]:
         """For JSON, in millimetres."""

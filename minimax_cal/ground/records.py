@@ -1,15 +1,13 @@
-"""Parts of result files: numbers that may be missing, arrays to the last digit, checked records."""
+"""Parts of result files: numbers that may be missing, arrays of them, checked records."""
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, TypeVar
 
-import numpy as np
 from pydantic import (
     BaseModel,
     BeforeValidator,
@@ -25,11 +23,10 @@ from pydantic_core.core_schema import no_info_before_validator_function
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, said
-from minimax_cal.ground.files import MOST, plain
+from minimax_cal.ground.files import numbers, plain
 
 AGAIN = "write it again with minimax-cal"
 FAULTS = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
-SAME = 1e-12  # relative, and absolute in m or rad: what rounding to other units may change
 
 
 def number_or_nan(value: object) -> object:
@@ -42,10 +39,19 @@ def pair_or_nan(value: object) -> object:
     return (math.nan, math.nan) if value is None else value
 
 
+def array_or_fault(value: object) -> Array:
+    """An array of numbers, null for NaN.  Raises ValueError."""
+    try:
+        return numbers(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError("holds something else than numbers in rows of one length") from error
+
+
 NUMBER = {"type": ["number", "null"]}
 PAIR = {"type": ["array", "null"], "items": NUMBER, "minItems": 2, "maxItems": 2}
 Number = Annotated[float, BeforeValidator(number_or_nan)]
 Ends = Annotated[tuple[Number, Number], BeforeValidator(pair_or_nan), WithJsonSchema(PAIR)]
+Values = Annotated[Any, BeforeValidator(array_or_fault), WithJsonSchema({"type": "array"})]
 Count = Annotated[int, Field(ge=0, lt=10**9)]
 Square = Annotated[float, Field(ge=0.0)]
 UNKNOWN = (math.nan, math.nan)
@@ -121,13 +127,6 @@ Kind = TypeVar("Kind")
 Recorded = Annotated[Kind, Gaps()]  # a dataclass as it stands in a file, by its own annotations
 
 
-class Packed(Part):
-    """An array of doubles, little-endian, in base64."""
-
-    shape: tuple[Count, ...]
-    float64: str
-
-
 Model = TypeVar("Model", bound=Part)
 
 
@@ -156,30 +155,3 @@ def reading(source: str, part: str = "") -> Iterator[None]:
         raise CalibrationError(
             f"{source}: {what}cannot be read ({said(error)}); {AGAIN}"
         ) from error
-
-
-def packed(values: Array) -> dict[str, Any]:
-    """An array for JSON, to the last digit."""
-    raw = np.ascontiguousarray(values, dtype="<f8")
-    return {"shape": list(raw.shape), "float64": base64.b64encode(raw.tobytes()).decode("ascii")}
-
-
-def unpacked(part: Packed) -> Array:
-    """The array of `packed`.  Raises ValueError."""
-    raw = np.frombuffer(base64.b64decode(part.float64, validate=True), dtype="<f8")
-    if raw.size != math.prod(part.shape):
-        raise ValueError(f"{raw.size} numbers in place of {math.prod(part.shape)}")
-    if np.any(np.abs(raw[np.isfinite(raw)]) > MOST):
-        raise ValueError(f"holds a number beyond {MOST:g}")
-    return np.array(raw.reshape(part.shape), dtype=float)
-
-
-def restored(read: Array, exact: Array | None) -> Array:
-    """Numbers as people read them, with the digits that their unit took.
-
-    exact: the same to the last digit.  Where a file was changed by hand, what people read counts.
-    """
-    if exact is None or exact.shape != read.shape:
-        return read
-    same = np.isclose(exact, read, rtol=SAME, atol=SAME, equal_nan=True)
-    return np.where(same, exact, read)

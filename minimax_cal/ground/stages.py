@@ -66,5 +66,15 @@ def clock(seconds: float) -> str:
     return f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
-def silent(message: str) -> None:
-    """Say nothing."""
+class Silent:
+    """Progress that says nothing."""
+
+    def __call__(self, message: str) -> None:
+        """Say nothing."""
+
+    def __repr__(self) -> str:
+        """As the default of a function prints."""
+        return "silent"
+
+
+silent = Silent()

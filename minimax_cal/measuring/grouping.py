@@ -360,7 +360,7 @@ def candidates(data: Measurements, by: str | None) -> Iterator[Region]:
         label = grouped(data, by)
         for number in np.unique(label):
             rows = label == number
-            yield Region(f"the {by} of line {data.line[np.argmax(rows)]}", rows)
+            yield Region(f"the {by} of {data.called(data.line[np.argmax(rows)])}", rows)
         return
     label = regions(data)
     for number in np.unique(label):

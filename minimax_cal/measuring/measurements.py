@@ -14,7 +14,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import write_whole
-from minimax_cal.ground.words import one_line
+from minimax_cal.ground.words import name_first, one_line
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.columns import (
     JOINT,
@@ -97,6 +97,17 @@ class Measurements:
         at = np.flatnonzero(self.line == line)
         name = str(names[at[0]]).strip() if names is not None and at.size else ""
         return f"pose {name}" if name else f"line {line}"
+
+    def list_rows(self, rows: Array, most: int = 8) -> str:
+        """Rows as people call them: poses P201, P202, else lines 202, 203; the first few.
+
+        rows: indices or a mask.
+        """
+        names = [self.called(line) for line in self.line[rows]]
+        kinds = {name.split(" ", 1)[0] for name in names}
+        if len(kinds) != 1 or len(names) == 1:
+            return name_first(names, most)
+        return f"{kinds.pop()}s {name_first([name.split(' ', 1)[1] for name in names], most)}"
 
     def in_visit_order(self) -> Measurements:
         """The same, its rows taken as visited one after the other."""

@@ -12,6 +12,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError, said
 from minimax_cal.ground.files import json_of, read_text
+from minimax_cal.ground.units import in_mm
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.history import Clock, ordered
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
@@ -146,7 +147,7 @@ class Cell:
         return {
             "base": pose_to_dict(self.base),
             "targets_mm": {
-                name: [float(v) * 1e3 for v in spot]
+                name: [in_mm(v) for v in spot]
                 for name, spot in zip(self.target_names, self.target_positions, strict=True)
             },
             "effects": self.effects.to_list(),
@@ -162,7 +163,7 @@ def pose_to_dict(pose: Array) -> dict[str, list[float]]:
     """A pose (4, 4) for JSON: millimetres and a rotation vector in radians."""
     turn = rotation_vector(pose[:3, :3])
     return {
-        "translation_mm": [float(v) * 1e3 for v in pose[:3, 3]],
+        "translation_mm": [in_mm(v) for v in pose[:3, 3]],
         "rotation_vector_rad": [float(v) for v in turn],
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -44,10 +45,10 @@ def plan(
     targets: int = 3,
     spots: Sequence[Sequence[float]] = (),
     normals: str = "flange",
-    acceptance: float = np.radians(30.0),
+    acceptance: float = math.radians(30.0),
     whole: bool = False,
     reach: tuple[float, float] = (0.5, 50.0),
-    elevation: tuple[float, float] = (np.radians(-50.0), np.radians(75.0)),
+    elevation: tuple[float, float] = (math.radians(-50.0), math.radians(75.0)),
     joints: Mapping[int, tuple[float, float]] | None = None,
     volume: Sequence[Sequence[float]] = (),
     floor: float = 0.0,

@@ -20,6 +20,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning, RobotError
 from minimax_cal.ground.files import json_text, once, read_text, write_whole
+from minimax_cal.ground.units import in_mm
 from minimax_cal.robots import couplings, kinematics, notation
 from minimax_cal.robots.angle_units import check_angles, check_limits
 from minimax_cal.robots.inverse import NEAR, at_poses, missing, nearest
@@ -297,7 +298,7 @@ class Robot:
                 "ratio": self.ratio[i],
                 "mass_kg": self.mass[i],
             }
-            out: dict[str, Any] = dict(a=a * 1e3, d=d * 1e3, theta=theta, alpha=alpha, beta=beta)
+            out: dict[str, Any] = dict(a=in_mm(a), d=in_mm(d), theta=theta, alpha=alpha, beta=beta)
             out["sign"] = int(sign[i])
             if self.prismatic[i]:
                 out["type"] = "prismatic"
@@ -307,7 +308,7 @@ class Robot:
                 if self.notation.modified:  # of the frame of joint i, which lies before the link
                     rest = tail(self.notation.told(self.mdh, self.prismatic)[i])
                     com = rest[:3, :3] @ com + rest[:3, 3]
-                out["com_mm"] = [float(c) * 1e3 for c in com]
+                out["com_mm"] = [in_mm(c) for c in com]
             if len(self.inertia) and np.all(np.isfinite(self.inertia[i])):
                 out["inertia"] = [float(c) for c in self.inertia_in_file(i)]
             if len(self.drive_gain) and np.isfinite(self.drive_gain[i]):
@@ -317,7 +318,7 @@ class Robot:
         known = np.isfinite(self.repeatability)
         coupling = couplings.to_dict(self.coupling)
         within = dict(zip(("mm", "mrad"), (1e3 * each for each in self.drawn_within), strict=True))
-        after = dict(a=end[0] * 1e3, alpha=end[3], beta=end[4])
+        after = dict(a=in_mm(end[0]), alpha=end[3], beta=end[4])
         return {
             "name": self.name,
             "convention": "modified" if self.notation.modified else CONVENTION,

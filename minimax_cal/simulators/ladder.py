@@ -348,9 +348,9 @@ class Run:
             (driven.touching, "touched something"),
         ):
             if rows.any():
-                lines = ", ".join(str(line) for line in self.data.line[rows][:8])
                 self.notices.append(
-                    f"{name}: the simulated arm {what} at {rows.sum()} poses (lines {lines})"
+                    f"{name}: the simulated arm {what} at {rows.sum()} poses "
+                    f"({self.data.list_rows(rows)})"
                 )
         for i in np.flatnonzero(driven.limited > AT_LIMIT):
             self.notices.append(

@@ -174,7 +174,7 @@ def test_a_file_delivers_what_the_fit_does(soft: mc.Fit, tmp_path: Path) -> None
         one, other = mc.deliver(soft, to), mc.deliver(tmp_path / "fit.json", to)
         assert_allclose(other.cell.robot.mdh, one.cell.robot.mdh, rtol=0, atol=1e-12)
         assert other.figures.rms == pytest.approx(one.figures.rms, rel=1e-9)
-        assert other.whole.rms == one.whole.rms
+        assert other.whole.rms == pytest.approx(one.whole.rms, rel=1e-9)
     written = json.loads(exported(tmp_path / "fit.json", "json").file.content)
     assert written == json.loads((tmp_path / "fit.json").read_text())["robot"]
 
@@ -184,7 +184,7 @@ def test_a_result_without_measurements_goes_out_as_it_is(soft: mc.Fit, tmp_path:
     found = exported(tmp_path / "fit.json", "urdf")
     assert found.delivered
     assert "fit.json holds no measurements" in found.notices[-1]
-    assert_array_equal(found.delivered.cell.robot.mdh, soft.robot.mdh)
+    assert_allclose(found.delivered.cell.robot.mdh, soft.robot.mdh, rtol=0, atol=1e-14)
     assert found.to_dict()["delivered"]["holdout_rms_mm"] is None
     arm = mc.deliver(soft.cell, "mjcf")
     assert arm.cell is soft.cell

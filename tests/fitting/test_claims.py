@@ -54,7 +54,7 @@ def test_bad_rows_that_are_held_out_are_told(robot: mc.Robot, noisy: Simulation)
     assert fit.beyond.worst_mm > 20.0  # they judge outside the measured region as well
     assert fit.beyond.trusted is not None
     assert_allclose(fit.beyond.trusted.worst_mm, clean.beyond.worst_mm, rtol=0.3)
-    assert "without outliers at worst" in fit.headline()
+    assert "without outliers worst part" in fit.headline()
 
 
 def test_sound_held_out_rows_are_no_suspects(robot: mc.Robot) -> None:
@@ -75,7 +75,7 @@ def test_suspects_of_a_file_come_back(robot: mc.Robot, noisy: Simulation, tmp_pa
     keys = [[(s.line, s.target, s.pose, s.held) for s in one.suspects] for one in (fit, again)]
     assert keys[0] == keys[1]
     assert again.beyond.to_dict() == fit.beyond.to_dict()
-    assert again.trusted == fit.trusted
+    assert again.trusted.rms_mm == pytest.approx(fit.trusted.rms_mm, rel=1e-9)
 
 
 def test_a_wrong_point_of_the_fit_is_set_aside_where_its_part_judges(robot: mc.Robot) -> None:

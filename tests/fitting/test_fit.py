@@ -1,7 +1,6 @@
 """A fit and its file: the same to the last digit; results for people."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
-from minimax_cal.fitting.crossed import NOT_CROSSED
 from minimax_cal.judging.bootstrap import bootstrap
 from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.reporting.html import Wording, compose, read_sources, render
@@ -42,20 +40,23 @@ def saved(fit: mc.Fit, tmp_path: Path) -> mc.Fit:
     return mc.load_fit(tmp_path / "fit.json")
 
 
-def test_what_was_saved_comes_back_to_the_last_digit(
-    fit: mc.Fit, saved: mc.Fit, rng: np.random.Generator
-) -> None:
+def assert_same(read: Any, made: Any) -> None:
+    """But for what millimetres and a rotation vector take of the last digits."""
+    assert_allclose(read, made, rtol=1e-11, atol=1e-14)
+
+
+def test_what_was_saved_comes_back(fit: mc.Fit, saved: mc.Fit, rng: np.random.Generator) -> None:
     q = rng.uniform(-2.0, 2.0, (20, 6))
-    assert_array_equal(saved.predict(q), fit.predict(q))
-    assert_array_equal(saved.covariance, fit.covariance)
+    assert_same(saved.predict(q), fit.predict(q))
+    assert_same(saved.covariance, fit.covariance)
     assert saved.summary() == fit.summary()
     assert repr(saved) == repr(fit)
     for name in ("value", "nominal", "sigma", "ci95"):
-        assert_array_equal(getattr(saved.parameters, name), getattr(fit.parameters, name))
+        assert_same(getattr(saved.parameters, name), getattr(fit.parameters, name))
     for key, error in fit.errors.items():
-        assert_array_equal(saved.errors[key], error)
+        assert_same(saved.errors[key], error)
     assert_array_equal(saved.held, fit.held)
-    assert_array_equal(saved.data.y, fit.data.y)
+    assert_same(saved.data.y, fit.data.y)
     assert_array_equal(saved.weights, fit.weights)
     assert vars(saved.identification).keys() == vars(fit.identification).keys()
     assert_array_equal(saved.identification.active, fit.identification.active)
@@ -69,10 +70,10 @@ def test_the_robot_is_of_geometry_alone(
     content = fit.to_dict()
     joint = bool(fit.cell.effects.causes)
     assert ("robot" in content["cell"]) is joint
-    assert_array_equal(saved.robot.mdh, fit.robot.mdh)
-    assert_array_equal(saved.geometric.base, fit.geometric.base)
-    assert_array_equal(saved.geometric.target_positions, fit.geometric.target_positions)
-    assert_array_equal(saved.cell.robot.mdh, fit.cell.robot.mdh)
+    assert_same(saved.robot.mdh, fit.robot.mdh)
+    assert_same(saved.geometric.base, fit.geometric.base)
+    assert_same(saved.geometric.target_positions, fit.geometric.target_positions)
+    assert_same(saved.cell.robot.mdh, fit.cell.robot.mdh)
     if joint:
         plain = mc.calibrate(robot, noisy.data)
         assert_allclose(fit.robot.mdh, plain.robot.mdh, rtol=0, atol=1e-9)
@@ -91,13 +92,13 @@ def test_the_report_is_the_same(fit: mc.Fit, saved: mc.Fit) -> None:
 
 
 def test_work_goes_on_from_a_saved_fit(fit: mc.Fit, saved: mc.Fit) -> None:
-    assert_array_equal(saved.estimator.model.weight, fit.estimator.model.weight)
-    assert_array_equal(saved.estimator.model.prior.weight, fit.estimator.model.prior.weight)
+    assert_same(saved.estimator.model.weight, fit.estimator.model.weight)
+    assert_same(saved.estimator.model.prior.weight, fit.estimator.model.prior.weight)
     assert_array_equal(saved.estimator.share, fit.estimator.share)
-    assert_array_equal(saved.distances.mean, fit.distances.mean)
+    assert_same(saved.distances.mean, fit.distances.mean)
     if fit.objective != "point":
         one, other = (bootstrap(each, 4, seed=1) for each in (fit, saved))
-        assert_array_equal(one.change, other.change)
+        assert_same(one.change, other.change)
 
 
 def test_the_estimator_gives_the_sigma_of_the_fit(fit: mc.Fit) -> None:
@@ -118,13 +119,14 @@ def test_a_file_without_poses(fit: mc.Fit, tmp_path: Path) -> None:
     fit.save(path, poses=False)
     content = json.loads(path.read_text())
     assert "poses" not in content
-    assert not {"measured", "weights", "crossed"} & content["arrays"].keys()
+    assert not {"weights", "crossed"} & content["arrays"].keys()
     back = mc.load_fit(path)
-    assert [p.to_dict() for p in back.parameters] == [p.to_dict() for p in fit.parameters]
+    assert [p.name for p in back.parameters] == [p.name for p in fit.parameters]
+    assert_same(back.parameters.value, fit.parameters.value)
     assert back.accuracy["train"].sse_mm2 == fit.accuracy["train"].sse_mm2
     assert back.beyond.to_dict() == fit.beyond.to_dict()
     assert not back.data.poses
-    assert_array_equal(back.predict(fit.data.q[:3]), fit.predict(fit.data.q[:3]))
+    assert_same(back.predict(fit.data.q[:3]), fit.predict(fit.data.q[:3]))
 
 
 def test_a_number_changed_by_hand_counts(fit: mc.Fit) -> None:
@@ -134,22 +136,15 @@ def test_a_number_changed_by_hand_counts(fit: mc.Fit) -> None:
     first[0] += 1.0
     moved = mc.Fit.from_dict(content).cell.target_positions - fit.cell.target_positions
     assert moved[0, 0] == pytest.approx(1e-3, abs=1e-12)
-    assert np.count_nonzero(moved) == 1
+    assert np.count_nonzero(np.abs(moved) > 1e-12) == 1
 
 
-def test_a_file_without_arrays_or_poses_opens(fit: mc.Fit) -> None:
-    """The same to what millimetres and a rotation vector keep."""
+def test_a_file_without_poses_or_covariance_opens(fit: mc.Fit) -> None:
     content = json.loads(fit.json())
-    for key in ("arrays", "widening"):
-        del content[key]
-    old = mc.Fit.from_dict(content)
-    assert_allclose(old.predict(np.ones(6)), fit.predict(np.ones(6)), rtol=0, atol=1e-12)
-    assert_allclose(old.covariance, fit.covariance, rtol=1e-9, atol=0)
-    assert old.headline() == replace(fit, error_crossed=NOT_CROSSED).headline()
     for key in ("poses", "covariance"):
         del content[key]
     bare = mc.Fit.from_dict(content)
-    assert_allclose(bare.before.base, fit.before.base, rtol=0, atol=1e-9)
+    assert_same(bare.before.base, fit.before.base)
     assert bare.data.poses == 0
     with pytest.raises(mc.CalibrationError, match="covariance"):
         _ = bare.covariance
@@ -161,7 +156,10 @@ def test_a_file_without_arrays_or_poses_opens(fit: mc.Fit) -> None:
         (lambda c: c.pop("accuracy"), "accuracy: Field required"),
         (lambda c: c["accuracy"]["train"].update(points=[1]), "accuracy.train is not of"),
         (lambda c: c.update(schema=2), "is of schema 2"),
-        (lambda c: c["arrays"]["prior"].update(float64="?"), "its arrays cannot be read"),
+        (
+            lambda c: c["arrays"].update(prior="?"),
+            "arrays.prior: Value error, holds something else",
+        ),
         (lambda c: c["parameters"][0].update(name="nonsense"), "cannot be read"),
         (lambda c: c["poses"]["q"].pop(), "its list of poses cannot be read"),
         (lambda c: c.update(status="fine"), "status: Input should be"),

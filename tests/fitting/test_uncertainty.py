@@ -522,13 +522,13 @@ def test_saved_uncertainty_comes_back(
     assert known.names == fit.uncertainty.names
     assert known.units == fit.uncertainty.units
     assert known.source == fit.uncertainty.source == "poses"
-    np.testing.assert_array_equal(known.covariance, fit.uncertainty.covariance)
+    np.testing.assert_allclose(known.covariance, fit.uncertainty.covariance, rtol=1e-12)
     for frame in uncertainty.FRAMES:
         one, two = (
             position_covariance(c, u, anywhere, frame, jitter=True)
             for c, u in ((fit.cell, fit.uncertainty), (cell, known))
         )
-        np.testing.assert_array_equal(two, one)
+        np.testing.assert_allclose(two, one, rtol=1e-9)
 
 
 def test_the_saved_block_is_in_millimetres(result: mc.Fit) -> None:

@@ -93,7 +93,7 @@ def names_of(data: Measurements, label: Array) -> Array:
     """(m,) name of each row's pose: its label, else the line at which it stands first."""
     _, first, group = np.unique(groups(data), return_index=True, return_inverse=True)
     told = np.flatnonzero(label != "")
-    name = np.array([f"line {line}" for line in data.line[first]], dtype=object)
+    name = np.array([data.called(line) for line in data.line[first]], dtype=object)
     name[group[told[::-1]]] = label[told[::-1]]  # of two labels the first
     return np.asarray(name[group].astype(str))
 

@@ -197,7 +197,7 @@ def shift_of(data: Measurements, order: Array, apart: Between, step: Step, effec
         a, b = (data.target_names[i] for i in apart.pairs[pair])
         amounts.append(Amount(f"{a}-{b}", float(step.change[pair]), "m", float(step.sigma[pair])))
     place = " or ".join(data.target_names[i] for i in step.targets)
-    where = f"line {data.line[rows[0]]}"
+    where = data.called(data.line[rows[0]])
     if effect == SHIFT:
         where += f" (visit {step.at + 1} of {len(order)})"
     text = (

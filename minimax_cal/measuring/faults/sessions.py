@@ -28,8 +28,8 @@ def mixed_units(data: Measurements) -> tuple[Fault, ...]:
         Fault(
             "mixed_units",
             "all",
-            f"{what} from line {data.line[np.argmax(session == other)]} on ({word}) are about "
-            f"{ratio:.3g} times those of the first session: another unit?",
+            f"{what} from {data.called(data.line[np.argmax(session == other)])} on ({word}) are "
+            f"about {ratio:.3g} times those of the first session: another unit?",
             np.flatnonzero(session == other),
             parameters=(Amount("ratio", ratio),),
         )
@@ -63,7 +63,7 @@ def session_jumps(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, .
     if not len(rows):
         return ()
     told = ", ".join(
-        f"line {line} on by {1e3 * size:.3g} mm"
+        f"{data.called(line)} on by {1e3 * size:.3g} mm"
         for line, size in zip(data.line[rows], sizes, strict=True)
     )
     return (

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.checks import orders_of
 from minimax_cal.measuring.faults.distances import Between, between
 from minimax_cal.measuring.faults.fault import NO_ERROR, Amount, Fault
@@ -34,12 +33,12 @@ def swapped_rows(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, ..
             orders.append(order)
     if not rows:
         return ()
-    lines = name_first([str(data.line[row]) for row in rows])
     return (
         Fault(
             "swapped_rows",
             "all",
-            f"targets stand under each other's names in {len(rows)} rows: lines {lines}",
+            f"targets stand under each other's names in {len(rows)} rows: "
+            f"{data.list_rows(np.array(rows))}",
             np.array(rows),
             np.stack(orders),
             (Amount("rows", float(len(rows))),),
