@@ -14,7 +14,6 @@ from minimax_cal.evidence.library import Aside, Candidate, Kind, Library, kinds
 from minimax_cal.evidence.limits import CREDIBLE, LINES
 from minimax_cal.evidence.noise import Noise, inflation, triangles
 from minimax_cal.evidence.products import LEAST, At, Products, within
-from minimax_cal.evidence.sweeping import Swept
 from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.bounded import bounded
 
@@ -276,7 +275,7 @@ class Fixed:
     error: (N,).
     """
 
-    products: Products | Swept
+    products: Products
     index: Array
     factors: Array
     weights: Array
@@ -399,10 +398,11 @@ def normal_equations(
     """
     main, loose, ridge = columns_of([one.candidate for one in fits], fits)
     index = np.concatenate([main, loose])
-    at = lib.products.at(np.array([noise.ratio]), index)
-    gram = beside_priors(at, index, ridge * noise.variance)[0]
+    (whole,), _ = lib.products.gram(np.array([noise.ratio]), index)
+    gram, pull = whole[:-1, :-1], whole[:-1, -1]
+    gram = gram + np.diag(np.pad(ridge * noise.variance, (len(main), 0)))
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    return gram / np.outer(scale, scale), at.pull[0] / scale, scale
+    return gram / np.outer(scale, scale), pull / scale, scale
 
 
 def against_signs(lib: Library, fits: Sequence[Added], noise: Noise) -> float:

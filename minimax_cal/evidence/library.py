@@ -120,7 +120,7 @@ class Library:
     """
 
     dictionary: Dictionary
-    products: Products | Swept
+    products: Products
     candidates: tuple[Candidate, ...]
     untestable: tuple[Key, ...] = ()
     found: dict[str, Candidate] = field(default_factory=dict)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -256,10 +255,16 @@ class At:
 
 
 class Products:
-    """Products for any ratio, of all rows."""
+    """Products for any ratio, of all rows.  kept: (N,) whether a row counts.
 
-    def __init__(self, columns: Columns) -> None:
-        self.columns, self.kept = columns, np.ones(len(columns.rows.error), dtype=bool)
+    count: of rows that were measured.  rank: of the geometry's columns.
+    """
+
+    def __init__(self, columns: Columns, kept: Array | None = None) -> None:
+        self.columns = columns
+        self.rank: int = columns.fixed - 1
+        self.kept = np.ones(len(columns.rows.error), dtype=bool) if kept is None else kept
+        self.count = int(np.count_nonzero(self.kept & columns.rows.measured))
         self.formed: dict[int | None, Beside] = {}
         self.summed: dict[int | None, Sums] = {}
         self.noises: dict[bytes, Noise] = {}
@@ -297,14 +302,9 @@ class Products:
                 out.append((here, self.beside(number), between))
         return out
 
-    @cached_property
-    def count(self) -> int:
-        """Rows that were measured."""
-        return int(np.count_nonzero(self.columns.rows.measured))
-
     def dof(self, index: Array) -> int:
         """Degrees of freedom beside the geometry and some of the candidates' columns."""
-        return self.count - (self.columns.fixed - 1) - len(index)
+        return self.count - self.rank - len(index)
 
     def noise(self, index: Array) -> Noise:
         """The noise beside some of the candidates' columns, by restricted maximum likelihood."""
@@ -317,23 +317,36 @@ class Products:
         """The noise, computed."""
         rows, dof = self.columns.rows, self.dof(index)
         if dof < LEAST_NOISE_DOF:
-            square = float(rows.error @ rows.error)
-            return Noise(0.0, square / max(self.count, 1) + 1e-18, 0.0)
-        chosen = np.concatenate([self.columns.fixed + index, [self.columns.fixed - 1]])
+            error = rows.error[self.kept]
+            return Noise(0.0, float(error @ error) / max(self.count, 1) + 1e-18, 0.0)
+        varied = rows.variance_ratio[self.kept]
 
         def cost(ratios: Array) -> tuple[Array, Array]:
-            gram = np.empty((len(ratios), len(chosen), len(chosen)))
-            logs, least = np.empty(len(ratios)), np.empty((len(ratios), len(index)))
-            for here, beside, between in self.views(ratios):
-                gram[here] = np.tensordot(between, beside.square(chosen), 1)
-                least[here] = LEAST * (between @ beside.sums.squares()[index].T)
-                logs[here] = between @ beside.logs
-            gram[:, range(len(index)), range(len(index))] += least
-            value, squares = costs(gram, ratios, rows.variance_ratio, dof)
+            gram, logs = self.gram(ratios, index)
+            value, squares = costs(gram, ratios, varied, dof)
             return value + logs, squares
 
-        ratio = likeliest(lambda ratios: cost(ratios)[0])
+        ratio = self.likeliest(lambda ratios: cost(ratios)[0])
         return noise_of(ratio, float(cost(np.array([ratio]))[1][0]) / dof, rows)
+
+    def likeliest(self, cost: Callable[[Array], Array]) -> float:
+        """The ratio of least cost."""
+        return likeliest(cost)
+
+    def gram(self, ratios: Array, index: Array) -> tuple[Array, Array]:
+        """(s, q + 1, q + 1) products among candidates' columns (q,) and, last, the error.
+
+        Geometry is projected out at ratios (s,); and (s,) log determinants of its products.
+        """
+        chosen = np.concatenate([self.columns.fixed + index, [self.columns.fixed - 1]])
+        gram = np.empty((len(ratios), len(chosen), len(chosen)))
+        logs, least = np.empty(len(ratios)), np.empty((len(ratios), len(index)))
+        for here, beside, between in self.views(ratios):
+            gram[here] = np.tensordot(between, beside.square(chosen), 1)
+            least[here] = LEAST * (between @ beside.sums.squares()[index].T)
+            logs[here] = between @ beside.logs
+        gram[:, range(len(index)), range(len(index))] += least
+        return gram, logs
 
     def geometry(self) -> Array:
         """(p, N) the geometry's columns."""

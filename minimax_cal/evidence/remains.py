@@ -108,9 +108,11 @@ class Rest:
         basis = self.basis.reshape(m, r, -1)
         return evened(self.rows.reshape(m, r), basis, spread, self.group).reshape(-1)
 
-    def without(self, rows: Array) -> Array:
-        """Rows (N, b) without what was fitted."""
-        return np.asarray(rows - self.basis @ (self.basis.T @ rows))
+    def beside(self, drawn: Array) -> Array:
+        """(N, 1 + b) the rows, and drawn ones (N, b) without what was fitted."""
+        out = np.concatenate([self.rows[:, None], drawn], axis=1)
+        out[:, 1:] -= self.basis @ (self.basis.T @ drawn)
+        return out
 
     def felt(self, motion: Array, rows: Array) -> Array:
         """(d, m, b) products at each visit of motions (N, d) with rows (N, b)."""
@@ -137,14 +139,13 @@ def remains(rest: Rest, components: Sequence[Component]) -> tuple[Remains, ...]:
     moving = [one for one in components if np.any(one.motion)]
     if not moving:
         return ()
-    drawn = rng.normal(size=(len(rest.rows), DRAWS)) * (rest.root > 0.0)[:, None]
-    drawn = rest.without(drawn) * np.sqrt(rest.total / max(rest.dof, 1))
-    white = scores_of(rest, moving, drawn)
-    score, chance = largest(white)
+    drawn = rest.beside(rng.normal(size=(len(rest.rows), DRAWS)) * (rest.root > 0.0)[:, None])
+    drawn[:, 1:] *= np.sqrt(rest.total / max(rest.dof, 1))
+    score, chance = largest(scores_of(rest, moving, drawn))
     order = np.argsort(-score).tolist()
     loud = sorted([i for i in order if chance[i] < AUDIBLE][:ASKED] or order[:1])
     signs = np.repeat(rng.choice((-1.0, 1.0), (len(rest.group), DRAWS)), rest.width, axis=0)
-    flipped = rest.without(signs * rest.even()[:, None])
+    flipped = rest.beside(signs * rest.even()[:, None])
     _, by_signs = largest(scores_of(rest, [moving[i] for i in loud], flipped))
     told = sorted(
         (1.0 if scatter > SCATTERS else float(chance[i]), -float(score[i]), i)
@@ -157,11 +158,11 @@ def remains(rest: Rest, components: Sequence[Component]) -> tuple[Remains, ...]:
 
 
 def scores_of(rest: Rest, components: Sequence[Component], drawn: Array) -> Array:
-    """(c, 1 + DRAWS) squared products of components with the rows, and with drawn rows (N, b)."""
-    every, out = np.concatenate([rest.rows[:, None], drawn], axis=1), []
+    """(c, b) squared products of components with rows (N, b), the first those that are left."""
+    out: list[Array] = []
     for _, same in groupby(components, key=lambda one: id(one.motion)):
         several = list(same)
-        felt = rest.felt(several[0].motion, every)
+        felt = rest.felt(several[0].motion, drawn)
         out += [score_of(one.feature, felt) for one in several]
     return np.array(out)
 
@@ -172,7 +173,8 @@ def score_of(feature: Array | Fading, felt: Array) -> Array:
         return feature.score(felt)
     ways, count, visits = feature.shape
     told = feature.reshape(-1, visits) @ felt
-    return np.asarray((told**2).reshape(len(felt), ways, count, -1).sum(axis=(0, 2)).max(axis=0))
+    np.square(told, out=told)
+    return np.asarray(told.reshape(len(felt), ways, count, -1).sum(axis=(0, 2)).max(axis=0))
 
 
 def largest(scores: Array) -> tuple[Array, Array]:
@@ -208,9 +210,9 @@ def share_of(rest: Rest, one: Component, drawn: Array) -> float:
 
     With z features of variance v the score |z'r|^2 is that by chance plus v |z'z|^2 (MINQUE); by
     chance, of rows of variance s, it has the mean s tr z'z and the variance 2 s^2 |z'z|^2.
-    drawn: (N, b) rows by chance.
+    drawn: (N, 1 + b) the rows, and rows by chance.
     """
-    felt = rest.felt(one.motion, np.concatenate([rest.rows[:, None], drawn], axis=1))
+    felt = rest.felt(one.motion, drawn)
     feature = one.feature
     if not isinstance(feature, Fading) and len(feature) > 1:
         feature = feature[[int(np.argmax([score_of(w[None], felt[..., :1])[0] for w in feature]))]]

@@ -7,11 +7,12 @@ once, so that nothing that a search asks of a part looks at rows again.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from minimax_cal.evidence.limits import LEAST_NOISE_DOF
-from minimax_cal.evidence.noise import Noise, costs, noise_of, told_apart, triangles
-from minimax_cal.evidence.products import LEAST, At, Columns
+from minimax_cal.evidence.noise import Noise, told_apart, triangles
+from minimax_cal.evidence.products import LEAST, At, Columns, Products
 from minimax_cal.ground.arrays import Array
 
 COUNT = 7  # ratios beside 0, between those of the noises beside nothing and beside all effects
@@ -51,59 +52,41 @@ def ratios_about(noises: list[Noise]) -> Array:
     return np.concatenate([[0.0], np.geomspace(low, high, COUNT)])
 
 
-class Swept:
+class Swept(Products):
     """Products of the rows that are kept, geometry swept out: as `Products`, at the Grams' ratios.
 
     kept: (N,) whether a row counts.  left: (s, 1 + D, 1 + D) of the error and candidates' columns.
     """
 
     def __init__(self, grams: Grams, kept: Array) -> None:
-        self.columns, self.ratios, self.kept = grams.columns, grams.ratios, kept
-        rows, p = self.columns.rows, self.columns.fixed - 1
+        super().__init__(grams.columns, kept)
+        self.ratios, p = grams.ratios, self.rank
         every = grams.products - grams.among(~kept)
         self.span = told_apart(every[0, :p, :p])
+        self.rank = self.span.shape[1]
         self.factor = triangles(self.span.T @ every[:, :p, :p] @ self.span)
         self.logs = 2.0 * np.log(np.einsum("srr->sr", self.factor)).sum(axis=1)
         self.part = np.linalg.inv(self.factor) @ (self.span.T @ every[:, :p, p:])
         self.square = every[:, p, p].copy()
         self.left = every[:, p:, p:] - np.swapaxes(self.part, 1, 2) @ self.part
-        weights = kept / (1.0 + np.outer(self.ratios, rows.variance_ratio))
+        weights = kept / (1.0 + np.outer(self.ratios, self.columns.rows.variance_ratio))
         self.whole = weights @ self.columns.raw**2
-        self.count = int(np.count_nonzero(kept & rows.measured))
-        self.noises: dict[bytes, Noise] = {}
-
-    def clear(self, index: Array) -> Array:
-        """(d, N) candidates' columns less what geometry imitates."""
-        return np.asarray(self.columns.clear[self.columns.fixed + index])
 
     def geometry(self) -> Array:
         """(r, N) the geometry's columns, as the combinations that the rows tell apart."""
         return np.asarray(self.span.T @ self.columns.clear[: self.columns.fixed - 1])
 
-    def dof(self, index: Array) -> int:
-        """Degrees of freedom beside the geometry and some of the candidates' columns."""
-        return self.count - int(self.span.shape[1]) - len(index)
+    def likeliest(self, cost: Callable[[Array], Array]) -> float:
+        """The ratio of least cost among those of the Grams."""
+        return float(self.ratios[int(np.argmin(cost(self.ratios)))])
 
-    def noise(self, index: Array) -> Noise:
-        """The likeliest noise beside some of the candidates' columns, among the ratios."""
-        mark = index.tobytes()
-        if mark not in self.noises:
-            self.noises[mark] = self.estimated(index)
-        return self.noises[mark]
-
-    def estimated(self, index: Array) -> Noise:
-        """The noise, computed."""
-        rows, dof = self.columns.rows, self.dof(index)
-        if dof < LEAST_NOISE_DOF:
-            error = rows.error[self.kept]
-            return Noise(0.0, float(error @ error) / max(self.count, 1) + 1e-18, 0.0)
+    def gram(self, ratios: Array, index: Array) -> tuple[Array, Array]:
+        """As `Products.gram`."""
+        here, each = np.searchsorted(self.ratios, ratios), range(len(index))
         chosen = np.concatenate([1 + index, [0]])
-        gram = self.left[:, chosen[:, None], chosen]
-        each = range(len(index))
-        gram[:, each, each] += LEAST * self.whole[:, index]
-        cost, squares = costs(gram, self.ratios, rows.variance_ratio[self.kept], dof)
-        best = int(np.argmin(cost + self.logs))
-        return noise_of(float(self.ratios[best]), float(squares[best]) / dof, rows)
+        gram = self.left[here[:, None, None], chosen[:, None], chosen]
+        gram[:, each, each] += LEAST * self.whole[here[:, None], index]
+        return gram, self.logs[here]
 
     def ratios_below(self, noise: Noise) -> Array:
         """(s,) the ratios at which candidates are compared beside a noise, the largest first."""
