@@ -62,7 +62,7 @@ class Straight:
         free = np.zeros(1, dtype=bool)
         column = self.regressors[:, [number]]
         return Spec(term, term.text, (term.text, "x"), column, none, np.zeros(0, dtype=int), free,
-                    1.0, 0, False, "")  # fmt: skip
+                    1.0, 0, False)  # fmt: skip
 
     def finer(self, term: Any) -> Sequence[Any]:
         return ()
