@@ -25,7 +25,9 @@ from minimax_cal.simulators.motion.numbers import POWERS, Numbers, given_numbers
 
 PRIOR = 0.5  # standard deviation of a body's log-Cholesky coordinates about the model's
 PRIOR_ASSUMED = 1.5  # the same where the masses of the model are assumed
-ROTOR = 0.5  # of the largest inertia about a joint: standard deviation of an unknown armature
+ROTOR = (
+    0.5  # standard deviation of an armature, of the inertia by the links or torque / acceleration
+)
 LEVELS_OFF = (0.5, 0.7, 1.0, 1.4)  # of a joint's largest speed, where damping levels off
 ROUNDS = 3  # of fits, each with the load and the friction of the one before
 STEPS = 60  # of a fit, and trials of a step
@@ -158,7 +160,8 @@ def columns_of(study: Study, scene: Scene, asked: Asked) -> Iterator[Column]:
                 powers = levelling(share * scene.arm.fastest[j])
                 yield Column(f"curve {share}", j, speeds(qd) @ powers / unit[j])
         if ARMATURE in asked.elements:
-            doubt = max(given.armature[j], ROTOR * study.inertia[j])
+            whole = unit[j] * np.abs(scene.logs.torque[:, j]).max() / np.abs(qdd).max()
+            doubt = max(given.armature[j], ROTOR * study.inertia[j], ROTOR * whole)
             yield Column("armature", j, qdd / unit[j], mean=given.armature[j], sd=doubt)
         if SPRINGS in asked.elements and j in asked.sprung:
             for power in range(POWERS):
@@ -258,7 +261,10 @@ def joint_fit(
         top = np.hstack([by_body.reshape(len(links), -1)[:, free.ravel()], linear])
         return np.vstack([top, np.diag(weight)])
 
-    x = least_within(residual, jacobian, np.maximum(middle, least), least)
+    beside = np.arange(len(middle)) >= count
+    x = np.maximum(middle, least)  # first what fits the drawn bodies: else link 2 takes J1's rotor
+    x = least_within(residual, lambda x: jacobian(x) * beside, x, least)
+    x = least_within(residual, jacobian, x, least)
     return study.bodies.at(coordinates(x)) if count else study.bodies.drawn, x[count:]
 
 
