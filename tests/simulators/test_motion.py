@@ -1,6 +1,7 @@
 """A model corrected by logs: it has the real arm's numbers, and moves as the arm does."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -233,6 +234,17 @@ def test_logged_commands_drive_the_servos_of_the_model(tmp_path: Path) -> None:
     assert gap.drives == "its position servos and the logged commands"
     first, last = (np.array(r.tracking_rms_mrad) for r in (gap.rungs[0], gap.rungs[-1]))
     assert (last < 0.1 * first).all()
+
+
+def test_no_link_grows_in_place_of_a_rotor(tmp_path: Path) -> None:
+    """Torques tell J1's rotor from no mass off its axis: what is nearer to the drawing counts."""
+    rotors = replace(LACKS, armature=np.array([6.0, 5.0, 2.0]))
+    arm, out = DrivenArm(three_joints(), with_motors(three_joints()), rotors, 3, STEP), "new.xml"
+    mc.motion_gap(save_model(arm, tmp_path), logged(arm, 3, 8.0), driven=False,
+                  write=tmp_path / out)  # fmt: skip
+    found, real = mujoco.MjModel.from_xml_path(str(tmp_path / out)), arm.real()
+    assert_allclose(found.dof_armature, real.dof_armature, rtol=0.02)
+    assert_allclose(found.body_mass[1:], real.body_mass[1:], rtol=0.1)
 
 
 def test_currents_need_drive_gains(made: SimpleNamespace, tmp_path: Path,

@@ -25,9 +25,7 @@ from minimax_cal.simulators.motion.numbers import POWERS, Numbers, given_numbers
 
 PRIOR = 0.5  # standard deviation of a body's log-Cholesky coordinates about the model's
 PRIOR_ASSUMED = 1.5  # the same where the masses of the model are assumed
-ROTOR = (
-    0.5  # standard deviation of an armature, of the inertia by the links or torque / acceleration
-)
+ROTOR = 0.5  # of the inertia by links, or torque / acceleration: deviation of an armature
 LEVELS_OFF = (0.5, 0.7, 1.0, 1.4)  # of a joint's largest speed, where damping levels off
 ROUNDS = 3  # of fits, each with the load and the friction of the one before
 STEPS = 60  # of a fit, and trials of a step
