@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,6 @@ from click.core import ParameterSource
 from minimax_cal.cli import options
 from minimax_cal.cli.options import (
     DETAILS,
-    PATH,
     ROBOT,
     ROWS,
     SOME_CAMPAIGNS,
@@ -23,13 +22,13 @@ from minimax_cal.cli.options import (
     options_from,
     plain_option,
     result_options,
-    stacked,
 )
+from minimax_cal.cli.pixel_files import PIXEL_FILES, PixelFiles
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.first_screen import first_table, frames_table
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options
-from minimax_cal.fitting.pixels.options import CAMERAS, PixelOptions, camera_of
+from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
 from minimax_cal.reporting.plots.figures import save_errors
@@ -42,46 +41,12 @@ if TYPE_CHECKING:
 BRIEF = 1000  # poses that one fit needs no compiled kernels for
 
 
-PIXEL_FILES = stacked(
-    plain_option(
-        CAMERAS,
-        "--pixels",
-        type=PATH,
-        metavar="FILE",
-        help="What cameras saw (CSV): pose, camera, target, u_px, v_px; takes the place of DATA.",
-    ),
-    plain_option(
-        CAMERAS,
-        "--joints",
-        type=PATH,
-        metavar="FILE",
-        help="The joint values of each pose of the detections (CSV): pose, q1_rad, ...",
-    ),
-    plain_option(
-        CAMERAS,
-        "--camera",
-        multiple=True,
-        metavar="NAME=FILE",
-        help="The K and D of a camera, as OpenCV or ROS write them (YAML); may be given several "
-        "times.",
-    ),
-    plain_option(
-        CAMERAS,
-        "--board",
-        type=PATH,
-        metavar="FILE",
-        help="The places of the targets on a board (CSV): target, x_mm, y_mm, z_mm [default: tags "
-        "of unknown place].",
-    ),
-    options_from(PixelOptions, "camera_on", "fix_camera", "camera_prior", "drawn_prior"),
-)
-
-
 @click.command(name="calibrate", cls=InGroups)
 @ROBOT
 @SOME_CAMPAIGNS
 @options_from(Options)
 @PIXEL_FILES
+@options_from(PixelOptions, "drawn_prior")
 @ROWS
 @plain_option(
     "What is known",
@@ -121,15 +86,15 @@ def calibrate_command(
 
     Or from what cameras saw, with --pixels, --joints and --camera in place of DATA.
     """
-    if pixels or joints or camera or board:
-        files = PixelFiles(data, pixels, joints, tuple(camera), board)
+    files = PixelFiles(pixels, joints, tuple(camera), board)
+    if files.given:
         lens = {
             "camera_on": camera_on,
             "fix_camera": fix_camera,
             "camera_prior": camera_prior,
             "drawn_prior": drawn_prior,
         }
-        return by_cameras(robot, files, to, lens, chosen, details=details)
+        return by_cameras(robot, data, files, to, lens, chosen, details=details)
     if not data:
         raise click.UsageError(
             "Missing argument 'DATA...', or --pixels with --joints and --camera."
@@ -156,19 +121,9 @@ def calibrate_command(
     return options.exit_code(fit.status, fit.reason)
 
 
-@dataclass(frozen=True)
-class PixelFiles:
-    """What was given of a calibration by cameras."""
-
-    data: tuple[Path, ...]
-    pixels: Path | None
-    joints: Path | None
-    camera: tuple[str, ...]
-    board: Path | None
-
-
 def by_cameras(
     robot: str,
+    data: tuple[Path, ...],
     files: PixelFiles,
     to: Output,
     lens: dict[str, Any],
@@ -179,12 +134,10 @@ def by_cameras(
     """Calibrate from pixels.  Raises OptionError for what they do not know."""
     from minimax_cal.fitting.pixels.calibrate import calibrate_pixels
 
-    if files.data:
+    if data:
         raise OptionError(
-            f"{files.data[0]}: DATA and pixels are two calibrations; give one of them"
+            f"{data[0]}: DATA and pixels are one fit in minimax-cal relative; give one of them here"
         )
-    if not (files.pixels and files.joints and files.camera):
-        raise OptionError("cameras need all three of pixels=, joints= and camera='NAME=FILE'")
     at = click.get_current_context()
     given = [
         name for name in chosen if at.get_parameter_source(name) is ParameterSource.COMMANDLINE
@@ -192,13 +145,9 @@ def by_cameras(
     for name in set(given) - {field.name for field in fields(PixelOptions)}:
         raise OptionError(f"{name}= is not for pixels: leave it out")
     own = {name: chosen[name] for name in given}
-    cameras = dict(camera_of(text) for text in files.camera)
-    if len(cameras) < len(files.camera):
-        raise OptionError("camera= gives one name twice; each camera has its own")
+    pixels, joints, cameras, board = files.paths()
     with to.stages() as progress:
-        fit = calibrate_pixels(
-            robot, files.pixels, files.joints, cameras, files.board, progress, **lens, **own
-        )
+        fit = calibrate_pixels(robot, pixels, joints, cameras, board, progress, **lens, **own)
     to.notice(*fit.notices)
     if to.deliver(fit.json, fit.status):
         first = [fit.accuracy_table().brief()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,9 @@ from minimax_cal.cli.options import (
     options_from,
     result_options,
 )
+from minimax_cal.cli.pixel_files import PIXEL_FILES, PixelFiles
 from minimax_cal.fitting.instruments import RelativeOptions, relative
+from minimax_cal.fitting.instruments.kinds import Given
 from minimax_cal.fitting.options import Options
 
 
@@ -26,11 +29,20 @@ from minimax_cal.fitting.options import Options
 @CAMPAIGNS
 @options_from(Options, "holdout", "seed", "fix", "free", "priors")
 @options_from(RelativeOptions)
+@PIXEL_FILES
 @options_from(Options, "method")
 @DETAILS
 @result_options("the result (JSON)")
 def relative_command(
-    robot: str, data: tuple[Path, ...], details: bool, to: Output, **chosen: Any
+    robot: str,
+    data: tuple[Path, ...],
+    details: bool,
+    to: Output,
+    pixels: Path | None,
+    joints: Path | None,
+    camera: Sequence[str],
+    board: Path | None,
+    **chosen: Any,
 ) -> int:
     """Calibrate ROBOT without coordinates, from lengths, closures, contacts or poses in DATA.
 
@@ -41,10 +53,15 @@ def relative_command(
     flange_x_mm, flange_y_mm, flange_z_mm with flange_rx_rad ... or flange_qw ... (whole poses).
 
     Several files, of any kinds, are one fit: all share the arm, each counts by its own noise.  A
-    tracker's measurements (smr1_x_mm ...) may be among them.
+    tracker's measurements (smr1_x_mm ...) may be among them, and what cameras saw (--pixels).
     """
+    files, every = PixelFiles(pixels, joints, tuple(camera), board), list[Given](data)
+    if files.given:
+        from minimax_cal.fitting.pixels.data import detected
+
+        every.append(detected(*files.paths()))
     with to.stages() as progress:
-        fit = relative(robot, list(data), progress, **chosen)
+        fit = relative(robot, every, progress, **chosen)
     to.notice(*fit.notices)
     if to.deliver(fit.json, fit.status):
         advice = options.keep(to.path, "relative.json")

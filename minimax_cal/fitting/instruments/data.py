@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +13,10 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
 
-KINDS = ("distances", "closures", "poses", "points", "contacts")
+if TYPE_CHECKING:
+    from minimax_cal.fitting.pixels.data import PixelData
+
+KINDS = ("distances", "closures", "poses", "points", "contacts", "pixels")
 PLANE, SPHERE = "plane", "sphere"
 NO_POSES: Array = np.zeros((0, 4, 4))
 NORM = 1e-3  # a quaternion farther from unit length is no rotation
@@ -54,8 +58,8 @@ class RelativeData:
     wires: s names, as wire1.  length: (m, s) from an anchor to the target, NaN where not measured
     [m].  socket: (m,) label of the socket that held the ball.  pose: (m, 4, 4) of the flange in
     the measurement frame [m].  surface: (m,) label of the one of `surfaces` that the probe's ball
-    touched; ball_radius: NaN where not known [m].  What is not of the kind is empty: s = 0, labels
-    '', no poses.
+    touched; ball_radius: NaN where not known [m].  pixels: of cameras, at these poses.  What is not
+    of the kind is empty: s = 0, labels '', no poses, None.
     """
 
     at: Measurements
@@ -67,6 +71,14 @@ class RelativeData:
     surface: Array = field(default_factory=lambda: np.zeros(0, dtype=str))
     surfaces: tuple[Surface, ...] = ()
     ball_radius: float = np.nan
+    pixels: PixelData | None = None
+
+    @property
+    def images(self) -> PixelData:
+        """The pixels at these poses."""
+        if self.pixels is None:
+            raise DataError(f"{self.at.source}: holds {self.kind}, no pixels")
+        return replace(self.pixels, at=self.at)
 
     @property
     def poses(self) -> int:
@@ -87,6 +99,7 @@ class RelativeData:
             socket=self.socket[rows] if len(self.socket) else self.socket,
             pose=self.pose[rows] if len(self.pose) else self.pose,
             surface=self.surface[rows] if len(self.surface) else self.surface,
+            pixels=self.pixels and self.pixels.take(rows),
         )
 
     def says(self, row: int) -> str:
@@ -226,6 +239,10 @@ def points(at: Measurements) -> RelativeData:
     return check(RelativeData(at, "points"))
 
 
+def check_pixels(data: RelativeData) -> None:
+    """Pixels are checked where they are read."""
+
+
 def check_points(data: RelativeData) -> None:
     """Raise DataError where there are none."""
     if not data.at.seen.any():
@@ -263,6 +280,7 @@ def check_contacts(data: RelativeData) -> None:
 CHECKS = {
     "contacts": check_contacts,
     "points": check_points,
+    "pixels": check_pixels,
     "distances": check_lengths,
     "closures": check_sockets,
     "poses": check_poses,

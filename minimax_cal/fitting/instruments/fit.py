@@ -29,6 +29,7 @@ from minimax_cal.fitting.instruments.rows import Block
 from minimax_cal.fitting.instruments.sockets import Closures
 from minimax_cal.fitting.instruments.stack import Known, Squares, Stack
 from minimax_cal.fitting.instruments.wires import Wires
+from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
@@ -106,9 +107,21 @@ def contacts_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> 
     return Contacts.of(robot, train)
 
 
+def pixels_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Block:
+    """Images as a block."""
+    from minimax_cal.fitting.pixels.block import Pixels  # it takes of a calibration by cameras
+
+    chosen = PixelOptions(
+        camera_on=options.camera_on, fix_camera=options.fix_camera,
+        camera_prior=options.camera_prior, holdout=0.0,
+    )  # fmt: skip
+    return Pixels.of(robot, train.images, chosen)
+
+
 BLOCKS = {
     "contacts": contacts_of,
     "distances": wires_of, "closures": closures_of, "points": points_of, "poses": poses_of,
+    "pixels": pixels_of,
 }  # fmt: skip
 
 
@@ -275,6 +288,8 @@ def numbers_of(train: RelativeData) -> int:
     if train.kind == "contacts":
         touched = [train.surface == surface.label for surface in train.surfaces]
         return sum(len(np.unique(pose[here])) for here in touched)
+    if train.kind == "pixels":
+        return 6 * len(np.unique(pose[train.images.pose]))
     of_each = 3 if train.kind == "points" else 1
     seen = train.at.seen if train.kind == "points" else np.isfinite(train.length)
     return of_each * sum(len(np.unique(pose[column])) for column in seen.T)

@@ -59,6 +59,9 @@ def relative(
     known_distances: Sequence[Known] = (),
     lever: float | None = None,
     priors: Mapping[str, float | str] | None = None,
+    camera_on: str = "",
+    fix_camera: bool = False,
+    camera_prior: str = "",
     method: str = AUTO,
     resolution: float = RESOLUTION,
 ) -> RelativeCalibration:
@@ -87,6 +90,8 @@ def relative(
         Of poses, what a radian counts as [m]; the file's own unless given.
     priors
         Sigma of a parameter's deviation from nominal, by name [m, rad], or a text as 5mm.
+    camera_on, fix_camera, camera_prior
+        Of pixels, as `calibrate_pixels` takes them.
     method
         Of the least squares.
     resolution
@@ -115,12 +120,15 @@ def relative(
         known_distances=known_distances,
         lever=lever,
         priors=sigmas_of(priors or {}),
+        camera_on=camera_on,
+        fix_camera=fix_camera,
+        camera_prior=camera_prior,
         method=method,
         resolution=resolution,
     )
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     given = [data] if isinstance(data, Given) else list(data)
-    every = [loaded(each) for each in given]
+    every = sorted((loaded(each) for each in given), key=lambda data: data.kind == "pixels")
     check_kinds(every)
     check_options(every, chosen)
     every = [replace(each, at=check_joints(robot, each.at)) for each in every]
@@ -138,6 +146,11 @@ def check_kinds(every: Sequence[RelativeData]) -> None:
     """Raise DataError where there is nothing but points of trackers, or nothing at all."""
     if not every:
         raise DataError("no file of measurements is given")
+    if all(data.kind == "pixels" for data in every):
+        raise DataError(
+            f"{every[0].at.source}: it holds pixels: use minimax-cal calibrate --pixels, or give "
+            "files of other instruments too"
+        )
     if all(data.kind == "points" for data in every):
         raise DataError(
             f"{every[0].at.source}:1: it holds reflectors: use minimax-cal calibrate, or give "

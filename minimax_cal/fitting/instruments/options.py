@@ -10,6 +10,7 @@ import numpy as np
 
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.options import Options, check_priors
+from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import option
@@ -78,6 +79,9 @@ class RelativeOptions:
         group="What is fitted",
     )
     priors: Mapping[str, float] = field(default_factory=dict)
+    camera_on: str = PixelOptions.camera_on
+    fix_camera: bool = PixelOptions.fix_camera
+    camera_prior: str = PixelOptions.camera_prior
     method: str = Options.method
     resolution: float = Options.resolution
 

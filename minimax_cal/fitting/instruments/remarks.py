@@ -106,7 +106,7 @@ def weak(
         for p in result.parameters
         if not p.identifiable and TARGET in p.name and "these poses" in p.reason
     ]
-    if kinds & {"points", "poses"} or (expected_mm <= WEAK * rms_mm and not untold):
+    if kinds & {"points", "poses", "pixels"} or (expected_mm <= WEAK * rms_mm and not untold):
         return ()
     where = f" ({', '.join(untold)} not at all)" if untold else ""
     more = next(MORE[kind] for kind in MORE if kind in kinds)

@@ -130,6 +130,8 @@ def numbers_by_row(data: RelativeData) -> Array:
     """(m,) how many numbers each row holds; of poses and points in space."""
     if data.kind == "poses":
         return np.full(data.poses, 6)
+    if data.kind == "pixels":
+        return 2 * np.bincount(data.images.pose, minlength=data.poses)
     if data.kind == "points":
         return np.asarray(3 * data.at.seen.sum(axis=1))
     if data.kind == "contacts":

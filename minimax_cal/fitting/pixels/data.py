@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from minimax_cal.fitting.instruments.data import RelativeData, check
 from minimax_cal.fitting.instruments.file import ANY_TARGET, optional_columns
-from minimax_cal.fitting.pixels.camera import Camera
+from minimax_cal.fitting.pixels.camera import Camera, read_camera
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.columns import TARGET, Rows, header_check, read_rows, whole_rows
@@ -72,6 +73,15 @@ class PixelData:
             for target in self.targets
         )
 
+    def take(self, rows: Array) -> PixelData:
+        """The images at some poses only.  rows: (m,) mask, or numbers in their order."""
+        chosen = np.arange(self.at.poses)[rows]
+        place = np.full(self.at.poses, -1)
+        place[chosen] = np.arange(len(chosen))
+        labels = tuple(self.labels[i] for i in chosen)
+        kept = replace(self.some(place[self.pose] >= 0), at=self.at.take(chosen), labels=labels)
+        return replace(kept, pose=place[kept.pose])
+
     def some(self, kept: Array) -> PixelData:
         """Some of the pixels, of the same poses.  kept: (N,) mask."""
         parts = ("pose", "camera", "target", "pixel", "line")
@@ -120,6 +130,23 @@ def read_pixels(
         digest=digest_of(file.digest, at.digest, *(camera.source for camera in cameras)),
     )
     return without_single(checked(data))
+
+
+def detected(
+    detections: Path | str,
+    joints: Path | str,
+    camera: Mapping[str, Path | str],
+    board: Path | str | None = None,
+) -> RelativeData:
+    """What cameras saw, for `relative`.  Files as `calibrate_pixels` takes them."""
+    cameras = [read_camera(name, path) for name, path in camera.items()]
+    return as_instrument(read_pixels(detections, joints, cameras, board))
+
+
+def as_instrument(data: PixelData) -> RelativeData:
+    """Pixels as one instrument of several."""
+    at = replace(data.at, source=data.source, digest=data.digest, notices=data.notices)
+    return check(RelativeData(at, "pixels", pixels=data))
 
 
 def digest_of(*parts: str) -> str:

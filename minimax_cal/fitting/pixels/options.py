@@ -14,7 +14,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import option
 
-CAMERAS = "Cameras in place of DATA"
+CAMERAS = "Cameras"
 SUM, WORST_TARGET, WORST_CAMERA = OBJECTIVES = ("sum", "minimax", "camera")
 # How well a camera's file knows its lens: a share of the focal length, pixels of the centre, and
 # the first radial and both tangential coefficients; higher radial ones are known worse.
