@@ -36,7 +36,7 @@ COMMANDS: dict[str, dict[str, Entry]] = {
         ),
         "relative": (
             "relative",
-            "Calibrate ROBOT without coordinates, from lengths, closures, contacts or poses in DATA.",
+            "Calibrate ROBOT without coordinates, by lengths, closures, contacts or poses in DATA.",
         ),
     },
     "Judge": {

@@ -44,7 +44,7 @@ def relative_command(
     board: Path | None,
     **chosen: Any,
 ) -> int:
-    """Calibrate ROBOT without coordinates, from lengths, closures, contacts or poses in DATA.
+    """Calibrate ROBOT without coordinates, by lengths, closures, contacts or poses in DATA.
 
     DATA has joint columns and one of: wire1_mm ... (lengths from unknown fixed points to a target
     on the flange); socket (rows with the same label held the flange's ball in the same socket);
