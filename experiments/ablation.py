@@ -106,6 +106,7 @@ RULES: dict[str, dict[str, object]] = {
     "each joint's own scatter": {"diagnosing.causes:weighed_anew": first},
     "joints read back": {"diagnosing.causes:read_back_fault": nothing},
     "mostly loose": {"diagnosing.verdict:mostly_loose": never},
+    "ends of an angle or the time": {"diagnosing.gap:ends_of": nothing},
     "priors of effects by their size": {
         "diagnosing.joint:weights_of": no_prior,
         "diagnosing.trial:weights_of": no_prior,

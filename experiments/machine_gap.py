@@ -199,8 +199,9 @@ def likeness(made: Made) -> tuple[Array, Array]:
 
 
 def told(row: Row) -> bool:
-    """A verdict that names."""
-    return row["verdict"] in ("named", "one_of")
+    """A verdict that names; or none, where every confirmed cause is minor."""
+    minor = row["verdict"] == "none" and bool(row["names"])
+    return row["verdict"] in ("named", "one_of") or minor
 
 
 def right(row: Row) -> bool:
@@ -221,8 +222,8 @@ def criteria(rows: Sequence[Row]) -> list[Criterion]:
 
     sound, plain = of("sound"), [row for row in of("single", "orders") if separable(row)]
     orders = [row for row in of("orders") if separable(row)]
-    beyond = [row for row in of("outside") if row["left"] >= SEEN]
-    mechanisms = [row for row in of("mechanism") if row["left"] >= SEEN]
+    missing = [row for row in of("outside", "mechanism") if row["left"] >= SEEN]
+    mechanisms = [row for row in missing if row["condition"] == "mechanism"]
     pairs, triples = ([row for row in of(c) if separable(row)] for c in ("pair", "triple"))
 
     def named(row: Row) -> bool:
@@ -232,28 +233,29 @@ def criteria(rows: Sequence[Row]) -> list[Criterion]:
         Criterion("no fault: nothing confirmed, not unknown", "false alarm", sound,
                   lambda r: not named(r) and r["verdict"] != "unknown", 0.985),
         Criterion("  something confirmed", "", sound, named),
-        Criterion("one cause, separable: right", "not right", plain, right, 0.96),
+        Criterion("one cause, separable: right", "not right", plain, right, 0.95),
         Criterion("  a wrong cause confirmed", "", plain, lambda r: r["strange"] > 0),
+        Criterion("  right, but minor: verdict none", "", plain,
+                  lambda r: right(r) and r["verdict"] == "none"),
         Criterion("  verdict unknown", "", plain, lambda r: r["verdict"] == "unknown"),
         Criterion("  two orders of one gear", "orders", orders, right, 0.95),
         Criterion("one cause, lambda >= 50: in the sets", "",
                   [r for r in of("single", "orders") if r["lambda"] >= SEEN],
                   lambda r: r["in_sets"]),
-        Criterion("outside the library, lambda (1 - rho^2) >= 50: unknown", "not unknown", beyond,
-                  lambda r: r["verdict"] == "unknown", 0.90),
-        Criterion("  named for sure", "outside, but named", beyond,
-                  lambda r: r["verdict"] == "named", 0.05, False),
-        Criterion("mechanisms and memories, likewise: unknown or not repeatable",
-                  "not unknown", mechanisms,
+        Criterion("outside the library, lambda (1 - rho^2) >= 50: unknown or not repeatable",
+                  "not unknown", missing,
                   lambda r: r["verdict"] in ("unknown", "not_repeatable"), 0.80),
-        Criterion("  none", "mechanism, but none", mechanisms,
+        Criterion("  of these mechanisms and memories", "", mechanisms,
+                  lambda r: r["verdict"] in ("unknown", "not_repeatable")),
+        Criterion("  none", "outside, but none", missing,
                   lambda r: r["verdict"] == "none", 0.08, False),
-        Criterion("  named for sure", "mechanism, but named", mechanisms,
+        Criterion("  named for sure", "outside, but named", missing,
                   lambda r: r["verdict"] == "named", 0.08, False),
-        Criterion("two causes, separable: right", "pair", pairs, right, 0.95),
+        Criterion("two causes, separable: right", "pair", pairs, right, 0.90),
         Criterion("three causes, separable: right", "triple", triples, right, 0.80),
-        Criterion("of all verdicts named, false", "", [r for r in rows if r["verdict"] == "named"],
-                  lambda r: r["strange"] > 0),
+        Criterion("of all verdicts named, false", "false name",
+                  [r for r in rows if r["verdict"] == "named"],
+                  lambda r: r["strange"] > 0, 0.06, False),
         Criterion("held-out RMS more than 5 % above geometry alone", "worse", rows,
                   lambda r: r["final_mm"] > WORSE * r["geometric_mm"], 0.005, False),
         Criterion("crashed", "crash", rows, lambda r: r["verdict"] == "error", 0.0, False),

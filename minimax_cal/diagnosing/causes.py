@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
-from minimax_cal.diagnosing.established import judged_again
+from minimax_cal.diagnosing.established import asked, judged_again, mostly_loose
 from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
 from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.diagnosing.scatter import weighed_anew
@@ -38,7 +38,8 @@ class Causes:
 
     faults: of the data.  exclude: effects that were not looked for.
     choice: the effects selected, effects: as findings, the weightiest first.
-    left: what they leave.  untestable: effects, and what the data lack for them.  maps: of joints,
+    left: what they leave.  untestable: effects, and what the data lack for them.  guessed:
+    whether anything is left that matters, or most names change with the poses.  maps: of joints,
     sought beside the effects, once there is a ladder.  jobs: processes that search parts of the
     poses, cluster: address of a Dask scheduler instead.
     """
@@ -49,6 +50,7 @@ class Causes:
     effects: tuple[Finding, ...]
     left: tuple[Remains, ...]
     untestable: tuple[tuple[str, str], ...]
+    guessed: bool = False
     maps: Mapped = NO_MAPS
     jobs: int = 1
     cluster: str = ""
@@ -98,7 +100,9 @@ def found_again(study: Study, causes: Causes) -> Causes:
     found = merged([finding(study, choice, i) for i in by_weight(choice)])
     found = [with_untested(one, study.scene, causes.exclude) for one in found]
     effects = judged_again(found, choice, study, causes.jobs, causes.cluster)
-    return replace(causes, choice=choice.portable(), effects=effects)
+    change = asked(effects) and mostly_loose(effects, [f for f in effects if f.established])
+    guessed = change or loudest(causes.left) is not None
+    return replace(causes, choice=choice.portable(), effects=effects, guessed=guessed)
 
 
 def beside_curves(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
@@ -119,7 +123,7 @@ def beside_maps(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
     """The causes with what their effects and some maps leave together."""
     fields = [study.rows.of(term.columns(study.scene).displacement(study.scene)) for term in maps]
     left = left_by(study, causes.choice, np.concatenate(fields, axis=1) if fields else None)
-    return replace(causes, left=left)
+    return replace(causes, left=left, guessed=loudest(left) is not None)
 
 
 def chosen(study: Study, exclude: Sequence[str], first: Sequence[Added] = ()) -> Choice:

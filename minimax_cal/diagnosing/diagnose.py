@@ -328,16 +328,17 @@ def with_maps(study: Study, causes: Causes, progress: Progress) -> tuple[Causes,
     found = often(causes.effects)
     chosen = [term for finding in found for term in finding.terms]
     causes = replace(causes, effects=tuple(whole(f, chosen, study.scene) for f in found))
-    ladder = climbed(study, [finding.terms for finding in causes.effects])
+    ladder = climbed(study, [f.terms for f in causes.effects], guessed=causes.guessed)
     progress("error maps of joints")
     maps = error_maps(ladder.last, causes.exclude)
     if not maps.terms:
         return causes, ladder
     effects = merged(maps.findings([causes.effects[i] for i in ladder.taken], study.scene))
-    ladder = climbed(study, [finding.terms for finding in effects])
+    causes = beside_maps(study, replace(causes, effects=tuple(effects), maps=maps), maps.terms)
+    ladder = climbed(study, [finding.terms for finding in effects], guessed=causes.guessed)
     texts = {term.text for term in ladder.last.terms}
     held = [term for term in maps.terms if term.text in texts]
-    return beside_maps(study, replace(causes, effects=tuple(effects), maps=maps), held), ladder
+    return (causes if len(held) == len(maps.terms) else beside_maps(study, causes, held)), ladder
 
 
 def floor_beneath(robot: Robot, data: Measurements, last: Joint, step: Step) -> Floor:

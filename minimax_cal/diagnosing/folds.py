@@ -30,7 +30,8 @@ def fold_of(study: Study, causes: Causes, rows: Array, state: State) -> Ladder:
     """
     small = studied(study.robot, study.data.take(rows), replace(study.fit, state=state))
     choice = tuned_again(select(causes.choice.part(study.rows.at(rows))))
-    return climbed(small, causes.maps.beside(effects_of(choice)))
+    named = causes.maps.beside(effects_of(choice))
+    return climbed(small, named, guessed=causes.guessed)
 
 
 def fold_errors(

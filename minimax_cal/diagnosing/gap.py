@@ -11,8 +11,8 @@ import numpy as np
 from minimax_cal.diagnosing.joint import Joint, joint
 from minimax_cal.diagnosing.result import TOLD_AS, Finding, Step, as_motion
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.diagnosing.trial import Trials
-from minimax_cal.evidence.limits import FOLDS, HELPS, MINOR, SAYS_NOTHING, SEEN_BEFORE
+from minimax_cal.diagnosing.trial import Predicting, Trials
+from minimax_cal.evidence.limits import END, FOLDS, HELPS, MINOR, SAYS_NOTHING, SEEN_BEFORE
 from minimax_cal.fitting.beyond import without
 from minimax_cal.fitting.stations import steps_of
 from minimax_cal.ground.arrays import Array
@@ -94,11 +94,15 @@ def folds(data: Measurements, count: int) -> Array:
     return np.asarray(order[group] % count)
 
 
-def climbed(study: Study, effects: Sequence[Sequence[Term]]) -> Ladder:
+def climbed(study: Study, effects: Sequence[Sequence[Term]], *, guessed: bool = False) -> Ladder:
     """The ladder of a study's effects, in their order; with maps of joints the largest first.
 
     What is refused is tried again beside what was taken after it: beside errors much larger than
     its own the prior of a map is too wide.
+
+    guessed: whether effects are a best guess: structure is left, or names change with the poses.
+    Then laws of a joint's angle, or of the time, must predict the ends of what drives them, left
+    out, no worse either.
     """
     part, trials = folds(study.data, FOLDS), Trials(study, effects)
     last, taken = trials.trial(()), list[int]()
@@ -111,7 +115,8 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]]) -> Ladder:
             wide = trials.trial((*taken, number))
             both = wide.spared(spared)
             better = wide.cross_validated(both) < (1.0 - HELPS) * last.cross_validated(both)
-            if better and wide.no_worse(last):
+            ends = ends_of(study.scene, effects[number][0]) if guessed else []
+            if better and wide.no_worse(last) and not is_worse(last, wide, ends):
                 last = wide
                 taken.append(number)
             else:
@@ -138,6 +143,28 @@ def by_size(trials: Trials, study: Study, effects: Sequence[Sequence[Term]]) -> 
             whole[number] += rows.of(np.tensordot(value, fields, 1)[None])[:, 0]
     clear = whole - (whole @ rows.basis) @ rows.basis.T
     return [int(number) for number in np.argsort(-(clear**2).sum(axis=1), kind="stable")]
+
+
+def is_worse(before: Predicting, wide: Predicting, parts: Sequence[Array]) -> bool:
+    """Whether parts that are left out are predicted worse with an effect more."""
+    both = wide.spared(before.spared(parts))
+    return wide.cross_validated(both) > before.cross_validated(both)
+
+
+def ends_of(scene: Scene, term: Term) -> list[Array]:
+    """Poses (m,) at both ends of the angle or the time that a law follows; none of other laws.
+
+    A map is nothing outside the angles that were measured.
+    """
+    effect, driver = EFFECTS[term.effect], np.zeros(0)
+    if effect.follows == "time":
+        driver = scene.column("clock")
+    elif effect.of_angle and not effect.is_map and term.place != "all":
+        driver = scene.q[joint_of(term.place)]
+    if not driver.size or np.ptp(driver) == 0.0:
+        return []
+    low, high = np.quantile(driver, (END, 1.0 - END))
+    return [driver <= low, driver >= high]
 
 
 def valued(findings: Sequence[Finding], ladder: Ladder) -> list[Finding]:

@@ -21,6 +21,7 @@ from minimax_cal.diagnosing.gap import (
     closed,
     closed_share,
     drawn,
+    ends_of,
     folds,
     motions,
     share_of,
@@ -130,6 +131,31 @@ def test_what_meets_the_training_poses_worse_is_no_rung(
 ) -> None:
     monkeypatch.setattr(Trial, "no_worse", lambda self, other: False)
     assert climbed(play, [(PLAY,)]).taken == ()
+
+
+@pytest.mark.parametrize(("law", "turns", "kept"), [
+    ("gear_error", 1.0, True), ("outside_step", 2.0, False), ("outside_step", 3.0, False),
+])  # fmt: skip
+def test_where_structure_is_left_a_law_has_to_hold_at_the_ends(
+    law: str, turns: float, kept: bool
+) -> None:
+    """Waves fitted to a jump of the joint are taken, but not where they are a best guess."""
+    study = study_of(make(Case("irb2600", "single", (Cause(law, "J3", 1000.0),), seed=1)))
+    wave = [(Term("gear_error", "J3", {"turns": turns}),)]
+    assert climbed(study, wave).taken == (0,)
+    assert climbed(study, wave, guessed=True).taken == ((0,) if kept else ())
+
+
+def test_the_ends_of_what_drives_a_law(play: Study, mapped: Term) -> None:
+    scene = play.scene
+    low, high = ends_of(scene, TURN)
+    assert scene.q[2, low].max() < scene.q[2, ~low].min()
+    assert scene.q[2, high].min() > scene.q[2, ~high].max()
+    assert abs(low.mean() - 0.2) < 1.5 / scene.poses
+    early, late = ends_of(scene, Term("frame_drift", "frame"))
+    assert scene.column("clock")[early].max() < scene.column("clock")[late].min()
+    for term in (mapped, PLAY, SOFT, Term("gear_error", "all", {"turns": 1.0, "joints": 63.0})):
+        assert not ends_of(scene, term)
 
 
 def test_findings_get_the_values_of_the_last_rung(play: Study, ladder: Ladder) -> None:
