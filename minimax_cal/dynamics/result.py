@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +18,7 @@ from minimax_cal.dynamics.probes import Unexplained
 from minimax_cal.dynamics.scene import YIELD, Arm
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
-from minimax_cal.ground.files import finite, json_of, json_text, read_text, write_whole
+from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.ground.records import Number, Part, Recorded, checked, reading
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.modelling.effects.words import name_place
@@ -220,27 +220,15 @@ class MotionDiagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of the contract, and more; `from_dict` reads it back."""
-        listed = {
-            name: [plain_record(one) for one in getattr(self, name)]
-            for name in ("effects", "budget", "unexplained", "not_testable", "curves")
-        }
-        arm = self.arm
         return {
             "schema": SCHEMA,
             "kind": KIND,
-            "robot": arm.robot.to_dict(),
-            "verdict": self.verdict,
+            "robot": self.arm.robot.to_dict(),
             "headline": self.headline(),
-            "unit": self.unit,
-            **listed,
             "too_little_motion": list(self.too_little),
-            "runs": list(self.runs),
-            "held_out": self.held_out,
-            "arm": {name: [finite(v) for v in getattr(arm, name).tolist()] for name in ARM},
+            "arm": plain({name: getattr(self.arm, name) for name in ARM}),
             "models": [model_dict(model) for model in self.models],
-            "held_run": asdict(self.held_run),
-            "notices": list(self.notices),
-            "seconds": self.seconds,
+            **plain({name: getattr(self, name) for name in KEPT}),
         }
 
     def json(self) -> str:
@@ -288,21 +276,6 @@ def grouped(effects: tuple[MotionEffect, ...]) -> str:
 def best_worth(one: MotionEffect) -> tuple[str, tuple[float, float]]:
     """The joint at which an effect closes most, and the RMS without and with it."""
     return max(one.worth.items(), key=lambda item: item[1][0] ** 2 - item[1][1] ** 2)
-
-
-def plain_record(one: Any) -> dict[str, Any]:
-    """A record for JSON; null where there is no number."""
-    found: dict[str, Any] = finite_only(asdict(one))
-    return found
-
-
-def finite_only(content: Any) -> Any:
-    """Data without NaN."""
-    if isinstance(content, Mapping):
-        return {key: finite_only(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [finite_only(value) for value in content]
-    return finite(content) if isinstance(content, float) else content
 
 
 def check_parts(found: MotionDiagnosis, joints: int) -> None:
@@ -408,10 +381,6 @@ def load_motion(path: Path | str) -> MotionDiagnosis:
     --------
     >>> motion = mc.load_motion("motion.json")
     """
-    try:
-        content = json_of(read_text(path))
-    except ValueError as error:
-        raise CalibrationError(f"{path}: is not JSON ({error})") from error
-    if not isinstance(content, Mapping):
-        raise CalibrationError(f"{path}: is no motion diagnosis")
-    return MotionDiagnosis.from_dict(content, str(path))
+    from minimax_cal.modelling.cell import saved_content  # only who reads a file waits for it
+
+    return MotionDiagnosis.from_dict(saved_content(path), str(path))

@@ -9,6 +9,7 @@ import os
 import tempfile
 import tomllib
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -190,7 +191,9 @@ def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def plain(content: Any) -> Any:
-    """Data as JSON holds them: arrays are lists, null where there is no finite number."""
+    """Data as JSON holds them: arrays are lists, records their fields, null no finite number."""
+    if is_dataclass(content):
+        content = {field.name: getattr(content, field.name) for field in fields(content)}
     if isinstance(content, Mapping):
         return {key: plain(value) for key, value in content.items()}
     if isinstance(content, np.ndarray | np.generic):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
@@ -13,7 +13,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.ground.files import finite, json_text, write_whole
+from minimax_cal.ground.files import finite, json_text, plain, write_whole
 from minimax_cal.ground.records import Number, Part, Recorded, checked
 from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.cell import saved_content
@@ -50,10 +50,6 @@ class Rung:
         """Whether the simulator does what the formulas of the fit say; True where none do."""
         off = abs(self.holdout_rms_mm - self.predicted_rms_mm)
         return not off > max(HOLDS * self.predicted_rms_mm, HOLDS_MM)
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {k: finite(v) if isinstance(v, float) else v for k, v in vars(self).items()}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -102,8 +98,8 @@ class SimulatorGap:
             "kind": KIND,
             "model": self.model,
             "robot": self.robot,
-            "rungs": [rung.to_dict() for rung in self.rungs],
-            "with_commands": self.commands.to_dict() if self.commands else None,
+            "rungs": plain(self.rungs),
+            "with_commands": plain(self.commands),
             "noise_floor_mm": finite(self.floor),
             "noise_floor_from": self.floor_from,
             "poses": {"train": self.train_poses, "holdout": self.holdout_poses},
@@ -158,7 +154,7 @@ class SimulatorGap:
             f"As given, the simulated arm misses the real one by {first.holdout_rms_mm:.3f} mm RMS "
             f"on {self.holdout_poses} held-out poses (largest {first.holdout_max_mm:.3f} mm)"
         )
-        falls = [a.holdout_rms_mm - b.holdout_rms_mm for a, b in steps(self.rungs)]
+        falls = [a.holdout_rms_mm - b.holdout_rms_mm for a, b in pairwise(self.rungs)]
         if falls:
             most = max(range(len(falls)), key=falls.__getitem__)
             text += (
@@ -180,11 +176,6 @@ class SimulatorGap:
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
         return f"{self.headline()}\n\n{self.table().text(width)}"
-
-
-def steps(rungs: Sequence[Rung]) -> list[tuple[Rung, Rung]]:
-    """Each rung and the next."""
-    return list(pairwise(rungs))
 
 
 class GapPart(Part):

@@ -13,10 +13,7 @@ from minimax_cal.ground.arrays import Array
 
 LEAST_ROWS, SHORTEST_RUN = 50, 2.0  # of a run that shows anything [1, s]
 GAP = 0.1  # a step over which no filter of the motion reaches [s]
-UNEVEN, MOST_UNEVEN = (
-    0.5,
-    0.05,
-)  # deviation of a step, of the median; share of rows that may have it
+UNEVEN, MOST_UNEVEN = 0.5, 0.05  # deviation of a step, of the median; share that may have it
 SLOWEST_RATE = 25.0  # fewer rows a second hold no motion of a few Hz [Hz]
 TURN = 2.0 * np.pi
 LARGEST = 2.0 * TURN  # two turns: no joint is commanded farther unless it turns without end [rad]

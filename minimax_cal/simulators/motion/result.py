@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.ground.records import Number, Part, Recorded, checked
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.modelling.cell import saved_content
@@ -88,15 +88,7 @@ class MotionGap:
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of the contract, and more; `from_dict` reads it back."""
-        listed = [vars(rung) for rung in self.rungs]
-        fields = vars(self) | {
-            "rungs": [{k: list(v) if isinstance(v, tuple) else v for k, v in rung.items()}
-                      for rung in listed],
-            "elements": [vars(e) | {"worth": {k: list(v) for k, v in e.worth.items()}}
-                         for e in self.elements],
-        }  # fmt: skip
-        plain = {k: list(v) if isinstance(v, tuple) else v for k, v in fields.items()}
-        return {"schema": 1, "kind": KIND, "along": "trajectories", **plain}
+        return {"schema": 1, "kind": KIND, "along": "trajectories", **plain(self)}
 
     @staticmethod
     def from_dict(content: Mapping[str, Any], source: str = "gap") -> MotionGap:
