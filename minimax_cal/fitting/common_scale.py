@@ -1,6 +1,7 @@
 """Whether all points are longer or shorter by one factor than errors of links would have them.
 
-After the fit, by how its lengths changed: all by one share, beyond what its angles let expect.
+After the fit, by how its lengths changed: all by one share, beyond what its angles let expect, and
+beyond what smooth functions of the pose that the fit lacks would make of it.
 
 Before the fit, by the drawn arm alone: errors e of its points are A x + c s + noise, A the links'
 columns and c that of a scale, both without what base and targets take.  Links are off by what arms
@@ -14,10 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtr
 
+from minimax_cal.evidence.components import likeliest
 from minimax_cal.fitting.start import BaseFit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.lack import by_pose
+from minimax_cal.modelling.model import Model, model_of
+from minimax_cal.modelling.parameters import State, zero_positions
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
 
@@ -33,32 +37,86 @@ MAX_P_VALUE, MAX_DOUBTFUL_P_VALUE = (
 )  # that lengths which are off at random agree so well on a share
 # sigmas of what the angles let expect, beside which doubtful agreement is enough
 MIN_CLEAR_SIGMAS = 3.0
+HALVINGS = 60  # of the range in which lengths are off at random
 MEDIAN = 0.6745  # of a Gaussian's absolute value, in sigmas
 
 
-def common_share(drawn: Array, change: Array, found: Array) -> float:
+def common_share(drawn: Array, change: Array, found: Array, covariance: Array) -> float:
     """The share by which the lengths of a fit changed together, 0 where that may be chance.
 
     The lengths must agree on it, or nearly so where it is more than the angles let expect: of arms
-    that are drawn to OFF_LENGTH and OFF_ANGLE, times one factor.  A share that a warm arm may have
-    is none.  drawn, change: (n, 5) rows [m, rad].  found: (n, 5) True where identified.
+    that are drawn to OFF_LENGTH and OFF_ANGLE, times one factor.  Each counts by its own sigma
+    beside what lengths are off at random.  A share that a warm arm may have is none.
+
+    drawn, change: (n, 5) rows [m, rad].  found: (n, 5) True where identified.  covariance:
+    (5n, 5n) of the changes, in the order of `parameters.links_of`, with what the model lacks.
     """
     lengths = found[:, :2] & (np.abs(drawn[:, :2]) > LEAST_LENGTH)
     angles = np.abs(change[:, 2:][found[:, 2:]])
     if lengths.sum() < FEWEST or len(angles) < FEWEST:
         return 0.0
+    place = np.arange(2 * len(drawn)).reshape(2, -1).T[lengths]
     length, more = drawn[:, :2][lengths], change[:, :2][lengths]
-    size = float(length @ length)
-    share = float(length @ more) / size
-    spare = len(length) - 1
-    apart = max(float(np.sqrt(((more - share * length) ** 2).sum() / spare)), 1e-12)
-    stretch = abs(share) * np.sqrt(size)
-    chance = 2.0 * float(stdtr(spare, -stretch / apart))
+    own = covariance[np.ix_(place, place)]
+    share, sigma = agreed(length, more, own, 0.0)
+    chance = 2.0 * float(stdtr(len(length) - 1, -abs(share) / sigma))
     usual = float(np.median(angles)) / MEDIAN / OFF_ANGLE * OFF_LENGTH
     clear = chance < MAX_P_VALUE or (
-        chance < MAX_DOUBTFUL_P_VALUE and stretch > MIN_CLEAR_SIGMAS * usual
+        chance < MAX_DOUBTFUL_P_VALUE
+        and abs(share) > MIN_CLEAR_SIGMAS * agreed(length, more, own, usual)[1]
     )
     return share if clear and abs(share) > LEAST_SHARE else 0.0
+
+
+def agreed(length: Array, more: Array, own: Array, least: float) -> tuple[float, float]:
+    """The share of lengths (k,) by which they changed, more (k,), and its sigma.
+
+    own: (k, k) covariance of the changes.  least: sigma of what lengths are off at random, at
+    least; as much as their disagreement asks for [Mandel and Paule 1970].
+    """
+    spare = len(length) - 1
+
+    def at(size: float) -> tuple[float, float, float]:
+        inverse = np.linalg.inv(own + size**2 * np.eye(len(length)))
+        weight = float(length @ inverse @ length)
+        share = float(length @ inverse @ more) / weight
+        off = more - share * length
+        return float(off @ inverse @ off), share, weight**-0.5
+
+    low, high = 1e-9, float(np.sqrt(more @ more)) + 1e-9
+    if at(low)[0] > spare:
+        for _ in range(HALVINGS):
+            middle = np.sqrt(low * high)
+            low, high = (middle, high) if at(middle)[0] > spare else (low, middle)
+    return at(max(low, least))[1:]
+
+
+def with_lack(robot: Robot, model: Model, state: State) -> tuple[Array, Array]:
+    """How far what the model lacks has moved the links of a fit, and their covariance with it.
+
+    The lack is one of smooth functions of the pose, as large as the fit's errors say
+    (`modelling.lack`): joints that bend stretch an arm as a scale would, but leave errors.
+    model: of the fitted poses.  Returns (5n,) and (5n, 5n) [m, rad], zero where not identified.
+    """
+    n, active = robot.joints, model.active[: model.names.geometric]
+    seen = np.broadcast_to(model.seen.T[..., None], (*model.seen.T.shape, 3)).reshape(-1)
+    every = np.moveaxis(model.jacobian(state), 0, 1)[..., : model.names.geometric]
+    m, k, _, p = every.shape
+    error = np.moveaxis(model.error(state), 0, 1).reshape(-1)[seen]
+    arm = every.reshape(m, 3 * k, p)[..., zero_positions(robot.prismatic)]
+    columns, kind = by_pose(robot.with_mdh(state.mdh), model.q, arm)
+    lack = columns.reshape(3 * k * m, -1)[seen]
+    rows = every.reshape(-1, p)[seen][:, active]
+    back = np.linalg.pinv(rows)
+    left = lack - rows @ (back @ lack)
+    dof = max(len(error) - rows.shape[1], 1)
+    found = likeliest(left.T @ lack, left.T @ error, float(error @ error), dof, kind[:, 1])
+    moved = back @ lack
+    spread = found.moment - np.outer(found.mean, found.mean)
+    shift, covariance = np.zeros(p), np.zeros((p, p))
+    shift[active] = back @ error - moved @ found.mean
+    covariance[np.ix_(active, active)] = found.noise * back @ back.T + moved @ spread @ moved.T
+    return shift[: 5 * n], covariance[: 5 * n, : 5 * n]
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from minimax_cal.fitting.claims import (
     unjudged,
     unseen_suspects,
 )
-from minimax_cal.fitting.common_scale import common_share
+from minimax_cal.fitting.common_scale import common_share, with_lack
 from minimax_cal.fitting.crossed import NOT_CROSSED, few_poses
 from minimax_cal.fitting.fit import (
     Fit,
@@ -296,7 +296,7 @@ def doubts(robot: Robot, solved: Solved, nominal_error: Array) -> Iterator[str]:
             f"the nominal robot misses by {1e3 * miss:.3g} mm: check that it is the robot of these "
             "measurements, with their joint signs, zero positions and units"
         )
-    if share := same_share(solved):
+    if share := same_share(robot, solved):
         yield (
             f"all lengths changed by the same share, {100.0 * share:+.3f} %, as no error of links "
             "does: check the scale, the units and the temperature compensation of the instrument; "
@@ -306,11 +306,15 @@ def doubts(robot: Robot, solved: Solved, nominal_error: Array) -> Iterator[str]:
         yield f"implausibly large changes: {named}; is the robot file the right one?"
 
 
-def same_share(solved: Solved) -> float:
+def same_share(robot: Robot, solved: Solved) -> float:
     """The share by which all identified lengths of the arm changed, 0 where they did not."""
     drawn, n = solved.nominal.mdh, len(solved.nominal.mdh)
     found = solved.identification.active[: 5 * n].reshape(5, n).T  # in the order of `links_of`
-    return common_share(drawn, solved.state.mdh - drawn, found)
+    change = solved.state.mdh - drawn
+    if not common_share(drawn, change, found, np.zeros((5 * n, 5 * n))):
+        return 0.0
+    shift, covariance = with_lack(robot, solved.estimator.whole, solved.state)
+    return common_share(drawn, change + shift.reshape(5, n).T, found, covariance)
 
 
 def parameters_of(robot: Robot, solved: Solved) -> Parameters:
