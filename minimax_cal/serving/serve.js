@@ -202,6 +202,44 @@
       && await run("read");
   }
 
+  // ---- a DH table that is typed: a CSV of it goes the way of a dropped file ----------------------
+
+  const DH = { a_mm: "0", alpha_deg: "0", d_mm: "0", theta_deg: "0", offset_deg: "0", sign: "1",
+    lower_deg: "", upper_deg: "" };
+
+  function dhRows() {
+    const rows = document.querySelector("#dh-table tbody");
+    const count = Math.min(Math.max(Number(byId("dh-joints").value) || 1, 1), 12);
+    while (rows.children.length > count) rows.lastChild.remove();
+    while (rows.children.length < count) {
+      const number = rows.children.length + 1, row = made("tr", "");
+      row.append(made("th", `${number}`));
+      for (const [name, value] of Object.entries(DH)) {
+        const cell = made("td", ""), field = made("input", "");
+        Object.assign(field, { type: "text", inputMode: "decimal", value, size: 7 });
+        field.setAttribute("aria-label", `joint ${number}, ${name}`);
+        cell.append(field);
+        row.append(cell);
+      }
+      rows.append(row);
+    }
+  }
+
+  document.querySelector("#dh-table thead tr").append(...Object.keys(DH).map((name) => made("th", name)));
+  byId("dh-joints").addEventListener("change", dhRows);
+  dhRows();
+  byId("dh-use").addEventListener("click", async () => {
+    const rows = [...document.querySelectorAll("#dh-table tbody tr")].map((row) =>
+      [...row.querySelectorAll("input")].map((field) => field.value.trim().replace(",", ".")));
+    const wrong = rows.flat().find((text) => text && !Number.isFinite(Number(text)));
+    if (wrong !== undefined) { complain(`${wrong}: is no number`); return; }
+    const kept = Object.keys(DH).map((name, i) => [name, i]).filter(([, i]) => rows.some((row) => row[i]));
+    const lines = [`# convention: ${byId("dh-convention").value}`, kept.map(([name]) => name).join(","),
+      ...rows.map((row) => kept.map(([, i]) => row[i]).join(","))];
+    const name = byId("dh-name").value.replace(/[^\w-]+/g, "_") || "arm";
+    await upload([new File([`${lines.join("\n")}\n`], `${name}.csv`)], "robot");
+  });
+
   for (const place of all("[data-drop]")) {
     const kind = place.dataset.drop, input = place.querySelector("input");
     input.addEventListener("change", async () => {

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from browsing import browsing
 from conftest import run, shared
@@ -13,6 +14,7 @@ from numpy.testing import assert_allclose
 from served import PATIENCE, Served
 
 import minimax_cal as mc
+from minimax_cal.serving.sessions import GIVEN
 
 pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[app]")
 PHONE = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
@@ -173,6 +175,35 @@ def test_from_dropped_files_to_a_passed_report(
     assert kept.read_bytes() == arm.read_bytes()
     assert severe(driver) == []
     assert asked(driver) == {f"http://127.0.0.1:{server.port}"}
+
+
+def test_a_dh_table_can_be_typed(driver: Any, server: Served, poses: Path) -> None:
+    """The table of the nominal arm, typed in, is the arm of the fit."""
+    begin(driver, server, "Typed")
+    drop(driver, "measured", poses)
+    wait_for(driver, "read")
+    click(driver, "#dh summary")
+    arm = mc.load_robot("irb120")
+    for i, (a, d, theta, alpha, _) in enumerate(arm.mdh):
+        values = (1e3 * a, *np.degrees([alpha]), 1e3 * d, *np.degrees([theta]))
+        row = f"#dh-table tbody tr:nth-child({i + 1}) input"
+        fields = driver.find_elements("css selector", row)
+        for field, value in zip(fields, values, strict=False):
+            field.clear()
+            field.send_keys(f"{value:.9g}")
+        fields[5].clear()
+        fields[5].send_keys(f"{arm.sign[i]:.0f}")
+    click(driver, "#dh-use")
+    folder = session_of(driver, server)
+    until((folder / GIVEN / "arm.csv").is_file, "the table did not arrive")
+    until(lambda: state(driver, "robot") == "done", "the table is not chosen")
+    do(driver, "fit", "#fit")
+    assert "convention: standard" in (folder / GIVEN / "arm.csv").read_text()
+    typed = mc.load_fit(folder / "fit.json")
+    assert typed.within.after.rms_mm == pytest.approx(
+        mc.calibrate("irb120", folder / "poses.csv").within.after.rms_mm, rel=1e-3
+    )
+    assert severe(driver) == []
 
 
 def unticked(driver: Any) -> tuple[str, str]:
