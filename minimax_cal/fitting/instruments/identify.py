@@ -42,7 +42,7 @@ SCALE = {  # what lacks a length, and what gives it
     ),
     "contacts": (
         "a contact has no length standard",
-        "a ball of known radius on a sphere or body of known size gives it",
+        "a ball of known radius on a sphere or body of known size gives it, or a file of lengths",
     ),
 }  # fmt: skip
 ALL_OWN = "all frames, anchors and targets of the files moved together"
