@@ -237,7 +237,7 @@ class Judges:
     def whole(self) -> Measurements:
         """All poses in the order of the file, held-out points that stand out NaN."""
         y = np.where(self.far.T[..., None], np.nan, self.held.y)
-        every = both(self.train, self.held.with_y(y))
+        every = self.train.followed_by(self.held.with_y(y))
         return every.take(np.argsort(every.line, kind="stable"))
 
     @property
@@ -281,19 +281,6 @@ def of_lines(wanted: Array, line: Array, rows: Array) -> Array:
     """
     known, nothing = dict(zip(line, rows, strict=True)), np.zeros(rows.shape[1], dtype=bool)
     return np.array([known.get(one, nothing) for one in wanted])
-
-
-def both(one: Measurements, other: Measurements) -> Measurements:
-    """The rows of two parts of one file."""
-    return replace(
-        one,
-        q=np.concatenate([one.q, other.q]),
-        y=np.concatenate([one.y, other.y]),
-        line=np.concatenate([one.line, other.line]),
-        columns={name: np.concatenate([column, other.columns[name]])
-                 for name, column in one.columns.items()},
-        unknown={},
-    )  # fmt: skip
 
 
 def with_shares(findings: Sequence[Finding], steps: Sequence[Step], floor: float) -> list[Finding]:

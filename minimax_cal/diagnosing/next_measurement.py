@@ -189,7 +189,7 @@ def plan(scene: Scene, weight: Array, rng: np.random.Generator) -> Plan:
         kind: (int(start), part.poses)
         for kind, start, part in zip(kinds, starts[:-1], some, strict=True)
     }
-    return Plan(joined(some), np.concatenate(parts, axis=1), at)
+    return Plan(old.followed_by(*some[1:]), np.concatenate(parts, axis=1), at)
 
 
 def aside(scene: Scene) -> Array:
@@ -210,21 +210,6 @@ def with_columns(data: Measurements, scene: Scene) -> Measurements:
 def then(data: Measurements, **columns: Array) -> Measurements:
     """The same rows with other columns."""
     return replace(data, columns={**data.columns, **columns})
-
-
-def joined(parts: Sequence[Measurements]) -> Measurements:
-    """Rows of several data sets of the same columns, one after another."""
-    first = parts[0]
-    return replace(
-        first,
-        q=np.concatenate([part.q for part in parts]),
-        y=np.concatenate([part.y for part in parts]),
-        line=np.concatenate([part.line for part in parts]),
-        columns={
-            name: np.concatenate([part.columns[name] for part in parts]) for name in first.columns
-        },
-        unknown={},
-    )
 
 
 def flipped(side: Array) -> Array:

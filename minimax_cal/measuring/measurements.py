@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -122,6 +122,22 @@ class Measurements:
             line=self.line[rows],
             columns={name: column[rows] for name, column in self.columns.items()},
             unknown={name: column[rows] for name, column in self.unknown.items()},
+        )
+
+    def followed_by(self, *others: Measurements) -> Measurements:
+        """These rows, then others with the same columns."""
+        parts = (self, *others)
+
+        def stacked(of: Callable[[Measurements], Mapping[str, Array]]) -> dict[str, Array]:
+            return {name: np.concatenate([of(part)[name] for part in parts]) for name in of(self)}
+
+        return replace(
+            self,
+            q=np.concatenate([part.q for part in parts]),
+            y=np.concatenate([part.y for part in parts]),
+            line=np.concatenate([part.line for part in parts]),
+            columns=stacked(lambda part: part.columns),
+            unknown=stacked(lambda part: part.unknown),
         )
 
     def keep(self, targets: Array) -> Measurements:

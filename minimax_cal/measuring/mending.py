@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import replace
-
-import numpy as np
 
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring.measurements import Measurements
@@ -51,15 +48,7 @@ def shifted(data: Measurements, value: str) -> Measurements:
             f"{data.line.max()}"
         )
     moved = with_points_moved(data.take(inside), int(found[1]))
-    parts = [data.take(data.line < first), moved, data.take(data.line > last)]
-    return replace(
-        data,
-        q=np.concatenate([part.q for part in parts]),
-        y=np.concatenate([part.y for part in parts]),
-        line=np.concatenate([part.line for part in parts]),
-        columns={k: np.concatenate([part.columns[k] for part in parts]) for k in data.columns},
-        unknown={k: np.concatenate([part.unknown[k] for part in parts]) for k in data.unknown},
-    )
+    return data.take(data.line < first).followed_by(moved, data.take(data.line > last))
 
 
 def reversed_points(data: Measurements, value: str) -> Measurements:

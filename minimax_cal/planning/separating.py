@@ -111,7 +111,7 @@ def with_poses(site: Site, q: Array, seen: Array, via: Array) -> Ahead:
     scene, weight = site.scene, site.model.weight
     m = scene.poses
     old = next_measurement.with_columns(scene.data, scene)
-    data = next_measurement.joined([old, further(scene, q).take(~via)])
+    data = old.followed_by(further(scene, q).take(~via))
     at = {"old": (0, m), "more": (m, int((~via).sum()))} | {
         kind: (m, 0) for kind in (*PREPARE, "old") if kind not in ("more", "old")
     }

@@ -14,7 +14,6 @@ from minimax_cal.diagnosing.next_measurement import (
     PREPARE,
     Pair,
     Site,
-    joined,
     payload,
     powers,
     separate,
@@ -325,7 +324,7 @@ def test_payload_is_one_that_the_arm_carries(wide: Site) -> None:
 
 def test_joined_data_are_one_after_another(sim: Simulation) -> None:
     a, b = sim.data.take(np.arange(3)), sim.data.take(np.arange(3, 7))
-    assert_allclose(joined([a, b]).q, sim.data.q[:7], rtol=0, atol=0)
+    assert_allclose(a.followed_by(b).q, sim.data.q[:7], rtol=0, atol=0)
 
 
 def test_a_call_is_short(robot: mc.Robot) -> None:
