@@ -47,3 +47,12 @@ def test_weak_pixels_leave_the_drawn_arm() -> None:
     assert prior < 1.03 * drawn
     (row,) = weak_table([job], [(drawn, fitted, out, prior, kept)]).rows
     assert np.allclose(row[5], 1.0)
+
+
+def test_planned_poses_lower_the_bound() -> None:
+    given, planned = (
+        run(Job(way, 0, True))
+        for way in ("reprojection, lenses freed", "poses planned, lenses freed")
+    )
+    assert sum(planned.least) < 0.6 * sum(given.least)
+    assert planned.error**2 < 4.0 * sum(planned.least)

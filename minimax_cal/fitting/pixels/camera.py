@@ -23,7 +23,6 @@ INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # those tha
 HELD = ("k4", "k5", "k6", "s1", "s2", "s3", "s4")  # of the rational and the thin prism model
 LENGTHS = (0, 4, 5, 8, 12, 14)  # of OpenCV's list of distortion coefficients
 TILT = 12  # from here on the list tilts the sensor
-NEAREST = 1e-9  # a depth below it is none [m]
 UNDISTORTED, ROUNDS = 1e-13, 50  # when Newton's steps in the image plane end; at most so many
 SHARP = 10.0  # no lens sees farther from its axis, as a tangent
 KEYS = {  # what K, D and the size are called: OpenCV's samples, ROS, ROS messages, tutorials
@@ -48,15 +47,6 @@ class Camera:
     intrinsic: Array
     size: tuple[int, int] = (0, 0)
     source: str = ""
-
-
-def project(intrinsic: Array, point: Array) -> Array:
-    """Pixels (..., 2, N) of points in the camera's axes.
-
-    intrinsic: (16, N) or (16, 1).  point: (..., 3, N) [m].
-    """
-    depth = point[..., 2, :]
-    return distorted(intrinsic, point[..., 0, :] / depth, point[..., 1, :] / depth)
 
 
 def distorted(intrinsic: Array, x: Array, y: Array) -> Array:
