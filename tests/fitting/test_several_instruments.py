@@ -92,6 +92,24 @@ def test_a_rough_instrument_does_not_spoil_a_fine_one() -> None:
     assert np.median(ratios) < 1.02
 
 
+def test_a_noise_that_is_given_counts_instead_of_the_residuals() -> None:
+    arm, rng = Arm.of("irb2600", 2, 0.0), np.random.default_rng(3)
+    seen, wires = tracker(arm, rng, 40, NOISE), SIMULATORS["wires_3"](arm, rng, 60, NOISE).data
+    plain = relative(arm.robot, [seen, wires])
+    told = relative(arm.robot, [seen, wires], noises={"distances": "0.3mm"})
+    assert [one.noise for one in told.instruments][1] == pytest.approx(3e-4, rel=1e-9)
+    sigmas = ({p.name: p.sigma for p in fit.parameters} for fit in (plain, told))
+    before, after = (sigma["distances.anchor1_x"] for sigma in sigmas)
+    assert after > 5.0 * before
+    for noises, words in (
+        ({"wire": 1e-4}, "noise wire: no file is called so; they are points, distances"),
+        ({"points": -1.0}, "must be positive"),
+        ({"points": "1 rad"}, "write FILE=SIGMA in mm"),
+    ):
+        with pytest.raises(mc.OptionError, match=words):
+            relative(arm.robot, [seen, wires], noises=noises)
+
+
 @cache
 def all_kinds() -> tuple[Arm, RelativeCalibration]:
     arm, rng = Arm.of("ur10", 3, 0.0), np.random.default_rng(6)

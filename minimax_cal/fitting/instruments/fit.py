@@ -133,7 +133,10 @@ def stack_of(robot: Robot, trains: Sequence[Train], options: RelativeOptions) ->
             replace(block, sole_length=False) if isinstance(block, Closures) else block
             for block in blocks
         ]
-    return Stack.of(robot, blocks, [each.label for each in trains])
+    stack = Stack.of(robot, blocks, [each.label for each in trains])
+    given = [options.noises.get(label, np.nan) for label in stack.labels]
+    of_rows = [sigma * block.row_noise for sigma, block in zip(given, blocks, strict=True)]
+    return replace(stack, given=np.square(of_rows))
 
 
 def allowed_of(stack: Stack, options: RelativeOptions) -> tuple[Array, Array]:
@@ -210,6 +213,7 @@ def weighed(
         return problem, solved(problem)
     count = [block.numbers for block in problem.stack.blocks]
     variance = np.maximum(costs(problem, begin) / count, LEAST_NOISE**2)
+    variance = np.where(np.isnan(problem.stack.given), variance, problem.stack.given)
     for _ in range(PRIOR_ROUNDS):
         problem = believed(problem, variance)
         found = solved(problem)
@@ -242,7 +246,7 @@ def costs(problem: Squares, x: State) -> Array:
 
 
 def variances(problem: Squares, x: State) -> Array:
-    """(b,) of a number of each block by what a fit leaves [m^2].
+    """(b,) of a number of each block, as given or by what a fit leaves [m^2].
 
     Each pays for its share of the parameters, tr(H^-1 G_b) of the whole Gram matrix H [Forstner's
     variance components]; a prior pays for parameters of its own.
@@ -256,7 +260,8 @@ def variances(problem: Squares, x: State) -> Array:
     paid = np.array([float(np.trace(inverse @ gram)) for gram in grams])
     spare = np.maximum([block.numbers for block in stack.blocks] - paid, 1.0)
     weighing = len(stack.blocks) > 1 or len(problem.weight)
-    return np.maximum(costs(problem, x) / spare, LEAST_NOISE**2 if weighing else 0.0)
+    left = np.maximum(costs(problem, x) / spare, LEAST_NOISE**2 if weighing else 0.0)
+    return np.where(np.isnan(stack.given), left, stack.given)
 
 
 def covariance_of(problem: Squares, x: State) -> Array:

@@ -20,7 +20,9 @@ from minimax_cal.fitting.instruments.options import (
     Known,
     Progress,
     RelativeOptions,
+    check_noises,
     check_options,
+    read_noises,
     silent,
 )
 from minimax_cal.fitting.instruments.points import WholePoses
@@ -58,6 +60,7 @@ def relative(
     offset: bool = False,
     known_distances: Sequence[Known] = (),
     lever: float | None = None,
+    noises: Mapping[str, float | str] | None = None,
     priors: Mapping[str, float | str] | None = None,
     camera_on: str = "",
     fix_camera: bool = False,
@@ -88,6 +91,8 @@ def relative(
         Of closures, sockets A, B and the distance of their centres [m].
     lever
         Of poses, what a radian counts as [m]; the file's own unless given.
+    noises
+        Sigma of a number of a file by its name [m], or a text as 0.2mm; of others residuals say it.
     priors
         Sigma of a parameter's deviation from nominal, by name [m, rad], or a text as 5mm.
     camera_on, fix_camera, camera_prior
@@ -119,6 +124,7 @@ def relative(
         offset=offset,
         known_distances=known_distances,
         lever=lever,
+        noises=read_noises(noises or {}),
         priors=sigmas_of(priors or {}),
         camera_on=camera_on,
         fix_camera=fix_camera,
@@ -175,10 +181,12 @@ def calibrate_instruments(
 ) -> RelativeCalibration:
     """Calibrate from all data together.  Raises CalibrationError."""
     began = time.perf_counter()
+    labels = labels_of(every)
+    check_noises(labels, every, options)
     for data in every:
         plausible.check_plausible(robot, data, options)
     splits = [held_back(data, options) for data in every]
-    named = zip(labels_of(every), every, splits, strict=True)
+    named = zip(labels, every, splits, strict=True)
     trains = [Train(label, data.take(~held)) for label, data, (held, _) in named]
     found = fit.fit_instruments(robot, trains, options, progress)
     measured = [

@@ -41,6 +41,18 @@ def known_text(known: Known) -> str:
     return f"known_distances={f'{first},{second},{1e3 * distance:g}'!r}"
 
 
+def noise_of(text: str) -> tuple[str, float]:
+    """FILE=SIGMA: a file by its stem, and how noisy its numbers are, in mm.  Raises OptionError."""
+    name, _, size = text.rpartition("=")
+    number = size.strip().removesuffix("mm").strip()
+    if name.strip() and re.fullmatch(r"[-+.\deE]+", number):
+        try:
+            return name.strip(), 1e-3 * float(number)
+        except ValueError:
+            pass
+    raise OptionError(f"noise {text!r}: write FILE=SIGMA in mm, as wires=0.2mm")
+
+
 @dataclass(frozen=True)
 class RelativeOptions:
     """How to calibrate.
@@ -49,6 +61,7 @@ class RelativeOptions:
     ``beta*``.  offset: fit a constant offset of each wire.  known_distances: sockets A, B and the
     distance of their centres [m].  lever: of poses, metres that a radian counts as; None for the
     file's own.  priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
+    noises: sigma of a number of a file, by its name [m]; of others their residuals say it.
     method: of the least squares.  resolution: relative singular value that counts as
     not measured.
     """
@@ -78,6 +91,15 @@ class RelativeOptions:
         "mm",
         group="What is fitted",
     )
+    noises: Mapping[str, float] = option(
+        dict,
+        "How noisy a file's numbers are, by its name without ending [default: as its residuals].",
+        flag="--noise",
+        metavar="FILE=SIGMA",
+        read=noise_of,
+        many=dict,
+        group="What is fitted",
+    )
     priors: Mapping[str, float] = field(default_factory=dict)
     camera_on: str = PixelOptions.camera_on
     fix_camera: bool = PixelOptions.fix_camera
@@ -88,7 +110,8 @@ class RelativeOptions:
     def settings(self) -> dict[str, object]:
         """For the record."""
         told = [list(known) for known in self.known_distances]
-        return {**vars(self), "known_distances": told, "priors": dict(self.priors)}
+        return {**vars(self), "known_distances": told, "priors": dict(self.priors),
+                "noises": dict(self.noises)}  # fmt: skip
 
 
 def check_options(every: Sequence[RelativeData], options: RelativeOptions) -> None:
@@ -122,6 +145,26 @@ def check_options(every: Sequence[RelativeData], options: RelativeOptions) -> No
             raise OptionError(f"{said}: needs two different sockets and a positive length")
         if sum({first, second} <= some for some in sockets) != 1:
             raise OptionError(f"{said}: both sockets must be in one file, and in no other")
+
+
+def read_noises(noises: Mapping[str, float | str]) -> dict[str, float]:
+    """Noises in metres, from numbers or texts.  Raises OptionError."""
+    pairs = (noise_of(f"{k}={v}") if isinstance(v, str) else (k, v) for k, v in noises.items())
+    return dict(pairs)
+
+
+def check_noises(
+    labels: Sequence[str], every: Sequence[RelativeData], options: RelativeOptions
+) -> None:
+    """Raise OptionError for the noise of a file that is not there, or that is none."""
+    kinds = dict(zip(labels, (data.kind for data in every), strict=True))
+    for name, sigma in options.noises.items():
+        if name not in labels:
+            raise OptionError(f"noise {name}: no file is called so; they are {', '.join(labels)}")
+        if kinds[name] == "pixels":
+            raise OptionError(f"noise {name}: of pixels the residuals say it; leave it out")
+        if not (np.isfinite(sigma) and sigma > 0.0):
+            raise OptionError(f"noise {name}: sigma {sigma:g} must be positive")
 
 
 def wishes(names: Names, options: RelativeOptions) -> tuple[Array, Array]:

@@ -41,12 +41,14 @@ class Stack:
 
     labels: of each; the names of a lone one's parameters go without.  precision: of each block's
     rows, relative to any.  names: all p parameters, those of the instruments at the end.
+    given: (b,) variance of a row that is given, NaN where residuals say it [m^2].
     """
 
     blocks: tuple[Block, ...]
     labels: tuple[str, ...]
     names: Names
     precision: Array
+    given: Array
 
     @staticmethod
     def of(robot: Robot, blocks: Sequence[Block], labels: Sequence[str]) -> Stack:
@@ -54,7 +56,8 @@ class Stack:
         stems = [f"{label}." if len(blocks) > 1 else "" for label in labels]
         own = [stem + name for stem, one in zip(stems, blocks, strict=True) for name in one.own]
         names = OwnNames(robot.joints, (), tuple(own), robot.notation.names(robot.joints))
-        return Stack(tuple(blocks), tuple(labels), names, np.ones(len(blocks)))
+        count = len(blocks)
+        return Stack(tuple(blocks), tuple(labels), names, np.ones(count), np.full(count, np.nan))
 
     @property
     def points(self) -> int:
