@@ -28,6 +28,10 @@ class Motion:
     qd: Array
     qdd: Array
 
+    def at(self, rows: Array | slice) -> Motion:
+        """Some samples."""
+        return Motion(self.q[rows], self.qd[rows], self.qdd[rows])
+
 
 def link_axes(links: Chain) -> Array:
     """(n, 3, 3, m) axes x, y, z of each link's own frame in the base, one a row."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
@@ -19,7 +20,7 @@ from scipy.linalg import toeplitz
 from scipy.sparse import block_diag, coo_array, csr_array
 
 from minimax_cal.dynamics.regressor import Motion
-from minimax_cal.dynamics.run import Run
+from minimax_cal.dynamics.run import Run, rows_of
 from minimax_cal.ground.arrays import Array
 
 SAMPLE_HZ = 100.0  # of what the columns are computed from
@@ -35,6 +36,7 @@ GAP_S = 0.1  # longer steps of time are gaps
 EDGE_S = 0.4  # at the ends and about gaps, where the filter has little to look at
 AR_ORDER = 4  # of the noise of a joint: rows that went before and matter
 QUARTERS = 4  # groups of a trajectory, which err together
+SAMPLED = ("torque", "since", "payload", "temperature", "gap")  # of Logs, beside the motion
 LEAST_NOISE = 1e-9  # of the largest torque: the noise of computed rows
 
 
@@ -224,18 +226,13 @@ class Logs:
     def only(self, runs: Sequence[int]) -> Logs:
         """The logs of some runs."""
         keep = np.concatenate([np.arange(self.start[r], self.start[r + 1]) for r in runs])
-        motion = Motion(self.motion.q[keep], self.motion.qd[keep], self.motion.qdd[keep])
         long = np.diff(self.start)[list(runs)]
-        return Logs(
-            tuple(self.names[r] for r in runs),
-            motion,
-            self.torque[keep],
-            self.since[keep],
-            self.payload[keep],
-            self.temperature[keep],
-            np.concatenate([[0], np.cumsum(long)]),
-            self.gap[keep],
-            self.unit,
+        return replace(
+            self,
+            names=tuple(self.names[r] for r in runs),
+            motion=self.motion.at(keep),
+            start=np.concatenate([[0], np.cumsum(long)]),
+            **rows_of(self, SAMPLED, keep),
         )
 
 
@@ -258,7 +255,7 @@ def prepare_run(run: Run) -> Logs:
     qd = slope(q, rate) if run.qd is None else smooth(even(run.qd), rate)
     qdd = slope(qd, rate) if run.qdd is None else smooth(even(run.qdd), rate)
     torque = smooth(even(run.torque), rate)
-    motion = Motion(q[::every], qd[::every], qdd[::every])
+    motion = Motion(q, qd, qdd).at(slice(None, None, every))
     m, n = motion.q.shape
     temperature = np.full((m, n), np.nan)
     if run.temperature is not None:
@@ -288,21 +285,15 @@ def prepare(runs: Sequence[Run]) -> Logs:
     """All trajectories on the even grid, one after another."""
     each = [prepare_run(run) for run in runs]
 
-    def joined(name: str) -> Array:
-        return np.concatenate([getattr(one, name) for one in each])
-
     q, qd, qdd = (np.concatenate([getattr(one.motion, k) for one in each])
                   for k in ("q", "qd", "qdd"))  # fmt: skip
-    return Logs(
-        tuple(one.names[0] for one in each),
-        Motion(q, qd, qdd),
-        joined("torque"),
-        joined("since"),
-        joined("payload"),
-        joined("temperature"),
-        np.concatenate([[0], np.cumsum([len(one.since) for one in each])]),
-        joined("gap"),
-        each[0].unit,
+    rows: dict[str, Any] = {k: np.concatenate([getattr(o, k) for o in each]) for k in SAMPLED}
+    return replace(
+        each[0],
+        names=tuple(one.names[0] for one in each),
+        motion=Motion(q, qd, qdd),
+        start=np.concatenate([[0], np.cumsum([len(one.since) for one in each])]),
+        **rows,
     )
 
 

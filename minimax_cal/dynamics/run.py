@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 from minimax_cal.ground.arrays import Array
 
 TORQUE = "N m"  # of a revolute joint; N of one that slides
 CURRENT = "A"
+ROWS = ("time", "q", "qd", "qdd", "torque", "temperature", "command")  # what has a value a row
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,3 +51,13 @@ class Run:
     def duration(self) -> float:
         """Time from the first row to the last [s]."""
         return float(self.time[-1] - self.time[0])
+
+    def at(self, rows: Array) -> Run:
+        """Some rows, time as it is.  rows: (m,) mask."""
+        return replace(self, **rows_of(self, ROWS, rows))
+
+
+def rows_of(record: Any, names: Sequence[str], rows: Array) -> dict[str, Any]:
+    """Some rows of fields of a record, None where it has none."""
+    every = {name: getattr(record, name) for name in names}
+    return {name: None if value is None else value[rows] for name, value in every.items()}

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.dynamics.logs.table import SHOWN, Log
-from minimax_cal.dynamics.run import CURRENT, TORQUE, Run
+from minimax_cal.dynamics.run import CURRENT, TORQUE, Run, rows_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 
 TURN = 2.0 * np.pi
+SAMPLED = ("row", "time", "q", "qd", "qdd", "torque")  # what has a value a row
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,15 +54,7 @@ class Draft:
 
     def keeping(self, rows: Array) -> Draft:
         """The same at some rows only.  rows: (m,) mask."""
-        return replace(
-            self,
-            row=self.row[rows],
-            time=self.time[rows],
-            q=self.q[rows],
-            qd=None if self.qd is None else self.qd[rows],
-            qdd=None if self.qdd is None else self.qdd[rows],
-            torque=self.torque[rows],
-        )
+        return replace(self, **rows_of(self, SAMPLED, rows))
 
     def lines(self, rows: Array) -> str:
         """Some lines of the file, to people."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -206,18 +205,5 @@ def divided(
 
 def part_of(run: Run, rows: Array, words: str) -> Run:
     """Some rows of a run.  rows: (m,) mask."""
-
-    def some(values: Any) -> Any:
-        return None if values is None else values[rows]
-
-    return replace(
-        run,
-        name=run.name + words,
-        time=run.time[rows] - run.time[rows][0],
-        q=run.q[rows],
-        qd=some(run.qd),
-        qdd=some(run.qdd),
-        torque=run.torque[rows],
-        temperature=some(run.temperature),
-        command=some(run.command),
-    )
+    part = run.at(rows)
+    return replace(part, name=run.name + words, time=part.time - part.time[0])
