@@ -259,15 +259,20 @@ def test_the_picture_shows_every_joint() -> None:
     assert_allclose(cells[2].lines[0].get_xdata()[-1], found.budget[-1].holdout_rms_moving[0])
 
 
-def stopping(seed: int) -> mc.Run:
-    """A run that stops and creeps back, with friction of bristles that yield after 1 mrad."""
+def stopping(seed: int, share: float = 0.0) -> mc.Run:
+    """A run that stops and creeps back, with friction of bristles that yield after 1 mrad.
+
+    share: of the load at joint 2 that is friction too.
+    """
     rng, time = np.random.default_rng(seed), np.arange(0.0, 20.0, 0.01)
     rate = 0.5 - 0.5 * np.tanh(4.0 * (time - 14.0))  # of the motion, which ends at 14 s
     q = fourier(rng, np.cumsum(rate) * 0.01, 3, 0.15)[0]
     q -= np.sign(np.gradient(q, axis=0)[1380]) * 4e-4 * np.clip((time[:, None] - 15.0) / 4, 0, 1)
     qd = np.gradient(q, time, axis=0)
     motion = Motion(q, qd, np.gradient(qd, time, axis=0))
-    torque = inverse_dynamics(ARM, motion, inertial_parameters(ARM)) + qd * [3.0, 4.0, 1.0]
+    rigid = inverse_dynamics(ARM, motion, inertial_parameters(ARM))
+    torque = rigid + qd * [3.0, 4.0, 1.0]
+    torque[:, 1] += share * np.abs(rigid[:, 1]) * np.sign(qd[:, 1])
     bent = np.zeros(3)
     for i in range(len(time)):
         step = q[i] - q[max(i - 1, 0)]

@@ -19,6 +19,7 @@ from minimax_cal.dynamics.rows import prepare  # noqa: E402
 from minimax_cal.simulators.motion.bodies import Bodies  # noqa: E402
 from minimax_cal.simulators.motion.bristles import has_bristles  # noqa: E402
 from minimax_cal.simulators.motion.driven import inverse_torque  # noqa: E402
+from minimax_cal.simulators.motion.module import installed  # noqa: E402
 from minimax_cal.simulators.motion.numbers import given_numbers  # noqa: E402
 from minimax_cal.simulators.motion.opened import open_model  # noqa: E402
 from minimax_cal.simulators.motion.written import write_numbers  # noqa: E402
@@ -79,6 +80,16 @@ def test_a_file_with_bristles_holds_rest_better_and_holds_still(
         mujoco.mj_kinematics(model, data)
         assert 1e3 * np.linalg.norm(site[0] - data.site("flange").xpos) < 0.02
     assert reached.speed < 2e-3
+
+
+def test_file_and_module_together_do_what_the_last_step_says(robot: Path, tmp_path: Path) -> None:
+    runs, out = [stopping(seed, 0.1) for seed in range(4)], tmp_path / "arm.xml"
+    found = mc.motion_gap(robot, runs, driven=False, friction="dcmotor", write=out)
+    opened, logs = open_model(out, 3), prepare(runs[-1:])
+    assert given_numbers(opened.chain, Bodies.of(opened.chain)).bristles.sum() > 5.0
+    with installed(Path(found.module).read_text(), opened.chain):
+        off = logs.y - logs.filtered(inverse_torque(opened.chain, logs))
+    assert_allclose(np.sqrt((off**2).mean(axis=0)), found.rungs[-1].torque_rms, rtol=1e-3)
 
 
 def test_another_element_is_refused(robot: Path) -> None:

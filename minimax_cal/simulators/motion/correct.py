@@ -101,11 +101,16 @@ class Bench:
             numbers = fit_numbers(self.study, asked)
             if BRISTLES in asked.elements:
                 numbers = self.with_bristles(numbers)
-            opened = self.written(numbers)
-            text = self.module(opened, numbers) if asked.laws else ""
-            with installed(text, opened.chain):
-                missed = self.judge.torque(opened.chain, numbers)
-            self.made[asked] = Candidate(asked, numbers, opened, missed, text)
+            return self.made_of(asked, numbers)
+        return self.made[asked]
+
+    def made_of(self, asked: Asked, numbers: Numbers) -> Candidate:
+        """The model with these numbers, and how far it misses."""
+        opened = self.written(numbers)
+        text = self.module(opened, numbers) if asked.laws else ""
+        with installed(text, opened.chain):
+            missed = self.judge.torque(opened.chain, numbers)
+        self.made[asked] = Candidate(asked, numbers, opened, missed, text)
         return self.made[asked]
 
     def with_bristles(self, numbers: Numbers) -> Numbers:
@@ -188,7 +193,7 @@ def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Correct
     if not full.asked.laws or full.score > plain.score - MODULE:
         full = plain
     if bench.bristled:
-        plain, full = (at_rest(bench, one) for one in (plain, full))
+        plain, full = at_rest(bench, plain, full)
     rungs = tuple(ladder(bench, plain, full, progress))
     names = unwritten(plain.opened.chain, plain.numbers.bodies, plain.opened.chain.names)
     notices = tuple(f"link of {name}: MuJoCo did not take its mass and inertia from the file; give "
@@ -239,13 +244,17 @@ def without_idle(bench: Bench, best: Candidate) -> Candidate:
     return best
 
 
-def at_rest(bench: Bench, best: Candidate) -> Candidate:
-    """With bristles, if all rows gain by them, and more than those that move lose."""
-    more = bench.candidate(replace(best.asked, elements=best.asked.elements | {BRISTLES}))
-    gain = mean_log(best.missed.whole) - mean_log(more.missed.whole)
-    helps = gain > MODULE + max(0.0, more.score - best.score)
-    follows = bench.tracking(more) < bench.tracking(best) + STAYS
-    return more if helps and follows else best
+def at_rest(bench: Bench, plain: Candidate, full: Candidate) -> tuple[Candidate, Candidate]:
+    """Both with the same bristles, if all rows gain by them, and more than moving ones lose."""
+    more = bench.candidate(full.asked.adding(BRISTLES))
+    gain = mean_log(full.missed.whole) - mean_log(more.missed.whole)
+    helps = gain > MODULE + max(0.0, more.score - full.score)
+    if not helps or bench.tracking(more) > bench.tracking(full) + STAYS:
+        return plain, full
+    if full is plain:
+        return more, more
+    held = {name: getattr(more.numbers, name) for name in ("bristles", "yields", "damped")}
+    return bench.made_of(plain.asked.adding(BRISTLES), plain.numbers.put(**held)), more
 
 
 def without_law(asked: Asked, effect: str) -> Asked:

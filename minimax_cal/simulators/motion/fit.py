@@ -59,6 +59,10 @@ class Asked:
     behind: tuple[Term, ...] = ()
     late: float = 0.0
 
+    def adding(self, element: str) -> Asked:
+        """With one element more."""
+        return replace(self, elements=self.elements | {element})
+
     def without(self, element: str) -> Asked:
         """All but one element."""
         return replace(self, elements=self.elements - {element})

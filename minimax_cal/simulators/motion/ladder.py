@@ -95,13 +95,7 @@ def motion_gap(
     >>> print(mc.motion_gap("arm.xml", ["run1.csv", "run2.csv"], write="corrected.xml").summary())
     """
     began = time.perf_counter()
-    if write is not None:
-        check_writable(write, MODELS)
-    mujoco()
-    if friction not in (None, MOTOR):
-        raise OptionError(f"friction={friction!r}: give {MOTOR}, or leave it")
-    if friction == MOTOR and not has_bristles():
-        raise OptionError(f"friction={MOTOR}: this MuJoCo has no motors without input; update it")
+    check_request(write, friction)
     progress("reading the model and the logs")
     runs = read_logs(model, logs)
     opened = open_model(model, runs[0].joints if runs else 0, tip)
@@ -117,7 +111,7 @@ def motion_gap(
         found = told_or_found(judge, opened, diagnosis, payload, progress)
         judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
                                            soft=found.arm.soft))  # fmt: skip
-        bench = replace(bench_of(judge, opened, found), bristled=friction == MOTOR)
+        bench = bench_of(judge, opened, found, bristled=friction == MOTOR)
         made = correct(bench, found, progress)
     path = None if write is None else Path(write)
     beside = path.with_name(path.stem + ENDING) if path and made.full.module else None
@@ -171,9 +165,20 @@ def told_or_found(
     return found
 
 
-def bench_of(judge: Judge, opened: Opened, found: MotionDiagnosis) -> Bench:
+def check_request(write: Path | str | None, friction: str | None) -> None:
+    """Raise CalibrationError for what cannot be written, what holds no friction, and no MuJoCo."""
+    if write is not None:
+        check_writable(write, MODELS)
+    mujoco()
+    if friction not in (None, MOTOR):
+        raise OptionError(f"friction={friction!r}: give {MOTOR}, or leave it")
+    if friction == MOTOR and not has_bristles():
+        raise OptionError(f"friction={MOTOR}: this MuJoCo has no motors without input; update it")
+
+
+def bench_of(judge: Judge, opened: Opened, found: MotionDiagnosis, *, bristled: bool) -> Bench:
     """Where corrections of a model are fitted and judged."""
     assumed = opened.given.assumed or not weighed(opened.chain.robot).all()
     study = Study.of(opened.chain, judge.arm, judge.learning, found.models[-1].terms,
                      largest_inertia(opened.chain), assumed=bool(assumed))  # fmt: skip
-    return Bench(judge, opened, study)
+    return Bench(judge, opened, study, bristled)
