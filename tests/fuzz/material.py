@@ -18,6 +18,7 @@ import minimax_cal as mc
 from experiments.pixel_cells import board_points, make_cell, write_cell
 from minimax_cal.cli import main
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
+from minimax_cal.fitting.instruments.closing import reach
 
 POSES = 24
 CELLS = """
@@ -97,7 +98,7 @@ def make() -> None:
     wires = np.linalg.norm(at[:, None] - posts, axis=-1) + rng.normal(0.0, 0.05, (len(q), 4))
     header = [*rows[0][:6], *(f"wire{i + 1}_mm" for i in range(4))]
     write("wires.csv", [header, *(list(map(str, [*a, *w])) for a, w in zip(q, wires, strict=True))])
-
+    touching(robot, rows[0][:6])
     motions()
     trajectories()
     images()
@@ -155,6 +156,22 @@ def sweeps(robot: mc.Robot) -> None:
     at += rng.normal(0.0, 0.02, at.shape)
     header = [*(f"q{j + 1}_rad" for j in range(6)), *(f"smr1_{axis}_mm" for axis in "xyz")]
     write("sweeps.csv", [header, *([f"{v:.9g}" for v in row] for row in np.hstack([q, at]))])
+
+
+def touching(robot: mc.Robot, joints: list[str]) -> None:
+    """A file of contacts: a ball of the probe on two plates and a sphere."""
+    rng, ball = np.random.default_rng(2), np.array([0.01, 0.02, 0.05])
+    rows = []
+    for label, kind, radius in (("A", "plane", ""), ("B", "plane", ""), ("C", "sphere", "20")):
+        goal = np.array([0.3, 0.1, 0.3]) + rng.uniform(-0.1, 0.1, (60, 3))
+        if kind == "plane":
+            goal[:, "BA".index(label) * 2] = 0.35
+        else:
+            off = rng.normal(size=(60, 3))
+            goal = 0.3 + 0.025 * off / np.linalg.norm(off, axis=1)[:, None]
+        q, gap = reach(robot, ball, goal, rng.uniform(-1.0, 1.0, (60, 6)))
+        rows += [[*map(str, one), label, kind, radius, "5"] for one in q[gap < 1e-9][:20]]
+    write("contacts.csv", [[*joints, "surface", "kind", "radius_mm", "ball_radius_mm"], *rows])
 
 
 def motions() -> None:
