@@ -24,7 +24,6 @@ from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
 from minimax_cal.modelling.dictionary import arm_library
-from minimax_cal.modelling.effects.gears import GEAR_RIPPLE
 from minimax_cal.modelling.effects.scene import Scene, joint_of, unmasked
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.time import SESSION_JUMP
@@ -54,11 +53,6 @@ class Causes:
     maps: Mapped = NO_MAPS
     jobs: int = 1
     cluster: str = ""
-
-    @property
-    def ripple(self) -> bool:
-        """Whether lines of gears were looked for."""
-        return GEAR_RIPPLE.name not in self.exclude
 
 
 def causes_of(
@@ -131,7 +125,7 @@ def chosen(study: Study, exclude: Sequence[str], first: Sequence[Added] = ()) ->
     lib = arm_library(study.scene, study.rows, exclude)
     if SESSION_JUMP.name not in exclude:
         lib = with_jumps(lib, study)
-    return selection.select(lib, ripple=GEAR_RIPPLE.name not in exclude, first=first)
+    return selection.select(lib, first=first)
 
 
 def with_jumps(lib: Library, study: Study) -> Library:

@@ -182,7 +182,7 @@ def search(arm: Arm, logs: Logs, exclude: Sequence[str]) -> Found:
     terms, lacking = terms_of(columns.scene, exclude)
     white = whitening(logs, generous(columns, terms))
     library = Library.of(dictionary_of(columns, white), terms, [])
-    choice = select(library, ripple=False)
+    choice = select(library)
     chosen = tuple(one.candidate.term for one in choice.found)
     hidden = [(effect, "all", "motion in which the rigid body does not imitate it")
               for effect, _ in choice.library.untestable]  # fmt: skip
@@ -205,7 +205,7 @@ def frequencies(choice: Choice) -> dict[tuple[str, str], float]:
     for _ in range(SPLITS):
         half = rng.permutation(count) < count // 2
         for kept in (half[group], ~half[group]):
-            part = select(choice.part(kept), ripple=False)
+            part = select(choice.part(kept))
             found.append({one.key for one in part.chosen})
     keys = {one.key for one in choice.chosen}
     return {key: float(np.mean([key in one for one in found])) for key in keys}

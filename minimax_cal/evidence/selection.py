@@ -119,16 +119,14 @@ class Choice:
 def select(
     lib: Library,
     *,
-    ripple: bool = True,
     level: float = LEVEL,
     first: Sequence[Added] = (),
 ) -> Choice:
     """Forward selection behind a Bonferroni gate, with replacement, dropping and noise updates.
 
     lib: of all rows, or of some, as `Choice.part` gives it: no other is looked at, nothing is
-    tuned, and replacement waits for the end.  ripple: whether to look for lines of gears besides.
-    level: chance of a false name on data without an effect.  first: what was chosen with other
-    weights.
+    tuned, and replacement waits for the end.  level: chance of a false name on data without an
+    effect.  first: what was chosen with other weights.
     """
     lib, fits = begun(lib, first)
     noise = noise_beside(lib, fits)
@@ -138,11 +136,12 @@ def select(
         lib, fits = refined(lib, fits, level, last=True)
         noise = noise_beside(lib, fits)
     for _ in range(MOST):
-        if ripple and not lib.is_part:
+        if not lib.is_part:
             known = lib.columns[:, columns_of([one.candidate for one in fits])[0]]
             heard = [one.candidate.term for one in fits if one.candidate.is_line]
             found = lib.dictionary.lines(noise, known, heard)
-            lib = replace(lib, candidates=plain(lib), lines=lib.aside(found))
+            lines = lib.aside(found) if found else None
+            lib = replace(lib, candidates=plain(lib), lines=lines)
         table = bench(lib, [one.candidate for one in fits], fits)
         if table.dof < LEAST_DOF:
             break

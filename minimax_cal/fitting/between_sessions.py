@@ -23,6 +23,7 @@ from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import seen_from
 from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.gears import GEAR_RIPPLE
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.time import SESSION_JUMP
 from minimax_cal.modelling.joint_fit import extended, scene_of
@@ -69,8 +70,8 @@ def changes(robot: Robot, data: Measurements, solved: Solved) -> tuple[Change, .
         for choice in effect.choices(scene, place)
         if "session" in choice or effect.follows not in CHANGING
     ]
-    lib = Library.of(ArmLaws(scene, rows), terms, ())
-    choice = selection.select(lib, ripple=False)
+    lib = Library.of(ArmLaws(scene, rows, (GEAR_RIPPLE.name,)), terms, ())
+    choice = selection.select(lib)
     if not any("session" in found.candidate.term.choice for found in choice.found):
         return ()
     again = stability.repeated(choice, np.repeat(clusters(data), rows.width))

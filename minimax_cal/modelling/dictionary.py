@@ -11,6 +11,7 @@ from minimax_cal.evidence.dictionary import Spec
 from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.noise import Noise
 from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.gears import GEAR_RIPPLE
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, FREE, Term
 from minimax_cal.modelling.periodogram import is_expected, strongest_lines
@@ -21,10 +22,11 @@ SHAPES = FREE - {"turns"}  # tuned numbers; a line's frequency is paid by its tr
 
 @dataclass(frozen=True, eq=False)
 class ArmLaws:
-    """The effects of an arm, for its linearised errors."""
+    """The effects of an arm, for its linearised errors.  exclude: those that are not sought."""
 
     scene: Scene
     problem: Rows
+    exclude: Sequence[str] = ()
 
     def spec(self, term: Term) -> Spec | None:
         """An effect with its columns; None where it moves no point."""
@@ -56,6 +58,8 @@ class ArmLaws:
 
     def lines(self, noise: Noise, known: Array, found: Sequence[Term]) -> list[tuple[Term, float]]:
         """Lines of gears, with the frequencies tried: `periodogram.strongest_lines`."""
+        if GEAR_RIPPLE.name in self.exclude:
+            return []
         return strongest_lines(self.scene, self.problem, noise, known, heard=found)
 
     def is_expected(self, line: Term, found: Sequence[Term]) -> bool:
@@ -77,4 +81,4 @@ def arm_library(scene: Scene, rows: Rows, exclude: Sequence[str] = ()) -> Librar
             terms += [Term(name, place, c) for c in effect.choices(scene, place)]
         if not places:
             untestable.append((name, "poses or joints at which it would show"))
-    return Library.of(ArmLaws(scene, rows), terms, untestable)
+    return Library.of(ArmLaws(scene, rows, exclude), terms, untestable)
