@@ -180,7 +180,7 @@ def test_what_curves_may_be_is_no_geometry_of_names(bumpy: tuple[Study, Causes])
     study, bare = bumpy
     (term,) = error_maps(joint(study, ())).terms
     beside = beside_curves(study, bare, (term,))
-    rows, wide = study.rows, beside.library.rows
+    rows, wide = study.rows, beside.choice.library.rows
     assert_allclose(wide.basis.T @ wide.basis, np.eye(wide.basis.shape[1]), atol=1e-9)
     assert_allclose(wide.basis.T @ wide.error, 0.0, atol=1e-12)
     columns = term.columns(study.scene)

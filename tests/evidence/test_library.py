@@ -57,7 +57,7 @@ def test_equal_motions_are_one(shifted: Study) -> None:
 
 
 def test_a_nest_moved_at_the_pose_at_which_it_did(shifted: Study) -> None:
-    found = select(arm_library(shifted.scene, shifted.rows), ripple=False).chosen
+    found = select(arm_library(shifted.scene, shifted.rows, ("gear_ripple",))).chosen
     clock = np.sort(shifted.scene.column("clock"))
     assert [c.term.label for c in found] == ["target_shift:smr1"]
     assert found[0].term.choice["since"] == clock[MOVED]

@@ -180,7 +180,7 @@ def test_a_part_names_what_its_rows_alone_name(causes: tuple[Cause, ...], poses:
         found = select(choice.part(kept))
         terms = [c.term for c in choice.part(kept).candidates]
         alone = Library.of(Some(choice.library.dictionary, kept), terms, ())
-        expected = select(alone, ripple=False)
+        expected = select(alone)
         assert {c.key for c in found.chosen} == {c.key for c in expected.chosen}
         assert len(found.chosen) >= len(causes)
 
