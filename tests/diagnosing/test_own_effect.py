@@ -101,7 +101,7 @@ def test_it_is_fitted_diagnosed_drawn_compensated_and_reported(
     told.save(tmp_path / "told.json")
     page = tmp_path / "report.html"
     assert run("report", tmp_path / "told.json", "-o", page) == 0
-    assert "hose_pull" in page.read_text()
+    assert "hose pull" in page.read_text()
     assert HOSE.cause in page.read_text()
 
 
