@@ -46,7 +46,7 @@ plt.show()
 
 without = mc.diagnose("ur10", made.data, exclude=["joint_compliance"], quick=True)
 for title, one in (("with the true cause", found), ("without it", without)):
-    names = ", ".join(finding.term.label for finding in one.findings)
+    names = ", ".join(finding.term.label for finding in one.effects)
     left_over = one.ladder[-1].holdout.rms_mm
     print(f"{title}: verdict {one.verdict}, held-out RMS {left_over:.3f} mm, {names}")
     assert one.remainder is not None
@@ -61,5 +61,5 @@ for title, one in (("with the true cause", found), ("without it", without)):
 # An effect that was found is fitted together with the geometry, and belongs to the robot from
 # then on.
 
-fit = mc.calibrate("ur10", made.data, effects=[one.term.label for one in found.findings])
+fit = mc.calibrate("ur10", made.data, effects=[one.term.label for one in found.effects])
 print(textwrap.fill(fit.headline(), 90))

@@ -271,7 +271,7 @@ def in_one_diagnosis(robot: object, both: Measurements) -> Names:
         return None
     named = [
         place(one.term.label)
-        for one in found.findings
+        for one in found.effects
         if one.established
         and (one.term.effect == ENCODER_ZERO.name or "session" in one.term.choice)
     ]

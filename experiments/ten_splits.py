@@ -79,7 +79,7 @@ def run(split: Split) -> Told:
                 term.choice["turns"] for term in one.shown or one.terms if "turns" in term.choice
             ),
         )
-        for one in found.findings
+        for one in found.effects
     )
     steps = found.ladder
     closed = float("nan") if found.closed is None else float(found.closed)

@@ -253,7 +253,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         robot=robot.name,
         status=Status.FAILED if wrong else study.fit.status,
         verdict="unknown" if wrong else verdict,
-        findings=tuple(findings),
+        effects=tuple(findings),
         ladder=tuple(steps),
         floor=floor,
         closed=share,

@@ -271,7 +271,7 @@ class Step:
 class Diagnosis:
     """What is still wrong with a calibrated robot.
 
-    status: of the geometric fit.  verdict: one of VERDICTS.  findings: by share of the gap.
+    status: of the geometric fit.  verdict: one of VERDICTS.  effects: by share of the gap.
     ladder: nominal, geometric, then with each effect.  beyond: on whole parts left out, effects
     searched again without each.  floor: RMS that noise alone would leave.
     closed: share of the gap closed, 0 to 1, with its interval, NaN where it says nothing.
@@ -288,7 +288,7 @@ class Diagnosis:
     robot: str
     status: Status
     verdict: str
-    findings: tuple[Finding, ...]
+    effects: tuple[Finding, ...]
     ladder: tuple[Step, ...]
     floor: Floor
     closed: float
@@ -338,23 +338,23 @@ class Diagnosis:
 
     @property
     def by_rung(self) -> list[Finding]:
-        """The findings in the order of the ladder, faults of the data first."""
+        """The effects in the order of the ladder, faults of the data first."""
         rungs = [step.name for step in self.ladder]
-        names = [f"+ {f.term.effect} {f.term.place}" for f in self.findings]
+        names = [f"+ {f.term.effect} {f.term.place}" for f in self.effects]
         at = [rungs.index(name) if name in rungs else 0 for name in names]
-        return [self.findings[i] for i in sorted(range(len(at)), key=at.__getitem__)]
+        return [self.effects[i] for i in sorted(range(len(at)), key=at.__getitem__)]
 
     @property
     def main(self) -> list[Finding]:
         """The confirmed causes but for the minor ones, the largest first; at least one if any."""
-        sure = [f for f in self.findings if f.established]
+        sure = [f for f in self.effects if f.established]
         return [f for f in sure if not f.minor] or sure[:1]
 
     @property
     def minor(self) -> list[Finding]:
         """The other confirmed causes."""
         main = self.main
-        return [f for f in self.findings if f.established and f not in main]
+        return [f for f in self.effects if f.established and f not in main]
 
     @property
     def minor_sizes(self) -> tuple[float, float]:
@@ -365,7 +365,7 @@ class Diagnosis:
 
     def leftover(self) -> Leftover:
         """What geometry leaves and what the effects leave, pose by pose."""
-        found = [finding.term for finding in self.findings]
+        found = [finding.term for finding in self.effects]
         return Leftover.of(self.data, self.held, self.noise, self.cells, found)
 
     @cached_property
@@ -396,7 +396,7 @@ class Diagnosis:
             "meets_floor": self.meets_floor,
             "next": self.next,
             "reasons": list(self.reasons),
-            "effects": [finding.to_dict() for finding in self.findings],
+            "effects": [finding.to_dict() for finding in self.effects],
             "set_aside": [point.to_dict() for point in self.set_aside],
             **(
                 {"accuracy": {"holdout_with_them": self.with_them.to_dict()}}

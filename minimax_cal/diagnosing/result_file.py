@@ -256,7 +256,7 @@ def assembled(
         robot=part.robot,
         status=part.status,
         verdict=part.verdict,
-        findings=tuple(finding.finding(fitted) for finding in part.effects),
+        effects=tuple(finding.finding(fitted) for finding in part.effects),
         ladder=tuple(rung.rung() for rung in part.gap.ladder),
         floor=Floor(
             part.gap.noise_floor_mm, *part.gap.noise_floor_range_mm, part.gap.noise_floor_from

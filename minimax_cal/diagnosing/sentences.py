@@ -89,7 +89,7 @@ def unexplained(found: Diagnosis) -> str:
             f"{left}, {found.ladder[-1].trusted.rms_mm:.3f} mm against at most "
             f"{found.floor.high:.3f} mm ({found.floor.source}{joints})."
         )
-    sure = any(f.established for f in found.findings)
+    sure = any(f.established for f in found.effects)
     if not found.structure < STRUCTURE:  # it is the causes that are not certain
         return f"{left}: {'these causes are uncertain' if sure else 'the cause is unknown'}."
     after = "after all effects" if sure else "after geometry"

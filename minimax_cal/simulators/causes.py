@@ -114,7 +114,7 @@ def established(told: Diagnosis) -> tuple[Term, ...]:
     """The effects that a diagnosis is sure of, in the order of its ladder."""
     sure = {
         term.text
-        for finding in told.findings
+        for finding in told.effects
         if finding.established
         for term in finding.terms
         if term.effect in EFFECTS

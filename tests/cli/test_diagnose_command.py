@@ -249,9 +249,9 @@ def test_what_cannot_be_tested_and_what_to_measure_next(folder: Path) -> None:
 
     found = mc.diagnose("ur10", folder / "gap.csv", quick=True)
     other = Alternative("base_flex", "frame", 0.9, 3.0, 1.0, "ten poses stretched out")
-    first = replace(found.findings[0], alternatives=(other,))
-    more = replace(found, findings=(first,), not_testable=(("settling", "the visit order"),))
+    first = replace(found.effects[0], alternatives=(other,))
+    more = replace(found, effects=(first,), not_testable=(("settling", "the visit order"),))
     *_, further, needs = more.tables()
     assert needs.rows == (("settling", "the visit order"),)
     assert further.rows[0][1:] == ("base flex", 0.9, 3.0, 1.0, "ten poses stretched out")
-    assert len(replace(more, findings=(), not_testable=()).tables()) == 1  # the ladder
+    assert len(replace(more, effects=(), not_testable=()).tables()) == 1  # the ladder

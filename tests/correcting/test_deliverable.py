@@ -218,7 +218,7 @@ def gap() -> mc.Diagnosis:
 
 
 def test_a_diagnosis_delivers_its_confirmed_effects(gap: mc.Diagnosis, tmp_path: Path) -> None:
-    firm = {f.term.label for f in gap.findings if f.established}
+    firm = {f.term.label for f in gap.effects if f.established}
     assert firm
     gap.save(tmp_path / "gap.json")
     for source in (gap, tmp_path / "gap.json"):

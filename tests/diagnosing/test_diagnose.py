@@ -48,14 +48,14 @@ def test_few_poses_that_judge_are_said() -> None:
 def test_nothing_is_named_on_a_sound_arm() -> None:
     made, found = sealed(condition="none"), diagnosed()
     assert found.verdict == "none"
-    assert found.findings == ()
+    assert found.effects == ()
     assert abs(found.floor.value / (1e3 * made.floor) - 1.0) < 0.1
     assert "No cause beyond geometry" in found.headline()
 
 
 def test_a_plain_effect_is_named_with_its_size(plain: mc.Diagnosis) -> None:
     assert plain.verdict == "named"
-    (one,) = plain.findings
+    (one,) = plain.effects
     assert (one.term.effect, one.term.place) == ("backlash", "J2")
     assert one.p_value < 1e-6
     assert plain.closed > 0.7
@@ -136,8 +136,8 @@ def test_a_law_outside_the_library_is_unknown() -> None:
 def test_without_the_true_effect_no_relative_is_named_with_confidence() -> None:
     made = sealed(Cause("backlash", "J2", 1000.0))
     found = mc.diagnose(made.robot, made.data, exclude=("backlash",), quick=True)
-    assert found.verdict == "unknown" or any(f.alternatives for f in found.findings)
-    assert all(f.term.effect != "backlash" for f in found.findings)
+    assert found.verdict == "unknown" or any(f.alternatives for f in found.effects)
+    assert all(f.term.effect != "backlash" for f in found.effects)
 
 
 def test_the_ladder_is_of_poses_that_no_fit_has_seen(plain: mc.Diagnosis) -> None:
@@ -150,7 +150,7 @@ def test_the_ladder_is_of_poses_that_no_fit_has_seen(plain: mc.Diagnosis) -> Non
         plain.data.with_y(np.where(held[:, None, None], plain.data.y + 5.0, plain.data.y)),
         quick=True,
     )
-    assert [f.values for f in again.findings][-1:] != [] or again.findings == ()
+    assert [f.values for f in again.effects][-1:] != [] or again.effects == ()
     assert_allclose(again.ladder[1].train.rms_mm, plain.ladder[1].train.rms_mm, rtol=1e-6)
 
 
@@ -162,15 +162,15 @@ def test_the_split_column_is_kept(plain: mc.Diagnosis) -> None:
 def test_outliers_and_swapped_rows_are_named_and_mended() -> None:
     cause = Cause("outliers", "all", 1.0)
     made, found = sealed(cause, seed=7), diagnosed(cause, seed=7)
-    assert found.findings[0].term.effect == "outliers"
+    assert found.effects[0].term.effect == "outliers"
     last = found.ladder[-1]
     assert last.trusted.rms_mm < 1.1e3 * made.floor * 1.05
     assert last.holdout.rms_mm > 2.0 * last.trusted.rms_mm  # what is held out stays there
     made = sealed(Cause("swapped_rows", "all", 1.0), seed=7)
     found = mc.diagnose(made.robot, made.data, quick=True)
-    assert found.findings[0].term.effect == "swapped_rows"
+    assert found.effects[0].term.effect == "swapped_rows"
     moved = np.flatnonzero(np.abs(made.displacement).max(axis=(0, 2)) > 0.01)
-    assert sorted(found.findings[0].rows) == made.data.line[moved].tolist()
+    assert sorted(found.effects[0].rows) == made.data.line[moved].tolist()
     assert found.ladder[-1].trusted.rms_mm < 1.1e3 * made.floor * 1.05
 
 
@@ -235,7 +235,7 @@ def test_one_target_is_enough() -> None:
 def test_qkm_gravity_is_named() -> None:
     found = mc.diagnose(*shared("qkm_hl6"), quick=True)
     gravity = {"joint_compliance", "link_bending"}
-    first = found.findings[0]
+    first = found.effects[0]
     assert {first.term.effect, *(a.effect for a in first.alternatives)} >= gravity
     assert found.ladder[-1].holdout.rms_mm < 0.7 * found.ladder[1].holdout.rms_mm
 
@@ -243,7 +243,7 @@ def test_qkm_gravity_is_named() -> None:
 def test_fanuc_gravity_is_named() -> None:
     robot, file = shared("fanuc_r2000")
     found = mc.diagnose(robot, mc.read_measurements(file).in_visit_order(), quick=True)
-    assert found.findings[0].term.effect in ("joint_compliance", "link_bending")
+    assert found.effects[0].term.effect in ("joint_compliance", "link_bending")
     assert found.ladder[-1].holdout.rms_mm < 0.7 * found.ladder[1].holdout.rms_mm
 
 
@@ -252,14 +252,14 @@ def test_meca_has_no_gravity() -> None:
     robot, file = shared("meca500_r")
     found = mc.diagnose(robot, mc.read_measurements(file).in_visit_order(), quick=True)
     gravity = {"joint_compliance", "link_bending", "base_flex", "gravity_compensator", "tool_flex"}
-    assert not gravity & {f.term.effect for f in found.findings}
-    assert ("backlash", "J6") in {(f.term.effect, f.term.place) for f in found.findings}
+    assert not gravity & {f.term.effect for f in found.effects}
+    assert ("backlash", "J6") in {(f.term.effect, f.term.place) for f in found.effects}
 
 
 @pytest.mark.slow
 def test_ur10_joints_err_by_curves_of_their_own_angle() -> None:
     found = mc.diagnose(*shared("ur10_b"), quick=True)
-    places = {f.term.place for f in found.findings if f.term.effect == "joint_error_map"}
+    places = {f.term.place for f in found.effects if f.term.effect == "joint_error_map"}
     assert places >= {"J1", "J2", "J3"}
     assert found.ladder[-1].holdout.rms_mm < 0.12
 
@@ -279,7 +279,7 @@ def irb120(every: int, *, read_back: bool = False) -> mc.Diagnosis:
 @pytest.mark.parametrize("every", [3, 1])
 def test_irb120_gives_way_at_its_joints(every: int) -> None:
     found = irb120(every)
-    assert found.findings[0].term.effect == "joint_compliance"
+    assert found.effects[0].term.effect == "joint_compliance"
     final = found.ladder[-1].holdout
     assert final.rms_mm <= 0.10
     assert final.max_mm <= 0.35
@@ -288,7 +288,7 @@ def test_irb120_gives_way_at_its_joints(every: int) -> None:
 @pytest.mark.slow
 def test_read_back_joints_are_not_called_backlash() -> None:
     """Every row is needed: a row tells of its move only if the pose before it is there."""
-    names = {f.term.effect for f in irb120(1, read_back=True).findings}
+    names = {f.term.effect for f in irb120(1, read_back=True).effects}
     assert names & {"readback", "settling"}
     assert "backlash" not in names
 
@@ -312,7 +312,7 @@ def test_the_whole_law_is_told_and_a_point_that_the_gap_hid() -> None:
     y = made.data.y.copy()
     y[row] += 1e-3 * np.sqrt(size[0] * size[-1]) * np.array([8.0, 0.0, 0.0])
     found = mc.diagnose(made.robot, made.data.with_y(y), quick=True)
-    (gear,) = found.findings
+    (gear,) = found.effects
     assert [term.text for term in gear.terms] == ["gear_error:J3:orders=2.0"]
     assert [term.text for term in gear.shown] == ["gear_error:J3:turns=1.0"]
     assert len(gear.names) == len(gear.values) == len(gear.sigmas) == 4

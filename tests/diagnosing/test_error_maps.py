@@ -128,7 +128,7 @@ def test_a_diagnosis_tells_the_curve_and_a_fit_compensates_it(robot: Robot, tmp_
     turn[:, 1] = bumps(q[:, 1])
     data = sim.data.with_y(sim.data.y + sim.cell.predict(q + turn) - sim.cell.predict(q))
     told = mc.diagnose(robot, data, quick=True)
-    (found,) = [f for f in told.findings if f.term.label == "joint_error_map:J2"]
+    (found,) = [f for f in told.effects if f.term.label == "joint_error_map:J2"]
     x, y, band = found.curve
     inside = (x > q[:, 1].min()) & (x < q[:, 1].max())
     off = (y - bumps(x))[inside]  # geometry may take a constant turn
@@ -160,7 +160,7 @@ def test_what_stood_in_for_curves_is_named_no_more() -> None:
         turn[:, joint_number] = np.interp(q[:, joint_number], nodes, heights)
     data = sim.data.with_y(sim.data.y + sim.cell.predict(q + turn) - sim.cell.predict(q))
     told = mc.diagnose(robot, data, quick=True)
-    found = [f.term.label for f in told.findings]
+    found = [f.term.label for f in told.effects]
     assert sorted(found) == [f"joint_error_map:J{number}" for number in (1, 2)]
     assert told.ladder[-1].holdout.rms_mm < 0.25 * told.ladder[1].holdout.rms_mm
 
@@ -215,7 +215,7 @@ def test_a_law_and_a_curve_much_smaller_are_both_told() -> None:
     turn[:, place] = np.interp(q[:, place], nodes, heights)
     data = sim.data.with_y(sim.data.y + sim.cell.predict(q + turn) - sim.cell.predict(q))
     told = mc.diagnose(robot, data, quick=True)
-    first, second = (f.term.label for f in told.findings[:2])
+    first, second = (f.term.label for f in told.effects[:2])
     assert (first, second) == ("joint_compliance:all", "joint_error_map:J3")
     steps = [step.name for step in told.ladder[2:]]
     assert steps[:2] == ["+ joint_compliance all", "+ joint_error_map J3"]

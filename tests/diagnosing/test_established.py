@@ -88,7 +88,7 @@ def test_poses_too_few_to_ask_leave_an_effect_tentative_and_in_the_model() -> No
     data = made.data.keep(np.arange(len(made.data.target_names)) == 0).take(np.arange(20))
     columns = {name: column for name, column in data.columns.items() if name != "split"}
     told = mc.diagnose(made.robot, replace(data, columns=columns), quick=True)
-    (one,) = told.findings
+    (one,) = told.effects
     assert one.term.key == ("joint_compliance", "J2")
     assert np.isnan(one.again)
     assert not one.established

@@ -124,7 +124,7 @@ def test_what_is_told_is_what_is_saved() -> None:
     made = make(Case("irb2600", "pair", (Cause("joint_compliance", "all", 2000.0),
                                          Cause("backlash", "J3", 2000.0)), seed=2))  # fmt: skip
     found = mc.diagnose(made.robot, made.data, quick=True)
-    assert len(found.findings) >= 2
+    assert len(found.effects) >= 2
     kept = {(t.effect, t.place): values for t, values in zip(
         found.cells[-1].effects.terms, found.cells[-1].effects.values, strict=True)}  # fmt: skip
     content = json.loads(found.json())
@@ -143,7 +143,7 @@ def test_heavy_tails_are_not_named() -> None:
     for _ in range(4):
         noise = 3e-5 * rng.standard_t(3, size=made.data.y.shape)
         found = mc.diagnose(made.robot, made.data.with_y(made.data.y + noise), quick=True)
-        verdicts.append((found.verdict, [f.term.effect for f in found.findings]))
+        verdicts.append((found.verdict, [f.term.effect for f in found.effects]))
     assert all(verdict != "named" for verdict, _ in verdicts), verdicts
     assert not any("outliers" in names for _, names in verdicts), verdicts
 

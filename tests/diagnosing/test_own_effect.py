@@ -78,13 +78,13 @@ def test_it_is_fitted_diagnosed_drawn_compensated_and_reported(
     robot: mc.Robot, measured: mc.Measurements, tmp_path: Path
 ) -> None:
     told = mc.diagnose(robot, measured, quick=True)
-    named = {finding.term.label: finding for finding in told.findings}
+    named = {finding.term.label: finding for finding in told.effects}
     assert set(named) == {"hose_pull:J5", "mast_sway:frame"}
     for label, true in (("hose_pull:J5", PULL), ("mast_sway:frame", SWAY)):
         (value,), (sigma,) = named[label].values, named[label].sigmas
         assert abs(value - true) < 4.0 * sigma < true
 
-    left = replace(told, findings=(named["hose_pull:J5"],), stated_curves=None)
+    left = replace(told, effects=(named["hose_pull:J5"],), stated_curves=None)
     curve = left.curves["residual"]
     assert curve.xlabel == "hose wound up (deg)"
     assert "joint 5" in curve.ylabel

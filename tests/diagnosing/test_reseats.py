@@ -36,7 +36,7 @@ def test_a_reseat_of_5_mm_is_named_with_its_size(targets: int) -> None:
     sim = simulate("irb120", 60, targets, seed=1, truth=TRUTH)
     found = mc.diagnose("irb120", reseated(sim, (3e-3, 0.0, 4e-3)), quick=True)
     assert found.verdict == "named"
-    (reseat,) = found.findings
+    (reseat,) = found.effects
     assert (reseat.term.effect, reseat.term.place) == ("target_reseat", "smr2")
     assert reseat.at == "at smr2"
     assert "re-seated" in reseat.cause
@@ -66,7 +66,7 @@ def test_8_of_60_poses_that_are_off_are_named(targets: int) -> None:
     y[rows] += 3e-3 * by / np.linalg.norm(by, axis=-1, keepdims=True)
     found = mc.diagnose("irb120", replace(sim.data.with_y(y), columns={}), quick=True)
     assert found.verdict == "named"
-    (wrong,) = found.findings
+    (wrong,) = found.effects
     assert wrong.term.effect == "outliers"
     assert set(wrong.rows) == set(sim.data.line[rows].tolist())
     assert found.ladder[-1].trusted.rms_mm < 2.0 * NOISE_MM

@@ -263,7 +263,7 @@ def test_the_tables_hold_the_numbers_of_people(made: Diagnosis) -> None:
 
 
 def test_what_every_row_says_alike_is_no_column(made: Diagnosis) -> None:
-    sure = replace(made, findings=(FINDINGS[0], replace(FINDINGS[1], again=1.0)))
+    sure = replace(made, effects=(FINDINGS[0], replace(FINDINGS[1], again=1.0)))
     table = sure.effects_table()
     assert "evidence" not in table.header
     assert {len(table.header), len(table.formats), *map(len, table.rows)} == {6}
@@ -272,7 +272,7 @@ def test_what_every_row_says_alike_is_no_column(made: Diagnosis) -> None:
 
 def test_a_cause_is_told_once(made: Diagnosis) -> None:
     twice = replace(FINDINGS[0], terms=(Term("joint_compliance", "J4"),), share=0.2)
-    rows = replace(made, findings=(FINDINGS[0], twice)).effects_table().rows
+    rows = replace(made, effects=(FINDINGS[0], twice)).effects_table().rows
     assert [row[1] == "as above" for row in rows] == [False, True]
     assert rows[0][0] == "joint compliance at joint 4"
 
@@ -280,7 +280,7 @@ def test_a_cause_is_told_once(made: Diagnosis) -> None:
 def test_rivals_are_told_with_what_tells_them_apart(made: Diagnosis) -> None:
     rivals = (Alternative("gear_error", "J2", 0.9, 12.0, 3.0, "20 poses"),
               Alternative("encoder_gain", "J2", 0.5, 30.0, 9.0))  # fmt: skip
-    found = replace(made, findings=(replace(FINDINGS[1], alternatives=rivals),))
+    found = replace(made, effects=(replace(FINDINGS[1], alternatives=rivals),))
     assert found.rival_table().rows == (
         ("backlash at joint 2", "gear error at joint 2", 0.9, 12.0, 3.0, "20 poses"),
         ("backlash at joint 2", "encoder gain at joint 2", 0.5, 30.0, 9.0,

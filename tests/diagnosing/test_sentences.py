@@ -57,7 +57,7 @@ def found(bare: Diagnosis) -> Diagnosis:
     after = {f"{effect} {place}": rms for effect, place, _, _, rms in FOUND}
     rungs = [step(f"+ {name}", after[name]) for name in LADDER]
     return replace(
-        bare, verdict="named", findings=tuple(finding(*row) for row in FOUND), closed=0.95,
+        bare, verdict="named", effects=tuple(finding(*row) for row in FOUND), closed=0.95,
         closed_ci=(0.9, 0.97), ladder=(step("nominal", 2.0), step("geometric", 0.8), *rungs),
         floor=Floor(0.03, 0.0, 0.03, AT_MOST), beyond=Beyond(),
     )  # fmt: skip
@@ -66,7 +66,7 @@ def found(bare: Diagnosis) -> Diagnosis:
 def marked(found: Diagnosis, **more: Any) -> Diagnosis:
     """With what the evidence says besides: whether effects are established, what remains."""
     for name, value in more.pop("established", {}).items():
-        one = next(f for f in found.findings if f.term.effect == name)
+        one = next(f for f in found.effects if f.term.effect == name)
         object.__setattr__(one, "again", float(value))
     for name, value in more.items():
         object.__setattr__(found, name, value)
@@ -76,19 +76,19 @@ def marked(found: Diagnosis, **more: Any) -> Diagnosis:
 def test_every_verdict_opens_the_words(found: Diagnosis) -> None:
     assert set(OPENINGS) == set(VERDICTS)
     alternative = Alternative("link_bending", "L2", 0.9, 3.0, 1.0)
-    first = replace(found.findings[0], alternatives=(alternative,))
+    first = replace(found.effects[0], alternatives=(alternative,))
     for verdict in VERDICTS:
         changed = replace(found, verdict=verdict)
         if verdict == "one_of":
-            changed = replace(changed, findings=(first, *found.findings[1:]))
+            changed = replace(changed, effects=(first, *found.effects[1:]))
         first_words = "Main causes" if verdict == "unknown" else OPENINGS[verdict]
         if verdict in ("none", "not_repeatable"):
-            changed = replace(changed, findings=())
+            changed = replace(changed, effects=())
         assert changed.headline().startswith(first_words), verdict
         assert OPENINGS[verdict] in changed.headline()
         assert changed.summary().startswith(changed.headline())
-    minor = replace(found.findings[-1], alternatives=(alternative,))
-    main = replace(found, verdict="one_of", findings=(*found.findings[:-1], minor))
+    minor = replace(found.effects[-1], alternatives=(alternative,))
+    main = replace(found, verdict="one_of", effects=(*found.effects[:-1], minor))
     assert main.headline().startswith(OPENINGS["named"])  # a minor one alone is ambiguous
 
 
@@ -118,17 +118,17 @@ def test_minor_effects_take_one_line(found: Diagnosis) -> None:
     (line,) = [text for text in found.reasons if "minor" in text]
     assert line.startswith("2 minor effects (gear error at joint 5; backlash at joint 4) together")
     assert line.endswith(" take 0.020 mm off the RMS error.")
-    many = tuple(replace(found.findings[-1], terms=(Term("backlash", f"J{n}"),))
+    many = tuple(replace(found.effects[-1], terms=(Term("backlash", f"J{n}"),))
                  for n in range(1, 7))  # fmt: skip
     (line,) = [
-        text for text in replace(found, findings=(*found.findings[:3], *many)).reasons
+        text for text in replace(found, effects=(*found.effects[:3], *many)).reasons
         if "minor" in text
     ]  # fmt: skip
     assert line == "6 minor effects together take 0.060 mm off the RMS error."
 
 
 def test_a_single_cause_is_one(found: Diagnosis) -> None:
-    alone = replace(found, findings=found.findings[:1], ladder=found.ladder[:3])
+    alone = replace(found, effects=found.effects[:1], ladder=found.ladder[:3])
     assert alone.headline().startswith("Main cause: joint compliance at joint 2 (")
     assert "minor" not in alone.headline()
 
@@ -136,17 +136,17 @@ def test_a_single_cause_is_one(found: Diagnosis) -> None:
 def test_alternatives_stand_at_their_own_place(found: Diagnosis) -> None:
     """Of two causes of a kind only the second has one; the measurement is for the larger share."""
     others = [Alternative("link_bending", f"L{n}", 0.9, 3.0, 1.0, f"measure {n}") for n in (1, 2)]
-    large, small = found.findings[:2]
+    large, small = found.effects[:2]
     second = replace(small, terms=(replace(small.term, effect=large.term.effect),),
                      alternatives=(others[0], replace(others[0], place="L3")))  # fmt: skip
-    both = replace(found, findings=(large, second), ladder=found.ladder[:4])
+    both = replace(found, effects=(large, second), ladder=found.ladder[:4])
     causes = both.reasons[0]
     assert "joint compliance at joint 2 and 3" in causes
     assert (
         ", or link bending at link 1 (for joint 3) or link bending at link 3 (for joint" in causes
     )
     assert "(for joint 2)" not in causes
-    both = replace(both, findings=(replace(large, alternatives=(others[1],)), second))
+    both = replace(both, effects=(replace(large, alternatives=(others[1],)), second))
     text = next(text for text in both.reasons if text.startswith("Recommended: "))
     assert large.share > second.share > 0.0
     assert text.startswith("Recommended: measure 2, to distinguish")
@@ -192,15 +192,15 @@ def test_what_does_not_help_is_not_proposed(found: Diagnosis) -> None:
     others = (Alternative("link_bending", "L2", 0.9, 3.0, 1.0, WIDER),
               Alternative("base_flex", "frame", 0.9, 3.0, 1.0, "no measurement considered is "
                           "enough: the best raises the power to 2 of the 25 needed"))  # fmt: skip
-    first = replace(found.findings[0], alternatives=others)
-    changed = replace(found, verdict="one_of", findings=(first, *found.findings[1:]))
+    first = replace(found.effects[0], alternatives=others)
+    changed = replace(found, verdict="one_of", effects=(first, *found.effects[1:]))
     (text,) = [text for text in changed.reasons if text.startswith("Recommended: ")]
     assert text == (
         f"Recommended: {WIDER}, to distinguish joint compliance at joint 2 from link bending "
         "at link 2."
     )
     assert "or base flex or link bending at link 2" in changed.reasons[0]
-    nothing = replace(changed, findings=(replace(first, alternatives=others[1:]),))
+    nothing = replace(changed, effects=(replace(first, alternatives=others[1:]),))
     said = [text for text in nothing.reasons if text.startswith("Recommended: ")]
     assert said == [REVISIT]  # the noise is not known here
 
@@ -210,7 +210,7 @@ def test_every_chance_and_power_says_what_is_enough(found: Diagnosis) -> None:
     told = replace(found, verdict="unknown", structure=1e-7, structure_in=place)
     assert "p = 1e-07, significant below 0.005" in told.headline()
     assert "Unexplained: the error after all effects is not random" in told.headline()
-    assert replace(told, findings=()).headline().startswith("Unexplained: the error after geometry")
+    assert replace(told, effects=()).headline().startswith("Unexplained: the error after geometry")
     assert "below 0.005 are significant" in told.effects_table().title
     assert "the power is below 25" in told.rival_table().title
     assert "lambda" not in told.summary()

@@ -36,7 +36,7 @@ def test_two_stations_are_diagnosed_as_one(plain: mc.Diagnosis) -> None:
     turn = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
     y = np.where((session == "b")[:, None, None], ONE.y @ turn.T + 2.0, ONE.y)
     found = diagnosed(replace(ONE.with_y(y), columns={**ONE.columns, "session": session}))
-    assert [f.term.label for f in found.findings] == [f.term.label for f in plain.findings]
+    assert [f.term.label for f in found.effects] == [f.term.label for f in plain.effects]
     assert_allclose(
         [step.holdout.rms_mm for step in found.ladder[1:]],
         [step.holdout.rms_mm for step in plain.ladder[1:]],
@@ -68,14 +68,14 @@ def test_a_jump_is_named_with_its_size_and_the_foot_judges_it(
 ) -> None:
     data = ONE.with_y(ONE.y + LATE[:, None, None] * SHIFT)
     found = diagnosed(replace(data, columns={**data.columns, **foot(move)}))
-    (jump,) = (f for f in found.findings if f.term.effect == "session_jump")
+    (jump,) = (f for f in found.effects if f.term.effect == "session_jump")
     assert jump.term.place == "frame"
     assert_allclose(jump.term.choice["since"], 70 / 119, rtol=1e-12)
     truth = np.concatenate([SHIFT @ MADE.cell.base[:3, :3], np.zeros(3)])
     assert np.all(np.abs(np.array(jump.values) - truth) < 4.0 * np.array(jump.sigmas))
-    assert {f.term.label for f in found.findings} == {
+    assert {f.term.label for f in found.effects} == {
         "session_jump:frame",
-        *(f.term.label for f in plain.findings),
+        *(f.term.label for f in plain.effects),
     }
     assert_allclose(found.ladder[-1].holdout.rms_mm, plain.ladder[-1].holdout.rms_mm, rtol=SAMPLING)
     (told,) = (text for text in found.notices if "on the foot" in text)

@@ -59,7 +59,7 @@ def two_orders() -> mc.Diagnosis:
 
 def test_two_orders_of_one_gear_are_one_effect(two_orders: mc.Diagnosis) -> None:
     assert two_orders.verdict in ("named", "one_of")
-    (one,) = two_orders.findings
+    (one,) = two_orders.effects
     assert one.term.key == ("gear_error", "J3")
     assert one.established
     assert set(one.names) == {f"{part} {k}/turn" for part in ("cos", "sin") for k in (1, 2)}
@@ -98,7 +98,7 @@ def test_an_old_file_holds_established_effects(two_orders: mc.Diagnosis) -> None
     said = json.loads(two_orders.json())
     del said["effects"][0]["established"], said["effects"][0]["frequency"], said["remainder"]
     again = mc.Diagnosis.from_dict(said)
-    assert all(found.established for found in again.findings)
+    assert all(found.established for found in again.effects)
     assert again.remainder is None
 
 

@@ -83,7 +83,7 @@ def test_a_diagnosis_is_what_one_process_finds(cluster: str) -> None:
     data = mc.simulate("irb120", 60, 1, 1, truth=mc.Truth(compliance=3e-6)).data
     alone, found = mc.diagnose("irb120", data), mc.diagnose("irb120", data, cluster=cluster)
     assert found.verdict == alone.verdict
-    assert [f.term.text for f in found.findings] == [f.term.text for f in alone.findings]
+    assert [f.term.text for f in found.effects] == [f.term.text for f in alone.effects]
     assert_allclose(found.beyond.typical_mm, alone.beyond.typical_mm, rtol=1e-12)
 
 

@@ -124,7 +124,7 @@ def test_campaigns_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFix
     assert "moved between sessions: encoder zero at joint 3 from june on by +0.5" in said
     found = mc.diagnose(ROBOT, paths, quick=True)
     assert found.verdict == "named"
-    (finding,) = found.findings
+    (finding,) = found.effects
     assert finding.term.label == "encoder_zero:J3"
     assert_allclose(finding.values[0], SHIFT, atol=FIVE * finding.sigmas[0], rtol=0)
     assert any("encoder zero at joint 3: from june on by +0.5" in text for text in found.notices)

@@ -116,8 +116,8 @@ def test_only_what_a_diagnosis_establishes_is_told_for_established(results: Path
     fit, gap = mc.load_fit(results / "fit.json"), load_diagnosis(results / "gap.json")
 
     def limiting(verdict: str, share: float) -> str:
-        found = tuple(replace(one, share=share) for one in gap.findings)
-        told = Sources(fit, replace(gap, verdict=verdict, findings=found))
+        found = tuple(replace(one, share=share) for one in gap.effects)
+        told = Sources(fit, replace(gap, verdict=verdict, effects=found))
         return limits_now(told, signed(told, (), "inside", None))
 
     cause = "gearboxes wind up under gravity"

@@ -67,7 +67,7 @@ def test_a_picture_of_each_kind_and_the_same_file_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize("targets", [1, 3])
 def test_nothing_found_no_order_and_one_target(targets: int, tmp_path: Path) -> None:
     found = replace(diagnosed("none", targets), robot="arm $x_{$")  # a name may hold a dollar
-    assert not found.findings
+    assert not found.effects
     diagnosis.save_diagnosis(found, tmp_path / "gap.svg")
     assert (tmp_path / "gap.svg").exists()
     left = found.leftover()

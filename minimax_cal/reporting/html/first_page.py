@@ -435,7 +435,7 @@ def left_now(gap: Diagnosis, left: float) -> str:
 
 def causes(gap: Diagnosis) -> list[Finding]:
     """The confirmed effects, the largest first."""
-    return [f for f in gap.findings if f.established and not f.rows]
+    return [f for f in gap.effects if f.established and not f.rows]
 
 
 def holds(sources: Sources, finding: Finding) -> bool:

@@ -40,7 +40,7 @@ def causes(sources: Sources) -> Blocks:
     if not gap:
         return ()
     blocks: list[Block] = []
-    if gap.findings:
+    if gap.effects:
         blocks.append(gap.effects_table())
         blocks += [] if fit and fit.cell.effects.terms else [gap.parameter_table()]
     else:
@@ -56,7 +56,7 @@ def causes(sources: Sources) -> Blocks:
                 "one helps."
             )
         )
-    elif gap.findings:
+    elif gap.effects:
         blocks.append(text("No alternative explains the effects as well; no further measurement is "
                            "needed to distinguish them."))  # fmt: skip
     if not gap.curves:
