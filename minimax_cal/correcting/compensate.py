@@ -32,6 +32,7 @@ from minimax_cal.measuring.measurements import FARTHEST, Measurements, check_col
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.compliance import WHOLE
 from minimax_cal.modelling.effects.scene import unmasked
+from minimax_cal.modelling.effects.time import ROOM
 from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.reach import Outcome, Reach, arm_of, bent, lever_of, motion, seen
 from minimax_cal.robots import kinematics
@@ -362,8 +363,9 @@ def remarks(arm: Cell, data: Measurements) -> list[str]:
             "the compliance was fitted to measured torques, and these targets have none (tau1_Nm "
             "...): torques of assumed masses are used"
         )
-    if any("temperature" in term.choice for term in terms) and "temperature" not in data.columns:
-        out.append("thermal growth: no column temperature_C, taken at 20 C")
+    warm = [name_effect(*term.key) for term in terms if "temperature" in term.choice]
+    if warm and "temperature" not in data.columns:
+        out.append(f"{', '.join(warm)}: no column temperature_C, taken at {ROOM:.0f} C")
     return out
 
 
