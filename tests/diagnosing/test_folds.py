@@ -129,7 +129,7 @@ def test_groups_that_are_named_are_the_parts(
     found = beyond_of(play, ALONE, replace(judges, by="region"), silent)  # type: ignore[arg-type]
     known = [part.name for part in parts(judges.everyone, "region")]
     assert [one.where for one in found.folds] == known
-    assert all(name.startswith("the region of line") for name in known)
+    assert all(name.startswith("the region of ") for name in known)
 
 
 def test_a_fold_is_sought_and_fitted_on_its_rows_alone(play: Study) -> None:

@@ -25,9 +25,14 @@ def test_tables_count_what_remains() -> None:
     *_, last = closed_table([case, case], [one, one]).rows
     assert last == ("median", 10.0, pytest.approx(10.0), pytest.approx(20.0),
                     pytest.approx(1.0), pytest.approx(2.0))  # fmt: skip
-    run = Judged("a", np.array([2.0, 2.0]), np.array([0.3, 0.4]), np.array([0.1, 0.2]))
+    low = np.array([0.05, 0.06])
+    run = Judged(
+        "a", np.array([2.0, 2.0]), np.array([0.3, 0.4]), np.array([0.1, 0.2]), low, 0.5 * low
+    )
     assert [row[1:] for row in real_table([run, run]).rows] == [
         (pytest.approx(2.0), pytest.approx(2.0)),
         (pytest.approx(0.3), pytest.approx(0.4)),
         (pytest.approx(0.1), pytest.approx(0.2)),
+        (pytest.approx(0.05), pytest.approx(0.06)),
+        (pytest.approx(0.025), pytest.approx(0.03)),
     ]

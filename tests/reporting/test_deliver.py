@@ -91,8 +91,7 @@ def test_the_page_and_the_command_say_for_which_file(
     first, *rest = capsys.readouterr().out.splitlines()
     assert first == NOT_PASSED
     assert any(
-        "hold for the file of minimax-cal export --to urdf (geometry alone)" in line
-        for line in rest
+        "hold for the urdf file of minimax-cal export (geometry alone)" in line for line in rest
     )
     assert sum(line.startswith(("urdf: ", "ros-yaml: ")) for line in rest) == 2
     assert run(*asked, "--deliver", "step") == 2

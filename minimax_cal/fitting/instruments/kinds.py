@@ -154,8 +154,8 @@ def check_kinds(every: Sequence[RelativeData]) -> None:
         raise DataError("no file of measurements is given")
     if all(data.kind == "pixels" for data in every):
         raise DataError(
-            f"{every[0].at.source}: it holds pixels: use minimax-cal calibrate --pixels, or give "
-            "files of other instruments too"
+            f"{every[0].at.source}: it holds pixels alone: give it to calibrate as pixels=, or add "
+            "files of other instruments"
         )
     if all(data.kind == "points" for data in every):
         raise DataError(

@@ -43,7 +43,7 @@ class Row:
     def name(self) -> str:
         """For people."""
         to = self.delivered.format
-        return CORRECTED if to == COMPENSATED else f"the file of minimax-cal export --to {to}"
+        return CORRECTED if to == COMPENSATED else f"the {to} file of minimax-cal export"
 
     @property
     def verdict(self) -> str:
