@@ -154,7 +154,7 @@ def test_lenses_that_are_held_stay() -> None:
 
 def test_pixels_alone_have_a_command_of_their_own() -> None:
     cell = cell_of(2)
-    with pytest.raises(mc.DataError, match="use minimax-cal calibrate --pixels"):
+    with pytest.raises(mc.DataError, match="pixels alone: give it to calibrate"):
         mc.relative(cell.drawn, [as_instrument(data_of(cell))])
 
 
