@@ -433,9 +433,12 @@ def check_shapes(
         "sensitivity": ((count,),), "prior": ((count,),), "weights": ((k, m),),
         "share": ((k,), (k, m)), "crossed": (every,), "drawn crossed": (every,)
     }  # fmt: skip
+    if arrays["singular"].ndim != 1 or not arrays["singular"].size:
+        raise ValueError("singular is not a row of numbers")
     for name, values in arrays.items():
         known = shapes.get(name, (values.shape,))
-        if values.shape not in known and data.poses:
+        asked = data.poses or name not in POSE_BY_POSE
+        if values.shape not in known and asked:
             raise ValueError(f"{name} is not of these parameters and poses")
 
 

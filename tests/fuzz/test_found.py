@@ -73,11 +73,13 @@ def test_a_broken_list_of_poses_is_told_in_our_words(
 def test_arrays_of_another_size_are_told_in_our_words(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for values, says in (
-        ([0.0] * 5, "prior is not of"),
-        ([[1.0], [1.0, 2.0]], "something else"),
+    for name, values, says in (
+        ("prior", [0.0] * 5, "prior is not of"),
+        ("prior", [[1.0], [1.0, 2.0]], "something else"),
+        ("singular", 3.0, "singular is not a row"),
+        ("singular", [], "singular is not a row"),
     ):
-        path = broken(tmp_path, "fit.json", lambda c, v=values: c["arrays"].update(prior=v))
+        path = broken(tmp_path, "fit.json", lambda c, n=name, v=values: c["arrays"].update({n: v}))
         assert says in refused(capsys, "iso9283", path)
 
 
