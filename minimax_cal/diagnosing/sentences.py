@@ -200,7 +200,9 @@ def shrunk(found: Diagnosis) -> str:
     )
     if len(found.ladder) < 3:
         return f"{text}."
-    text += f", all effects {last.rms_mm:.3f} mm (largest {last.max_mm:.3f} mm{without_far(found)})"
+    more = "" if all(f.established for f in found.by_rung) else ", possible ones included,"
+    far = f"largest {last.max_mm:.3f} mm{without_far(found)}"
+    text += f", all effects{more} {last.rms_mm:.3f} mm ({far})"
     return f"{text}; {closed_words(found)}." if math.isfinite(found.closed) else f"{text}."
 
 
