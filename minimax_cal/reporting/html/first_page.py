@@ -352,7 +352,7 @@ def iso_rows(fit: Fit) -> list[tuple[Cell, ...]]:
     if not all(np.isfinite(size).any() for size in sizes):
         return []
     return [
-        (f"AP of ISO 9283 of the centroid, {name} ({np.isfinite(sizes[1]).sum()} held out)",
+        (f"AP of ISO 9283, {name} ({np.isfinite(sizes[1]).sum()} held out)",
          *(float(take(size)) for size in sizes), math.nan, math.nan, "")
         for name, take in (("mean", np.nanmean), ("largest", np.nanmax))
     ]  # fmt: skip
