@@ -480,7 +480,7 @@ class Diagnosis:
 
     @staticmethod
     def from_dict(content: Mapping[str, Any], source: str = "diagnosis") -> Diagnosis:
-        """From `to_dict`, or from the JSON of an earlier version.  Raises CalibrationError."""
+        """From `to_dict`.  Raises CalibrationError."""
         from minimax_cal.diagnosing.result_file import read
         from minimax_cal.ground.records import reading
 

@@ -34,6 +34,7 @@ from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import for_people, in_files, turned_for_people
+from minimax_cal.ground.words import list_counts
 from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.grouping import clusters, grouped
@@ -718,8 +719,7 @@ class Fit:
 
     def answerers(self) -> str:
         """Backends with the number of QPs they answered, and how rough the answers were."""
-        most_first = sorted(self.answered.items(), key=lambda item: -item[1])
-        who = ", ".join(f"{count} by {name}" for name, count in most_first)
+        who = list_counts(self.answered)
         residual = self.work.qp_residual
         if residual > ROUGH:
             who += f" (used as they are, relative residual up to {residual:.1g})"
@@ -746,7 +746,7 @@ class Fit:
         return "\n\n".join([self.headline(), *tables, self.solution()])
 
     def to_dict(self, *, poses: bool = True) -> dict[str, Any]:
-        """The JSON of the contract, and more; `from_dict` reads it back to the last digit.
+        """The JSON of the contract, and more; `from_dict` reads it back, lengths to 15 digits.
 
         poses: whether with the measurements, which of many poses are nearly all of it.
         """
@@ -756,7 +756,7 @@ class Fit:
 
     @staticmethod
     def from_dict(content: Mapping[str, Any], source: str = "fit") -> Fit:
-        """From `to_dict`, or from the JSON of an earlier version.  Raises CalibrationError."""
+        """From `to_dict`.  Raises CalibrationError."""
         from minimax_cal.fitting.fit_file import read
         from minimax_cal.ground.records import reading
 

@@ -6,7 +6,7 @@ import csv
 import io
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
 HIDDEN = ("Cc", "Cs", "LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
@@ -21,6 +21,12 @@ def name_first(names: Sequence[str], most: int = 8, mark: str = ", ") -> str:
     """The first few names, and how many more there are."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return mark.join(names[:most]) + more
+
+
+def list_counts(counts: Mapping[str, int]) -> str:
+    """How many by whom, the most first, as 4 by daqp, 1 by highs."""
+    most_first = sorted(counts.items(), key=lambda item: -item[1])
+    return ", ".join(f"{count} by {name}" for name, count in most_first)
 
 
 def visible(text: str) -> str:

@@ -103,11 +103,14 @@ class Measurements:
 
         rows: indices or a mask.
         """
-        names = [self.called(line) for line in self.line[rows]]
-        kinds = {name.split(" ", 1)[0] for name in names}
-        if len(kinds) != 1 or len(names) == 1:
-            return name_first(names, most)
-        return f"{kinds.pop()}s {name_first([name.split(' ', 1)[1] for name in names], most)}"
+        every = self.line[rows]
+        names = [self.called(line) for line in every[:most]]
+        kinds = {name.partition(" ")[0] for name in names}
+        if len(kinds) == 1 and len(names) > 1:
+            names = [name.partition(" ")[2] for name in names]
+            names[0] = f"{kinds.pop()}s {names[0]}"
+        more = [""] * (len(every) - len(names))  # counted, and not named
+        return name_first([*names, *more], most)
 
     def in_visit_order(self) -> Measurements:
         """The same, its rows taken as visited one after the other."""

@@ -115,6 +115,17 @@ def rotation(w: Array) -> Array:
     return np.asarray(np.eye(3) + first * k + second * (k @ k))
 
 
+def right_jacobian(w: Array) -> Array:
+    """J with exp(w + dw) = exp(w) exp(J dw): (..., 3, 3).  w: (..., 3) rotation vectors [rad]."""
+    size = np.linalg.norm(w, axis=-1)[..., None, None]
+    small = size < 1e-4  # where the quotients are their limits to rounding
+    safe = np.where(small, 1.0, size)
+    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    skew = hat(w)
+    return np.asarray(np.eye(3) - first * skew + second * skew @ skew)
+
+
 def rotation_vector(turn: Array) -> Array:
     """The rotation vector (3,) of a rotation (3, 3) [rad]: the inverse of `rotation`."""
     v, w = along_quaternion(turn)

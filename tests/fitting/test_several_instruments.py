@@ -18,11 +18,10 @@ from minimax_cal.fitting.instruments import (
     relative,
     write_relative,
 )
-from minimax_cal.fitting.instruments.points import right_jacobian
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import model_of
-from minimax_cal.robots.kinematics import rotation, rotation_vector
+from minimax_cal.robots.kinematics import right_jacobian, rotation, rotation_vector
 from minimax_cal.robots.sampling import random_poses
 
 TOOL = np.array([[0.1, 0.0, 0.1], [0.0, 0.1, 0.1], [-0.1, -0.1, 0.2]])

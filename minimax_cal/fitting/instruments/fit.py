@@ -186,12 +186,14 @@ def fit_instruments(
         again = replace(problem, active=told.active)
         problem, ended = weighed(again, nominal, options)
     state, stack = ended.x.take(np.array(0)), problem.stack
-    closed = stack.closed(robot, nominal) if len(trains) > 1 else stack
-    alone = determined_alone(closed, nominal, told.active, options.resolution)
-    noise = np.sqrt(variances(problem, state))
+    alone: tuple[Alone, ...] = ()
+    if len(trains) > 1:
+        closed = stack.closed(robot, nominal)
+        alone = determined_alone(closed, nominal, told.active, options.resolution)
+    variance = variances(problem, state)
     return InstrumentFit(
-        stack, nominal, state, told, ended, covariance_of(problem, state), noise,
-        trains, tuple(alone) if len(trains) > 1 else (),
+        stack, nominal, state, told, ended, covariance_of(problem, state, variance),
+        np.sqrt(variance), trains, alone,
     )  # fmt: skip
 
 
@@ -212,7 +214,9 @@ def weighed(
     if len(problem.stack.blocks) == 1 and not priors:
         return problem, solved(problem)
     count = [block.numbers for block in problem.stack.blocks]
-    variance = np.maximum(costs(problem, begin) / count, LEAST_NOISE**2)
+    none = np.zeros(problem.stack.names.count, dtype=bool)
+    cost = [float(error @ error) for error, _ in problem.stack.rows_by_block(begin, none)]
+    variance = np.maximum(np.divide(cost, count), LEAST_NOISE**2)
     variance = np.where(np.isnan(problem.stack.given), variance, problem.stack.given)
     for _ in range(PRIOR_ROUNDS):
         problem = believed(problem, variance)
@@ -234,49 +238,37 @@ def believed(problem: Squares, variance: Array) -> Squares:
     return replace(problem, stack=replace(problem.stack, precision=unit / variance), weight=weight)
 
 
-def costs(problem: Squares, x: State) -> Array:
-    """(b,) sums of the squared rows of each block, as heavy as one another [m^2]."""
-    none = np.zeros(problem.stack.names.count, dtype=bool)
-    stack = problem.stack
-    rows = [
-        block.rows(stack.part(x, i), none[stack.columns(i)])[0]
-        for i, block in enumerate(stack.blocks)
-    ]
-    return np.array([float(error @ error) for error in rows])
-
-
 def variances(problem: Squares, x: State) -> Array:
     """(b,) of a number of each block, as given or by what a fit leaves [m^2].
 
     Each pays for its share of the parameters, tr(H^-1 G_b) of the whole Gram matrix H [Forstner's
     variance components]; a prior pays for parameters of its own.
     """
-    stack, single = problem.stack, np.eye(len(problem.stack.blocks), dtype=bool)
-    grams = []
-    for chosen in single:
-        _, jacobian = stack.only(chosen).rows(x, problem.active)
-        grams.append(jacobian @ jacobian.T)
+    stack = problem.stack
+    errors, slopes = zip(*stack.rows_by_block(x, problem.active), strict=True)
+    grams = [w * slope @ slope.T for w, slope in zip(stack.precision, slopes, strict=True)]
     inverse = solve_normal(sum(grams) + problem.prior, np.eye(len(grams[0])))
     paid = np.array([float(np.trace(inverse @ gram)) for gram in grams])
     spare = np.maximum([block.numbers for block in stack.blocks] - paid, 1.0)
     weighing = len(stack.blocks) > 1 or len(problem.weight)
-    left = np.maximum(costs(problem, x) / spare, LEAST_NOISE**2 if weighing else 0.0)
+    cost = np.array([float(error @ error) for error in errors])
+    left = np.maximum(cost / spare, LEAST_NOISE**2 if weighing else 0.0)
     return np.where(np.isnan(stack.given), left, stack.given)
 
 
-def covariance_of(problem: Squares, x: State) -> Array:
+def covariance_of(problem: Squares, x: State, variance: Array) -> Array:
     """Covariance (p, p) of all parameters at a solution [SI], NaN where not identified.
 
     s^2 H^-1 F H^-1 with H = sum w j j' + P and F = sum w^2 j j' + P over the rows j of weight w and
     the priors P: a known distance weighs much and is no surer than a coordinate.  s^2: of a number
-    of the best instrument, to which the others are weighed.
+    of the best instrument, to which the others are weighed.  variance: (b,) as `variances` has it.
     """
     active, stack = problem.active, problem.stack
     _, jacobians = stack.rows(x, active)
     inverse = solve_normal(jacobians @ jacobians.T + problem.prior, np.eye(len(jacobians)))
     middle = (jacobians * stack.weights) @ jacobians.T + problem.prior
     covariance = np.full((len(active),) * 2, np.nan)
-    unit = float((variances(problem, x) * stack.precision).mean())
+    unit = float((variance * stack.precision).mean())
     covariance[np.ix_(active, active)] = unit * inverse @ middle @ inverse
     return covariance
 

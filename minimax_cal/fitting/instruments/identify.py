@@ -6,7 +6,7 @@ their rows at plenty of poses that no one had to measure.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -164,19 +164,20 @@ class Alone:
     names: tuple[str, ...]
 
 
-def determined_alone(stack: Stack, x: State, active: Array, resolution: float) -> list[Alone]:
-    """What the links would lack without each block.
+def determined_alone(stack: Stack, x: State, active: Array, resolution: float) -> tuple[Alone, ...]:
+    """What the links would lack without each of several blocks.
 
     stack: where the arm fits it.  active: (p,).
     """
     out = []
-    stack = replace(stack, precision=np.ones(len(stack.blocks)))
+    every = np.ones(stack.names.count, dtype=bool)
+    grams = [slope @ slope.T for _, slope in stack.rows_by_block(x, every)]
+    whole = np.sqrt(np.diag(np.sum(grams, axis=0)))
     for i in range(len(stack.blocks)):
-        others = stack.only(np.arange(len(stack.blocks)) != i)
-        gram, chosen = others.gram(x), active.copy()
+        others, chosen = np.sum(grams[:i] + grams[i + 1 :], axis=0), active.copy()
         chosen[stack.columns(i)[stack.names.geometric :]] = False
-        whole = np.sqrt(np.diag(stack.gram(x))[chosen])
-        alike = gram[np.ix_(chosen, chosen)] / np.outer(whole, whole)
+        size = whole[chosen]
+        alike = others[np.ix_(chosen, chosen)] / np.outer(size, size)
         values, vectors = np.linalg.eigh(alike)
         lost = vectors[:, values <= resolution**2 * values[-1]]
         share = np.linalg.norm(lost, axis=1)
@@ -184,7 +185,7 @@ def determined_alone(stack: Stack, x: State, active: Array, resolution: float) -
         named = [stack.names.all[p] for p, s in zip(places, share, strict=True)
                  if s > SHARED and stack.names.links[p]]  # fmt: skip
         out.append(Alone(lost.shape[1], tuple(named)))
-    return out
+    return tuple(out)
 
 
 def position_sigma(robot: Robot, model: Model, x: State, covariance: Array) -> float:

@@ -17,6 +17,7 @@ from minimax_cal.fitting.instruments.poses import (
     spots_of,
     tool_of,
 )
+from minimax_cal.fitting.instruments.rows import Plain
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
@@ -25,23 +26,12 @@ from minimax_cal.modelling.model import Block as Poses
 from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.modelling.parameters import BASE_NAMES, State
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.kinematics import hat, rotation_vector
+from minimax_cal.robots.kinematics import hat, right_jacobian, rotation_vector
 from minimax_cal.robots.robot import Robot
 
 
-def right_jacobian(w: Array) -> Array:
-    """J with exp(w + dw) = exp(w) exp(J dw): (..., 3, 3).  w: (..., 3) rotation vectors [rad]."""
-    size = np.linalg.norm(w, axis=-1)[..., None, None]
-    small = size < 1e-4  # where the quotients are their limits to rounding
-    safe = np.where(small, 1.0, size)
-    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
-    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
-    skew = hat(w)
-    return np.asarray(np.eye(3) - first * skew + second * skew @ skew)
-
-
 @dataclass(frozen=True, eq=False)
-class Points:
+class Points(Plain):
     """Targets that an instrument sees from a place of its own, as a block, see `rows.Block`.
 
     Its own: the base's place and turn along and from the axes of the base that fits the arm as
@@ -145,16 +135,6 @@ class Points:
     def errors(self, robot: Robot, x: State, data: RelativeData, held: Array) -> Array:
         """Of the points, along the axes of the base."""
         return model_of(robot, data.at).error(self.arm_state(x))
-
-    def turns(self, robot: Robot, x: State, data: RelativeData) -> Array:
-        """None."""
-        return np.zeros(0)
-
-    def listed(
-        self, fitted: tuple[Parameter, ...], nominal: State, x: State, covariance: Array
-    ) -> tuple[Parameter, ...]:
-        """As they are."""
-        return fitted
 
     def placed(self, x: State, nominal: State) -> dict[str, Any]:
         """Base in the instrument's frame, targets in the flange."""

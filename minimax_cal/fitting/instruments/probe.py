@@ -18,22 +18,21 @@ import scipy
 from minimax_cal.fitting.fit import Parameter
 from minimax_cal.fitting.instruments.closing import CLOSED, reach
 from minimax_cal.fitting.instruments.data import PLANE, SPHERE, RelativeData, Surface
-from minimax_cal.fitting.instruments.points import right_jacobian
 from minimax_cal.fitting.instruments.refine import refined, spots_aside
 from minimax_cal.fitting.instruments.rows import (
     SPOT,
+    OnFlange,
     arm_at,
     motion,
     places,
     scaled_lstsq,
-    with_spot,
 )
 from minimax_cal.fitting.instruments.wires import linear_target
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.kinematics import Chain, hat, rotation
+from minimax_cal.robots.kinematics import Chain, hat, right_jacobian, rotation
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_joints
 from minimax_cal.robots.transforms import nearest_rotation
@@ -93,7 +92,7 @@ class Shapes:
 
 
 @dataclass(frozen=True, eq=False)
-class Contacts:
+class Contacts(OnFlange):
     """Contacts as a block, see `rows.Block`.
 
     model: the arm at the m poses.  shapes: the surfaces.  touched: (m,) which.  drawn: (e,) own
@@ -107,7 +106,6 @@ class Contacts:
 
     kind = "contacts"
     given_up: ClassVar[tuple[str, ...]] = ("ball_radius",)
-    spots = slice(0, 3)
     row_noise = 1.0
     has_length = False  # the rank says whether some radius is one
     whole = "all surfaces moved together"
@@ -239,10 +237,6 @@ class Contacts:
         q, _ = reach(robot, x.effects[:3], goal, robot.commanded(self.model.q))
         return replace(self, model=arm_at(robot, q))
 
-    def arm_state(self, x: State) -> State:
-        """The state of its model."""
-        return with_spot(x)
-
     def mean_square(self, x: State) -> float:
         """Of the gaps [m^2]."""
         return float(np.mean(self.gaps(x) ** 2))
@@ -256,10 +250,6 @@ class Contacts:
         error[touched, np.arange(data.poses)] = 0.0
         error[touched, np.arange(data.poses), 0] = -gap
         return error
-
-    def turns(self, robot: Robot, x: State, data: RelativeData) -> Array:
-        """None."""
-        return np.zeros(0)
 
     def listed(
         self, fitted: tuple[Parameter, ...], nominal: State, x: State, covariance: Array

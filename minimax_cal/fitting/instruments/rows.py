@@ -121,6 +121,30 @@ class Block(Protocol):
         """For JSON: what was fitted besides the robot."""
 
 
+class Plain:
+    """Of `Block`, what most instruments have: no orientations, and parameters listed as fitted."""
+
+    def turns(self, robot: Robot, x: State, data: RelativeData) -> Array:
+        """None."""
+        return np.zeros(0)
+
+    def listed(
+        self, fitted: tuple[Parameter, ...], nominal: State, x: State, covariance: Array
+    ) -> tuple[Parameter, ...]:
+        """As they are."""
+        return fitted
+
+
+class OnFlange(Plain):
+    """Of `Block`, what instruments have whose one target comes first among their own."""
+
+    spots = slice(0, 3)
+
+    def arm_state(self, x: State) -> State:
+        """The state of its model."""
+        return with_spot(x)
+
+
 def arm_at(robot: Robot, q: Array) -> Model:
     """The arm with one point on its flange at joint values (m, n), as the controller gives them."""
     names = Names.of(robot, (TARGET,))

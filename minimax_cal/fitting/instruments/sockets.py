@@ -7,17 +7,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from minimax_cal.fitting.fit import Parameter
 from minimax_cal.fitting.instruments.closing import closing_poses, reach
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.rows import (
     LINEAR_RANK,
     SPOT,
+    OnFlange,
     arm_at,
     motion,
     own_state,
     places,
-    with_spot,
 )
 from minimax_cal.fitting.instruments.split import misclosures
 from minimax_cal.ground.arrays import Array
@@ -29,7 +28,7 @@ SOCKETS, VISITS = 20, 10
 
 
 @dataclass(frozen=True, eq=False)
-class Closures:
+class Closures(OnFlange):
     """Visits to sockets, about each socket's barycentre, as a block, see `rows.Block`.
 
     model: the arm at the m poses, sorted by socket.  first: (g,) where each socket begins.
@@ -49,7 +48,6 @@ class Closures:
     own = SPOT
     given_up: ClassVar[tuple[str, ...]] = ()
     held: ClassVar[tuple[str, ...]] = ()
-    spots = slice(0, 3)
     row_noise = 1.0
     whole = ""
     parts = ("visits",)
@@ -153,10 +151,6 @@ class Closures:
         q, _ = reach(robot, x.effects[:3], goal, robot.commanded(self.model.q))
         return replace(self, model=arm_at(robot, q))
 
-    def arm_state(self, x: State) -> State:
-        """The state of its model."""
-        return with_spot(x)
-
     def mean_square(self, x: State) -> float:
         """Of visits about their socket [m^2]."""
         off = self.centred(places(self.model, x))
@@ -165,16 +159,6 @@ class Closures:
     def errors(self, robot: Robot, x: State, data: RelativeData, held: Array) -> Array:
         """Of visits about their socket."""
         return misclosures(places(arm_at(robot, data.at.q), x).T, data.socket, held)[None]
-
-    def turns(self, robot: Robot, x: State, data: RelativeData) -> Array:
-        """None."""
-        return np.zeros(0)
-
-    def listed(
-        self, fitted: tuple[Parameter, ...], nominal: State, x: State, covariance: Array
-    ) -> tuple[Parameter, ...]:
-        """As they are."""
-        return fitted
 
     def placed(self, x: State, nominal: State) -> dict[str, Any]:
         """Ball in the last frame, sockets in the robot's base."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -90,26 +90,29 @@ class Stack:
         """The state of a block."""
         return replace(x, effects=x.effects[..., self.slots[i]])
 
-    def only(self, chosen: Array) -> Stack:
-        """With no weight on some blocks, whose parameters stay.  chosen: (b,) mask."""
-        return replace(self, precision=np.where(chosen, self.precision, 0.0))
+    def rows_by_block(self, x: State, active: Array) -> Iterator[tuple[Array, Array]]:
+        """Of each block: measured minus predicted (..., rows), as heavy as those of any other.
 
-    def rows(self, x: State, active: Array) -> tuple[Array, Array]:
-        """Measured minus predicted (..., rows), derivative of the predicted (..., active, rows).
-
-        Of all blocks, each by the root of its precision.  active: (p,).
+        And the derivative of the predicted (..., active, rows).  active: (p,).
         """
-        errors, jacobians = [], []
         place = np.cumsum(active) - 1
-        for i, (block, precision) in enumerate(zip(self.blocks, self.precision, strict=True)):
+        for i, block in enumerate(self.blocks):
             columns = self.columns(i)
             mine = active[columns] & self.movable[: len(columns)]
             error, jacobian = block.rows(self.part(x, i), mine)
             whole = np.zeros((*error.shape[:-1], int(active.sum()), error.shape[-1]))
             whole[..., place[columns[mine]], :] = jacobian
-            errors.append(np.sqrt(precision) * error)
-            jacobians.append(np.sqrt(precision) * whole)
-        return np.concatenate(errors, axis=-1), np.concatenate(jacobians, axis=-1)
+            yield error, whole
+
+    def rows(self, x: State, active: Array) -> tuple[Array, Array]:
+        """Those of all blocks, each by the root of its precision."""
+        found = list(self.rows_by_block(x, active))
+        roots = np.sqrt(self.precision)
+        errors, jacobians = (
+            np.concatenate([root * part for root, part in zip(roots, parts, strict=True)], axis=-1)
+            for parts in zip(*found, strict=True)
+        )
+        return errors, jacobians
 
     @property
     def weights(self) -> Array:

@@ -13,11 +13,11 @@ from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.refine import refined, spots_aside
 from minimax_cal.fitting.instruments.rows import (
     SPOT,
+    OnFlange,
     arm_at,
     motion,
     places,
     scaled_lstsq,
-    with_spot,
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Model
@@ -31,7 +31,7 @@ ENOUGH = 60  # poses that tell one start from another
 
 
 @dataclass(frozen=True, eq=False)
-class Wires:
+class Wires(OnFlange):
     """Wires as a block, see `rows.Block`.
 
     length: (m, s), NaN where not measured [m].  Its own: the target, s anchors, s offsets.
@@ -43,7 +43,6 @@ class Wires:
     with_offsets: bool = False
 
     kind = "distances"
-    spots = slice(0, 3)
     row_noise = 1.0
     whole = "all anchors moved together"
     has_length = True
@@ -154,10 +153,6 @@ class Wires:
         """The same: lengths fit any arm by its anchors."""
         return self
 
-    def arm_state(self, x: State) -> State:
-        """The state of its model."""
-        return with_spot(x)
-
     def mean_square(self, x: State) -> float:
         """Of the misses of lengths [m^2]."""
         return float(np.nanmean(self.misses(x) ** 2))
@@ -166,10 +161,6 @@ class Wires:
         """The error of a length stands first of three."""
         error = replace(self, model=arm_at(robot, data.at.q), length=data.length).misses(x)
         return np.stack([error, *(np.where(np.isnan(error), np.nan, 0.0),) * 2], axis=-1)
-
-    def turns(self, robot: Robot, x: State, data: RelativeData) -> Array:
-        """None."""
-        return np.zeros(0)
 
     def listed(
         self, fitted: tuple[Parameter, ...], nominal: State, x: State, covariance: Array

@@ -14,8 +14,7 @@ import numpy as np
 
 from minimax_cal.fitting.fit import Parameter
 from minimax_cal.fitting.instruments.data import RelativeData
-from minimax_cal.fitting.instruments.points import right_jacobian
-from minimax_cal.fitting.instruments.rows import arm_at, own_state
+from minimax_cal.fitting.instruments.rows import Plain, arm_at, own_state
 from minimax_cal.fitting.pixels.calibrate import fitted_on, judged_pixels, placed, table_of
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.fit import PixelFit
@@ -26,11 +25,12 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
+from minimax_cal.robots.kinematics import right_jacobian
 from minimax_cal.robots.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)
-class Pixels:
+class Pixels(Plain):
     """Pixels of training images.
 
     data: of them.  fit: their own.  seen: their model.  metre: what a pixel is at a typical target.
@@ -203,10 +203,6 @@ class Pixels:
         wrong = judged_pixels(robot, pixels, held, self.fit).aside
         out[pixels.part[wrong], pixels.pose[wrong]] = np.nan
         return out
-
-    def turns(self, robot: Robot, x: State, data: RelativeData) -> Array:
-        """None."""
-        return np.zeros(0)
 
     def listed(
         self, fitted: tuple[Parameter, ...], nominal: State, x: State, covariance: Array

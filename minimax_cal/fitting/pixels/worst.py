@@ -20,6 +20,7 @@ from minimax_cal.fitting.pixels.options import SUM, WORST_CAMERA, WORST_TARGET, 
 from minimax_cal.fitting.solve import MIN_TARGET_WEIGHT, QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
+from minimax_cal.ground.words import list_counts
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.minimax import Kkt, Linear, Optimum
 from minimax_cal.solvers.status import Status
@@ -140,11 +141,10 @@ class WorstPixels:
 
     def sentence(self) -> str:
         """For people."""
-        most_first = sorted(self.answered.items(), key=lambda item: -item[1])
         return (
             f"Worst of {len(self.functions)} in training: {self.before:.4f} px RMS -> "
             f"{self.size.max():.4f} px, held by {len(self.active)}; QPs: "
-            f"{', '.join(f'{count} by {name}' for name, count in most_first)}."
+            f"{list_counts(self.answered)}."
         )
 
     def table(self) -> Table:
