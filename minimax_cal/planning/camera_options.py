@@ -92,7 +92,7 @@ def check_cameras(sees: CameraOptions, count: int) -> None:
         raise OptionError(f"print_looks={sees.print_looks!r}: give {' or '.join(SIDES)}")
     if len(sees.camera_at) != count or sees.board_at is None:
         raise OptionError(
-            f"{count} cameras: give camera_at= for each, in their order, and board_at=, about "
+            f"{count} camera{'s' * (count != 1)}: give camera_at= for each, in their order, and board_at=, about "
             "where they are; or a calibration by cameras as fit="
         )
     if not 0.0 < sees.distance[0] < sees.distance[1]:
