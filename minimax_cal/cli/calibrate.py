@@ -142,7 +142,7 @@ def by_cameras(
     given = [
         name for name in chosen if at.get_parameter_source(name) is ParameterSource.COMMANDLINE
     ]
-    for name in set(given) - {field.name for field in fields(PixelOptions)}:
+    for name in sorted(set(given) - {field.name for field in fields(PixelOptions)}):
         raise OptionError(f"{name}= is not for pixels: leave it out")
     own = {name: chosen[name] for name in given}
     pixels, joints, cameras, board = files.paths()

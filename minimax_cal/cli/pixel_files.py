@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from minimax_cal.cli.options import PATH, options_from, plain_option, stacked
-from minimax_cal.fitting.pixels.options import CAMERAS, PixelOptions, camera_of
+from minimax_cal.fitting.pixels.options import CAMERAS, PixelOptions, cameras_of
 from minimax_cal.ground.errors import OptionError
 
 PIXEL_FILES = stacked(
@@ -62,7 +62,4 @@ class PixelFiles:
         """Detections, joints, cameras by name, board.  Raises OptionError."""
         if not (self.pixels and self.joints and self.camera):
             raise OptionError("cameras need all three of pixels=, joints= and camera='NAME=FILE'")
-        cameras = dict(camera_of(text) for text in self.camera)
-        if len(cameras) < len(self.camera):
-            raise OptionError("camera= gives one name twice; each camera has its own")
-        return self.pixels, self.joints, cameras, self.board
+        return self.pixels, self.joints, cameras_of(self.camera), self.board

@@ -22,7 +22,7 @@ from minimax_cal.cli.options import (
     result_options,
     writable,
 )
-from minimax_cal.fitting.pixels.options import camera_of
+from minimax_cal.fitting.pixels.options import cameras_of
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.stages import Progress
@@ -149,17 +149,15 @@ def plan_command(
 
 def poses_of(arm: Robot, poses: int, kind: str, chosen: dict[str, Any], progress: Progress) -> Plan:
     """The poses for a tracker, or for cameras.  Raises OptionError."""
-    files = [camera_of(text) for text in chosen["camera"]]
+    cameras = cameras_of(chosen["camera"])
     own = {name: value for name, value in chosen.items() if name in ALLOWED[kind]}
     if kind == "poses":
         return plan(arm, poses, progress=progress, **own)
-    if not files or chosen["board"] is None:
+    if not cameras or chosen["board"] is None:
         raise OptionError("images need both camera='NAME=FILE' and board=")
-    if len(dict(files)) < len(files):
-        raise OptionError("camera= gives one name twice; each camera has its own")
     from minimax_cal.planning.cameras import plan_cameras
 
-    return plan_cameras(arm, poses, progress=progress, **{**own, "camera": dict(files)})
+    return plan_cameras(arm, poses, progress=progress, **{**own, "camera": cameras})
 
 
 def check_given(kind: str) -> None:

@@ -367,7 +367,7 @@ def steps_of(
     steps.append(judges.step(f"without {' and '.join(spoilt)}" if spoilt else "geometric", first))
     for number, wider in zip(ladder.taken, ladder.fits[1:], strict=True):
         term = causes.effects[number].term
-        steps.append(judges.step(f"+ {term.effect} {term.place}", wider.cell))
+        steps.append(judges.step(term.step, wider.cell))
     return steps
 
 

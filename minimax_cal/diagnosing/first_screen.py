@@ -17,7 +17,7 @@ def budget_table(found: Diagnosis) -> Table:
     every = [(NAMED.get(step.name) or name_step(step.name), step.holdout) for step in found.ladder]
     most = MAX_STEPS - 1  # the last row is the noise
     if len(every) > most:
-        main = [f"+ {f.term.effect} {f.term.place}" for f in found.main]
+        main = [f.term.step for f in found.main]
         last = max((i for i, step in enumerate(found.ladder) if step.name in main), default=1)
         kept = min(last + 1, most - 1)
         every = [*every[:kept], (rest_of(found, kept), every[-1][1])]
@@ -34,9 +34,8 @@ def budget_table(found: Diagnosis) -> Table:
 
 def rest_of(found: Diagnosis, kept: int) -> str:
     """The steps after those kept, counted by kind, as + 16 minor and 2 possible effects."""
-    kinds = {f"+ {f.term.effect} {f.term.place}": kind
-             for kind, some in (("main", found.main), ("minor", found.minor))
-             for f in some}  # fmt: skip
+    of_kind = (("main", found.main), ("minor", found.minor))
+    kinds = {f.term.step: kind for kind, some in of_kind for f in some}
     counts = Counter(kinds.get(step.name, "possible") for step in found.ladder[kept:])
     said = [f"{counts[kind]} {kind}" for kind in ("main", "minor", "possible") if counts[kind]]
     return f"+ {' and '.join(said)} effect{'s' if counts.total() > 1 else ''}"

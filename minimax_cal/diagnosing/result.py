@@ -340,7 +340,7 @@ class Diagnosis:
     def by_rung(self) -> list[Finding]:
         """The effects in the order of the ladder, faults of the data first."""
         rungs = [step.name for step in self.ladder]
-        names = [f"+ {f.term.effect} {f.term.place}" for f in self.effects]
+        names = [f.term.step for f in self.effects]
         at = [rungs.index(name) if name in rungs else 0 for name in names]
         return [self.effects[i] for i in sorted(range(len(at)), key=at.__getitem__)]
 
@@ -473,9 +473,7 @@ class Diagnosis:
         """Every arm with its name: nominal, geometric, then with each effect."""
         if self.nominal is None:
             return ()
-        added = [f"+ {cell.effects.terms[-1].effect} {cell.effects.terms[-1].place}"
-                 for cell in self.cells[1:]]  # fmt: skip
-        names = ("nominal", "geometric", *added)
+        names = ("nominal", "geometric", *(c.effects.terms[-1].step for c in self.cells[1:]))
         return tuple(zip(names, (self.nominal, *self.cells), strict=True))
 
     @staticmethod

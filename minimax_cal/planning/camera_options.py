@@ -91,9 +91,10 @@ def check_cameras(sees: CameraOptions, count: int) -> None:
     if sees.print_looks not in SIDES:
         raise OptionError(f"print_looks={sees.print_looks!r}: give {' or '.join(SIDES)}")
     if len(sees.camera_at) != count or sees.board_at is None:
+        many = "camera" if count == 1 else "cameras"
         raise OptionError(
-            f"{count} camera{'s' * (count != 1)}: give camera_at= for each, in their order, and board_at=, about "
-            "where they are; or a calibration by cameras as fit="
+            f"{count} {many}: give camera_at= for each, in their order, and board_at=, about where "
+            "they are; or a calibration by cameras as fit="
         )
     if not 0.0 < sees.distance[0] < sees.distance[1]:
         raise OptionError("distance=: give near:far in m, both above 0, near below far")

@@ -219,7 +219,7 @@ class Run:
             if unheld(more.cell, more.train):
                 mapped.append(term)
                 continue
-            rung = self.fitted(f"+ {' '.join(term.key)}", more)
+            rung = self.fitted(term.step, more)
             if worse(rung, rungs[-1]):
                 change = f"{rungs[-1].holdout_rms_mm:.4f} -> {rung.holdout_rms_mm:.4f} mm"
                 left_out.append(

@@ -49,6 +49,14 @@ def camera_of(text: str) -> tuple[str, str]:
     return name.strip(), path.strip()
 
 
+def cameras_of(texts: Sequence[str]) -> dict[str, str]:
+    """Files by the cameras' names, of NAME=FILE each.  Raises OptionError."""
+    named = dict(camera_of(text) for text in texts)
+    if len(named) < len(texts):
+        raise OptionError("camera= gives one name twice; each camera has its own")
+    return named
+
+
 @dataclass(frozen=True)
 class PixelOptions:
     """How to calibrate.

@@ -134,6 +134,11 @@ class Term:
         return self.effect, self.place
 
     @property
+    def step(self) -> str:
+        """Its step of an error budget, as + joint_compliance J2."""
+        return f"+ {self.effect} {self.place}"
+
+    @property
     def frees_frames(self) -> bool:
         """Whether it is that of `of_sessions`, which says nothing of the robot."""
         return "sessions" in self.choice
