@@ -27,7 +27,7 @@ from minimax_cal.fitting.options import Options
 @click.command(name="relative", cls=InGroups)
 @ROBOT
 @CAMPAIGNS
-@options_from(Options, "holdout", "seed", "fix", "free", "priors")
+@options_from(Options, "holdout", "seed", "fix", "free", "priors", "effects")
 @options_from(RelativeOptions)
 @PIXEL_FILES
 @options_from(Options, "method")

@@ -292,7 +292,9 @@ def as_it_is(made: Delivered, known: Opened) -> Delivered:
         why = f"{known.source} does not tell its nominal robot"
         if known.nominal:
             why = f"{known.source} was placed by a check, on poses too few for a fit"
-    alone = known.fit.geometric if known.fit and known.number and not held else made.cell
+    alone = made.cell
+    if known.number and not held:  # else it would be right only together with its effects
+        alone = known.fit.geometric if known.fit else known.geometric or alone
     return replace(
         made, carries=labels(held), not_carried=labels(lost), cell=alone, figures=Figures(),
         fit=None, reason=why if lost or made.rest else "",

@@ -245,6 +245,23 @@ def parameter_table(parameters: Iterable[Parameter]) -> Table:
     return Table("parameters", header, tuple(rows), formats)
 
 
+def table_of_effects(parameters: Iterable[Parameter]) -> Table:
+    """Of parameters those of effects, as in the files."""
+    rows = tuple(
+        (
+            name_codes(p.name),
+            p.written[1],
+            p.value * p.written[0],
+            p.sigma * p.written[0],
+            name_codes(p.why_not),
+        )
+        for p in parameters
+        if p.of_effect
+    )
+    header = ("effect", "unit", "value", "sigma", NOT_IDENTIFIED)
+    return Table("effects beyond geometry", header, rows, ("", "", ".4g", ".2g", ""))
+
+
 @dataclass(frozen=True)
 class Provenance:
     """Where a result came from, so that it can be had again."""
@@ -655,25 +672,15 @@ class Fit:
         """
         maps = [term for term in self.cell.effects.terms if EFFECTS[term.effect].is_map]
         labels = tuple(f"{term.label}." for term in maps)
-        rows: list[tuple[TableCell, ...]] = [
-            (
-                name_codes(p.name),
-                p.written[1],
-                p.value * p.written[0],
-                p.sigma * p.written[0],
-                name_codes(p.why_not),
-            )
-            for p in self.parameters
-            if p.of_effect and not p.name.startswith(labels)
-        ]
+        rows: list[tuple[TableCell, ...]] = []
         if maps:
             scene, effects = self.cell.scene(with_history(self.data)), self.cell.effects
             for term in maps:
                 own = effects.values[effects.terms.index(term)]
                 turn = Fitted((term,), (own,)).turn(scene)[:, joint_of(term.place)]
                 rows.append((f"{name_effect(*term.key)}, RMS", "rad", rms(turn), math.nan, ""))
-        header = ("effect", "unit", "value", "sigma", NOT_IDENTIFIED)
-        return Table("effects beyond geometry", header, tuple(rows), ("", "", ".4g", ".2g", ""))
+        plain = table_of_effects(p for p in self.parameters if not p.name.startswith(labels))
+        return replace(plain, rows=(*plain.rows, *rows))
 
     def sentences(self) -> tuple[str, ...]:
         """The result: what went wrong if anything, inside, set aside, outside, identified."""

@@ -23,16 +23,20 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
 from minimax_cal.ground.records import checked, reading
 from minimax_cal.measuring.checks import check_joints
+from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.spans import Span, spans_of
 from minimax_cal.measuring.stations import labels
 from minimax_cal.modelling.cell import Cell, cell_from_dict, saved_content
 from minimax_cal.modelling.effects.table import EFFECTS, Term
+from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.near import nearby
 from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.solvers.status import Status
 
 RELATIVE = "relative calibration"  # kind of a file
+FINITE_PASSES = 2  # of a fit with effects: the second takes finite turns into account
 NOMINAL, CALIBRATED, GEOMETRIC = "nominal", "calibrated", "geometric"
 NO_JOINTS = np.zeros((0, 0))
 NOWHERE = Measurements(NO_JOINTS, np.zeros((0, 0, 3)), (), np.zeros(0, dtype=bool), np.zeros(0), {})
@@ -71,7 +75,8 @@ class Opened:
     went in the training poses, none where the file does not tell.
     options: how it was fitted, None where its poses do not tell its links.  fit: the calibration.
     outside: the claim of the last rung.  possible: effects, as texts, that a diagnosis has not
-    confirmed; none where its rung was chosen.
+    confirmed; none where its rung was chosen.  geometric: the last rung fitted without effects,
+    where the file tells it.
     """
 
     source: str
@@ -88,6 +93,7 @@ class Opened:
     fit: Fit | None = None
     outside: Callable[[], Beyond] = Beyond
     possible: frozenset[str] = frozenset()
+    geometric: Cell | None = None
 
     @property
     def cell(self) -> Cell:
@@ -128,7 +134,7 @@ class Opened:
             return self.cell, self.nominal, ()
         before = place(self.nominal.robot, data) if self.nominal else None
         said = f"{self.source}: knows no base and no targets: both are fitted to {data.source}"
-        return place(self.cell.robot, data), before, (said,)
+        return settled(self.cell, data), before, (said,)
 
 
 def in_new_frame(cell: Cell, data: Measurements) -> Cell:
@@ -152,6 +158,24 @@ def place(robot: Robot, data: Measurements) -> Cell:
     """An arm where it fits all poses best.  Raises DataError."""
     data = check_joints(robot, data)
     return Cell.of(robot, fit_base(model_of(robot, data), robot.mdh).state, data.target_names)
+
+
+def settled(cell: Cell, data: Measurements) -> Cell:
+    """A cell whose base and targets are not known where it fits all poses best, effects included.
+
+    Raises DataError.
+    """
+    found, terms = place(cell.robot, data), cell.effects.terms
+    if not terms:
+        return found
+    data = with_history(check_joints(cell.robot, data))
+    model, state = model_of(cell.robot, data), replace(found.state, effects=cell.state.effects)
+    free = np.arange(model.names.count) >= 5 * model.names.joints
+    for _ in range(FINITE_PASSES):
+        bent, begin = extended(model, cell.robot, data, state, terms)
+        alone = bent.only(np.pad(free, (0, len(state.effects))))
+        state = nearby(alone, begin).x.take(np.array(0))
+    return Cell.of(cell.robot, state, data.target_names, cell.effects, cell.sessions)
 
 
 def open_result(source: Result | Opened, rung: int | None = None) -> Opened:
@@ -216,9 +240,12 @@ def of_relative(content: Mapping[str, Any], source: str) -> Opened:
         return Cell(robot, np.eye(4), (), np.zeros((0, 3)))
 
     calibrated = "calibrated_robot" if "calibrated_robot" in content else "robot"
-    rungs = (Rung(NOMINAL, bare("nominal_robot")), Rung(CALIBRATED, bare(calibrated)))
+    alone = bare(calibrated)
+    whole = cell_from_dict(content["cell"], f"{source}: cell") if content.get("cell") else alone
+    rungs = (Rung(NOMINAL, bare("nominal_robot")), Rung(CALIBRATED, whole))
     kept = content.get("status") == Status.NO_BETTER  # the drawn arm is the robot of such a file
-    return Opened(source, rungs, 1, placed=False, status=Status.NO_BETTER if kept else None)
+    status = Status.NO_BETTER if kept else None
+    return Opened(source, rungs, 1, placed=False, status=status, geometric=alone)
 
 
 def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:

@@ -15,7 +15,7 @@ from minimax_cal.modelling.effects.gears import GEAR_RIPPLE
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, FREE, Term
 from minimax_cal.modelling.periodogram import is_expected, strongest_lines
-from minimax_cal.modelling.rows import Rows
+from minimax_cal.modelling.rows import Posed
 
 SHAPES = FREE - {"turns"}  # tuned numbers; a line's frequency is paid by its tries
 
@@ -25,7 +25,7 @@ class ArmLaws:
     """The effects of an arm, for its linearised errors.  exclude: those that are not sought."""
 
     scene: Scene
-    problem: Rows
+    problem: Posed
     exclude: Sequence[str] = ()
 
     def spec(self, term: Term) -> Spec | None:
@@ -67,7 +67,7 @@ class ArmLaws:
         return is_expected(self.scene, line, found)
 
 
-def arm_library(scene: Scene, rows: Rows, exclude: Sequence[str] = ()) -> Library:
+def arm_library(scene: Scene, rows: Posed, exclude: Sequence[str] = ()) -> Library:
     """Every effect at every place in every variant that the data can test."""
     terms, untestable = list[Term](), list[tuple[str, str]]()
     for name, effect in EFFECTS.items():

@@ -334,6 +334,16 @@ class SumOfSquares:
     model: Model
 
     @property
+    def names(self) -> Names:
+        """Of all parameters."""
+        return self.model.names
+
+    @property
+    def active(self) -> Array:
+        """(p,) True where one is free."""
+        return self.model.active
+
+    @property
     def linear(self) -> Array:
         """(free,) True for lengths."""
         return np.asarray(self.model.names.linear[self.model.active])

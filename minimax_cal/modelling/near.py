@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.bounds import settled
 from minimax_cal.modelling.model import Model, SumOfSquares, arrays_of
-from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots.kernels import sums
 from minimax_cal.robots.kernels.choice import kernels
 from minimax_cal.solvers import least_squares
@@ -26,6 +27,7 @@ from minimax_cal.solvers.least_squares import (
 from minimax_cal.solvers.status import Status
 
 ROUNDING = 1e-13  # of the cost: a decrease by less is none
+UNSEEN = 1e-10  # of the cost: a decrease by less may be lost in the rounding of its rows
 HALVINGS = 10  # of a step that leads up
 MAX_STEPS = 15  # plain steps; a start from which these do not suffice is not near
 
@@ -40,7 +42,9 @@ def nearby(model: Model, begin: State, method: str = JOINT) -> LeastSquares[Stat
     from the first step.
     """
     found = unbounded(model, begin, method)
-    return found if is_kept(found.x.take(np.array(0)), model.room) else between(model, found)
+    if is_kept(found.x.take(np.array(0)), model.room):
+        return found
+    return between(SumOfSquares(model), float(model.counts.sum()), model.room, found)
 
 
 def unbounded(model: Model, begin: State, method: str) -> LeastSquares[State]:
@@ -114,21 +118,44 @@ def straight_down(x: State, trace: Array, method: str) -> LeastSquares[State]:
     return LeastSquares(x, trace[-1:], steps, (Status.CONVERGED,), trace[:, None], METHODS[method])
 
 
-def between(model: Model, free: LeastSquares[State]) -> LeastSquares[State]:
-    """The fit between the bounds, from that without them: Gauss-Newton, each step between them."""
-    problem, points, room = SumOfSquares(model), float(model.counts.sum()), model.room
-    open_ends = np.full((model.names.geometric, 2), np.inf) * [-1.0, 1.0]
-    allowed = np.concatenate([open_ends, room])[model.active]
+class Squares(Protocol):
+    """A sum of squares over the active ones of named parameters."""
+
+    @property
+    def names(self) -> Names:
+        """Of all p."""
+
+    @property
+    def active(self) -> Array:
+        """(p,) True where one is free."""
+
+    def normal(self, x: State) -> tuple[Array, Array, Array]:
+        """Cost, slope and Gram matrix."""
+
+    def step(self, x: State, dx: Array) -> State:
+        """The state moved by a step in the free parameters."""
+
+
+def between(
+    problem: Squares, points: float, room: Array, free: LeastSquares[State]
+) -> LeastSquares[State]:
+    """The fit between the bounds, from that without them: Gauss-Newton, each step between them.
+
+    room: (e, 2) of the effects of a state.
+    """
+    closed = np.pad(room, ((problem.names.geometric, 0), (0, 0)))
+    closed[: problem.names.geometric] = np.inf * np.array([-1.0, 1.0])
+    allowed = closed[problem.active]
     state = kept(free.x.take(np.array(0)), room)
     cost, gradient, gram = problem.normal(state)
     costs, status = [float(cost)], Status.ITERATION_LIMIT
     for _ in range(MAX_STEPS):
-        ends = allowed - model.values(state)[model.active][:, None]
+        values = np.pad(state.effects, (problem.names.geometric, 0))  # of others none is bounded
+        ends = allowed - values[problem.active][:, None]
         step = bounded(gram, gradient, *ends.T)
         square = float(step @ gram @ step)
-        settles = square <= points * NEAR.step**2
-        if not settles:
-            settles = 2.0 * float(step @ gradient) - square <= ROUNDING * costs[-1]
+        gain = 2.0 * float(step @ gradient) - square
+        settles = square <= points * NEAR.step**2 or gain <= ROUNDING * costs[-1]
         trial = kept(problem.step(state, step), room)
         found = problem.normal(trial)
         for _ in range(HALVINGS):
@@ -138,7 +165,7 @@ def between(model: Model, free: LeastSquares[State]) -> LeastSquares[State]:
             trial = kept(problem.step(state, step), room)
             found = problem.normal(trial)
         if not settles and found[0] > costs[-1]:
-            status = Status.STALLED
+            status = Status.CONVERGED if gain <= UNSEEN * costs[-1] else Status.STALLED
             break
         state, (cost, gradient, gram) = trial, found
         costs.append(float(cost))

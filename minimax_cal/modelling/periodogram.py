@@ -14,7 +14,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.gears import sweeping
 from minimax_cal.modelling.effects.scene import Scene, joint_of
 from minimax_cal.modelling.effects.table import Term
-from minimax_cal.modelling.rows import Rows
+from minimax_cal.modelling.rows import Posed
 
 SLOWEST, FASTEST = 8.0, 260.0  # waves a turn that are looked for; no gear has fewer teeth
 DENSITY = 4.0  # frequencies tried for each one that is independent
@@ -25,7 +25,7 @@ BESIDE = 1.0  # a strain wave gear turns by one more or less than its ratio tell
 
 def strongest_lines(
     scene: Scene,
-    rows: Rows,
+    rows: Posed,
     noise: Noise,
     known: Array,
     *,

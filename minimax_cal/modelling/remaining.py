@@ -17,7 +17,7 @@ from minimax_cal.evidence.remains import Component, Fading
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene, turning
 from minimax_cal.modelling.effects.time import ROOM
-from minimax_cal.modelling.rows import Rows
+from minimax_cal.modelling.rows import Posed
 from minimax_cal.robots.kinematics import cross
 
 WIDE, SHORT = 1.0, 0.15  # lengths of a joint's curve, of a radian or of half its travel
@@ -32,7 +32,9 @@ MIN_SPAN = 1e-9  # of a driver's size: it does not vary
 Drivers = dict[str, Array | Fading]
 
 
-def components(scene: Scene, rows: Rows, named: Sequence[tuple[str, Array]]) -> Iterator[Component]:
+def components(
+    scene: Scene, rows: Posed, named: Sequence[tuple[str, Array]]
+) -> Iterator[Component]:
     """Everything that is asked of the rest.
 
     named: label and rows (N, d) of the motion of each law that was fitted.

@@ -22,16 +22,20 @@ MAX_COMPUTED_NOISE = 1e-8  # noise below which data were computed, not measured 
 
 
 @dataclass(frozen=True, eq=False)
-class Rows(Problem):
-    """Rows of the linearised errors [m], poses rotated so that both noises are diagonal.
+class Posed(Problem):
+    """Rows of linearised errors [m], r a pose, poses rotated so that both noises are diagonal.
 
     variance_ratio: of the joints' noise over the instrument's; size: its mean [m^2/rad^2].
-    group: the pose of each row, of repeats the same.  turn: (m, r, r) the rotations, r = 3k.
-    weight: (m, r) square roots of the points' weights.
+    group: the pose of each row, of repeats the same.  turn: (m, r, r) the rotations.
+    weight: (m, r) square roots of the rows' weights.
     """
 
     turn: Array
     weight: Array
+
+    def of(self, fields: Array) -> Array:
+        """(N, D) displacement fields (D, k, 3, m) as rows."""
+        raise NotImplementedError
 
     @property
     def width(self) -> int:
@@ -50,6 +54,11 @@ class Rows(Problem):
     def at(self, poses: Array) -> Array:
         """(N,) mask of the rows of some poses (m,)."""
         return np.repeat(np.asarray(poses, dtype=bool), self.width)
+
+
+@dataclass(frozen=True, eq=False)
+class Rows(Posed):
+    """Rows of points of a tracker: r = 3k a pose, of k targets."""
 
     def of(self, fields: Array) -> Array:
         """(N, D) displacement fields (D, k, 3, m) as rows."""

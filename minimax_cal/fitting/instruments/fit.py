@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from minimax_cal.fitting.instruments.identify import (
     generic_count,
     identified,
 )
+from minimax_cal.fitting.instruments.laws import Laws
 from minimax_cal.fitting.instruments.options import (
     Progress,
     RelativeOptions,
@@ -30,10 +32,13 @@ from minimax_cal.fitting.instruments.sockets import Closures
 from minimax_cal.fitting.instruments.stack import Known, Squares, Stack
 from minimax_cal.fitting.instruments.wires import Wires
 from minimax_cal.fitting.pixels.options import PixelOptions
-from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS
+from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS, without_resting
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring.grouping import groups
+from minimax_cal.modelling.effects.bounds import at_bounds
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.near import between, is_kept
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares
@@ -54,13 +59,14 @@ class Train:
 class InstrumentFit:
     """What the solver found.
 
-    stack: the instruments, weighed by their noise.  nominal: the arm as drawn with the instruments
-    fitted to it.  state: the calibrated one.  covariance: (p, p) [SI], NaN where not identified.
-    noise: (b,) sigma of a row of each instrument [m].  trains: what was fitted.  alone: what each
-    determines by itself, empty where there is one.
+    problem: as it was solved, its instruments weighed by their noise.  nominal: the arm as drawn
+    with the instruments fitted to it.  state: the calibrated one.  covariance: (p, p) [SI], NaN
+    where not identified.  noise: (b,) sigma of a row of each instrument [m].  trains: what was
+    fitted.  alone: what each determines by itself, empty where there is one.  stiff: the fit of
+    geometry alone, where this one has laws besides.
     """
 
-    stack: Stack
+    problem: Squares
     nominal: State
     state: State
     identification: Identification
@@ -69,10 +75,23 @@ class InstrumentFit:
     noise: Array
     trains: Sequence[Train]
     alone: tuple[Alone, ...]
+    stiff: InstrumentFit | None = None
+
+    @property
+    def stack(self) -> Stack:
+        """The instruments, weighed by their noise."""
+        return self.problem.stack
 
     def state_of(self, i: int) -> tuple[State, State]:
         """As drawn and calibrated, of an instrument."""
         return self.stack.part(self.nominal, i), self.stack.part(self.state, i)
+
+
+def by_socket(train: Train) -> Train:
+    """Visits of one socket together, as the rows of `Closures` have them."""
+    if train.data.kind != "closures":
+        return train
+    return replace(train, data=train.data.take(np.argsort(train.data.socket, kind="stable")))
 
 
 def wires_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Block:
@@ -145,15 +164,13 @@ def allowed_of(stack: Stack, options: RelativeOptions) -> tuple[Array, Array]:
     allowed, wanted = wishes(names, options)
     allowed[5 * names.joints : names.geometric] = False
     for i, block in enumerate(stack.blocks):
-        own = stack.columns(i)[names.geometric :]
-        allowed[own] &= [name not in block.held for name in block.own]
+        allowed[stack.own(i)] &= [name not in block.held for name in block.own]
     return allowed, wanted
 
 
 def start_of(robot: Robot, stack: Stack, allowed: Array) -> State:
     """The arm as drawn, and what fits it best."""
-    first = stack.names.geometric
-    free = [allowed[stack.columns(i)[first:]] for i in range(len(stack.blocks))]
+    free = [allowed[stack.own(i)] for i in range(len(stack.blocks))]
     pairs = zip(stack.blocks, free, strict=True)
     return stack.state(robot.mdh, [block.start(robot, own) for block, own in pairs])
 
@@ -163,38 +180,128 @@ def fit_instruments(
 ) -> InstrumentFit:
     """Fit the identifiable parameters to the training measurements.  Raises DataError."""
     progress("start")
+    trains = [by_socket(train) for train in trains]
     stack = stack_of(robot, trains, options)
     allowed, wanted = allowed_of(stack, options)
     known = Known(links_of(robot.mdh), sigmas_of(stack.names, options))
-    held = np.pad(np.isfinite(known.sigma), (0, len(allowed) - len(known.sigma)))
+    held = known.told(stack.names.count)
     nominal = start_of(robot, stack, allowed)
     progress("identifiable parameters")
     reference = stack.reference(robot, nominal)
     check_count(trains, stack, generic_count(robot, reference, nominal, allowed & ~held))
 
-    def identify(stack: Stack) -> Identification:
+    def identify(stack: Stack, known: Known, x: State) -> Identification:
+        more = (0, len(stack.laws.names))
         return identified(
-            robot, stack, reference, nominal, allowed, wanted,
-            known=held, resolution=options.resolution,
+            robot, stack, reference, x, np.pad(allowed, more, constant_values=True),
+            np.pad(wanted, more), known=known.told(stack.names.count),
+            resolution=options.resolution,
         )  # fmt: skip
 
-    told = identify(stack)
+    told = identify(stack, known, nominal)
     progress("least squares")
     problem, ended = weighed(Squares(stack, told.active, known), nominal, options)
     if len(trains) > 1:  # an instrument that is rough tells less than it seemed
-        told = identify(problem.stack)
+        told = identify(problem.stack, known, nominal)
         again = replace(problem, active=told.active)
         problem, ended = weighed(again, nominal, options)
-    state, stack = ended.x.take(np.array(0)), problem.stack
-    alone: tuple[Alone, ...] = ()
-    if len(trains) > 1:
-        closed = stack.closed(robot, nominal)
-        alone = determined_alone(closed, nominal, told.active, options.resolution)
+    fit = stiff = solved(problem, ended, nominal, told, trains)
+    if options.effects:
+        progress("effects")
+
+        def beside(fit: InstrumentFit, laws: Laws) -> InstrumentFit:
+            return with_laws(robot, fit, laws, known, identify, options)
+
+        laws = laws_of(robot, stiff, options.effects)
+        fit = replace(beside(beside(stiff, laws), laws), stiff=stiff)  # then for finite turns too
+    return with_alone(robot, fit, options)
+
+
+def with_laws(
+    robot: Robot,
+    fit: InstrumentFit,
+    laws: Laws,
+    known: Known,
+    identify: Callable[[Stack, Known, State], Identification],
+    options: RelativeOptions,
+) -> InstrumentFit:
+    """Geometry and effects together, from a fit whose laws are linear where it ended.
+
+    known: of the links.
+    """
+    data = [train.data for train in fit.trains]
+    scenes = fit.stack.scenes(robot, data, fit.state)
+    stack, begin = fit.stack.bent(robot, data, laws, fit.state)
+    first, count = stack.names.geometric, len(laws.names)
+    own = fit.nominal.effects[: stack.lawless - first]
+    drawn = replace(fit.nominal, effects=np.pad(own, (0, count)))
+    known = replace(known, laws=laws.sigma(scenes[0]))
+    told = identify(stack, known, drawn)
+    untold = np.flatnonzero(~told.active[stack.lawless :]) + stack.lawless - first
+    begin.effects[untold] = 0.0
+    problem = Squares(stack, told.active, known, room=laws.room(scenes))
+    return resting(solved(*weighed(problem, begin, options), drawn, told, fit.trains))
+
+
+def solved(
+    problem: Squares,
+    ended: LeastSquares[State],
+    nominal: State,
+    told: Identification,
+    trains: Sequence[Train],
+) -> InstrumentFit:
+    """What a solved problem says."""
+    state = ended.x.take(np.array(0))
     variance = variances(problem, state)
     return InstrumentFit(
-        stack, nominal, state, told, ended, covariance_of(problem, state, variance),
-        np.sqrt(variance), trains, alone,
+        problem, nominal, state, told, ended, covariance_of(problem, state, variance),
+        np.sqrt(variance), trains, (),
     )  # fmt: skip
+
+
+def with_alone(robot: Robot, fit: InstrumentFit, options: RelativeOptions) -> InstrumentFit:
+    """The fit with what each of several instruments determines by itself."""
+    if len(fit.trains) < 2:
+        return fit
+    closed, active = fit.stack.closed(robot, fit.nominal), fit.identification.active
+    alone = determined_alone(closed, fit.nominal, active, options.resolution)
+    return replace(fit, alone=alone)
+
+
+def laws_of(robot: Robot, fit: InstrumentFit, texts: Sequence[str | Term]) -> Laws:
+    """The effects that were asked for; of a law that has several variants the best one.
+
+    fit: of geometry alone.  Raises OptionError.
+    """
+    from minimax_cal.evidence.selection import best_variant  # slow to import
+    from minimax_cal.fitting.instruments.linear import rows_of_all, scene_of_all
+    from minimax_cal.modelling.dictionary import ArmLaws
+
+    if any(block.kind == "pixels" for block in fit.stack.blocks):
+        raise OptionError(
+            "effects= is not for pixels yet: leave them out, or fit the effects from the others"
+        )
+    scene = scene_of_all(robot, fit)
+
+    def pick(chosen: Sequence[Term], several: Sequence[Term]) -> Term:
+        laws = ArmLaws(scene, rows_of_all(scene, fit))
+        return cast(Term, best_variant(laws, chosen, several))
+
+    each = fit.stack.scenes(robot, [train.data for train in fit.trains], fit.state)
+    return Laws.of(scene, each, texts, pick)
+
+
+def resting(fit: InstrumentFit) -> InstrumentFit:
+    """The fit, the parameters of laws that rest at a bound without sigma."""
+    rests = at_bounds(fit.stack.values(fit.state), fit.problem.room)
+    if not rests.any():
+        return fit
+    names = fit.stack.names
+    every = np.pad(rests, (fit.stack.lawless - names.geometric, 0))
+    known = without_resting(fit.identification, names, every)
+    again = replace(fit.problem, active=known.active)
+    covariance = covariance_of(again, fit.state, np.square(fit.noise))
+    return replace(fit, identification=known, covariance=covariance)
 
 
 def weighed(
@@ -208,7 +315,10 @@ def weighed(
     points, method = float(problem.stack.points), method_of(options.method)
 
     def solved(problem: Squares) -> LeastSquares[State]:
-        return least_squares.solve(problem, begin.batch(), 1, points, method, least_squares.NEAR)
+        found = least_squares.solve(problem, begin.batch(), 1, points, method, least_squares.NEAR)
+        if not len(problem.room) or is_kept(found.x.take(np.array(0)), problem.whole_room):
+            return found
+        return between(problem, points, problem.whole_room, found)
 
     priors = problem.known is not None and problem.known.any
     if len(problem.stack.blocks) == 1 and not priors:
@@ -320,16 +430,16 @@ def check_count(trains: Sequence[Train], stack: Stack, unknowns: int) -> None:
 
 def parameters_of(robot: Robot, fit: InstrumentFit) -> tuple[Parameter, ...]:
     """Every parameter, link by link; then each instrument's own."""
-    names, first = fit.stack.names, fit.stack.names.geometric
+    names = fit.stack.names
     before, after = (x.along(np.eye(3), robot) for x in (fit.nominal, fit.state))
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     every = link_by_link(names, names.units, before, after, sigma, fit.identification)
     out = every[: 5 * robot.joints]
     for i, block in enumerate(fit.stack.blocks):
-        own = fit.stack.columns(i)[first:]
+        own = fit.stack.own(i)
         listed = tuple(every[j] for j in own)
         out += block.listed(listed, *fit.state_of(i), fit.covariance[np.ix_(own, own)])
-    return out
+    return out + every[fit.stack.lawless :]
 
 
 def placed(fit: InstrumentFit, i: int) -> Mapping[str, object]:
@@ -352,7 +462,7 @@ def beyond_one(robot: Robot, fit: InstrumentFit, options: RelativeOptions) -> tu
     train = poses_as_targets(fit.trains[0].data)
     origin = replace(train, y=train.y.mean(axis=1, keepdims=True), target_names=("smr1",))
     lone = Stack.of(robot, [Points.of(robot, origin)], [""])
-    _, tool = block.tool(block.arm_state(fit.state))
+    tool = block.tool(block.arm_state(fit.state))
     x = lone.state(fit.state.mdh, [np.append(fit.state.effects[:6], tool[:3, 3])])
     allowed, wanted = allowed_of(lone, options)
     alone = identified(

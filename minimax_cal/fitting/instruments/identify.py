@@ -6,7 +6,7 @@ their rows at plenty of poses that no one had to measure.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,9 +21,11 @@ from minimax_cal.fitting.identify import (
     plenty_of_poses,
     redundant,
 )
+from minimax_cal.fitting.instruments.laws import NO_LAWS, Laws
 from minimax_cal.fitting.instruments.rows import TARGET, motion
 from minimax_cal.fitting.instruments.stack import Stack
 from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.cell import still
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
@@ -51,26 +53,25 @@ ALL_OWN = "all frames, anchors and targets of the files moved together"
 def order_of(robot: Robot, stack: Stack) -> Array:
     """Parameters in the order in which redundant ones are given up.
 
-    First what the instruments give up, as offsets of wires, then as `identify.drop_order`, the
-    instruments' own last.
+    First laws and what the instruments give up, as offsets of wires, then as
+    `identify.drop_order`, the instruments' own last.
     """
-    names = stack.names
-    extra = np.arange(names.geometric, names.count)
+    names, laws = stack.names, range(stack.lawless, stack.names.count)
+    extra = np.arange(names.geometric, stack.lawless)
     soft = np.array([name in b.given_up for b in stack.blocks for name in b.own], dtype=bool)
-    order = [*extra[soft], *drop_order(robot, names), *extra[~soft]]
+    order = [*laws, *extra[soft], *drop_order(robot, names), *extra[~soft]]
     return np.array([int(i) for i in order], dtype=int)
 
 
 def length_row(stack: Stack, x: State) -> Array:
     """(p,) derivative of the distance between two places of the first block's target."""
     block, columns = stack.blocks[0], stack.columns(0)
-    arm = block.model.names.count
-    point, moved = motion(block.model, stack.part(x, 0), np.ones(arm, dtype=bool))
+    point, moved = motion(block.model, stack.part(x, 0), np.ones(len(columns), dtype=bool))
     far = int(np.argmax(((point - point[:, :1]) ** 2).sum(axis=0)))
     gap = point[:, far] - point[:, 0]
     row = np.zeros(stack.names.count)
     along = gap / max(float(np.linalg.norm(gap)), 1e-12)
-    row[columns[:arm]] = along @ (moved[..., far] - moved[..., 0]).T
+    row[columns] = along @ (moved[..., far] - moved[..., 0]).T
     return row
 
 
@@ -114,12 +115,13 @@ def identified(
 ) -> Identification:
     """The largest set of allowed parameters that the measurements determine; see `identify`.
 
-    reference: the instruments at plenty of poses.  x: the arm as drawn, with the instruments' own
-    parameters fitted to it.  wanted: (p,) those to give up last.  known: (p,) True where a prior
-    stands in for measurements.
+    reference: the instruments at plenty of poses, without laws, which only the poses at hand tell.
+    x: the arm as drawn, with the instruments' own parameters fitted to it.  wanted: (p,) those to
+    give up last.  known: (p,) True where a prior stands in for measurements.
     """
     names = stack.names
     plain, gram = reference.gram(x), stack.closed(robot, x).gram(x)
+    stiff = stack.lawless
     size, scale = np.sqrt(np.diag(plain)), np.sqrt(np.diag(gram) / max(stack.points, 1))
     kept = Kept(names, allowed, {}).without(~allowed & names.links, "fixed by the user")
     closing = all(block.kind == CLOSURES for block in stack.blocks)
@@ -127,21 +129,25 @@ def identified(
         (size, ALIKE if closing else FRAMELESS),
         (scale, "moves nothing at these poses"),
     ):
-        kept = kept.without(kept.active & (motion_of <= STILL * motion_of.max()), reason)
+        still = np.zeros(names.count, dtype=bool)
+        still[: len(motion_of)] = motion_of <= STILL * motion_of[:stiff].max()
+        kept = kept.without(kept.active & still, reason)
     order = order_of(robot, stack)
     order = np.concatenate([order[~wanted[order]], order[wanted[order]]])
-    no_length = open_scale(reference, x, plain, kept.active, order)
+    no_length = open_scale(reference, x, plain, kept.active[:stiff], order[order < stiff])
     keeper = scale_keeper(robot, kept.active, wanted) if no_length else []
     order = np.array(list(dict.fromkeys([*keeper, *(int(i) for i in order)])))
-    gone = redundant(plain, kept.active, order, RANK_TOLERANCE)
+    gone = redundant(plain, kept.active[:stiff], order[order < stiff], RANK_TOLERANCE)
     kept = kept.without(gone, SAME_MOTION).without(
         [i for i in gone if i in keeper], LENGTHS + "; ".join(SCALE.get(stack.blocks[0].kind, ()))
     )
     told = gram + np.diag(np.where(known, np.maximum(np.diag(gram), RANK_TOLERANCE), 0.0))
     kept = kept.without(redundant(told, kept.active, order, resolution), NOT_TOLD)
     whole = stack.blocks[0].whole if len(stack.blocks) == 1 else ALL_OWN
-    stems = {name.rpartition("_")[0] for name in names.effects if whole}
-    return kept.identification(gram, scale, stems - {TARGET, "base"}, whole)
+    own = names.effects[: stiff - names.geometric]
+    stems = {name.rpartition("_")[0] for name in own if whole}
+    curves = gram + np.diag(np.where(known & (np.arange(names.count) >= stiff), np.diag(gram), 0.0))
+    return kept.identification(curves, scale, stems - {TARGET, "base"}, whole)
 
 
 def generic_count(robot: Robot, reference: Stack, x: State, allowed: Array) -> int:
@@ -175,7 +181,7 @@ def determined_alone(stack: Stack, x: State, active: Array, resolution: float) -
     whole = np.sqrt(np.diag(np.sum(grams, axis=0)))
     for i in range(len(stack.blocks)):
         others, chosen = np.sum(grams[:i] + grams[i + 1 :], axis=0), active.copy()
-        chosen[stack.columns(i)[stack.names.geometric :]] = False
+        chosen[stack.own(i)] = False
         size = whole[chosen]
         alike = others[np.ix_(chosen, chosen)] / np.outer(size, size)
         values, vectors = np.linalg.eigh(alike)
@@ -188,17 +194,21 @@ def determined_alone(stack: Stack, x: State, active: Array, resolution: float) -
     return tuple(out)
 
 
-def position_sigma(robot: Robot, model: Model, x: State, covariance: Array) -> float:
+def position_sigma(
+    robot: Robot, model: Model, x: State, covariance: Array, laws: Laws = NO_LAWS
+) -> float:
     """RMS of a position's standard deviation at random poses, by the parameters alone [m].
 
     Of the targets' centroid in base axes.  The best rigid motion of all positions is taken out: a
     base is fitted wherever an arm is put to work.  covariance: (p, p) of the model's parameters,
-    NaN where not identified.
+    behind them those of laws by which the arm gives way, NaN where not identified.
     """
     names = model.names
     told = np.isfinite(np.diag(covariance))
     told[5 * names.joints : 5 * names.joints + 6] = False  # the base, which is fitted again
-    some = plenty_of_poses(robot, model)
+    some = plenty_of_poses(robot, replace(model, names=replace(names, effects=())))
+    here = still(robot.commanded(some.q), names.target_names, robot)
+    some = laws.on(some, robot, here, x)
     jacobian = some.jacobian(x).mean(axis=0)[..., told].reshape(3 * len(some.q), -1)
     links = kinematics.chain(x.mdh, some.q, some.prismatic)
     point = kinematics.points(links, x.target_positions).mean(axis=0).T

@@ -32,15 +32,22 @@ from minimax_cal.fitting.instruments.result import (
     Measured,
     RelativeCalibration,
 )
+from minimax_cal.fitting.instruments.rows import TARGET
 from minimax_cal.fitting.instruments.split import before_and_after, count_numbers, held_back
 from minimax_cal.fitting.intervals import rms_interval, told
+from minimax_cal.fitting.opened import Writes, listed_effects
 from minimax_cal.fitting.options import listed, sigmas_of
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.campaigns import session_names
 from minimax_cal.measuring.checks import check_joints, limit_notices
 from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.history import Clock, with_history
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.stations import Sessions
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.joint_fit import fitted
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.least_squares import AUTO
 from minimax_cal.solvers.status import Status
@@ -62,6 +69,7 @@ def relative(
     lever: float | None = None,
     noises: Mapping[str, float | str] | None = None,
     priors: Mapping[str, float | str] | None = None,
+    effects: str | Path | Writes | Sequence[str | Path | Term] = (),
     camera_on: str = "",
     fix_camera: bool = False,
     camera_prior: str = "",
@@ -95,6 +103,9 @@ def relative(
         Sigma of a number of a file by its name [m], or a text as 0.2mm; of others residuals say it.
     priors
         Sigma of a parameter's deviation from nominal, by name [m, rad], or a text as 5mm.
+    effects
+        Of the arm beyond geometry, fitted with it, as joint_compliance:all; or a diagnosis, of
+        which the confirmed effects are taken.
     camera_on, fix_camera, camera_prior
         Of pixels, as `calibrate_pixels` takes them.
     method
@@ -126,6 +137,7 @@ def relative(
         lever=lever,
         noises=read_noises(noises or {}),
         priors=sigmas_of(priors or {}),
+        effects=listed_effects(effects),
         camera_on=camera_on,
         fix_camera=fix_camera,
         camera_prior=camera_prior,
@@ -137,7 +149,7 @@ def relative(
     every = sorted((loaded(each) for each in given), key=lambda data: data.kind == "pixels")
     check_kinds(every)
     check_options(every, chosen)
-    every = [replace(each, at=check_joints(robot, each.at)) for each in every]
+    every = [replace(each, at=with_history(check_joints(robot, each.at))) for each in every]
     return calibrate_instruments(robot, every, chosen, progress)
 
 
@@ -202,11 +214,12 @@ def calibrate_instruments(
     ]
     sources = ", ".join(data.at.source for data in every)
     source = replace(every[0].at, source=sources, digest=" ".join(d.at.digest for d in every))
+    geometry = found.stiff or found
     levers = [b.lever for b in found.stack.blocks if isinstance(b, WholePoses)]
     settings = options.settings() | ({"lever": levers[0]} if levers else {})
     result = RelativeCalibration(
         **vars(whole),
-        robot=robot.with_mdh(found.state.mdh),
+        robot=robot.with_mdh(geometry.state.mdh),
         nominal=robot,
         status=found.found.status[0],
         iterations=int(found.found.iterations[0]),
@@ -218,6 +231,7 @@ def calibrate_instruments(
         notices=tuple(dict.fromkeys(notices)),
         provenance=Provenance.of(robot, source, settings),
         instruments=() if single else instruments_of(found, every, splits, measured),
+        cell=cell_of(robot, found) if found.stiff else None,
     )
     return judged(robot, every, splits, found, measured, result, options)
 
@@ -256,8 +270,10 @@ def measured_by(
 ) -> Measured:
     """The errors of an instrument, as drawn and calibrated.  held: (m,)."""
     block, states = found.stack.blocks[i], found.state_of(i)
-    nominal, calibrated = (block.errors(robot, x, data, held) for x in states)
-    turned = [block.turns(robot, x, data)[None] for x in states]
+    models = [found.stack.model_at(robot, i, data, x) for x in (found.nominal, found.state)]
+    pairs = list(zip(models, states, strict=True))
+    nominal, calibrated = (block.errors(model, x, data, held) for model, x in pairs)
+    turned = [block.turns(model, x, data)[None] for model, x in pairs]
     turns = before_and_after(turned[0], turned[1], held) if turned[0].size else {}
     return Measured(
         kind=data.kind,
@@ -291,6 +307,19 @@ def together(labels: Sequence[str], measured: Sequence[Measured]) -> Measured:
     )
 
 
+def cell_of(robot: Robot, found: InstrumentFit) -> Cell:
+    """The arm with its effects in its own base, and amid the first file's targets one of its own.
+
+    Where these are is all that the laws know of them.
+    """
+    stack, data = found.stack, [train.data for train in found.trains]
+    scene = stack.scenes(robot, data, found.state)[0]
+    effects = fitted(stack.laws.terms, scene, stack.values(found.state))
+    amid = scene.target_positions.mean(axis=0, keepdims=True)
+    sessions = Sessions({}, Clock.of(data[0].at))
+    return Cell(robot.with_mdh(found.state.mdh), np.eye(4), (TARGET,), amid, effects, sessions)
+
+
 def instruments_of(
     found: InstrumentFit,
     every: Sequence[RelativeData],
@@ -318,8 +347,10 @@ def instruments_of(
 
 def sigma_of_positions(robot: Robot, found: InstrumentFit) -> float:
     """`identify.position_sigma`, of the target of the first file."""
-    block, columns = found.stack.blocks[0], found.stack.columns(0)
-    first = found.stack.names.geometric
-    place = np.concatenate([columns[:first], columns[first:][block.spots]])
-    x = block.arm_state(found.stack.part(found.state, 0))
-    return position_sigma(robot, block.model, x, found.covariance[np.ix_(place, place)])
+    stack, block = found.stack, found.stack.blocks[0]
+    every = np.arange(stack.names.count)
+    parts = every[: stack.names.geometric], stack.own(0)[block.spots], every[stack.lawless :]
+    place = np.concatenate(parts)
+    x = block.arm_state(stack.part(found.state, 0))
+    covariance = found.covariance[np.ix_(place, place)]
+    return position_sigma(robot, block.model, x, covariance, stack.laws)

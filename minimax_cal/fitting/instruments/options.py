@@ -17,6 +17,7 @@ from minimax_cal.ground.options import option
 from minimax_cal.ground.stages import Progress as Progress
 from minimax_cal.ground.stages import silent as silent
 from minimax_cal.measuring.measurements import FARTHEST
+from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.solvers.least_squares import AUTO, METHODS
 
@@ -62,6 +63,7 @@ class RelativeOptions:
     distance of their centres [m].  lever: of poses, metres that a radian counts as; None for the
     file's own.  priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
     noises: sigma of a number of a file, by its name [m]; of others their residuals say it.
+    effects: beyond geometry, of the arm, fitted jointly, as `Options` has them.
     method: of the least squares.  resolution: relative singular value that counts as
     not measured.
     """
@@ -101,6 +103,7 @@ class RelativeOptions:
         group="What is fitted",
     )
     priors: Mapping[str, float] = field(default_factory=dict)
+    effects: Sequence[str | Term] = ()
     camera_on: str = PixelOptions.camera_on
     fix_camera: bool = PixelOptions.fix_camera
     camera_prior: str = PixelOptions.camera_prior
@@ -110,8 +113,9 @@ class RelativeOptions:
     def settings(self) -> dict[str, object]:
         """For the record."""
         told = [list(known) for known in self.known_distances]
+        effects = [e.text if isinstance(e, Term) else e for e in self.effects]
         return {**vars(self), "known_distances": told, "priors": dict(self.priors),
-                "noises": dict(self.noises)}  # fmt: skip
+                "noises": dict(self.noises), "effects": effects}  # fmt: skip
 
 
 def check_options(every: Sequence[RelativeData], options: RelativeOptions) -> None:

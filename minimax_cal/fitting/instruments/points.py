@@ -13,15 +13,15 @@ from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.poses import (
     TOOL,
     pose_errors,
+    posed,
     poses_as_targets,
     spots_of,
-    tool_of,
 )
-from minimax_cal.fitting.instruments.rows import Plain
+from minimax_cal.fitting.instruments.rows import Plain, of_laws
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.cell import Cell, pose_to_dict
+from minimax_cal.modelling.cell import pose_to_dict
 from minimax_cal.modelling.model import Block as Poses
 from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.modelling.parameters import BASE_NAMES, State
@@ -88,12 +88,18 @@ class Points(Plain):
         """(rows,) one each."""
         return np.ones(3 * self.model.weight.size)
 
+    @property
+    def pose_of_row(self) -> Array:
+        """Target by target, axis by axis."""
+        k, m = self.model.weight.shape
+        return np.tile(np.arange(m), 3 * k)
+
     def arm_state(self, x: State) -> State:
         """Links, base in the instrument's frame, targets."""
-        axes, own = self.drawn.rotation, x.effects
+        axes, own = self.drawn.rotation, x.effects[..., : len(self.own)]
         rotation, origin = axes @ kinematics.rotation(own[..., 3:6]), own[..., :3] @ axes.T
         targets = own[..., 6:].reshape(*own.shape[:-1], -1, 3)
-        return State(x.mdh, rotation, origin, targets)
+        return State(x.mdh, rotation, origin, targets, of_laws(self.model, x))
 
     def rows(self, x: State, active: Array) -> tuple[Array, Array]:
         """Three rows for each target at each pose, 0 where it was not measured."""
@@ -132,9 +138,13 @@ class Points(Plain):
         error = self.model.error(self.arm_state(x))
         return float(np.nanmean((error**2).sum(axis=-1)))
 
-    def errors(self, robot: Robot, x: State, data: RelativeData, held: Array) -> Array:
+    def model_at(self, robot: Robot, data: RelativeData) -> Model:
+        """With the points there."""
+        return model_of(robot, self.seen_at(data))
+
+    def errors(self, model: Model, x: State, data: RelativeData, held: Array) -> Array:
         """Of the points, along the axes of the base."""
-        return model_of(robot, data.at).error(self.arm_state(x))
+        return model.error(self.arm_state(x))
 
     def placed(self, x: State, nominal: State) -> dict[str, Any]:
         """Base in the instrument's frame, targets in the flange."""
@@ -178,24 +188,46 @@ class WholePoses(Points):
         """
         return 6 * len(self.model.q) + 3 * len(self.model.y) - 6
 
-    def tool(self, state: State) -> tuple[Cell, Array]:
-        """The cell, and the pose (4, 4) of the measured frame in its flange [m]."""
-        cell = Cell.of(self.robot, state, self.model.names.target_names)
-        return cell, tool_of(cell, spots_of(self.lever))
+    def shapeless(self, x: State) -> Array:
+        """What no rigid motion of the reflectors makes."""
+        state, k = self.arm_state(x), len(self.model.y)
+        links = kinematics.chain(state.mdh, self.model.q, self.model.prismatic)
+        arm = np.moveaxis(kinematics.points(links, state.target_positions), -1, 0)
+        arm = arm - arm.mean(axis=1, keepdims=True)
+        shift = np.broadcast_to(np.eye(3), (*arm.shape, 3))
+        rigid = np.concatenate([shift, -hat(arm)], axis=-1).reshape(len(arm), 3 * k, 6)
+        basis = np.linalg.qr(rigid)[0]
+        return np.asarray(np.eye(3 * k) - basis @ np.swapaxes(basis, 1, 2))
 
-    def errors(self, robot: Robot, x: State, data: RelativeData, held: Array) -> Array:
+    def tool(self, state: State) -> Array:
+        """Pose (4, 4) of the measured frame in the flange [m]."""
+        return posed(state.target_positions, spots_of(self.lever))
+
+    def seen_at(self, data: RelativeData) -> Measurements:
+        """With the virtual reflectors."""
+        return poses_as_targets(data, self.lever)
+
+    def predicted(self, model: Model, x: State) -> Array:
+        """(m, 4, 4) poses of the measured frame, nearest to where the model has its reflectors."""
+        state = self.arm_state(x)
+        links = kinematics.chain(state.mdh, model.q, model.prismatic)
+        point = kinematics.points(links, state.target_positions)
+        in_base = np.moveaxis(model.displaced(state, point, slice(None)), -1, 0)
+        return posed(in_base @ state.rotation.T + state.origin, spots_of(self.lever))
+
+    def errors(self, model: Model, x: State, data: RelativeData, held: Array) -> Array:
         """Of positions, in the measurement frame."""
-        return pose_errors(*self.tool(self.arm_state(x)), data)[0][None]
+        return pose_errors(self.predicted(model, x), data)[0][None]
 
-    def turns(self, robot: Robot, x: State, data: RelativeData) -> Array:
+    def turns(self, model: Model, x: State, data: RelativeData) -> Array:
         """(m,) angles between orientations [rad]."""
-        return pose_errors(*self.tool(self.arm_state(x)), data)[1]
+        return pose_errors(self.predicted(model, x), data)[1]
 
     def listed(
         self, fitted: tuple[Parameter, ...], nominal: State, x: State, covariance: Array
     ) -> tuple[Parameter, ...]:
         """The base, and the tool instead of its reflectors."""
-        (_, before), (_, tool) = (self.tool(self.arm_state(each)) for each in (nominal, x))
+        before, tool = (self.tool(self.arm_state(each)) for each in (nominal, x))
         arm = spots_of(self.lever) @ tool[:3, :3].T  # in the flange's axes
         k = len(arm)
         rigid = np.concatenate([np.tile(np.eye(3), (k, 1)), -hat(arm).reshape(3 * k, 3)], axis=1)
@@ -223,7 +255,7 @@ class WholePoses(Points):
         out: dict[str, Array] = {}
         for stem, each in (("", x), ("nominal_", nominal)):
             state = self.arm_state(each)
-            out |= {f"{stem}base": state.base, f"{stem}tool": self.tool(state)[1]}
+            out |= {f"{stem}base": state.base, f"{stem}tool": self.tool(state)}
         return {name: pose_to_dict(pose) for name, pose in out.items()} | {
             "lever_mm": 1e3 * self.lever
         }

@@ -16,7 +16,6 @@ from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots.transforms import nearest_rotation, transform
 
 LEVER = 0.1  # where nothing tells the ratio of the noises [m]
@@ -59,14 +58,20 @@ def lever_of(data: RelativeData, lever: float | None) -> tuple[float, str]:
     return LEVER, "by default; give the lever, the ratio of linear and angular noise"
 
 
-def tool_of(cell: Cell, spots: Array) -> Array:
-    """Pose (4, 4) of the measured frame in the flange that fits the reflectors best [m]."""
-    centre = cell.target_positions.mean(axis=0)
-    return transform(nearest_rotation((cell.target_positions - centre).T @ spots), centre)
+def posed(points: Array, spots: Array) -> Array:
+    """Poses (..., 4, 4) of a frame nearest to its reflectors (..., k, 3) [m]; spots: (k, 3) in it.
+
+    The spots are about its origin.
+    """
+    centre = points.mean(axis=-2)
+    return transform(nearest_rotation(np.swapaxes(points - centre[..., None, :], -1, -2) @ spots),
+                     centre)  # fmt: skip
 
 
-def pose_errors(cell: Cell, tool: Array, data: RelativeData) -> tuple[Array, Array]:
-    """Measured minus predicted positions (m, 3) [m], and angles between orientations (m,) [rad]."""
-    pose = cell.base @ cell.robot.pose(data.at.q) @ tool
+def pose_errors(pose: Array, data: RelativeData) -> tuple[Array, Array]:
+    """Measured minus predicted positions (m, 3) [m], and angles between orientations (m,) [rad].
+
+    pose: (m, 4, 4) predicted.
+    """
     turn = np.swapaxes(pose[:, :3, :3], 1, 2) @ data.pose[:, :3, :3]
     return data.pose[:, :3, 3] - pose[:, :3, 3], np.asarray(Rotation.from_matrix(turn).magnitude())

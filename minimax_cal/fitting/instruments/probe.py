@@ -149,14 +149,20 @@ class Contacts(OnFlange):
         """(rows,) one each."""
         return np.ones(self.points)
 
+    @property
+    def pose_of_row(self) -> Array:
+        """One a pose."""
+        return np.arange(self.points)
+
     def gaps(self, x: State) -> Array:
         """(..., m) how far the ball is from its surface [m]."""
-        return -self.rows(x, np.zeros(self.model.names.count - 3 + len(self.own), dtype=bool))[0]
+        count = self.model.names.count - 3 + len(self.own)
+        return -self.rows(x, np.zeros(count, dtype=bool))[0]
 
     def rows(self, x: State, active: Array) -> tuple[Array, Array]:
         """A row for each contact: the ball's distance from the surface, which is zero."""
-        arm, own = self.model.names.count, x.effects
-        point, arms = motion(self.model, x, active[:arm])
+        own = x.effects[..., : len(self.own)]
+        point, arms = motion(self.model, x, active)
         *batch, _, m = point.shape
         gap, along = np.zeros((*batch, m)), np.zeros((*batch, 3, m))
         slope = np.zeros((*batch, own.shape[-1], m))
@@ -169,8 +175,10 @@ class Contacts(OnFlange):
             if self.shapes.surfaces[at].is_face:
                 slope[..., -7:-1, here] = self.by_body(point[..., here], at, own)
         by_arm = np.einsum("...cm,...pcm->...pm", along, arms)
-        by_own = slope[..., 3:, :][..., active[arm:], :]
-        return -gap, np.concatenate([by_arm, by_own], axis=-2)
+        first = self.model.names.geometric - 3
+        every = np.zeros((*batch, len(active), m))
+        every[..., first + 3 : first + own.shape[-1], :] = slope[..., 3:, :]
+        return -gap, by_arm + every[..., active, :]
 
     def met(self, p: Array, at: int, own: Array) -> tuple[Array, Array, Array]:
         """Normal (..., 3, m) where p lies, its gap (..., m), slopes by the surface's own (.., m).
@@ -215,7 +223,7 @@ class Contacts(OnFlange):
         goal = p.T.copy()
         for at in range(len(self.shapes.surfaces)):
             rows = touched == at
-            normal, gap, _ = self.met(p[:, rows], at, x.effects)
+            normal, gap, _ = self.met(p[:, rows], at, x.effects[: len(self.own)])
             goal[rows] -= (gap * normal).T
         return goal
 
@@ -235,17 +243,17 @@ class Contacts(OnFlange):
         """At nearby poses where the arm itself touches."""
         goal = self.nearest(robot, x, places(self.model, x), self.touched)
         q, _ = reach(robot, x.effects[:3], goal, robot.commanded(self.model.q))
-        return replace(self, model=arm_at(robot, q))
+        return replace(self, model=replace(self.model, q=robot.turned(q)))
 
     def mean_square(self, x: State) -> float:
         """Of the gaps [m^2]."""
         return float(np.mean(self.gaps(x) ** 2))
 
-    def errors(self, robot: Robot, x: State, data: RelativeData, held: Array) -> Array:
+    def errors(self, model: Model, x: State, data: RelativeData, held: Array) -> Array:
         """The gap at a contact stands first of three, a part a surface."""
         labels = self.parts
         touched = np.array([labels.index(str(label)) for label in data.surface])
-        gap = replace(self, model=arm_at(robot, data.at.q), touched=touched).gaps(x)
+        gap = replace(self, model=model, touched=touched).gaps(x)
         error = np.full((len(labels), data.poses, 3), np.nan)
         error[touched, np.arange(data.poses)] = 0.0
         error[touched, np.arange(data.poses), 0] = -gap
@@ -260,7 +268,7 @@ class Contacts(OnFlange):
 
     def placed(self, x: State, nominal: State) -> dict[str, Any]:
         """Ball in the last frame, surfaces in the robot's base."""
-        own, out = x.effects, {}
+        own, out = x.effects[: len(self.own)], {}
         turn, origin = self.shapes.body(own) if self.shapes.has_body else (np.eye(3), np.zeros(3))
         for at, (surface, slot) in enumerate(
             zip(self.shapes.surfaces, self.shapes.slots(), strict=True)

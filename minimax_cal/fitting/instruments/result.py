@@ -12,7 +12,13 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from minimax_cal.fitting.fit import ACCURACIES, Parameter, Provenance, parameter_table
+from minimax_cal.fitting.fit import (
+    ACCURACIES,
+    Parameter,
+    Provenance,
+    parameter_table,
+    table_of_effects,
+)
 from minimax_cal.fitting.fit_file import SCHEMA, ScoresPart, TableParameter, in_si
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval
@@ -20,9 +26,10 @@ from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.ground.records import Number, Part, checked, reading
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Cell as TableCell
+from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
-from minimax_cal.modelling.cell import pose_from_dict
+from minimax_cal.modelling.cell import Cell, cell_from_dict, pose_from_dict
 from minimax_cal.modelling.frames import paired, tables_of
 from minimax_cal.robots.frames import CONVENTION, Frame
 from minimax_cal.robots.robot import Robot, robot_from_dict
@@ -105,6 +112,7 @@ class RelativePart(MeasuredPart):
     robot: dict[str, Any]
     nominal_robot: dict[str, Any]
     instruments: tuple[InstrumentPart, ...] = ()
+    cell: dict[str, Any] = Field(default_factory=dict)
     status: Status
     iterations: int = 0
     seconds: Number = math.nan
@@ -160,7 +168,7 @@ class Measured:
 
     def scores(self, title: str) -> Table:
         """Accuracy before and after, training and held out."""
-        rows: list[tuple[Cell, ...]] = []
+        rows: list[tuple[TableCell, ...]] = []
         for heading, key in ACCURACIES:
             a, turned = self.accuracy[key], [1e3 * value for value in self.turns.get(key, ())]
             rows.append(
@@ -176,7 +184,7 @@ class Measured:
 
     def parts_table(self, title: str) -> Table:
         """RMS errors part by part, as wire by wire."""
-        rows: tuple[tuple[Cell, ...], ...] = tuple(
+        rows: tuple[tuple[TableCell, ...], ...] = tuple(
             (
                 part,
                 *(1e3 * rms(np.linalg.norm(self.errors[key][i], axis=-1)) for _, key in ACCURACIES),
@@ -264,7 +272,8 @@ class RelativeCalibration(Measured):
 
     robot: calibrated; nominal: as drawn.  position_sigma: expected error of a position over the
     joints' range, by the parameters' sigmas alone, the base fitted [m].  beyond: parameters that
-    whole poses tell and one reflector does not.  instruments: each of several files.
+    whole poses tell and one reflector does not.  instruments: each of several files.  cell: the arm
+    with its effects, fitted together; None without any.  robot is then of a fit without them.
     """
 
     robot: Robot
@@ -279,6 +288,7 @@ class RelativeCalibration(Measured):
     notices: tuple[str, ...]
     provenance: Provenance
     instruments: tuple[InstrumentResult, ...] = ()
+    cell: Cell | None = None
 
     @property
     def identified(self) -> int:
@@ -291,7 +301,7 @@ class RelativeCalibration(Measured):
 
     def files_table(self) -> Table:
         """Each of several files: held-out RMS before and after, and what it alone determines."""
-        rows: list[tuple[Cell, ...]] = []
+        rows: list[tuple[TableCell, ...]] = []
         for one in self.instruments:
             before, after, _ = one.before_and_after()
             ends = (1e3 * one.interval.low, 1e3 * one.interval.high)
@@ -310,9 +320,10 @@ class RelativeCalibration(Measured):
 
     def first_tables(self) -> list[Table]:
         """What stands on the first screen."""
+        first = [self.accuracy_table().brief("poses", "count", "RMS mm", "max mm")]
         if self.instruments:
-            return [self.files_table(), self.alone_table()]
-        return [self.accuracy_table().brief("poses", "count", "RMS mm", "max mm")]
+            first = [self.files_table(), self.alone_table()]
+        return [*first, *self.effect_tables()]
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
@@ -327,7 +338,12 @@ class RelativeCalibration(Measured):
         first = [self.files_table(), self.alone_table()] if self.instruments else [
             self.accuracy_table()
         ]  # fmt: skip
-        return (*first, *own, parameter_table(self.parameters))
+        geometry = parameter_table(p for p in self.parameters if not p.of_effect)
+        return (*first, *self.effect_tables(), *own, geometry)
+
+    def effect_tables(self) -> tuple[Table, ...]:
+        """The parameters of effects beyond geometry; none without any."""
+        return (table_of_effects(self.parameters),) if self.cell else ()
 
     def headline(self) -> str:
         """The result in some sentences, with what it does not say."""
@@ -369,6 +385,8 @@ class RelativeCalibration(Measured):
         }
         if self.instruments:
             content["instruments"] = [one.to_dict() for one in self.instruments]
+        if self.cell:
+            content["cell"] = self.cell.whole()
         return dict(plain(content))
 
     @staticmethod
@@ -390,6 +408,7 @@ class RelativeCalibration(Measured):
             notices=part.notices,
             provenance=part.provenance,
             instruments=tuple(InstrumentResult.of(each) for each in part.instruments),
+            cell=cell_from_dict(part.cell, f"{source}: cell") if part.cell else None,
         )
         with reading(source, "instrument"):  # poses that are none are refused here, not when shown
             _ = [each.frames for each in (found, *found.instruments)]

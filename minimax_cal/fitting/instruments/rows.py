@@ -7,13 +7,15 @@ targets, surfaces) stands in the state where effects stand elsewhere.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol, Self
+from dataclasses import replace
+from typing import Any, Protocol, Self, TypeVar, cast
 
 import numpy as np
 
 from minimax_cal.fitting.fit import Parameter
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import Block as Poses
 from minimax_cal.modelling.model import Model, Prior
 from minimax_cal.modelling.parameters import Names, State, links_of
@@ -29,8 +31,9 @@ NO_TURNS: Mapping[str, tuple[float, float]] = {}
 class Block(Protocol):
     """An instrument's measurements as a part of the least-squares problem.
 
-    A state of a block has the links and the e parameters of the block's own, as effects; its p
-    parameters are in the order of `Names`: links, the base (which is the frame), its own.
+    A state of a block has the links and, as effects, the e parameters of the block's own and those
+    of the laws by which its arm gives way; its p parameters are in the order of `Names`: links, the
+    base (which is the frame), its own, the laws'.
     """
 
     @property
@@ -39,7 +42,7 @@ class Block(Protocol):
 
     @property
     def model(self) -> Model:
-        """The arm at the poses, with the block's own points on the flange."""
+        """The arm at the poses, with the block's own points on the flange and the laws' fields."""
 
     @property
     def own(self) -> tuple[str, ...]:
@@ -91,6 +94,19 @@ class Block(Protocol):
         active: (p,).
         """
 
+    @property
+    def pose_of_row(self) -> Array:
+        """(rows,) the pose at which each was measured."""
+
+    def by_pose(self) -> Self:
+        """The block with rows that move with their own pose alone, but for what is eliminated."""
+
+    def places_of_rows(self) -> Array:
+        """(q, rows) how the rows of `by_pose` move with each number that `rows` eliminates."""
+
+    def shapeless(self, x: State) -> Array:
+        """(m, r, r) projector, pose by pose, on sums of its rows that hold no number."""
+
     def start(self, robot: Robot, free: Array) -> Array:
         """(e,) that fit the arm as drawn best.  free: (e,) True where one may be fitted."""
 
@@ -106,10 +122,19 @@ class Block(Protocol):
     def mean_square(self, x: State) -> float:
         """Of the misses, as `errors` has them [m^2]."""
 
-    def errors(self, robot: Robot, x: State, data: RelativeData, held: Array) -> Array:
-        """Of all rows of the data: (parts, m, 3), NaN where not measured [m]; numbers first."""
+    def seen_at(self, data: RelativeData) -> Measurements:
+        """Where the poses of data stand, with the points that the model compares."""
 
-    def turns(self, robot: Robot, x: State, data: RelativeData) -> Array:
+    def model_at(self, robot: Robot, data: RelativeData) -> Model:
+        """The stiff arm as `model` has it, at all rows of the data."""
+
+    def errors(self, model: Model, x: State, data: RelativeData, held: Array) -> Array:
+        """Of all rows of the data: (parts, m, 3), NaN where not measured [m]; numbers first.
+
+        model: the arm at these rows.
+        """
+
+    def turns(self, model: Model, x: State, data: RelativeData) -> Array:
         """(m,) errors of orientation [rad], empty where none is measured."""
 
     def listed(
@@ -124,9 +149,25 @@ class Block(Protocol):
 class Plain:
     """Of `Block`, what most instruments have: no orientations, and parameters listed as fitted."""
 
-    def turns(self, robot: Robot, x: State, data: RelativeData) -> Array:
+    def turns(self, model: Model, x: State, data: RelativeData) -> Array:
         """None."""
         return np.zeros(0)
+
+    def by_pose(self) -> Self:
+        """As it is."""
+        return self
+
+    def places_of_rows(self: Block) -> Array:
+        """Nothing is eliminated."""
+        return np.zeros((0, len(self.weights)))
+
+    def shapeless(self: Block, x: State) -> Array:
+        """Every row holds a number."""
+        return np.zeros((len(self.model.q), 0, 0))
+
+    def seen_at(self, data: RelativeData) -> Measurements:
+        """As they are."""
+        return data.at
 
     def listed(
         self, fitted: tuple[Parameter, ...], nominal: State, x: State, covariance: Array
@@ -140,9 +181,21 @@ class OnFlange(Plain):
 
     spots = slice(0, 3)
 
-    def arm_state(self, x: State) -> State:
+    def arm_state(self: Block, x: State) -> State:
         """The state of its model."""
-        return with_spot(x)
+        return with_spot(self.model, x)
+
+    def model_at(self, robot: Robot, data: RelativeData) -> Model:
+        """With the one target."""
+        return arm_at(robot, data.at.q)
+
+
+Some = TypeVar("Some", bound=Block)
+
+
+def through(block: Some, model: Model) -> Some:
+    """The block with another arm at its poses.  Of an instrument that has its arm as a field."""
+    return cast(Some, replace(cast(Any, block), model=model))
 
 
 def arm_at(robot: Robot, q: Array) -> Model:
@@ -173,23 +226,36 @@ def own_state(mdh: Array, own: Array) -> State:
     return State(mdh, rotation, np.zeros((*batch, 3)), np.zeros((*batch, 0, 3)), own)
 
 
-def with_spot(x: State) -> State:
+def of_laws(model: Model, x: State) -> Array:
+    """(..., k) values of the laws by which a model gives way, which are last in a block's state."""
+    return x.effects[..., x.effects.shape[-1] - len(model.fields) :]
+
+
+def with_spot(model: Model, x: State) -> State:
     """The state of the arm with the target that is first among a block's own."""
-    return State(x.mdh, x.rotation, x.origin, x.effects[..., None, :3])
+    return State(x.mdh, x.rotation, x.origin, x.effects[..., None, :3], of_laws(model, x))
 
 
 def places(model: Model, x: State) -> Array:
     """The point on the flange in the base: (..., 3, m) [m]."""
-    links = kinematics.chain(x.mdh, model.q, model.prismatic)
-    return np.asarray(kinematics.points(links, with_spot(x).target_positions)[..., 0, :, :])
+    links, state = kinematics.chain(x.mdh, model.q, model.prismatic), with_spot(model, x)
+    point = kinematics.points(links, state.target_positions)
+    return np.asarray(model.displaced(state, point, slice(None))[..., 0, :, :])
 
 
 def motion(model: Model, x: State, active: Array) -> tuple[Array, Array]:
-    """`places`, and their derivative by the active parameters of the arm: (..., active, 3, m)."""
+    """`places`, and their derivative by the active parameters of a block: (..., active, 3, m).
+
+    active: (p,).  What is neither of the arm nor its target moves nothing.
+    """
     links = kinematics.chain(x.mdh, model.q, model.prismatic)
     poses = Poses(slice(0, len(model.q)), links)
-    error, turned = model.weighted_rows(with_spot(x), poses, active)
-    return -error[..., 0, :, :], turned[..., 0, :, :, :]
+    moving = np.zeros(len(active), dtype=bool)
+    moving[: model.names.geometric] = moving[len(active) - len(model.fields) :] = True
+    error, turned = model.weighted_rows(with_spot(model, x), poses, active[moving])
+    slope = np.zeros((*turned.shape[:-4], int(active.sum()), *turned.shape[-2:]))
+    slope[..., moving[active], :, :] = turned[..., 0, :, :, :]
+    return -error[..., 0, :, :], slope
 
 
 def scaled_lstsq(matrix: Array, right: Array) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -34,6 +34,7 @@ class Closures(OnFlange):
     model: the arm at the m poses, sorted by socket.  first: (g,) where each socket begins.
     pairs: (l, 2) sockets whose distance (l,) is known [m].  labels: (g,) of the sockets.
     known: these distances as given.  sole_length: whether they are the only lengths of the fit.
+    loose: whether rows move with their own visit alone, the sockets standing where they do.
     """
 
     model: Model
@@ -43,6 +44,7 @@ class Closures(OnFlange):
     labels: tuple[str, ...] = ()
     known: tuple[tuple[str, str, float], ...] = ()
     sole_length: bool = True
+    loose: bool = False
 
     kind = "closures"
     own = SPOT
@@ -106,7 +108,7 @@ class Closures(OnFlange):
         """
         point, arms = motion(self.model, x, active)
         *batch, p, _, m = arms.shape
-        error, jacobian = -self.centred(point), self.centred(arms)
+        error, jacobian = -self.centred(point), arms if self.loose else self.centred(arms)
         parts = [error.reshape(*batch, 3 * m), jacobian.reshape(*batch, p, 3 * m)]
         if len(self.pairs):
             a, b = self.pairs.T
@@ -118,6 +120,22 @@ class Closures(OnFlange):
             parts[0] = np.concatenate([parts[0], weight * (self.distance - length)], axis=-1)
             parts[1] = np.concatenate([parts[1], weight * along.sum(axis=-2)], axis=-1)
         return parts[0], parts[1]
+
+    @property
+    def pose_of_row(self) -> Array:
+        """Axis by axis; a known distance with the first visit to its first socket."""
+        return np.concatenate([np.tile(np.arange(self.points), 3), self.first[self.pairs[:, 0]]])
+
+    def by_pose(self) -> Self:
+        """With the sockets where they are."""
+        return replace(self, loose=True)
+
+    def places_of_rows(self) -> Array:
+        """The sockets' places."""
+        here = np.repeat(np.arange(len(self.first)), self.visits)
+        of_visit = (here == np.arange(len(self.first))[:, None]).astype(float)
+        moved = np.kron(np.eye(3), of_visit)
+        return np.pad(moved, ((0, 0), (0, len(self.pairs))))
 
     def start(self, robot: Robot, free: Array) -> Array:
         """The ball's place on the flange for the arm as drawn, in which misclosures are linear."""
@@ -149,16 +167,16 @@ class Closures(OnFlange):
         centre = self.barycentres(places(self.model, x))
         goal = np.repeat(centre, self.visits, axis=-1).T
         q, _ = reach(robot, x.effects[:3], goal, robot.commanded(self.model.q))
-        return replace(self, model=arm_at(robot, q))
+        return replace(self, model=replace(self.model, q=robot.turned(q)))
 
     def mean_square(self, x: State) -> float:
         """Of visits about their socket [m^2]."""
         off = self.centred(places(self.model, x))
         return float((off**2).sum(axis=0).mean())
 
-    def errors(self, robot: Robot, x: State, data: RelativeData, held: Array) -> Array:
+    def errors(self, model: Model, x: State, data: RelativeData, held: Array) -> Array:
         """Of visits about their socket."""
-        return misclosures(places(arm_at(robot, data.at.q), x).T, data.socket, held)[None]
+        return misclosures(places(model, x).T, data.socket, held)[None]
 
     def placed(self, x: State, nominal: State) -> dict[str, Any]:
         """Ball in the last frame, sockets in the robot's base."""

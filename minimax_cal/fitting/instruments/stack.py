@@ -9,8 +9,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from minimax_cal.fitting.instruments.rows import Block, own_state
+from minimax_cal.fitting.instruments.data import RelativeData
+from minimax_cal.fitting.instruments.laws import NO_LAWS, Laws
+from minimax_cal.fitting.instruments.rows import Block, own_state, through
 from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.joint_fit import scene_of
+from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import BASE_NAMES, Names, State
 from minimax_cal.robots.robot import Robot
 
@@ -19,7 +24,12 @@ ANGLES = ("_rx", "_ry", "_rz", "_tilt1", "_tilt2")  # endings of names
 
 @dataclass(frozen=True)
 class OwnNames(Names):
-    """Parameters of an arm whose base is the frame, and so none of them, and of instruments."""
+    """Parameters of an arm whose base is the frame, and so none of them, and of instruments.
+
+    laws: units of the last ones, those of the laws by which the arm gives way.
+    """
+
+    laws: tuple[str, ...] = ()
 
     @cached_property
     def all(self) -> tuple[str, ...]:
@@ -32,7 +42,8 @@ class OwnNames(Names):
         """(p,) SI."""
         turned = [name.endswith(ANGLES) for name in self.all]
         length = self.linear & ~np.array(turned)
-        return tuple("m" if each else "rad" for each in length)
+        own = length[: self.count - len(self.laws)]
+        return (*("m" if each else "rad" for each in own), *self.laws)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,15 +51,17 @@ class Stack:
     """Instruments that share an arm.
 
     labels: of each; the names of a lone one's parameters go without.  precision: of each block's
-    rows, relative to any.  names: all p parameters, those of the instruments at the end.
-    given: (b,) variance of a row that is given, NaN where residuals say it [m^2].
+    rows, relative to any.  names: all p parameters, behind the arm's those of the instruments, and
+    last those of the laws.  given: (b,) variance of a row that is given, NaN where residuals say it
+    [m^2].  laws: by which the arm gives way.
     """
 
     blocks: tuple[Block, ...]
     labels: tuple[str, ...]
-    names: Names
+    names: OwnNames
     precision: Array
     given: Array
+    laws: Laws = NO_LAWS
 
     @staticmethod
     def of(robot: Robot, blocks: Sequence[Block], labels: Sequence[str]) -> Stack:
@@ -76,19 +89,68 @@ class Stack:
         ends = np.cumsum([0, *(len(block.own) for block in self.blocks)]).tolist()
         return tuple(slice(*pair) for pair in pairwise(ends))
 
+    @property
+    def lawless(self) -> int:
+        """Number of parameters before those of the laws."""
+        return self.names.count - len(self.laws.names)
+
+    def own(self, i: int) -> Array:
+        """Where the parameters of a block's own stand among all."""
+        return np.arange(self.names.geometric, self.names.count)[self.slots[i]]
+
     def columns(self, i: int) -> Array:
-        """Where the parameters of a block stand among all."""
-        first = self.names.geometric
-        own = np.arange(first, self.names.count)[self.slots[i]]
-        return np.concatenate([np.arange(first), own])
+        """Where the parameters that a block's rows depend on stand among all."""
+        every = np.arange(self.names.count)
+        return np.concatenate([every[: self.names.geometric], self.own(i), every[self.lawless :]])
 
     def state(self, mdh: Array, own: Sequence[Array]) -> State:
-        """A state of all blocks."""
-        return own_state(mdh, np.concatenate([*own, np.zeros(0)]))
+        """A state of all blocks, of an arm that does not give way."""
+        return own_state(mdh, np.concatenate([*own, np.zeros(len(self.laws.names))]))
 
     def part(self, x: State, i: int) -> State:
         """The state of a block."""
-        return replace(x, effects=x.effects[..., self.slots[i]])
+        first = self.names.geometric
+        return replace(x, effects=x.effects[..., self.columns(i)[first:] - first])
+
+    def values(self, x: State) -> Array:
+        """(k,) of the laws."""
+        return x.effects[..., self.lawless - self.names.geometric :]
+
+    def scenes(self, robot: Robot, data: Sequence[RelativeData], x: State) -> list[Scene]:
+        """What laws look at, block by block, with the geometry of a state.
+
+        data: of each block, in the order of its poses.
+        """
+        out = []
+        for i, (block, each) in enumerate(zip(self.blocks, data, strict=True)):
+            state = block.arm_state(self.part(x, i))
+            out.append(scene_of(robot, block.seen_at(each), block.model, state))
+        return out
+
+    def bent(
+        self, robot: Robot, data: Sequence[RelativeData], laws: Laws, x: State
+    ) -> tuple[Stack, State]:
+        """The same instruments looking at an arm that gives way, linear at a state; that state.
+
+        data: as `scenes`.  Laws that the stack did not have yet have the value 0.
+        """
+        values = self.values(x) if self.laws.names else np.zeros(len(laws.names))
+        blocks = []
+        for i, (block, each) in enumerate(zip(self.blocks, data, strict=True)):
+            state = replace(block.arm_state(self.part(x, i)), effects=values)
+            model = laws.on(block.model, robot, block.seen_at(each), state)
+            blocks.append(through(block, model))
+        stiff = self.names.effects[: self.lawless - self.names.geometric]
+        names = replace(self.names, effects=(*stiff, *laws.names), laws=laws.units)
+        own = x.effects[..., : len(stiff)]
+        stack = replace(self, blocks=tuple(blocks), names=names, laws=laws)
+        return stack, replace(x, effects=np.concatenate([own, values], axis=-1))
+
+    def model_at(self, robot: Robot, i: int, data: RelativeData, x: State) -> Model:
+        """The arm of a block at all rows of its data, its laws linear at a state."""
+        block = self.blocks[i]
+        state = replace(block.arm_state(self.part(x, i)), effects=self.values(x))
+        return self.laws.on(block.model_at(robot, data), robot, block.seen_at(data), state)
 
     def rows_by_block(self, x: State, active: Array) -> Iterator[tuple[Array, Array]]:
         """Of each block: measured minus predicted (..., rows), as heavy as those of any other.
@@ -140,39 +202,61 @@ class Known:
     """What is known of the links before any measurement.
 
     mean: (5 n,) as drawn.  sigma: (5 n,) how far they may be from there, infinite where nothing is
-    known [SI].
+    known [SI].  laws: (k,) the same of the laws' parameters, whose mean is 0.
     """
 
     mean: Array
     sigma: Array
+    laws: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def any(self) -> bool:
         """Whether anything is known."""
-        return bool(np.isfinite(self.sigma).any())
+        return bool(np.isfinite(self.sigma).any() or np.isfinite(self.laws).any())
+
+    def told(self, count: int) -> Array:
+        """(count,) True for parameters of which something is known."""
+        return self.weights(1.0, count) > 0.0
 
     def weights(self, variance: float, count: int) -> Array:
         """(count,) weights of all parameters beside rows of a variance [m^2 per unit^2]."""
-        return np.pad(variance / self.sigma**2, (0, count - len(self.sigma)))
+        links = np.pad(variance / self.sigma**2, (0, count - len(self.sigma)))
+        return links + np.pad(variance / self.laws**2, (count - len(self.laws), 0))
 
-    def off(self, x: State) -> Array:
-        """(..., 5 n) how far the links are from their mean."""
+    def off(self, x: State, count: int) -> Array:
+        """(..., count) how far the parameters are from their mean, 0 where they have none."""
         links = np.swapaxes(x.mdh, -1, -2)  # in the order of `parameters.links_of`
-        return np.asarray(self.mean - links.reshape(*links.shape[:-2], -1))
+        links = links.reshape(*links.shape[:-2], -1)
+        out = np.zeros((*links.shape[:-1], count))
+        out[..., : len(self.mean)] = self.mean - links
+        out[..., count - len(self.laws) :] = -x.effects[..., x.effects.shape[-1] - len(self.laws) :]
+        return out
 
 
 @dataclass(frozen=True, eq=False)
 class Squares:
     """The sum of squared rows over the active parameters, for `solvers.least_squares`.
 
-    Nothing is left to eliminate linearly.  known: of the links, which counts with the weights (p,)
-    where these are given.
+    Nothing is left to eliminate linearly.  known: of the links and the laws, which counts with the
+    weights (p,) where these are given.  room: (k, 2) between which the laws' parameters must lie.
     """
 
     stack: Stack
     active: Array
     known: Known | None = None
     weight: Array = field(default_factory=lambda: np.zeros(0))
+    room: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+    @property
+    def names(self) -> Names:
+        """Of all parameters."""
+        return self.stack.names
+
+    @property
+    def whole_room(self) -> Array:
+        """(e, 2) between which all that stands as effects in a state must lie."""
+        open_ends = np.full((self.stack.lawless - self.names.geometric, 2), np.inf)
+        return np.concatenate([open_ends * [-1.0, 1.0], self.room])
 
     @property
     def linear(self) -> Array:
@@ -192,9 +276,8 @@ class Squares:
         gradient = (jacobian @ error[..., None])[..., 0]
         gram = jacobian @ np.swapaxes(jacobian, -1, -2)
         if self.known and len(self.weight):
-            off = np.zeros((*cost.shape, len(self.active)))
-            off[..., : len(self.known.mean)] = self.known.off(x)
-            off, weight = off[..., self.active], self.weight[self.active]
+            off = self.known.off(x, len(self.active))[..., self.active]
+            weight = self.weight[self.active]
             cost = cost + (weight * off**2).sum(axis=-1)
             gradient = gradient + weight * off
             gram = gram + self.prior

@@ -89,10 +89,15 @@ class Wires(OnFlange):
         """(rows,) one each."""
         return np.ones(self.points)
 
+    @property
+    def pose_of_row(self) -> Array:
+        """Wire by wire."""
+        return np.nonzero(np.isfinite(self.length.T))[1]
+
     def split(self, x: State) -> tuple[Array, Array]:
         """Anchors (..., s, 3) and offsets (..., s) [m]."""
         s, own = self.length.shape[1], x.effects[..., 3:]
-        return own[..., : 3 * s].reshape(*own.shape[:-1], s, 3), own[..., 3 * s :]
+        return own[..., : 3 * s].reshape(*own.shape[:-1], s, 3), own[..., 3 * s : 4 * s]
 
     def misses(self, x: State) -> Array:
         """Measured minus predicted lengths: (..., s, m), NaN where not measured [m]."""
@@ -102,19 +107,19 @@ class Wires(OnFlange):
 
     def rows(self, x: State, active: Array) -> tuple[Array, Array]:
         """A row for each measured length: it grows as the target moves along the wire."""
-        arm = self.model.names.count
-        point, arms = motion(self.model, x, active[:arm])
+        first = self.model.names.geometric
+        point, arms = motion(self.model, x, active)
         anchors, offsets = self.split(x)
         gap = point[..., None, :, :] - anchors[..., None]
         distance = np.maximum(np.linalg.norm(gap, axis=-2), 1e-12)
         unit = gap / distance[..., None, :]
         *batch, s, m = distance.shape
-        own = np.zeros((*batch, 4 * s, s, m))
+        own = np.zeros((*batch, len(active), s, m))
         for i in range(s):
-            own[..., 3 * i : 3 * i + 3, i, :] = -unit[..., i, :, :]
-            own[..., 3 * s + i, i, :] = 1.0
+            own[..., first + 3 * i : first + 3 * i + 3, i, :] = -unit[..., i, :, :]
+            own[..., first + 3 * s + i, i, :] = 1.0
         along = np.einsum("...scm,...pcm->...psm", unit, arms)
-        jacobian = np.concatenate([along, own[..., active[arm:], :, :]], axis=-3)
+        jacobian = along + own[..., active, :, :]
         seen = np.isfinite(self.length.T)
         error = self.length.T - distance - offsets[..., None]
         return error[..., seen], jacobian[..., seen]
@@ -145,7 +150,7 @@ class Wires(OnFlange):
 
     def reference(self, robot: Robot, x: State) -> Wires:
         """At plenty of random poses."""
-        count = max(PLENTY, self.model.names.count + 4 * len(self.wires))
+        count = max(PLENTY, self.model.names.geometric + 4 * len(self.wires))
         model = plenty_of_poses(robot, self.model, count)
         return replace(self, model=model, length=np.zeros((count, len(self.wires))))
 
@@ -157,9 +162,9 @@ class Wires(OnFlange):
         """Of the misses of lengths [m^2]."""
         return float(np.nanmean(self.misses(x) ** 2))
 
-    def errors(self, robot: Robot, x: State, data: RelativeData, held: Array) -> Array:
+    def errors(self, model: Model, x: State, data: RelativeData, held: Array) -> Array:
         """The error of a length stands first of three."""
-        error = replace(self, model=arm_at(robot, data.at.q), length=data.length).misses(x)
+        error = replace(self, model=model, length=data.length).misses(x)
         return np.stack([error, *(np.where(np.isnan(error), np.nan, 0.0),) * 2], axis=-1)
 
     def listed(

@@ -194,12 +194,21 @@ class Pixels(Plain):
         error = self.seen.errors(scene) * depth / focal
         return float((error[:, self.seen.weight > 0.0] ** 2).sum(axis=0).mean())
 
-    def errors(self, robot: Robot, x: State, data: RelativeData, held: Array) -> Array:
+    @property
+    def pose_of_row(self) -> Array:
+        """u of all pixels, v of all; lenses with the first pose."""
+        return np.concatenate([np.tile(self.seen.pose, 2), np.zeros(self.lens_rows, dtype=int)])
+
+    def model_at(self, robot: Robot, data: RelativeData) -> Model:
+        """The arm alone."""
+        return arm_at(robot, data.at.q)
+
+    def errors(self, model: Model, x: State, data: RelativeData, held: Array) -> Array:
         """At the targets, of all images; wrong pixels are left out."""
-        pixels = data.images
-        model = PixelModel.of(robot, pixels, self.seen.on_flange)
+        robot, pixels = self.robot, data.images
+        every = PixelModel.of(robot, pixels, self.seen.on_flange)
         known = np.isin(np.arange(len(pixels.targets)), self.seen.target) | self.has_length
-        out = table_of(model, pixels, self.scene_of(x.mdh, x.effects), known[pixels.target])[0]
+        out = table_of(every, pixels, self.scene_of(x.mdh, x.effects), known[pixels.target])[0]
         wrong = judged_pixels(robot, pixels, held, self.fit).aside
         out[pixels.part[wrong], pixels.pose[wrong]] = np.nan
         return out

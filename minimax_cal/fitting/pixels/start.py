@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.instruments.data import RelativeData
-from minimax_cal.fitting.instruments.poses import poses_as_targets, spots_of, tool_of
+from minimax_cal.fitting.instruments.poses import posed, poses_as_targets, spots_of
 from minimax_cal.fitting.pixels.camera import undistorted
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.model import PixelModel, Scene, lens_of
@@ -25,7 +25,6 @@ from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import model_of
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
@@ -236,7 +235,7 @@ def by_poses(
         if kept.all() or kept.sum() < IMAGES:
             break
         targets = targets.take(kept)
-    tool = tool_of(Cell.of(robot, found, targets.target_names), spots_of(LEVER))
+    tool = posed(found.target_positions, spots_of(LEVER))
     still = np.linalg.inv(found.base)
     place, board = (tool, still) if model.on_flange else (still, tool)
     return place, board, data.board @ board[:3, :3].T + board[:3, 3]
