@@ -112,6 +112,7 @@ def cases(data: Path) -> Iterator[tuple[str, list[str]]]:
         yield f"relative {kind}", ["relative", arm, str(data / f"{kind}.csv"), "--json"]
     both = [str(data / f"{kind}.csv") for kind in ("wires", "closures")]
     yield "relative several", ["relative", arm, *both, "--json"]
+    yield "relative effects", ["relative", arm, *both, "--effects", "joint_compliance", "--json"]
     yield (
         "simulate",
         ["simulate", "ur10", "--poses", "9", "--compliance", "2", "-o", "simulated.csv"],
