@@ -20,7 +20,6 @@ from minimax_cal.cli.options import (
     result_options,
 )
 from minimax_cal.cli.stderr import tell
-from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
 from minimax_cal.judging.watching.health import check
 
@@ -71,7 +70,7 @@ def check_command(
         found.save(to.path)
         to.wrote(to.path)
     if to.as_json:
-        click.echo(json_text(found.to_dict()), nl=False)
+        click.echo(found.json(), nl=False)
     else:
         present(details, [found.headline()], [found.first_table()], found.tables,
                 keep(to.path, "checked.json"))  # fmt: skip

@@ -7,7 +7,6 @@ from pathlib import Path
 import click
 
 from minimax_cal.cli.options import DETAILS, PATH, InGroups, Output, keep, present, result_options
-from minimax_cal.ground.files import json_text
 from minimax_cal.judging.watching.comparison import compare
 
 
@@ -24,7 +23,7 @@ def compare_command(a: Path, b: Path, details: bool, to: Output) -> int:
     """
     found = compare(a, b)
     to.notice(*found.notices)
-    if to.deliver(lambda: json_text(found.to_dict())):
+    if to.deliver(found.json):
         present(details, [found.headline()], [found.first_table()], found.tables,
                 keep(to.path, "compared.json"))  # fmt: skip
     return 0

@@ -89,7 +89,7 @@ def gap_command(
     if to.deliver(found.json):
         first = found.table().brief("model", "RMS mm", "max mm", "fit says mm")
         advice = options.keep(to.path, "gap.json")
-        options.present(details, [found.headline()], [first], lambda: [found.table()], advice)
+        options.present(details, [found.headline()], [first], found.tables, advice)
     to.draw(save_simulator_gap, found)
     return options.exit_code(found.status) or int(not found.holds)
 
@@ -104,8 +104,7 @@ def gap_of_logs(
     to.wrote(chosen["write"], Path(found.module) if found.module else None)
     to.notice(*found.notices, *found.sentences())
     if to.deliver(found.json):
-        every = (found.table(), found.tracking_table())
         advice = options.keep(to.path, "gap.json")
-        options.present(details, [found.headline()], [every[0].brief()], lambda: every, advice)
+        options.present(details, [found.headline()], [found.table().brief()], found.tables, advice)
     to.draw(save_motion_gap, found)
     return 0

@@ -193,6 +193,6 @@ def show_motion(
         return 0
     options.present(
         details, [found.headline()], [found.told_table().brief()],
-        lambda: (found.told_table(), found.motion_table()), keep(to.path, "motion.csv"),
+        found.tables, keep(to.path, "motion.csv"),
     )  # fmt: skip
     return 0

@@ -109,7 +109,7 @@ def torques_command(
         to.notice(*(f"{made.written}: {text}" for text in made.sentences()))
     if to.deliver(lambda: json_text(found.to_dict() | (made.short() if made else {}))):
         options.present(
-            details, found.sentences(), [found.summary().brief()], found.tables,
+            details, found.sentences(), [found.budget_table().brief()], found.tables,
             advice(model, logs, write, to.path),
         )  # fmt: skip
     to.draw(save_motion, found)

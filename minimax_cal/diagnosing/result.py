@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,8 @@ from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.set_aside import WithThem, aside_sentence
 from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.files import finite, json_text, number, plain, write_whole
+from minimax_cal.ground.files import finite, number, plain
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import in_files
@@ -268,7 +268,7 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Diagnosis:
+class Diagnosis(Result):
     """What is still wrong with a calibrated robot.
 
     status: of the geometric fit.  verdict: one of VERDICTS.  effects: by share of the gap.
@@ -316,11 +316,6 @@ class Diagnosis:
 
     def __repr__(self) -> str:
         return f"<Diagnosis of {self.robot}: {self.verdict}. {self.headline()}>"
-
-    def _repr_html_(self) -> str:
-        """For a notebook."""
-        tables = "\n".join(table.html() for table in self.tables())
-        return f"<p>{escape(self.headline())}</p>\n{tables}"
 
     @cached_property
     def reasons(self) -> tuple[str, ...]:
@@ -485,14 +480,6 @@ class Diagnosis:
         with reading(source):
             return read(content, source)
 
-    def json(self) -> str:
-        """`to_dict` as text."""
-        return json_text(self.to_dict())
-
-    def save(self, path: Path | str) -> None:
-        """Write the JSON; never a half-written file."""
-        write_whole(path, self.json())
-
     def ladder_table(self) -> Table:
         """The error budget, step by step."""
         rows: list[tuple[TableCell, ...]] = [
@@ -576,10 +563,6 @@ class Diagnosis:
     def headline(self) -> str:
         """The verdict in words."""
         return " ".join(self.said)
-
-    def summary(self, width: int = 110) -> str:
-        """The result as plain text."""
-        return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
 
 
 def load_diagnosis(path: Path | str) -> Diagnosis:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.dynamics.logs import read_runs
+from minimax_cal.dynamics.logs.with_robot import against_robot
 from minimax_cal.dynamics.regressor import link_parameters
 from minimax_cal.dynamics.run import CURRENT, Run
 from minimax_cal.ground.arrays import Array
@@ -42,7 +43,10 @@ def read_logs(
 def runs_of(
     given: Robot | str | Path, robot: Robot, logs: Sequence[Run | str | Path] | str | Path
 ) -> tuple[Run, ...]:
-    """The runs, of this robot and of one unit.  Raises CalibrationError."""
+    """The runs of this robot and of one unit, with notices of what does not fit the robot.
+
+    Raises CalibrationError.
+    """
     runs = read_logs(given, logs)
     if not runs:
         raise OptionError("logs: name a file or more; each is a trajectory")
@@ -57,7 +61,7 @@ def runs_of(
                 f"{run.source}: is in {run.unit}, {runs[0].source} in {runs[0].unit}; diagnose "
                 "currents and torques apart"
             )
-    return runs
+    return tuple(against_robot(robot, run) for run in runs)
 
 
 def with_payload(runs: Sequence[Run], payload: Payload | None) -> list[Run]:

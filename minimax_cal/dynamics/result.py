@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,8 +17,9 @@ from minimax_cal.dynamics.probes import Unexplained
 from minimax_cal.dynamics.scene import YIELD, Arm
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
-from minimax_cal.ground.files import json_text, plain, write_whole
+from minimax_cal.ground.files import plain
 from minimax_cal.ground.records import Number, Part, Recorded, checked, reading
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.robots.robot import robot_from_dict
@@ -121,7 +121,7 @@ class FrictionCurve:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MotionDiagnosis:
+class MotionDiagnosis(Result):
     """Why the torques of an arm are not those of its model, and how far each effect closes the gap.
 
     unit: "N m" or "A", of torques.  models: a fit of each step of the budget but the first.
@@ -145,10 +145,6 @@ class MotionDiagnosis:
 
     def __repr__(self) -> str:
         return f"<MotionDiagnosis of {self.arm.robot.name}: {self.headline()}>"
-
-    def _repr_html_(self) -> str:
-        """For a notebook."""
-        return f"<p>{escape(self.headline())}</p>\n{self.summary().html()}"
 
     @property
     def arm(self) -> Arm:
@@ -188,10 +184,10 @@ class MotionDiagnosis:
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
-        every = (self.summary(), self.effects_table(), self.unexplained_table())
+        every = (self.budget_table(), self.effects_table(), self.unexplained_table())
         return tuple(table for table in every if table.rows)
 
-    def summary(self) -> Table:
+    def budget_table(self) -> Table:
         """The error budget: held-out RMS of each joint, step by step."""
         joints = [f"J{j + 1}" for j in range(len(self.budget[0].holdout_rms))]
         rows: tuple[tuple[Cell, ...], ...] = tuple(
@@ -230,14 +226,6 @@ class MotionDiagnosis:
             "models": [model_dict(model) for model in self.models],
             **plain({name: getattr(self, name) for name in KEPT}),
         }
-
-    def json(self) -> str:
-        """The JSON, as `save` writes it."""
-        return json_text(self.to_dict())
-
-    def save(self, path: Path | str) -> None:
-        """Write the diagnosis as JSON."""
-        write_whole(path, self.json())
 
     @staticmethod
     def from_dict(content: Mapping[str, Any], source: str = "motion diagnosis") -> MotionDiagnosis:

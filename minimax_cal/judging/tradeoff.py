@@ -28,7 +28,7 @@ from minimax_cal.fitting.options import Progress, silent, usable
 from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.stages import count_stage
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
@@ -175,7 +175,7 @@ class Choice:
 
 
 @dataclass(frozen=True, eq=False)
-class Tradeoff:
+class Tradeoff(Result):
     """The choices, from the least RMS to the least worst error on the training poses."""
 
     robot: str
@@ -226,9 +226,9 @@ class Tradeoff:
             f"{text}; on held-out poses RMS changes by {rms:+.0f} %, the largest by {most:+.0f} %."
         )
 
-    def summary(self, width: int = 120) -> str:
-        """The table and the headline as plain text."""
-        return f"{self.table().text(width)}\n\n{self.headline()}"
+    def tables(self) -> tuple[Table, ...]:
+        """Every choice."""
+        return (self.table(),)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -243,14 +243,6 @@ class Tradeoff:
             "notices": list(self.notices),
             "provenance": vars(self.provenance),
         }
-
-    def json(self) -> str:
-        """`to_dict` as text."""
-        return json_text(self.to_dict())
-
-    def save(self, path: Path | str) -> None:
-        """Write the JSON; never a half-written file."""
-        write_whole(path, self.json())
 
 
 def tradeoff(

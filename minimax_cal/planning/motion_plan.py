@@ -20,8 +20,9 @@ from minimax_cal.dynamics.regressor import (
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import json_text, plain, write_whole
+from minimax_cal.ground.files import plain
 from minimax_cal.ground.options import option
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.ground.tables import Cell as TableCell
@@ -105,7 +106,7 @@ class Told:
 
 
 @dataclass(frozen=True, eq=False)
-class MotionPlan:
+class MotionPlan(Result):
     """parts: in the order of driving.  told: what they will tell, for a noise of `noise` (n,)."""
 
     robot: Robot
@@ -184,18 +185,14 @@ class MotionPlan:
         """Points and speeds for a controller that joins them by itself."""
         return self.rows_of(unit, WAYPOINTS_HZ, True)
 
-    def save(self, path: Path | str) -> None:
-        """Write JSON."""
-        write_whole(path, self.json())
-
-    def json(self) -> str:
-        """JSON: the series' coefficients in SI, and what they will tell."""
-        return json_text(plain(self.to_dict()))
+    def tables(self) -> tuple[Table, ...]:
+        """What the motion will tell, and what moves."""
+        return self.told_table(), self.motion_table()
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """For JSON: the series' coefficients in SI, and what they will tell."""
         moved = self.motion_table()
-        return {
+        whole = {
             "schema": SCHEMA,
             "kind": "motion_plan",
             "robot": self.robot.name,
@@ -221,6 +218,7 @@ class MotionPlan:
             "notices": self.notices,
             "seconds": self.seconds,
         }
+        return dict(plain(whole))
 
 
 def shown(told: Told) -> str:

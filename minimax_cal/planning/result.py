@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import json_text, plain, write_whole
+from minimax_cal.ground.files import plain, write_whole
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.cell import Cell
@@ -34,7 +35,7 @@ MEANINGS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(Result):
     """Poses to measure.
 
     cell: the robot, its base and targets as assumed.  criterion: a key of MEANINGS.
@@ -188,10 +189,6 @@ class Plan:
             self.candidates.table(),
         )
 
-    def summary(self, width: int = 110) -> str:
-        """The plan as plain text."""
-        return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
-
     # ---- files ---------------------------------------------------------------------------------
 
     def csv(self, unit: str = "deg") -> str:
@@ -242,11 +239,3 @@ class Plan:
             "seconds": self.seconds,
         }
         return dict(plain(whole))
-
-    def json(self) -> str:
-        """`to_dict` as text."""
-        return json_text(self.to_dict())
-
-    def save(self, path: Path | str) -> None:
-        """Write the JSON; never a half-written file."""
-        write_whole(path, self.json())

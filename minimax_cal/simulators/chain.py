@@ -64,6 +64,24 @@ class Chain:
         """Of the joints."""
         return tuple(self.model.joint(j).name for j in self.joints)
 
+    @property
+    def places(self) -> Array:
+        """(n,) where the joints are in qpos."""
+        return np.array(self.model.jnt_qposadr[list(self.joints)])
+
+    @property
+    def dofs(self) -> Array:
+        """(n,) where they are in qvel and forces."""
+        return np.array(self.model.jnt_dofadr[list(self.joints)])
+
+    def in_model(self, model: Any) -> Chain:
+        """The same joints in another compiled model, whose bodies stand where they did."""
+        return replace(self, model=model, joints=self.ids_in(model))
+
+    def ids_in(self, model: Any) -> tuple[int, ...]:
+        """Of the joints of the same names in another model."""
+        return tuple(int(model.joint(name).id) for name in self.names)
+
     def servo(self, joint: int) -> int:
         """Id of the position actuator of a joint; -1 where there is none."""
         m = self.model
@@ -246,9 +264,7 @@ def as_urdf(model: Any, joints: Sequence[int], source: str) -> UrdfRobot:
               None, nothing)
     )  # fmt: skip
     name = Path(source).stem
-    carried = masses(model, data, bodies, poses)
-    about = inertias(model, data, bodies, poses)
-    urdf = Urdf(source, b"", name, "world", tuple(parts), carried, about)
+    urdf = Urdf(source, b"", name, "world", tuple(parts), *masses(model, data, bodies, poses))
     return to_robot(urdf)
 
 
@@ -261,37 +277,29 @@ def holders(model: Any, bodies: Bodies) -> Array:
     return holder
 
 
-def inertias(model: Any, data: Any, bodies: Bodies, poses: Sequence[Array]) -> dict[str, Array]:
-    """Inertia (3, 3) in the link's axes of the same, about its centre of gravity [kg m^2]."""
-    holder, out = holders(model, bodies), {}
+def masses(
+    model: Any, data: Any, bodies: Bodies, poses: Sequence[Array]
+) -> tuple[dict[str, tuple[float, Array]], dict[str, Array]]:
+    """What each joint alone carries, in its link's frame.
+
+    Mass [kg] and centre of gravity [m]; inertia (3, 3) about that [kg m^2], where there is some.
+    """
+    holder, weights, inertias = holders(model, bodies), {}, {}
     for i, pose in enumerate(poses):
         mine = np.flatnonzero(holder == i)
         total = float(model.body_mass[mine].sum())
         if total <= 0.0:
             continue
         centre = (model.body_mass[mine, None] * data.xipos[mine]).sum(axis=0) / total
+        weights[f"link_{i + 1}"] = total, inverse(pose)[:3, :3] @ (centre - pose[:3, 3])
         whole = np.zeros((3, 3))
         for body in mine:
             turn, arm = data.ximat[body].reshape(3, 3), data.xipos[body] - centre
             whole += turn @ np.diag(model.body_inertia[body]) @ turn.T
             whole += model.body_mass[body] * (arm @ arm * np.eye(3) - np.outer(arm, arm))
         if whole.any():
-            out[f"link_{i + 1}"] = pose[:3, :3].T @ whole @ pose[:3, :3]
-    return out
-
-
-def masses(
-    model: Any, data: Any, bodies: Bodies, poses: Sequence[Array]
-) -> dict[str, tuple[float, Array]]:
-    """Mass [kg] and centre of gravity in the link's frame [m] of what each joint alone carries."""
-    holder, out = holders(model, bodies), {}
-    for i, pose in enumerate(poses):
-        mine = np.flatnonzero(holder == i)
-        total = float(model.body_mass[mine].sum())
-        if total > 0.0:
-            centre = (model.body_mass[mine, None] * data.xipos[mine]).sum(axis=0) / total
-            out[f"link_{i + 1}"] = (total, inverse(pose)[:3, :3] @ (centre - pose[:3, 3]))
-    return out
+            inertias[f"link_{i + 1}"] = pose[:3, :3].T @ whole @ pose[:3, :3]
+    return weights, inertias
 
 
 def own_pose(attributes: dict[str, str], compiler: dict[str, str]) -> Array:

@@ -72,11 +72,6 @@ class Document:
         """Another one, to be changed by itself."""
         return deepcopy(self)
 
-    @property
-    def tree(self) -> ET.Element:
-        """The root of the tree."""
-        return self.root
-
     def raw(self, *, whole: bool = False) -> bytes:
         """The file.  whole: with all that it includes written out."""
         return self.before + self.element(self.root, b"", whole=whole) + self.after

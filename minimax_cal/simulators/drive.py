@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 from typing import Any
 
@@ -117,9 +117,9 @@ def visits(
 ) -> list[Visit]:
     """A run of moves, one after the other, with a model of its own."""
     mj, model = mujoco(), copy(chain.model)
-    chain_here = Chain(model, chain.joints, chain.seen, chain.robot, chain.base, chain.gravity)
+    chain_here = replace(chain, model=model)
     data, sides = mj.MjData(model), plays(chain_here)
-    at = np.array([int(model.jnt_qposadr[joint]) for joint in chain.joints])
+    at = chain.places
     moved = way_to(model, carrier(chain_here))
     dofs = np.array([int(model.jnt_dofadr[joint]) for joint in moved])
     rest = np.where(model.jnt_type[list(moved)] == 2, STILL_SLIDE, STILL)
@@ -180,7 +180,7 @@ class Limits:
                          open_ends)  # fmt: skip
         torque = np.where(m.jnt_actfrclimited[joints, None], m.jnt_actfrcrange[joints], open_ends)
         inside = 1.0 - 1e-9
-        return Limits(servos, np.array(m.jnt_dofadr[joints]), force * inside, torque * inside)
+        return Limits(servos, chain.dofs, force * inside, torque * inside)
 
     def reached(self, force: Array, torque: Array) -> Array:
         """(..., n) True where an actuator or its joint is at a limit."""
@@ -229,7 +229,7 @@ def set_joints(chain: Chain, commands: Array, play: Array | None) -> Driven:
     """The same for a model without servos: its joints are set and nothing moves."""
     model, mj, out = chain.model, mujoco(), []
     data = mj.MjData(model)
-    at = np.array([int(model.jnt_qposadr[joint]) for joint in chain.joints])
+    at = chain.places
     for row in range(len(commands)):
         data.qpos[at] = commands[row]
         for joint, place in plays(chain).items():

@@ -65,14 +65,11 @@ class Given:
     folder: Path
     assumed: bool = False
 
-    @property
-    def tree(self) -> ET.Element:
-        """The root of its tree."""
-        return self.document.root
-
     def compiled(self, tree: ET.Element | None = None) -> Any:
         """The model as MuJoCo sees it.  Raises RobotError."""
-        text = ET.tostring(assets_from(self.tree if tree is None else tree, self.folder.resolve()))
+        text = ET.tostring(
+            assets_from(self.document.root if tree is None else tree, self.folder.resolve())
+        )
         try:
             return mujoco().MjModel.from_xml_string(text.decode())
         except (ValueError, RuntimeError) as error:
@@ -306,13 +303,7 @@ def seats(
     nominal, robot: each with its frame 0 in the world (4, 4) [m].
     """
     model, parents = chain.model, {c: p for p in tree.iter() for c in p}
-    world = [e for part in tree.iter("worldbody") for e in part.iter("joint")]
-    named = {e.get("name"): e for e in world if e.get("name")}
-    missing = [name or "one without a name" for name in chain.names if name not in named]
-    if missing or len(set(chain.bodies)) < len(chain.bodies):
-        what = f"joint {missing[0]}" if missing else "two joints on one body"
-        raise RobotError(f"{given.source}: {what}: give each joint a name and a body of its own")
-    joints = [named[name] for name in chain.names]
+    joints = elements_of(tree, chain)
     bodies = [parents[joint] for joint in joints]
     for number, element in zip(chain.joints, joints, strict=True):
         if model.jnt_stiffness[number]:  # its own, or of its class
@@ -344,8 +335,20 @@ def seats(
         anchors=np.array([model.jnt_pos[j] for j in chain.joints]),
         axes=np.array([model.jnt_axis[j] for j in chain.joints]),
         drives=drives_of(chain),
-        degrees=compiler_of(given).get("angle", "degree") == "degree",
+        degrees=counts_degrees(given.document.root),
     )
+
+
+def elements_of(root: ET.Element, chain: Chain) -> list[ET.Element]:
+    """The elements of an arm's joints.  Raises RobotError."""
+    world = [e for part in root.iter("worldbody") for e in part.iter("joint")]
+    named = {e.get("name"): e for e in world if e.get("name")}
+    missing = [name or "one without a name" for name in chain.names if name not in named]
+    if missing or len(set(chain.bodies)) < len(chain.bodies):
+        what = f"joint {missing[0]}" if missing else "two joints on one body"
+        source = chain.seen.urdf.source
+        raise RobotError(f"{source}: {what}: give each joint a name and a body of its own")
+    return [named[name] for name in chain.names]
 
 
 def drives_of(chain: Chain) -> Drives:
@@ -383,8 +386,7 @@ def check_limits(chain: Chain, q: Array, source: str) -> None:
     if drives.gravity_free:
         return
     data = mj.MjData(model)
-    at = [int(model.jnt_qposadr[joint]) for joint in chain.joints]
-    dofs = [int(model.jnt_dofadr[joint]) for joint in chain.joints]
+    at, dofs = chain.places, chain.dofs
     for row in q:
         data.qpos[at] = row
         mj.mj_forward(model, data)
@@ -405,8 +407,7 @@ def largest_inertia(chain: Chain) -> Array:
     """(n,) about each joint, its motor's with it, over poses all over the workspace [kg m^2]."""
     model, mj = chain.model, mujoco()
     data, column = mj.MjData(model), np.zeros(model.nv)
-    at = [int(model.jnt_qposadr[joint]) for joint in chain.joints]
-    dofs = [int(model.jnt_dofadr[joint]) for joint in chain.joints]
+    at, dofs = chain.places, chain.dofs
     out = np.zeros(len(dofs))
     for row in random_joints(chain.robot, (SAMPLES,), np.random.default_rng(0)):
         data.qpos[at] = row
@@ -417,13 +418,18 @@ def largest_inertia(chain: Chain) -> Array:
     return out
 
 
-def compiler_of(given: Given) -> dict[str, str]:
+def compiler_of(root: ET.Element) -> dict[str, str]:
     """Attributes of the <compiler>, the last word of several."""
     out: dict[str, str] = {}
-    for element in given.tree:
+    for element in root:
         if element.tag == "compiler":
             out |= element.attrib
     return out
+
+
+def counts_degrees(root: ET.Element) -> bool:
+    """Whether a file counts angles in degrees."""
+    return compiler_of(root).get("angle", "degree") == "degree"
 
 
 def place(
@@ -442,7 +448,7 @@ def place(
     if difference(compiled, pose) <= SAME * 10.0:
         return
     if parents[body].tag not in ("body", "worldbody"):
-        own = own_pose(body.attrib, compiler_of(given))
+        own = own_pose(body.attrib, compiler_of(given.document.root))
         pose = own @ inverse(compiled) @ pose
     for name in ORIENTATIONS:
         body.attrib.pop(name, None)

@@ -6,7 +6,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -251,7 +250,7 @@ class Run:
         if path is None:
             return self.of(document)
         write_whole(path, content)
-        return self.chain_in(mujoco().MjModel.from_xml_path(str(path)))
+        return self.chain.in_model(mujoco().MjModel.from_xml_path(str(path)))
 
     def with_commands(self, whole: Arm, fit: Fit, path: Path | None) -> Rung:
         """The arm with all effects, driven with mapped commands.
@@ -292,12 +291,7 @@ class Run:
 
     def of(self, document: Document) -> Chain:
         """The arm in a changed tree."""
-        return self.chain_in(self.given.compiled(document.root))
-
-    def chain_in(self, model: Any) -> Chain:
-        """The same joints in another compiled model."""
-        joints = tuple(model.joint(name).id for name in self.chain.names)
-        return replace(self.chain, model=model, joints=joints)
+        return self.chain.in_model(self.given.compiled(document.root))
 
     def rung(
         self,

@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from html import escape
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field
 
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.ground.files import finite, json_text, plain, write_whole
+from minimax_cal.ground.files import finite, plain
 from minimax_cal.ground.records import Number, Part, Recorded, checked
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
-from minimax_cal.modelling.cell import saved_content
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.solvers.status import Status
 
@@ -53,7 +51,7 @@ class Rung:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SimulatorGap:
+class SimulatorGap(Result):
     """The gap between a simulator's model and measurements, as a ladder in the simulator itself.
 
     rungs: as given, without servo sag, with calibrated geometry, with each effect.  commands: the
@@ -81,10 +79,6 @@ class SimulatorGap:
 
     def __repr__(self) -> str:
         return f"<SimulatorGap of {self.model}: {self.headline()}>"
-
-    def _repr_html_(self) -> str:
-        """For a notebook."""
-        return f"<p>{escape(self.headline())}</p>\n{self.table().html()}"
 
     @property
     def holds(self) -> bool:
@@ -124,14 +118,6 @@ class SimulatorGap:
             part.seconds, part.provenance,
         )  # fmt: skip
 
-    def json(self) -> str:
-        """`to_dict` as text."""
-        return json_text(self.to_dict())
-
-    def save(self, path: Path | str) -> None:
-        """Write the JSON; never a half-written file."""
-        write_whole(path, self.json())
-
     def table(self) -> Table:
         """The ladder."""
         every = (*self.rungs, *([self.commands] if self.commands else []))
@@ -146,6 +132,10 @@ class SimulatorGap:
         header = ("model", "RMS mm", "max mm", "fit says mm", "joints off mrad", "")
         title = f"{self.robot} in the simulator: errors on {self.holdout_poses} held-out poses"
         return Table(title, header, rows, ("", ".4f", ".4f", ".4f", ".3f", ""))
+
+    def tables(self) -> tuple[Table, ...]:
+        """The ladder."""
+        return (self.table(),)
 
     def headline(self) -> str:
         """The result in a sentence or two."""
@@ -173,10 +163,6 @@ class SimulatorGap:
             text += f". Outside the measured region nothing is claimed: {self.beyond['reason']}"
         return text + "."
 
-    def summary(self, width: int = 110) -> str:
-        """The result as plain text."""
-        return f"{self.headline()}\n\n{self.table().text(width)}"
-
 
 class GapPart(Part):
     """The file of `minimax-cal gap -o`."""
@@ -197,8 +183,3 @@ class GapPart(Part):
     written: str = ""
     seconds: Number = math.nan
     provenance: Provenance
-
-
-def load_simulator_gap(path: Path | str) -> SimulatorGap:
-    """What `SimulatorGap.save` or `minimax-cal gap -o` wrote.  Raises CalibrationError."""
-    return SimulatorGap.from_dict(saved_content(path), str(path))

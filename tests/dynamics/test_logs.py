@@ -15,6 +15,7 @@ from dynamics.motions import fourier
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
+from minimax_cal.dynamics.given import runs_of
 from minimax_cal.dynamics.logs import are_logs, import_logs, read_runs, runs_text
 from minimax_cal.dynamics.logs.with_robot import against_robot, gravity
 from minimax_cal.ground.arrays import Array
@@ -470,21 +471,21 @@ def heavy_run(robot: mc.Robot, gain: float) -> mc.Run:
 def test_a_current_called_effort(robot: mc.Robot) -> None:
     n = robot.joints
     heavy = replace(robot, mass=np.full(n, 8.0), com=np.full((n, 3), 0.05))
-    assert against_robot(heavy, [heavy_run(heavy, 1.0)])[0].notices == ()
-    (run,) = against_robot(heavy, [heavy_run(heavy, 0.08)])
+    assert against_robot(heavy, heavy_run(heavy, 1.0)).notices == ()
+    run = against_robot(heavy, heavy_run(heavy, 0.08))
     assert [bool(re.search(r"joint [23] is 0.08\d* times what holds .* a current\?", text))
             for text in run.notices] == [True]  # fmt: skip
-    assert against_robot(heavy, [replace(run, unit="A", notices=())])[0].notices == ()
-    assert against_robot(robot, [replace(run, notices=())])[0].notices == ()  # no masses given
+    assert against_robot(heavy, replace(run, unit="A", notices=())).notices == ()
+    assert against_robot(robot, replace(run, notices=())).notices == ()  # no masses given
 
 
 def test_torques_of_other_joints_or_signs(robot: mc.Robot) -> None:
     n = robot.joints
     heavy = replace(robot, mass=np.full(n, 8.0), com=np.full((n, 3), 0.05))
     run = heavy_run(heavy, 1.0)
-    (told,) = against_robot(heavy, [replace(run, torque=run.torque[:, ::-1])])[0].notices
+    (told,) = against_robot(heavy, replace(run, torque=run.torque[:, ::-1])).notices
     assert re.search(r"the torque of joint [45] follows gravity at joint [23] .* order", told)
-    (told,) = against_robot(heavy, [replace(run, torque=-run.torque)])[0].notices
+    (told,) = against_robot(heavy, replace(run, torque=-run.torque)).notices
     assert re.search(r"joint [23] has the sign of gravity, not of what holds it", told)
 
 
@@ -493,18 +494,18 @@ def test_real_torques_are_those_of_the_arm() -> None:
         pytest.skip("no shared data")
     (real,) = read_runs(next(urdf.parent.glob("*.csv")))
     arm = mc.load_robot(urdf)
-    assert against_robot(arm, [real])[0].notices == ()
-    (told,) = against_robot(arm, [replace(real, unit="N m")])[0].notices
+    assert against_robot(arm, real).notices == ()
+    (told,) = against_robot(arm, replace(real, unit="N m")).notices
     assert "a current?" in told
     swapped = real.torque[:, [0, 2, 1, 3, 4, 5]]
-    (told,) = against_robot(arm, [replace(real, torque=swapped)])[0].notices
+    (told,) = against_robot(arm, replace(real, torque=swapped)).notices
     assert "the torque of joint 3 follows gravity at joint 2" in told
 
 
 def test_joints_outside_their_limits(robot: mc.Robot) -> None:
     run = heavy_run(replace(robot, mass=np.full(robot.joints, 8.0), com=np.zeros((6, 3))), 1.0)
     off = replace(run, q=run.q + np.array([0.0, 4.0, 0.0, 0.0, 0.0, 0.0]))
-    (told,) = against_robot(robot, [off])[0].notices
+    ((told,),) = [one.notices for one in runs_of(robot, robot, [off])]
     assert re.search(r"a.csv: joint 2 moves from .* deg, outside the limits of", told)
-    with pytest.raises(mc.DataError, match=r"a.csv: has 5 joints, but .* has 6"):
-        against_robot(robot, [replace(run, q=run.q[:, :5])])
+    with pytest.raises(mc.OptionError, match=r"a.csv: has 5 joints, .* has 6"):
+        runs_of(robot, robot, [replace(run, q=run.q[:, :5])])

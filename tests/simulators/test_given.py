@@ -112,8 +112,8 @@ def test_everything_stays_but_what_was_corrected(given: tuple[Path, Chain], tmp_
     path, chain = given
     cell = bent_cell(chain.robot, {"joint_compliance:all": [2e-6] * 5, "encoder_gain:J4": [1e-3]})
     corrected(path, chain, cell, tmp_path / "out.xml")
-    before = read_model(path).tree
-    after = read_model(tmp_path / "out.xml").tree
+    before = read_model(path).document.root
+    after = read_model(tmp_path / "out.xml").document.root
     own = {"smr1", "smr2", "smr3", "flange"}
     for parent in list(after.iter("body")):
         for site in [e for e in parent.findall("site") if e.get("name") in own]:

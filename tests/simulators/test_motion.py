@@ -31,7 +31,7 @@ from experiments.driven_arms import (  # noqa: E402
 from minimax_cal.simulators.motion import bodies  # noqa: E402
 from minimax_cal.simulators.motion.fit import least_within, levelling, speeds  # noqa: E402
 from minimax_cal.simulators.motion.module import loaded  # noqa: E402
-from minimax_cal.simulators.motion.result import load_motion_gap  # noqa: E402
+from minimax_cal.simulators.motion.result import MotionGap  # noqa: E402
 
 STEP = 0.002
 LACKS = Withheld(
@@ -68,7 +68,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     figure = folder / "gap.png"
     files = ("--write", out, "--json", "-o", text, "--figure", figure, "-q")
     assert run("gap", model, *logs, *files) == 0
-    gap = load_motion_gap(text)
+    gap = MotionGap.from_dict(json.loads(text.read_text()))
     return SimpleNamespace(arm=arm, model=model, logs=logs, out=out, gap=gap, text=text,
                            figure=figure)  # fmt: skip
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, regressor
 from minimax_cal.dynamics.run import TORQUE, Run
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError
 from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.robot import Robot
 
@@ -21,17 +20,9 @@ FOLLOWS = 0.9  # correlation of a torque with gravity; 0.93 to 0.96 at the shoul
 SLACK = 0.01  # of the range of a joint: how far outside its limits it may be
 
 
-def against_robot(robot: Robot, runs: Sequence[Run]) -> tuple[Run, ...]:
-    """The runs, with notices of what does not fit the robot.  Raises DataError for other joints."""
-    for run in runs:
-        if run.joints != robot.joints:
-            raise DataError(
-                f"{run.source}: has {run.joints} joints, but {robot.name} has {robot.joints}"
-            )
-    return tuple(
-        replace(run, notices=(*run.notices, *outside(robot, run), *odd_torque(robot, run)))
-        for run in runs
-    )
+def against_robot(robot: Robot, run: Run) -> Run:
+    """A run of the robot's joints, with notices of what does not fit it."""
+    return replace(run, notices=(*run.notices, *outside(robot, run), *odd_torque(robot, run)))
 
 
 def outside(robot: Robot, run: Run) -> Iterator[str]:

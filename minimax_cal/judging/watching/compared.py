@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from minimax_cal.ground.files import plain
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import for_people, in_files
 from minimax_cal.judging.watching.moved import Moved, moved_table
@@ -50,7 +51,7 @@ class Difference:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class Comparison(Result):
     """Two calibrations side by side.
 
     differences: of every link parameter.  changed: those that explain them, the clearest first.
@@ -120,10 +121,6 @@ class Comparison:
         return tuple(
             table for table in (self.changed_table(), self.common_table(), each) if table.rows
         )
-
-    def summary(self, width: int = 110) -> str:
-        """The result as plain text."""
-        return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: lengths in mm, angles in rad."""

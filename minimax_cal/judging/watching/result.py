@@ -10,6 +10,7 @@ from typing import Any
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.set_aside import WithThem, aside_sentence
 from minimax_cal.ground.files import json_text, plain, write_whole
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.tolerance import KINDS, Limit
 from minimax_cal.judging.watching.moved import Moved, moved_table
@@ -45,7 +46,7 @@ class Hidden:
 
 
 @dataclass(frozen=True, eq=False)
-class Health:
+class Health(Result):
     """What a few new poses say of a calibration.
 
     verdicts: of each requirement.  moved: parameters that have.  hidden: those that nobody could
@@ -157,10 +158,6 @@ class Health:
             tuple((h.parameter, h.like, h.needs) for h in self.hidden),
         )
         return tuple(table for table in (self.required_table(), moved, found, hidden) if table.rows)
-
-    def summary(self, width: int = 110) -> str:
-        """The result as plain text."""
-        return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of the contract, and more: lengths in mm, angles in rad."""

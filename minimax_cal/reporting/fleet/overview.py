@@ -9,9 +9,10 @@ from typing import Any
 
 from minimax_cal.fitting.options import silent
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import check_writable, json_text, made_folder, write_whole
+from minimax_cal.ground.files import check_writable, made_folder, write_whole
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.parallel import look_for
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.stages import count_stage
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.tolerance import NOT_PASSED, PASSED
@@ -24,7 +25,7 @@ GOOD, BAD = (PASSED, VALID), (NOT_PASSED, NOT_VALID, FAILED)
 
 
 @dataclass(frozen=True)
-class Fleet:
+class Fleet(Result):
     """What became of all cells, in the order of the file."""
 
     rows: tuple[Row, ...]
@@ -56,19 +57,15 @@ class Fleet:
         formats = ("", "", "", "", ".3f", ".3f", ".3f", "", "")
         return Table(f"cells of {self.source}", header, rows, formats)
 
-    def summary(self, width: int = 110) -> str:
-        """The result as plain text."""
-        return f"{self.headline()}\n\n{self.table().text(width)}"
+    def tables(self) -> tuple[Table, ...]:
+        """A row a cell."""
+        return (self.table(),)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         rows = [row.to_dict() for row in self.rows]
         counts = {"cells": len(rows), "failed": len(self.failed)}
         return {"schema": 1, "kind": "fleet", "source": self.source, **counts, "rows": rows}
-
-    def json(self) -> str:
-        """`to_dict` as text."""
-        return json_text(self.to_dict())
 
     def html(self) -> str:
         """One page that needs nothing else.  Raises OptionError without jinja2."""

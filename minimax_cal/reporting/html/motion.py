@@ -115,7 +115,7 @@ def verdict_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
 
 def budget_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
     """Tables of all rows and of moving ones, and how both fall."""
-    whole = found.summary()
+    whole = found.budget_table()
     moving: tuple[tuple[Cell, ...], ...] = tuple(
         (step.name, *step.holdout_rms_moving) for step in found.budget
     )

@@ -29,16 +29,10 @@ class Gains:
     damper: Array
 
 
-def places(chain: Chain) -> tuple[Array, Array]:
-    """(n,) where an arm's joints are in qpos, and in qvel."""
-    model, joints = chain.model, list(chain.joints)
-    return np.array(model.jnt_qposadr[joints]), np.array(model.jnt_dofadr[joints])
-
-
 def inverse_torque(chain: Chain, logs: Logs) -> Array:
     """(M, n) torque that a model takes for the motion of logs, as its drives feel it [N m]."""
     mj, model = mujoco(), chain.model
-    data, (at, dofs) = mj.MjData(model), places(chain)
+    data, (at, dofs) = mj.MjData(model), (chain.places, chain.dofs)
     out = np.empty(logs.motion.q.shape)
     joint, number, bristle = np.array(bristles_in(chain), dtype=int).reshape(-1, 3).T
     yields = given_bristles(chain)[1]
@@ -80,7 +74,7 @@ def follow_torques(
     inertia they are critically damped.  They make up for what the model gets wrong: where it is
     right, the arm follows the log by the measured torques alone.
     """
-    model, (at, dofs) = chain.model, places(chain)
+    model, at, dofs = chain.model, chain.places, chain.dofs
     wanted = CubicSpline(run.time, run.q)
     time = steps_of(run.time, chain)
     q, qd, ahead = wanted(time), wanted(time, 1), on_steps(run.time, torque, chain)
@@ -105,7 +99,7 @@ def by_gains(gains: Gains) -> Pull:
 def by_inertia(chain: Chain) -> Pull:
     """Drives whose gains follow the inertia of an arm."""
     mj, model = mujoco(), chain.model
-    data, (at, dofs) = mj.MjData(model), places(chain)
+    data, (at, dofs) = mj.MjData(model), (chain.places, chain.dofs)
     wanted, torque = np.zeros(model.nv), np.zeros(model.nv)
 
     def pull(q: Array, off: Array, slow: Array) -> Array:
@@ -120,7 +114,7 @@ def by_inertia(chain: Chain) -> Pull:
 
 def follow_gains(chain: Chain, run: Run, commands: Array, gains: Gains, source: str) -> Array:
     """(m, n) joint values where proportional and derivative drives bring an arm by commands."""
-    model, (at, dofs) = chain.model, places(chain)
+    model, at, dofs = chain.model, chain.places, chain.dofs
     wanted = on_steps(run.time, commands, chain)
 
     def drive(data: Any, now: int) -> None:
@@ -161,7 +155,7 @@ def on_steps(time: Array, values: Array, chain: Chain) -> Array:
 def stepped(chain: Chain, run: Run, drive: Callable[[Any, int], None], source: str) -> Array:
     """(m, n) joint values at the times of a run.  drive: sets what acts at a step."""
     mj, model = mujoco(), chain.model
-    data, (at, dofs) = mj.MjData(model), places(chain)
+    data, (at, dofs) = mj.MjData(model), (chain.places, chain.dofs)
     start = CubicSpline(run.time, run.q)
     data.qpos[at], data.qvel[dofs] = start(run.time[0]), start(run.time[0], 1)
     time = steps_of(run.time, chain)

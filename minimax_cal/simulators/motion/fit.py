@@ -410,7 +410,7 @@ def sense_of(study: Study, scene: Scene, numbers: Numbers) -> Array:
 def softness(chain: Chain, numbers: Numbers) -> tuple[Array, Array]:
     """(n,) D [kg m^2] and b [1/s] of the friction of each joint, as a model has it."""
     model = chain.model
-    dofs = [int(model.jnt_dofadr[j]) for j in chain.joints]
+    dofs = chain.dofs
     reference, impedance = np.array(model.dof_solref[dofs]), np.array(model.dof_solimp[dofs])
     start, end = np.clip(impedance[:, :2].T, *IMPEDANCES)
     time = np.maximum(reference[:, 0], 2.0 * float(model.opt.timestep))
@@ -421,7 +421,7 @@ def softness(chain: Chain, numbers: Numbers) -> tuple[Array, Array]:
 def weights(chain: Chain, numbers: Numbers) -> Array:
     """(n,) inverse inertia of each joint at rest in a model with other masses [1/(kg m^2)]."""
     mj, model = mujoco(), copy(chain.model)
-    dofs = [int(model.jnt_dofadr[j]) for j in chain.joints]
+    dofs = chain.dofs
     for body, pseudo in zip(chain.bodies, numbers.bodies, strict=True):
         values = inertial(pseudo)
         model.body_mass[body], model.body_ipos[body] = values["mass"][0], values["pos"]

@@ -99,7 +99,7 @@ def motion_gap(
     progress("reading the model and the logs")
     runs = read_logs(model, logs)
     opened = open_model(model, runs[0].joints if runs else 0, tip)
-    runs_of(model, opened.chain.robot, runs)
+    runs = runs_of(model, opened.chain.robot, runs)
     with threadpool_limits(limits=1, user_api="blas"):
         judge = Judge.of(opened, runs, (holdout, holdout_run), payload, drive_gain, ratio)
         judge = judge.driving(opened, gains) if driven else judge

@@ -64,10 +64,7 @@ class Numbers:
 
 def given_numbers(chain: Chain, bodies: Bodies) -> Numbers:
     """Those of a model."""
-    model = chain.model
-    dofs = [int(model.jnt_dofadr[j]) for j in chain.joints]
-    joints = list(chain.joints)
-    places = [int(model.jnt_qposadr[j]) for j in joints]
+    model, dofs, joints = chain.model, chain.dofs, np.array(chain.joints)
     damping = np.column_stack([model.dof_damping[dofs], of_powers(model, "dof_dampingpoly", dofs)])
     spring = np.column_stack(
         [model.jnt_stiffness[joints], of_powers(model, "jnt_stiffnesspoly", joints)]
@@ -79,7 +76,7 @@ def given_numbers(chain: Chain, bodies: Bodies) -> Numbers:
         friction=np.array(model.dof_frictionloss[dofs]) + held.sum(axis=1),
         damping=damping,
         stiffness=spring,
-        rest=np.array(model.qpos_spring[places]),
+        rest=np.array(model.qpos_spring[chain.places]),
         gain=np.ones(len(dofs)),
         bristles=held,
         yields=yields,
@@ -111,7 +108,7 @@ def given_bristles(chain: Chain) -> tuple[Array, Array, Array]:
     return held, yields, damped
 
 
-def of_powers(model: Any, name: str, places: list[int]) -> Array:
+def of_powers(model: Any, name: str, places: Array) -> Array:
     """(n, 2) of the higher powers, 0 in a MuJoCo that has none."""
     found = getattr(model, name, None)
     return np.zeros((len(places), POWERS - 1)) if found is None else np.array(found[places])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.errors import OptionError
@@ -36,20 +35,14 @@ class Opened:
     def again(self, document: Document) -> Opened:
         """The same arm in a changed tree."""
         given = replace(self.given, document=document)
-        model = given.compiled()
-        return replace(self, given=given, chain=self.chain_in(model))
+        return replace(self, given=given, chain=self.chain.in_model(given.compiled()))
 
     def rebuilt(self, given: Given) -> Opened:
         """The arm of the same joints, whose bodies may stand elsewhere."""
         model = given.compiled()
-        joints = tuple(int(model.joint(name).id) for name in self.chain.names)
+        joints = self.chain.ids_in(model)
         chain = chain_along(model, joints, given.source, unknown=given.assumed)
         return replace(self, given=given, chain=chain)
-
-    def chain_in(self, model: Any) -> Chain:
-        """The same joints in another compiled model."""
-        joints = tuple(int(model.joint(name).id) for name in self.chain.names)
-        return replace(self.chain, model=model, joints=joints)
 
     def content(self, path: Path | None) -> bytes:
         """The file, to be written at a path."""

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from html import escape
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from minimax_cal.ground.files import json_text, plain, write_whole
+from minimax_cal.ground.files import plain
 from minimax_cal.ground.records import Number, Part, Recorded, checked
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell, Table
-from minimax_cal.modelling.cell import saved_content
 from minimax_cal.simulators.result import KIND
 
 
@@ -58,7 +56,7 @@ class WrittenElement:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MotionGap:
+class MotionGap(Result):
     """The gap between a simulator's model and logs of the arm, measured in the simulator.
 
     rungs: as given, then with each element.  elements: what was corrected, with its worth.
@@ -82,10 +80,6 @@ class MotionGap:
     def __repr__(self) -> str:
         return f"<MotionGap of {self.model}: {self.headline()}>"
 
-    def _repr_html_(self) -> str:
-        """For a notebook."""
-        return f"<p>{escape(self.headline())}</p>\n{self.table().html()}"
-
     def to_dict(self) -> dict[str, Any]:
         """The JSON of the contract, and more; `from_dict` reads it back."""
         return {"schema": 1, "kind": KIND, "along": "trajectories", **plain(self)}
@@ -96,14 +90,6 @@ class MotionGap:
         part = checked(MotionGapPart, content, source)
         names = MotionGap.__dataclass_fields__
         return MotionGap(**{name: getattr(part, name) for name in names})
-
-    def json(self) -> str:
-        """`to_dict` as text."""
-        return json_text(self.to_dict())
-
-    def save(self, path: Path | str) -> None:
-        """Write the JSON; never a half-written file."""
-        write_whole(path, self.json())
 
     def headline(self) -> str:
         """The result in a sentence or two."""
@@ -138,14 +124,14 @@ class MotionGap:
         title = f"RMS torque [{self.unit}] while moving, held out ({', '.join(self.held_out)})"
         return by_joint(title, [(rung.name, rung.torque_rms_moving) for rung in self.rungs])
 
+    def tables(self) -> tuple[Table, ...]:
+        """Torques, and joint errors where drives moved the arm."""
+        return (self.table(), *((self.tracking_table(),) if self.drives else ()))
+
     def tracking_table(self) -> Table:
         """RMS joint error under the drives, rung by rung."""
         title = f"RMS joint error [mrad] under {self.drives}"
         return by_joint(title, [(rung.name, rung.tracking_rms_mrad) for rung in self.rungs])
-
-    def summary(self, width: int = 110) -> str:
-        """The result as plain text."""
-        return f"{self.headline()}\n\n{self.table().text(width)}"
 
 
 def by_joint(title: str, rows: list[tuple[str, tuple[float, ...]]]) -> Table:
@@ -172,8 +158,3 @@ class MotionGapPart(Part):
     written: str = ""
     module: str = ""
     seconds: Number = 0.0
-
-
-def load_motion_gap(path: Path | str) -> MotionGap:
-    """What `gap MODEL LOG... -o` or `MotionGap.save` wrote.  Raises CalibrationError."""
-    return MotionGap.from_dict(saved_content(path), str(path))

@@ -9,7 +9,6 @@ import numpy as np
 
 from minimax_cal.dynamics.regressor import inertial_parameters
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import RobotError
 from minimax_cal.robots.gravity import LEAST_MASS, masses_of, weighed
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import tail
@@ -17,6 +16,7 @@ from minimax_cal.simulators.arm import stiff
 from minimax_cal.simulators.chain import Chain
 from minimax_cal.simulators.document import Document
 from minimax_cal.simulators.elements import known, numbers, section, tune
+from minimax_cal.simulators.given import counts_degrees, elements_of
 from minimax_cal.simulators.mjcf import new_tree
 from minimax_cal.simulators.motion.bodies import Bodies, inertial, parameters_of, pseudo_inertia
 from minimax_cal.simulators.motion.numbers import Numbers, bristle
@@ -31,42 +31,25 @@ SHORTEST = 0.5  # of a timestep: a shorter delay is none
 
 
 def write_numbers(document: Document, chain: Chain, given: Numbers, found: Numbers) -> None:
-    """Change a model's elements to what was found, where that differs from what it has."""
-    joints, holders = elements_of(document.root, chain)
-    for i, (joint, body) in enumerate(zip(joints, holders, strict=True)):
+    """Change a model's elements to what was found, where that differs from what it has.
+
+    Raises RobotError.
+    """
+    parents = {child: parent for parent in document.root.iter() for child in parent}
+    for i, joint in enumerate(elements_of(document.root, chain)):
         if differs(found.bodies[i], given.bodies[i]):
-            weigh(body, found.bodies[i])
+            weigh(parents[joint], found.bodies[i])
         put(joint, "armature", found.armature[i], given.armature[i])
         put(joint, "frictionloss", found.loss[i], given.loss[i])
         put(joint, "damping", powers(found.damping[i]), powers(given.damping[i]))
         put(joint, "stiffness", powers(found.stiffness[i]), powers(given.stiffness[i]))
         if differs(found.stiffness[i], given.stiffness[i]):
             rest = found.rest[i]
-            turns = chain.model.jnt_type[chain.joints[i]] != 2 and degrees(document.root)
+            turns = chain.model.jnt_type[chain.joints[i]] != 2 and counts_degrees(document.root)
             joint.set("springref", numbers([np.degrees(rest) if turns else rest]))
     write_gains(document.root, chain, found)
     write_delay(document.root, chain, found)
     write_bristles(document.root, chain, found)
-
-
-def elements_of(root: ET.Element, chain: Chain) -> tuple[list[ET.Element], list[ET.Element]]:
-    """The elements of an arm's joints, and of the bodies that carry them.  Raises RobotError."""
-    parents = {child: parent for parent in root.iter() for child in parent}
-    world = [e for part in root.iter("worldbody") for e in part.iter("joint")]
-    named = {e.get("name"): e for e in world if e.get("name")}
-    for name in chain.names:
-        if name not in named:
-            raise RobotError(
-                f"joint {name or 'without a name'}: give each joint a name and a body of its own"
-            )
-    joints = [named[name] for name in chain.names]
-    return joints, [parents[joint] for joint in joints]
-
-
-def degrees(root: ET.Element) -> bool:
-    """Whether a file counts angles in degrees."""
-    said = [c.get("angle") for c in root.iter("compiler") if c.get("angle")]
-    return (said[-1] if said else "degree") == "degree"
 
 
 def differs(found: Array, given: Array) -> bool:
