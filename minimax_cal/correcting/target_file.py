@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import numpy as np
 from minimax_cal.correcting.compensate import Compensation
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.files import csv_text
 from minimax_cal.measuring.columns import (
     JOINT,
     TARGET,
@@ -41,17 +40,15 @@ class TargetFile:
 
     def corrected(self, found: Compensation) -> str:
         """The same file with other joints, and what remains at each target."""
-        stream = io.StringIO()
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([*self.file.header, *ADDED])
+        rows = [[*self.file.header, *ADDED]]
         joints = {i: m for i, name in enumerate(self.file.header) if (m := JOINT.fullmatch(name))}
         for k, row in enumerate(self.file.rows):
             out = list(row)
             for i, match in joints.items():
                 out[i] = f"{found.q[k, int(match[1]) - 1] / UNITS[match[2]]:.9f}"
             left = (f"{1e3 * found.distance[k]:.6f}", f"{1e3 * found.angle[k]:.6f}")
-            writer.writerow([*out, *left, str(found.outcome[k])])
-        return stream.getvalue()
+            rows.append([*out, *left, str(found.outcome[k])])
+        return csv_text(rows)
 
 
 def read_targets(path: Path | str) -> TargetFile:

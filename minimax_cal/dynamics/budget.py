@@ -10,7 +10,7 @@ import numpy as np
 
 from minimax_cal.dynamics.laws import Term
 from minimax_cal.dynamics.model import FRICTION, RIGID, Normal, held_friction, solve_scaled
-from minimax_cal.dynamics.rows import Logs
+from minimax_cal.dynamics.rows import Logs, rms_by_joint
 from minimax_cal.dynamics.search import Columns
 from minimax_cal.ground.arrays import Array
 
@@ -95,8 +95,7 @@ class LeftOut:
     def rms(self, missed: Array, moving: Array | None = None) -> Array:
         """(n,) of each joint over the rows left out, or the moving ones of them (R, n)."""
         rows = self.judged[:, None] & (np.ones(missed.shape, bool) if moving is None else moving)
-        count = np.maximum(rows.sum(axis=0), 1)
-        return np.asarray(np.sqrt((missed**2 * rows).sum(axis=0) / count))
+        return rms_by_joint(missed, rows)
 
 
 def products_of(normal: Normal, rows: Array) -> tuple[Array, Array]:

@@ -34,6 +34,8 @@ from minimax_cal.dynamics.result import (
     NotTestable,
     Parameter,
     best_worth,
+    changed_joints,
+    worth_by_joint,
 )
 from minimax_cal.dynamics.rows import ROW_HZ, Logs, prepare, whitening
 from minimax_cal.dynamics.run import CURRENT, Run
@@ -293,9 +295,8 @@ def worth_of(judge: LeftOut, whole: Array, missed: Array) -> dict[str, tuple[flo
     """Of each joint that changes by a thousandth, the RMS of moving rows without and with it."""
     moving = judge.normal.columns.scene.logs.moving
     ends = judge.rms(missed, moving), judge.rms(whole, moving)
-    pairs = {f"J{j + 1}": (float(a), float(b)) for j, (a, b) in enumerate(zip(*ends, strict=True))}
-    shown = {key: (a, b) for key, (a, b) in pairs.items() if abs(a - b) > 1e-3 * a}
-    return shown or pairs
+    every = worth_by_joint(*ends)
+    return changed_joints(every) or every
 
 
 def is_minor(worth: dict[str, tuple[float, float]], before: Array) -> bool:
@@ -418,8 +419,7 @@ def changed_link(change: LinkChange) -> MotionEffect:
         Parameter(name, float(v), float(s), unit)
         for name, unit, v, s in zip(law.names, law.units, change.value, change.sigma, strict=True)
     )
-    worth = {f"J{j + 1}": (float(a), float(b))
-             for j, (a, b) in enumerate(zip(change.before, change.after, strict=True))}  # fmt: skip
+    worth = worth_by_joint(change.before, change.after)
     others = tuple(Alternative("payload" if k == count - 1 else "link_inertia", f"L{k + 1}", 1.0,
                                "a run with a known payload") for k in change.others)  # fmt: skip
     return MotionEffect(effect, f"L{change.link + 1}", parameters, worth, others,

@@ -11,14 +11,14 @@ import numpy as np
 
 from minimax_cal.dynamics.given import runs_of
 from minimax_cal.dynamics.model import TorqueModel
-from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
-from minimax_cal.dynamics.rows import Logs, prepare
+from minimax_cal.dynamics.result import MotionDiagnosis, load_motion, table_by_joint
+from minimax_cal.dynamics.rows import Logs, prepare, rms_by_joint
 from minimax_cal.dynamics.run import Run
 from minimax_cal.dynamics.scene import Scene
 from minimax_cal.dynamics.search import Columns
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,8 @@ class MotionEvaluation:
 
     def table(self) -> Table:
         """RMS of all rows by joint, step by step."""
-        joints = [f"J{j + 1}" for j in range(len(self.steps[0].rms))]
-        rows: tuple[tuple[Cell, ...], ...] = tuple((one.name, *one.rms) for one in self.steps)
         title = f"RMS torque [{self.unit}] on {', '.join(self.runs)}, all rows"
-        return Table(title, ("step", *joints), rows, ("", *[".3g"] * len(joints)))
+        return table_by_joint(title, "step", [(one.name, one.rms) for one in self.steps])
 
 
 def missed(model: TorqueModel, logs: Logs, columns: Columns) -> Array:
@@ -112,10 +110,7 @@ def evaluate_motion(
         if id(model.context) not in columns:
             columns[id(model.context)] = Columns(model.context.in_scene(scene))
         off = missed(model, prepared, columns[id(model.context)])
-        count = np.maximum(prepared.moving.sum(axis=0), 1)
-        moving = np.sqrt((off**2 * prepared.moving).sum(axis=0) / count)
-        whole = np.sqrt((off**2).mean(axis=0))
-        steps.append(MotionStepError(model.name, tuple(map(float, whole)),
-                                     tuple(map(float, moving))))  # fmt: skip
+        whole, moving = rms_by_joint(off), rms_by_joint(off, prepared.moving)
+        steps.append(MotionStepError(model.name, tuple(whole.tolist()), tuple(moving.tolist())))
     said = tuple(text for run in runs for text in run.notices)
     return MotionEvaluation(found.unit, tuple(steps), prepared.names, said)

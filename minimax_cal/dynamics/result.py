@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -29,6 +29,7 @@ SCHEMA = 1
 WORDS = {"coulomb": "Coulomb friction", "viscous": "viscous friction",
          "link_inertia": "mass or inertia of a link"}  # fmt: skip
 WORDS |= {name: law.words for name, law in LAWS.items()}
+SHOWN = 1e-3  # relative change of a joint's RMS that is listed
 SENTENCES = {
     "named": "Cause identified",
     "one_of": "Ambiguous cause",
@@ -189,12 +190,9 @@ class MotionDiagnosis(Result):
 
     def budget_table(self) -> Table:
         """The error budget: held-out RMS of each joint, step by step."""
-        joints = [f"J{j + 1}" for j in range(len(self.budget[0].holdout_rms))]
-        rows: tuple[tuple[Cell, ...], ...] = tuple(
-            (step.name, *step.holdout_rms) for step in self.budget
-        )
         title = f"Held-out RMS torque [{self.unit}], all rows ({self.held_out})"
-        return Table(title, ("step", *joints), rows, ("", *[".3g"] * len(joints)))
+        rows = [(step.name, step.holdout_rms) for step in self.budget]
+        return table_by_joint(title, "step", rows)
 
     def effects_table(self) -> Table:
         """The effects, the most valuable first."""
@@ -259,6 +257,24 @@ def grouped(effects: tuple[MotionEffect, ...]) -> str:
     usual = [WORDS[name] for name in USUAL]
     order = sorted(places, key=lambda words: words in usual)  # what a toolbox has comes last
     return "; ".join(f"{words} at {', '.join(sorted(places[words]))}" for words in order)
+
+
+def table_by_joint(title: str, what: str, rows: Sequence[tuple[str, Sequence[float]]]) -> Table:
+    """A number of each joint, row by row.  what: the rows' names are."""
+    joints = [f"J{j + 1}" for j in range(len(rows[0][1]))]
+    cells: tuple[tuple[Cell, ...], ...] = tuple((name, *values) for name, values in rows)
+    return Table(title, (what, *joints), cells, ("", *[".3g"] * len(joints)))
+
+
+def worth_by_joint(without: Array, with_it: Array) -> dict[str, tuple[float, float]]:
+    """RMS without and with something (n,) each, by joint."""
+    pairs = zip(without, with_it, strict=True)
+    return {f"J{j + 1}": (float(a), float(b)) for j, (a, b) in enumerate(pairs)}
+
+
+def changed_joints(worth: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    """Of the joints that something changes by a thousandth or more."""
+    return {joint: (a, b) for joint, (a, b) in worth.items() if abs(a - b) > SHOWN * a}
 
 
 def best_worth(one: MotionEffect) -> tuple[str, tuple[float, float]]:

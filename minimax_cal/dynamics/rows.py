@@ -331,6 +331,14 @@ class Whitening:
         return np.asarray(out * own[:, AR_ORDER])
 
 
+def rms_by_joint(missed: Array, rows: Array | None = None) -> Array:
+    """(n,) RMS of what is missed (R, n), of all rows or of some of each joint (R, n)."""
+    if rows is None:
+        return np.asarray(np.sqrt((missed**2).mean(axis=0)))
+    count = np.maximum(rows.sum(axis=0), 1)
+    return np.asarray(np.sqrt((missed**2 * rows).sum(axis=0) / count))
+
+
 def in_order(kept: Array, run: Array) -> Array:
     """(N,) fitted rows of the same joint and run just before, at most AR_ORDER."""
     out = np.zeros(kept.shape, dtype=int)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import csv
 import errno
+import io
 import json
 import math
 import os
 import tempfile
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -148,6 +150,13 @@ def made_folder(path: Path) -> Path:
 def json_text(content: object) -> str:
     """JSON as this project writes it; NaN, which JSON does not know, raises ValueError."""
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """CSV as this project writes it, the header first."""
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerows(rows)
+    return stream.getvalue()
 
 
 def json_of(text: str | bytes) -> Any:

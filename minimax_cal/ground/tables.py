@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from minimax_cal.ground.files import csv_text
 from minimax_cal.ground.words import visible
 
 Cell = str | float | int
@@ -111,11 +111,7 @@ class Table:
 
     def csv(self) -> str:
         """Header and rows at full precision."""
-        stream = io.StringIO()
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(self.header)
-        writer.writerows(self.rows)
-        return stream.getvalue()
+        return csv_text((self.header, *self.rows))
 
     def latex(self) -> str:
         """A booktabs tabular with the title as caption."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -13,7 +11,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.ground.files import write_whole
+from minimax_cal.ground.files import csv_text, write_whole
 from minimax_cal.ground.words import name_first, one_line
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.columns import (
@@ -427,11 +425,7 @@ def measurements_text(data: Measurements) -> str:
     header += [f"{name}_{axis}_mm" for name in data.target_names for axis in "xyz"]
     named = {name: file_column(name) for name in data.columns}
     header += [name for name, _ in named.values()]
-    stream = io.StringIO()
-    if data.simulated:
-        stream.write(f"{SIMULATED}\n")
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header)
+    rows = [header]
     for j in range(data.poses):
         q = data.q[j] * np.where(data.sliding, 1e3, 1.0)
         y = data.y[j].reshape(3 * k) * 1e3
@@ -444,8 +438,8 @@ def measurements_text(data: Measurements) -> str:
             else:
                 number = float(value) * named[name][1]
                 row.append("" if np.isnan(number) else f"{number:.9g}")
-        writer.writerow(row)
-    return stream.getvalue()
+        rows.append(row)
+    return (f"{SIMULATED}\n" if data.simulated else "") + csv_text(rows)
 
 
 def file_column(stem: str) -> tuple[str, float]:

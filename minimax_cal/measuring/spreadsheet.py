@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from datetime import date, datetime, time
 from pathlib import Path
 
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.files import csv_text
 
 SUFFIXES = (".xlsx", ".xlsm", ".xls", ".ods")
 
@@ -42,10 +41,7 @@ def text_of_workbook(path: Path | str, mark: str = "\t") -> str:
 
 def csv_of_workbook(path: Path | str) -> str:
     """The same as CSV."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerows(line.split("\t") for line in text_of_workbook(path).splitlines())
-    return stream.getvalue()
+    return csv_text(line.split("\t") for line in text_of_workbook(path).splitlines())
 
 
 def numbers_in(table: Sequence[Sequence[object]]) -> int:

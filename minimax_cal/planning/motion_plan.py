@@ -36,7 +36,7 @@ from minimax_cal.planning.motion import (
     improved,
     shrunk,
 )
-from minimax_cal.planning.stops import ANGLES, csv_text
+from minimax_cal.planning.stops import ANGLES, rounded_csv
 from minimax_cal.planning.visibility import THICK, Room
 from minimax_cal.robots.gravity import masses_of, weighed
 from minimax_cal.robots.robot import Robot, load_robot
@@ -175,7 +175,7 @@ class MotionPlan(Result):
                 row = [float(value) for block in blocks for value in block[at]]
                 load = [f"{part.payload:g}"] if loaded else []
                 rows.append([part.name, f"{t:.6g}", *row, *load])
-        return csv_text(header, rows)
+        return rounded_csv(header, rows)
 
     def csv(self, unit: str = "deg") -> str:
         """The motion, in the columns of a log: drive it, and add the torques."""

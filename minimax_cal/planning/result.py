@@ -20,7 +20,7 @@ from minimax_cal.planning.observability import INDICES
 from minimax_cal.planning.promise import Growth, Separation
 from minimax_cal.planning.prospect import Instrument
 from minimax_cal.planning.route import Visits
-from minimax_cal.planning.stops import csv_text, stops
+from minimax_cal.planning.stops import rounded_csv, stops
 
 SCHEMA = 1
 POWER = "separate"  # the criterion that is a power: the larger the better
@@ -193,7 +193,7 @@ class Plan(Result):
 
     def csv(self, unit: str = "deg") -> str:
         """The stops as CSV.  unit: of turning joints."""
-        return csv_text(*stops(self.visits, self.cell, self.expected, unit))
+        return rounded_csv(*stops(self.visits, self.cell, self.expected, unit))
 
     def save_csv(self, path: Path | str, unit: str = "deg") -> None:
         """Write the stops; never a half-written file."""

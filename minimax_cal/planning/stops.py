@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import csv_text
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.planning.route import Visits
@@ -48,15 +47,11 @@ def stops(
     return header, rows
 
 
-def csv_text(header: Sequence[str], rows: Sequence[Sequence[TableCell]]) -> str:
+def rounded_csv(header: Sequence[str], rows: Sequence[Sequence[TableCell]]) -> str:
     """The file: angles to a microdegree or less, lengths to 1 um, empty where not seen."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header)
     digits = [{"rad": 9, "deg": 6}.get(name.rpartition("_")[2], 3) for name in header]
-    for row in rows:
-        writer.writerow([written(cell, d) for cell, d in zip(row, digits, strict=True)])
-    return stream.getvalue()
+    cells = ([written(*each) for each in zip(row, digits, strict=True)] for row in rows)
+    return csv_text([header, *cells])
 
 
 def written(cell: TableCell, digits: int) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -62,25 +62,28 @@ def only_known(known: Collection[str], given: object, free: tuple[str, ...] = ()
     return given
 
 
-class UnitsSchema(BaseModel):
-    """Units of a robot file."""
+class Strict(BaseModel):
+    """A part of a robot file: what is not known would be ignored in silence, and is refused."""
 
     model_config = ConfigDict(extra="forbid")
-
-    length: Literal["mm", "m"]
-    angle: Literal["rad", "deg"]
+    notes: ClassVar[tuple[str, ...]] = ()  # how keys begin that are nobody's
 
     @model_validator(mode="before")
     @classmethod
     def no_slip(cls, given: object) -> object:
-        """What is not known would be ignored in silence."""
-        return only_known(cls.model_fields, given)
+        """The keys, if all are known.  Raises ValueError with the nearest."""
+        return only_known(cls.model_fields, given, cls.notes)
 
 
-class JointSchema(BaseModel):
+class UnitsSchema(Strict):
+    """Units of a robot file."""
+
+    length: Literal["mm", "m"]
+    angle: Literal["rad", "deg"]
+
+
+class JointSchema(Strict):
     """One joint of a robot file, in the file's units."""
-
-    model_config = ConfigDict(extra="forbid")
 
     a: Finite
     d: Finite
@@ -99,45 +102,23 @@ class JointSchema(BaseModel):
     drive_gain: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] | None = None
     name: str = ""
 
-    @model_validator(mode="before")
-    @classmethod
-    def no_slip(cls, given: object) -> object:
-        """What is not known would be ignored in silence."""
-        return only_known(cls.model_fields, given)
 
-
-class EndSchema(BaseModel):
+class EndSchema(Strict):
     """What follows the last joint of modified DH, as the a, alpha and beta of a next row."""
-
-    model_config = ConfigDict(extra="forbid")
 
     a: Finite = 0.0
     alpha: Finite = 0.0
     beta: Finite = 0.0
 
-    @model_validator(mode="before")
-    @classmethod
-    def no_slip(cls, given: object) -> object:
-        """What is not known would be ignored in silence."""
-        return only_known(cls.model_fields, given)
 
-
-class WithinSchema(BaseModel):
+class WithinSchema(Strict):
     """How well the drawing is known: standard deviations of its lengths and of its angles."""
-
-    model_config = ConfigDict(extra="forbid")
 
     mm: Annotated[float, Field(gt=0.0, lt=100.0)] = 0.3
     mrad: Annotated[float, Field(gt=0.0, lt=100.0)] = 0.5
 
-    @model_validator(mode="before")
-    @classmethod
-    def no_slip(cls, given: object) -> object:
-        """What is not known would be ignored in silence."""
-        return only_known(cls.model_fields, given)
 
-
-class RobotSchema(BaseModel):
+class RobotSchema(Strict):
     """A robot file.  Keys that begin as `FREE` says are notes; others are refused."""
 
     model_config = ConfigDict(
@@ -147,6 +128,7 @@ class RobotSchema(BaseModel):
             "additionalProperties": False,
         },
     )
+    notes = FREE
 
     name: str
     convention: str = CONVENTION
@@ -158,12 +140,6 @@ class RobotSchema(BaseModel):
     repeatability_mm: Annotated[float, Field(gt=0.0, lt=100.0)] | None = None
     nominal: Literal["drawn", "rough"] = "drawn"
     drawn_within: WithinSchema = WithinSchema()
-
-    @model_validator(mode="before")
-    @classmethod
-    def no_slip(cls, given: object) -> object:
-        """What is not known would be ignored in silence."""
-        return only_known(cls.model_fields, given, FREE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +9,7 @@ import numpy as np
 from minimax_cal.dynamics.run import TORQUE, Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.files import csv_text
 
 
 def runs_text(runs: Sequence[Run], sliding: Array) -> str:
@@ -38,11 +37,9 @@ def runs_text(runs: Sequence[Run], sliding: Array) -> str:
             blocks.append((names, [None if v is None else v * scale for v in given]))
     blocks.append(([f"{letter}{j + 1}_{u}" for j, u in enumerate(drive)], [r.torque for r in runs]))
     blocks += [block for block in (warmth(runs, n), payload(runs)) if block]
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
     many = len(runs) > 1
     header = [name for names, _ in blocks for name in names]
-    writer.writerow([*(["run"] if many else []), "t_s", *header])
+    lines = [[*(["run"] if many else []), "t_s", *header]]
     for at, run in enumerate(runs):
         parts = [values[at] for _, values in blocks]
         widths = [len(names) for names, _ in blocks]
@@ -50,8 +47,8 @@ def runs_text(runs: Sequence[Run], sliding: Array) -> str:
             cells = [f"{run.time[row]:.6f}"]
             for part, width in zip(parts, widths, strict=True):
                 cells += [""] * width if part is None else [f"{v:.9g}" for v in part[row]]
-            writer.writerow([*([run.name] if many else []), *cells])
-    return stream.getvalue()
+            lines.append([*([run.name] if many else []), *cells])
+    return csv_text(lines)
 
 
 def warmth(runs: Sequence[Run], n: int) -> tuple[list[str], list[Array | None]] | None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,7 +21,7 @@ from minimax_cal.fitting.instruments.data import (
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.ground.files import write_whole
+from minimax_cal.ground.files import csv_text, write_whole
 from minimax_cal.measuring.columns import (
     JOINT,
     TARGET,
@@ -290,12 +288,8 @@ def write_relative(path: Path | str, data: RelativeData) -> None:
     for stem, column in at.columns.items():
         name, factor = ("rotation_u95_rad", 1.0) if stem == "rotation_u95" else file_column(stem)
         columns[name] = column if column.dtype.kind == "U" else factor * column
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(columns)
-    for row in zip(*columns.values(), strict=True):
-        writer.writerow([cell(value) for value in row])
-    write_whole(path, stream.getvalue())
+    rows = ([cell(value) for value in row] for row in zip(*columns.values(), strict=True))
+    write_whole(path, csv_text([list(columns), *rows]))
 
 
 def contact_columns(data: RelativeData) -> dict[str, Array]:

@@ -12,7 +12,14 @@ import numpy as np
 from minimax_cal.dynamics.diagnose import MATTERS
 from minimax_cal.dynamics.laws import CURVE as SPEED_CURVE
 from minimax_cal.dynamics.laws import LAWS, Term
-from minimax_cal.dynamics.result import WORDS, MotionDiagnosis, MotionEffect, best_worth
+from minimax_cal.dynamics.result import (
+    WORDS,
+    MotionDiagnosis,
+    MotionEffect,
+    best_worth,
+    changed_joints,
+    worth_by_joint,
+)
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress
 from minimax_cal.simulators.motion.bristles import fit_bristles
@@ -48,7 +55,6 @@ ATTRIBUTES = {  # of the elements, in the order in which they are shown
 }
 STAYS = 1e-3  # fall of the mean log RMS torque by which an element stays
 MODULE = 0.01  # the same, for a module beside the file, and of all rows for friction at rest
-SHOWN = 1e-3  # relative change of a joint's RMS that is listed
 LEVELS = ("degressive", "stribeck")  # laws that damping of higher powers comes near to
 SPRUNG, GEARED = ("cable",), ("drive_gain",)
 IN_FILE = frozenset({"armature", "delay", *LEVELS, *SPRUNG, *GEARED})
@@ -290,21 +296,15 @@ def rung(bench: Bench, one: Candidate, name: str, progress: Progress) -> MotionR
     return bench.judge.rung(name, one.opened.chain, one.numbers, one.module, one.missed)
 
 
-def worth_of(without: Array, with_it: Array) -> dict[str, tuple[float, float]]:
-    """RMS torque without and with something, of the joints where it changes."""
-    pairs = zip(without, with_it, strict=True)
-    every = {f"J{j + 1}": (float(a), float(b)) for j, (a, b) in enumerate(pairs)}
-    return {key: (a, b) for key, (a, b) in every.items() if abs(a - b) > SHOWN * b}
-
-
 def worths(bench: Bench, plain: Candidate) -> Iterator[WrittenElement]:
     """What each element of the file is worth."""
     for name, attributes in ATTRIBUTES.items():
         if name in plain.asked.elements:
             bare = bench.candidate(plain.asked.without(name))
             rows = "whole" if name == BRISTLES else "moving"
-            yield WrittenElement(name, "file", attributes, worth_of(
-                getattr(bare.missed, rows), getattr(plain.missed, rows)))  # fmt: skip
+            ends = (getattr(one.missed, rows) for one in (bare, plain))
+            worth = changed_joints(worth_by_joint(*ends))
+            yield WrittenElement(name, "file", attributes, worth)
 
 
 def law_worths(bench: Bench, full: Candidate) -> Iterator[WrittenElement]:
@@ -312,7 +312,7 @@ def law_worths(bench: Bench, full: Candidate) -> Iterator[WrittenElement]:
     for effect in effects_of(full.asked.laws):
         bare = bench.candidate(without_law(full.asked, effect))
         where = ", ".join(t.place for t in full.asked.laws if t.effect == effect)
-        worth = worth_of(bare.missed.moving, full.missed.moving)
+        worth = changed_joints(worth_by_joint(bare.missed.moving, full.missed.moving))
         yield WrittenElement(WORDS[effect], "module", f"at {where}", worth)
 
 

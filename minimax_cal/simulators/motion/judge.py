@@ -10,7 +10,7 @@ import numpy as np
 
 from minimax_cal.dynamics.diagnose import named_runs
 from minimax_cal.dynamics.given import Payload, known_of, ratios_of, torque_gains, with_payload
-from minimax_cal.dynamics.rows import Logs, prepare
+from minimax_cal.dynamics.rows import Logs, prepare, rms_by_joint
 from minimax_cal.dynamics.run import Run
 from minimax_cal.dynamics.scene import Arm, Scene
 from minimax_cal.ground.arrays import Array
@@ -121,10 +121,8 @@ class Judge:
 
     def torque(self, chain: Chain, numbers: Numbers | None = None) -> Missed:
         """What a model gets wrong on the runs that judge."""
-        off = self.off(chain, self.held, numbers) ** 2
-        moving = self.held.moving
-        count = np.maximum(moving.sum(axis=0), 1)
-        return Missed(np.sqrt(off.mean(axis=0)), np.sqrt((off * moving).sum(axis=0) / count))
+        off = self.off(chain, self.held, numbers)
+        return Missed(rms_by_joint(off), rms_by_joint(off, self.held.moving))
 
     @cached_property
     def known(self) -> Array:
@@ -163,13 +161,8 @@ class Judge:
         with installed(module, chain):
             off = self.torque(chain, numbers) if missed is None else missed
             where = self.tracking(chain, numbers) if self.drives else np.zeros(0)
-        return MotionRung(name, floats(off.whole * self.arm.gain), floats(off.whole),
-                          floats(off.moving), floats(1e3 * where))  # fmt: skip
-
-
-def floats(values: Array) -> tuple[float, ...]:
-    """Plain numbers."""
-    return tuple(map(float, values))
+        sizes = (off.whole * self.arm.gain, off.whole, off.moving, 1e3 * where)
+        return MotionRung(name, *(tuple(size.tolist()) for size in sizes))
 
 
 def command_of(run: Run) -> Array:

@@ -9,10 +9,11 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from minimax_cal.dynamics.result import table_by_joint
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.records import Number, Part, Recorded, checked
 from minimax_cal.ground.results import Result
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.simulators.result import KIND
 
 
@@ -122,7 +123,8 @@ class MotionGap(Result):
     def table(self) -> Table:
         """RMS torque of each joint, rung by rung."""
         title = f"RMS torque [{self.unit}] while moving, held out ({', '.join(self.held_out)})"
-        return by_joint(title, [(rung.name, rung.torque_rms_moving) for rung in self.rungs])
+        rows = [(rung.name, rung.torque_rms_moving) for rung in self.rungs]
+        return table_by_joint(title, "model", rows)
 
     def tables(self) -> tuple[Table, ...]:
         """Torques, and joint errors where drives moved the arm."""
@@ -131,14 +133,8 @@ class MotionGap(Result):
     def tracking_table(self) -> Table:
         """RMS joint error under the drives, rung by rung."""
         title = f"RMS joint error [mrad] under {self.drives}"
-        return by_joint(title, [(rung.name, rung.tracking_rms_mrad) for rung in self.rungs])
-
-
-def by_joint(title: str, rows: list[tuple[str, tuple[float, ...]]]) -> Table:
-    """A table of a number for each joint."""
-    joints = [f"J{j + 1}" for j in range(len(rows[0][1]))]
-    cells: tuple[tuple[Cell, ...], ...] = tuple((name, *values) for name, values in rows)
-    return Table(title, ("model", *joints), cells, ("", *[".3g"] * len(joints)))
+        rows = [(rung.name, rung.tracking_rms_mrad) for rung in self.rungs]
+        return table_by_joint(title, "model", rows)
 
 
 class MotionGapPart(Part):
