@@ -105,8 +105,7 @@ class Leftover:
 
 def without(effects: Fitted, term: Term) -> Fitted:
     """Fitted effects less one, all its lines."""
-    kept = [i for i, other in enumerate(effects.terms) if other.label != term.label]
-    return Fitted(tuple(effects.terms[i] for i in kept), tuple(effects.values[i] for i in kept))
+    return effects.where(lambda other: other.label != term.label)
 
 
 # ---- the residual map --------------------------------------------------------------------------

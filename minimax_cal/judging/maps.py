@@ -32,6 +32,7 @@ from minimax_cal.measuring.spans import (
     spans_in_words,
 )
 from minimax_cal.modelling.cell import Cell
+from minimax_cal.robots.ranges import SLIDE, near_zero
 from minimax_cal.robots.robot import Robot
 
 Predict = Callable[[Array], Array]  # joints (m, n) [rad, m] -> radius that holds 95 % (m,) [m]
@@ -40,7 +41,6 @@ WIDER = 0.25  # share of the poses' range added at either end where a limit is n
 NEAR = 0.95  # share of the training poses that count as near another one
 LITTLE = 0.5  # a joint that moved over less of its range is worth a notice
 LEVEL, DOUBT = 0.95, 0.01  # share that the radius holds; chance of as few, below which it is told
-SLIDE = 0.5  # of a slide without limits and without poses [m]
 
 
 def unknown(q: Array) -> Array:
@@ -251,22 +251,16 @@ def joint_range(robot: Robot, q: Array) -> tuple[Array, Array]:
 
     q: (m, n) poses that say what to sample where a limit is not known; m may be 0.
     """
-    most = np.where(robot.prismatic, SLIDE, np.pi)
+    most, turn = (np.where(robot.prismatic, far, np.pi) for far in (SLIDE, np.inf))
     low, high = -most, most
     if len(q):
         low, high = q.min(axis=0), q.max(axis=0)
         more = WIDER * (high - low)
-        turn = np.where(robot.prismatic, np.inf, np.pi)
         low = np.minimum(low, np.maximum(low - more, -turn))
         high = np.maximum(high, np.minimum(high + more, turn))
     lower = np.where(np.isfinite(robot.lower), robot.lower, low)
     upper = np.where(np.isfinite(robot.upper), robot.upper, high)
-    bound = np.where(robot.prismatic, np.inf, np.pi)
-    outside = (lower > bound) | (upper < -bound)  # a range beyond a turn stays as it is
-    return (
-        np.where(outside, lower, np.maximum(lower, -bound)),
-        np.where(outside, upper, np.minimum(upper, bound)),
-    )
+    return near_zero(lower, upper, turn)
 
 
 def tcp_place(cell: Cell, q: Array) -> Array:

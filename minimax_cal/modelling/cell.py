@@ -227,7 +227,7 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
     cell = Cell(robot_from_dict(robot, source), base, names, spots, effects, sessions)
     try:
         scene = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
-        for term, value in zip(effects.terms, effects.values, strict=True):
+        for term, value in effects.pairs:
             names = term.columns(scene).names
             if len(names) != len(value):
                 raise ValueError(f"{term.label}: {len(value)} values for {', '.join(names)}")

@@ -12,7 +12,7 @@ from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
-from minimax_cal.modelling.effects.table import EFFECTS, Fitted, Term
+from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.inverse import NEAR, at_poses, missing, nearest
 
@@ -258,17 +258,11 @@ def arm_of(cell: Cell) -> Cell:
     """
     middle = cell.target_positions.mean(axis=0) if len(cell.target_positions) else np.zeros(3)
     moving = flange_terms(cell)
-    kept = [
-        (term, value)
-        for term, value in zip(cell.effects.terms, cell.effects.values, strict=True)
-        if term in moving
-    ]
-    effects = Fitted(tuple(term for term, _ in kept), tuple(value for _, value in kept))
     return replace(
         cell,
         target_names=CORNERS,
         target_positions=middle + USUAL_LEVER * TETRAHEDRON,
-        effects=effects,
+        effects=cell.effects.where(moving.__contains__),
     )
 
 

@@ -13,9 +13,9 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.planning.visibility import ARM, Condition, Room, Sight, View
+from minimax_cal.robots.ranges import SLIDE, near_zero
 from minimax_cal.robots.robot import Robot
 
-SLIDE = 0.5  # how far a slide without limits goes to either side [m]
 Conditions = Mapping[str, Condition]
 
 
@@ -70,9 +70,7 @@ def limits_of(
     went = ~known & ~named & (least < largest)
     lower = np.where(np.isfinite(robot.lower), robot.lower, np.where(went, least, -most))
     upper = np.where(np.isfinite(robot.upper), robot.upper, np.where(went, largest, most))
-    once = known & ~robot.prismatic & (np.maximum(lower, -np.pi) < np.minimum(upper, np.pi))
-    lower = np.where(once, np.maximum(lower, -np.pi), lower)
-    upper = np.where(once, np.minimum(upper, np.pi), upper)
+    lower, upper = near_zero(lower, upper, np.where(known & ~robot.prismatic, np.pi, np.inf))
     for joint, (low, high) in narrow.items():
         lower[joint], upper[joint] = max(lower[joint], low), min(upper[joint], high)
         if not lower[joint] < upper[joint]:

@@ -6,6 +6,8 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 
+SLIDE = 0.5  # how far a slide without limits goes to either side [m]
+
 
 def near_zero(lower: Array, upper: Array, most: Array | float = np.pi) -> tuple[Array, Array]:
     """(n,) ends of the part of joint ranges within `most` of zero.

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.robots.ranges import near_zero
+from minimax_cal.robots.ranges import SLIDE, near_zero
 from minimax_cal.robots.robot import Robot
-
-SLIDE = 0.5  # how far a slide goes to either side, at most [m]
 
 
 def joint_range(robot: Robot, span: float = np.pi) -> tuple[Array, Array]:

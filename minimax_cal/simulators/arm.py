@@ -138,8 +138,7 @@ def imitated(
     cell: Cell, scene: Scene, parts: Parts, measured: Measurements | None, *, fixed: bool
 ) -> tuple[Springs, State]:
     """Springs that do what laws do, and the geometry that they begin from."""
-    terms = (*parts.soft, *parts.sagging)
-    laws = Fitted(tuple(t for t, _ in terms), tuple(v for _, v in terms))
+    laws = Fitted.of((*parts.soft, *parts.sagging))
     plain = replace(cell, effects=NOTHING)
     model = model_of(cell.robot, replace(scene.data, y=plain.predict(scene.data.q)))
     geometry = np.moveaxis(model.jacobian(plain.state), 1, 2)
@@ -216,15 +215,13 @@ class Parts:
 
     def whole(self) -> Arm:
         """The arm with what no element holds."""
-        terms, values = [t for t, _ in self.mapped], [v for _, v in self.mapped]
-        mapped = Fitted(tuple(terms), tuple(values))
-        return replace(self.arm, mapped=mapped, left_out=tuple(self.left_out))
+        return replace(self.arm, mapped=Fitted.of(self.mapped), left_out=tuple(self.left_out))
 
 
 def parts_of(cell: Cell, scene: Scene, arm: Arm) -> Parts:
     """What is to hold each effect of a cell; those of 0 need nothing.  arm: to begin with."""
     parts = Parts(arm)
-    for term, values in zip(cell.effects.terms, cell.effects.values, strict=True):
+    for term, values in cell.effects.pairs:
         if values.any():
             ELEMENTS.get(term.effect, without_element)(parts, scene, term, values)
     return parts
@@ -241,8 +238,7 @@ def held_terms(cell: Cell) -> tuple[Term, ...]:
             ELEMENTS.get(term.effect, without_element)(parts, scene, term, values)
         return not parts.left_out
 
-    pairs = zip(cell.effects.terms, cell.effects.values, strict=True)
-    return tuple(term for term, values in pairs if is_held(term, values))
+    return tuple(term for term, values in cell.effects.pairs if is_held(term, values))
 
 
 def unheld(cell: Cell, data: Measurements) -> tuple[Term, ...]:

@@ -75,7 +75,7 @@ def springs_of(
     """
     wanted = sum(
         (np.tensordot(v, t.columns(scene).displacement(scene), 1)
-         for t, v in zip(laws.terms, laws.values, strict=True)),
+         for t, v in laws.pairs),
         np.zeros(scene.points.shape),
     )  # fmt: skip
     seen = np.isfinite(left).reshape(-1)

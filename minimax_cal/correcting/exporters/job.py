@@ -99,13 +99,12 @@ def compliance_of(cell: Cell) -> Array:
     """
     out = np.full(cell.robot.joints, np.nan)
     scene = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
-    laws = zip(cell.effects.terms, cell.effects.values, strict=True)
-    compliances = [(term, values) for term, values in laws if term.effect == JOINT_COMPLIANCE.name]
-    for term, values in compliances:
+    compliances = cell.effects.where(lambda term: term.effect == JOINT_COMPLIANCE.name)
+    for term, values in compliances.pairs:
         for name, value in zip(term.columns(scene).names, values, strict=True):
             if name[1:].isdigit():
                 out[int(name[1:]) - 1] = value
-    for term, _ in compliances:
+    for term in compliances.terms:
         if stiffens(term.choice):
             out[joint_of(term.place)] = np.nan
     return out

@@ -104,7 +104,6 @@ def parts_of(robot: Robot, i: int, links: Sequence[str]) -> list[Part]:
     others = [int(j) for j in np.flatnonzero(shares) if j != i]
     ends = [links[i], *(f"link_{i + 1}_with_{j + 1}" for j in others)]
     ends = [*ends, links[i + 1]] if shares[i] else [*ends[:-1], links[i + 1]]
-    drives = joint_names(robot)
     drives, follow = joint_names(robot), []
     for at, j in enumerate(others):
         low, high = sorted(float(shares[j] * end) for end in (robot.lower[j], robot.upper[j]))

@@ -17,7 +17,7 @@ from minimax_cal.measuring.grouping import regions
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import labels
-from minimax_cal.modelling.effects.table import EFFECTS, Fitted
+from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.modelling.effects.words import name_effect
 
 LEAST_FOOT = 3  # reflectors on the foot tell where it stands
@@ -47,14 +47,13 @@ def watched_of(
         )
     foot, foot_now = (NOBODY, NOBODY) if frame else feet(fit, data)
     place = dict(zip(cell.target_names, cell.target_positions, strict=True))
-    kept = [
-        (term, value)
-        for term, value in zip(cell.effects.terms, cell.effects.values, strict=True)
-        if not EFFECTS[term.effect].of_session
-        and (term.place not in cell.target_names or term.place in data.target_names)
-    ]
-    terms, values = tuple(term for term, _ in kept), tuple(value for _, value in kept)
-    gone = [name_effect(*term.key) for term in cell.effects.terms if term not in terms]
+    kept = cell.effects.where(
+        lambda term: (
+            not EFFECTS[term.effect].of_session
+            and (term.place not in cell.target_names or term.place in data.target_names)
+        )
+    )
+    gone = [name_effect(*term.key) for term in cell.effects.terms if term not in kept.terms]
     said = (f"left out: {', '.join(gone)}; they ended with the calibration's session",)
     ratio = usual_u95(data) / usual_u95(fit.data)
     variance = known_by.noise.variance * (ratio**2 if math.isfinite(ratio) else 1.0)
@@ -64,7 +63,7 @@ def watched_of(
             cell,
             target_names=data.target_names,
             target_positions=np.array([place.get(t, np.zeros(3)) for t in data.target_names]),
-            effects=Fitted(terms, values),
+            effects=kept,
             sessions=cell.sessions if frame else replace(cell.sessions, frames={}),
         ),
         data=cell.placed(data) if frame else data,

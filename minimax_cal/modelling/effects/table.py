@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -289,6 +289,21 @@ class Fitted:
     terms: tuple[Term, ...]
     values: tuple[Array, ...]
 
+    @staticmethod
+    def of(pairs: Iterable[tuple[Term, Array]]) -> Fitted:
+        """Terms, each with its values."""
+        listed = tuple(pairs)
+        return Fitted(tuple(term for term, _ in listed), tuple(value for _, value in listed))
+
+    @property
+    def pairs(self) -> tuple[tuple[Term, Array], ...]:
+        """Each term with its values."""
+        return tuple(zip(self.terms, self.values, strict=True))
+
+    def where(self, is_kept: Callable[[Term], bool]) -> Fitted:
+        """Some of the terms, with their values."""
+        return Fitted.of((term, value) for term, value in self.pairs if is_kept(term))
+
     @property
     def causes(self) -> tuple[Term, ...]:
         """The terms that say something of the arm: all but the frames of several sessions."""
@@ -297,7 +312,7 @@ class Fitted:
     def turn(self, scene: Scene) -> Array:
         """(m, n) by how much the joints turn, signs applied [rad, m]."""
         out = np.zeros((scene.joints, scene.poses))
-        for term, value in zip(self.terms, self.values, strict=True):
+        for term, value in self.pairs:
             columns = term.columns(scene)
             if columns.turn.size:
                 out += np.einsum("d,dnm->nm", value, columns.turn)
@@ -306,7 +321,7 @@ class Fitted:
     def shift(self, scene: Scene) -> Array:
         """(k, 3, m) by how much the targets move besides, in base axes [m]."""
         out = np.zeros(scene.points.shape)
-        for term, value in zip(self.terms, self.values, strict=True):
+        for term, value in self.pairs:
             columns = term.columns(scene)
             if columns.shift.size:
                 out += np.einsum("d,dkcm->kcm", value, columns.shift)
@@ -325,7 +340,7 @@ class Fitted:
         """For JSON, in SI; an infinite time constant is null."""
         return [
             plain({"effect": t.effect, "place": t.place, "choice": t.choice, "values": value})
-            for t, value in zip(self.terms, self.values, strict=True)
+            for t, value in self.pairs
         ]
 
 
@@ -334,16 +349,16 @@ NOTHING = Fitted((), ())
 
 def fitted_from_list(content: Sequence[Mapping[str, Any]]) -> Fitted:
     """Effects from the JSON of a calibration.  Raises KeyError, TypeError, ValueError."""
-    terms, values = [], []
+    pairs = []
     for entry in content:
         name = str(entry["effect"])
         if name not in EFFECTS:
             raise ValueError(f"effect {name!r} is not known here")
         choice = {str(k): float("inf") if v is None else float(v)
                   for k, v in entry["choice"].items()}  # fmt: skip
-        terms.append(Term(name, str(entry["place"]), choice))
-        values.append(np.array(entry["values"], dtype=float).reshape(-1))
-    return Fitted(tuple(terms), tuple(values))
+        term = Term(name, str(entry["place"]), choice)
+        pairs.append((term, np.array(entry["values"], dtype=float).reshape(-1)))
+    return Fitted.of(pairs)
 
 
 def names_of(terms: Sequence[Term], scene: Scene) -> tuple[tuple[str, ...], tuple[str, ...]]:
