@@ -49,7 +49,7 @@ print(poses.poses, "poses of", ", ".join(poses.target_names))
 
 fit = mc.calibrate("irb120", poses)
 print(fit.headline())
-figure = fit.plot()
+figure = mc.plot_errors(fit)
 plt.show()
 
 # %%

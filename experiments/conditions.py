@@ -104,7 +104,7 @@ def run(job: Job) -> Outcome:
     train, held, _ = split(data, 1.0 - job.train / data.poses, job.seed)
     objective = "sum" if job.condition == "nominal" else job.condition
     fit = mc.calibrate(robot, train, objective, holdout=0.0)
-    cell = fit.before if job.condition == "nominal" else fit.cell
+    cell = fit.nominal if job.condition == "nominal" else fit.cell
     status = "-" if job.condition == "nominal" else str(fit.status)
     return Outcome(errors_of(cell, train), errors_of(cell, held), status)
 

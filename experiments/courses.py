@@ -132,7 +132,7 @@ def gain(arm: str, seed: int) -> Gain:
     fit = calibrate(robot, train, "sum", holdout=0.0)
     nominal, calibrated = (
         (evaluate(cell, train).rms_mm, evaluate(cell, held).rms_mm)
-        for cell in (fit.before, fit.cell)
+        for cell in (fit.nominal, fit.cell)
     )
     return Gain(arm, nominal, calibrated)
 

@@ -314,7 +314,7 @@ def resampled(batch: Batch) -> tuple[Array, Array]:
         if not np.array_equal(found.place, place):
             continue
         low, high = found.interval(LEVEL).T
-        truth = true.state.along(fit.before.base[:3, :3], robot)[place]
+        truth = true.state.along(fit.nominal.base[:3, :3], robot)[place]
         held.append((low <= truth) & (truth <= high))
         q = random_poses(robot, WORKSPACE, rng)
         low, high = found.position_interval(q, LEVEL)

@@ -184,7 +184,7 @@ def shift_of(
     Its variance is that over noise and lack of fit of the usual sizes; without `lack`, as if all
     that the fit of the whole session leaves were noise.  late: (m,) True where shifted.
     """
-    model = model_of(fit.before.robot, data)
+    model = model_of(fit.nominal.robot, data)
     every = Estimator(model.only(np.ones(model.names.count, dtype=bool)), np.ones(len(model.y)))
     poses, n = Poses.of(every, fit.cell.state), fit.robot.joints
     slope, after = poses.jacobian, late[:, None, None]

@@ -435,7 +435,7 @@ def run_real(job: RealJob) -> RealOutcome:
     data = every.only(0)
     train, held, _ = split(data, job.held, job.seed)
     fit = calibrate(robot, train, objective="sum", holdout=0.0)
-    nominal = after_base(held, robot, fit.before.target_positions[0])
+    nominal = after_base(held, robot, fit.nominal.target_positions[0])
     if job.kind == "tracker":
         identified = sum(p.identifiable for p in fit.parameters)
         held_mm = rms_mm(np.linalg.norm(fit.cell.error(held)[0], axis=1))

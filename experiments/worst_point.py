@@ -161,7 +161,7 @@ def agreement(job: tuple[int, int]) -> Agreement:
     best = minimax.solve(case.worst, case.start, QP)
     proof = certify(case.worst, best, case.data.line)
     values = {way: run(case) for way, run in WAYS.items()}
-    return Agreement(seed, values, len(proof.multiplier), proof.bound, proof.gap)
+    return Agreement(seed, values, len(proof.points), proof.bound, proof.gap)
 
 
 def agreement_table(points: int, found: Sequence[Agreement]) -> Table:

@@ -53,6 +53,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.planning.motion_plan import plan_motion
     from minimax_cal.planning.plan import plan
     from minimax_cal.reporting.fleet.overview import fleet
+    from minimax_cal.reporting.plots.figures import plot_errors
     from minimax_cal.reporting.report import report
     from minimax_cal.robots.robot import Robot, builtin_robots, load_robot
     from minimax_cal.simulators.commands import load_commands
@@ -115,6 +116,7 @@ __all__ = [
     "plan",
     "plan_cameras",
     "plan_motion",
+    "plot_errors",
     "read_campaigns",
     "read_measurements",
     "read_runs",
@@ -187,6 +189,7 @@ MODULES = {  # name: where it is defined
     "MotionGap": "simulators.motion.result",
     "motion_gap": "simulators.motion.ladder",
     "fleet": "reporting.fleet.overview",
+    "plot_errors": "reporting.plots.figures",
     "report": "reporting.report",
 }
 

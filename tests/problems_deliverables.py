@@ -78,5 +78,5 @@ READERS: dict[str, Callable[[str, mc.Robot, Path], mc.Robot]] = {
 def reached(fit: mc.Fit, to: str, new: Measurements, folder: Path) -> float:
     """RMS on new poses of the file of a fit, loaded again, base and targets fitted to them [mm]."""
     text = mc.export(fit, to, notify=lambda notice: None)
-    robot = READERS[to](text, fit.before.robot, folder)
+    robot = READERS[to](text, fit.nominal.robot, folder)
     return accuracy(place(robot, new).error(new)).rms_mm

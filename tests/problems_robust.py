@@ -52,7 +52,7 @@ class Case:
         """(k, m) True for the suspects."""
         out = np.zeros_like(self.bad)
         for one in found.suspects:
-            out[self.data.target_names.index(one.target), one.pose] = True
+            out[self.data.target_names.index(one.target), self.data.line == one.line] = True
         return out
 
 

@@ -70,7 +70,7 @@ def test_arrays_are_measurements(robot: mc.Robot, noisy: Simulation) -> None:
 def test_a_fit_draws_itself_and_is_short(robot: mc.Robot, noisy: Simulation) -> None:
     pytest.importorskip("matplotlib")
     fit = mc.calibrate(robot, noisy.data, "sum")
-    left, right = fit.plot().axes
+    left, right = mc.plot_errors(fit).axes
     shown = np.concatenate([np.asarray(line.get_ydata()) for line in left.lines])
     held = 1e3 * np.linalg.norm(
         np.concatenate([fit.errors["nominal"], fit.errors["holdout"]]), axis=-1

@@ -23,7 +23,6 @@ from minimax_cal.diagnosing.result import (
 from minimax_cal.evidence.limits import CONFIRMED
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.fit_file import (
-    EARLIER,
     BeyondPart,
     ScoresPart,
     TableParameter,
@@ -154,7 +153,7 @@ class GapPart(Part):
     closed: Number = math.nan
     closed_ci95: Ends | None = None
     ladder: Annotated[tuple[RungPart, ...], Field(min_length=2)]
-    beyond: BeyondPart = Field(default_factory=lambda: BeyondPart(reason=EARLIER))
+    beyond: BeyondPart
 
 
 class NoisePart(Part):

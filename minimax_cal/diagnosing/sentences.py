@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from minimax_cal.diagnosing.last_question import ABOVE_NOISE, ONLY_MINOR
 from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding
 from minimax_cal.evidence.limits import HALF, STRUCTURE
+from minimax_cal.ground.words import capitalise
 from minimax_cal.measuring.floor import REPEATS
 from minimax_cal.modelling.effects.words import name_place, name_structure
 from minimax_cal.solvers.status import Status
@@ -233,7 +234,7 @@ def remaining(found: Diagnosis) -> str:
         else f"measurement noise is at most {floor.value:.3f} mm (from the residuals)"
     )
     if left is None:
-        return f"{noise[:1].upper()}{noise[1:]}."
+        return f"{capitalise(noise)}."
     if left.predictable_mm < NOTHING_MM:
         return f"The remaining {found.ladder[-1].holdout.rms_mm:.3f} mm looks random; {noise}."
     where = ", ".join(

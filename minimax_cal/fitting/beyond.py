@@ -66,11 +66,10 @@ class Beyond:
     typical: RMS over all parts together.  worst: of the worst part.  Both [mm], NaN with a
     `reason` where nothing can be left out.  geometric: the same for geometry alone.  rms_high,
     max_high: upper 95 % limits, of the worst part and of the part with the largest distance [mm].
-    missed: parts that could not be judged, None where an earlier version did not tell.  sought:
-    whether effects were sought anew without each part; None without effects.  trusted: where
-    held-out points stand out, which judge as well.  spans: of every joint in the poses of the fit,
-    none where a file does not tell.  plan: the command that proposes poses over the whole range,
-    where a joint went too little for a claim.
+    missed: parts that could not be judged.  sought: whether effects were sought anew without each
+    part; None without effects.  trusted: where held-out points stand out, which judge as well.
+    spans: of every joint in the poses of the fit.  plan: the command that proposes poses over the
+    whole range, where a joint went too little for a claim.
     """
 
     folds: tuple[Fold, ...] = ()
@@ -79,7 +78,7 @@ class Beyond:
     reason: str = ""
     rms_high_mm: float = math.nan
     max_high_mm: float = math.nan
-    missed: tuple[str, ...] | None = ()
+    missed: tuple[str, ...] = ()
     sought: bool | None = None
     trusted: Trusted | None = None
     spans: tuple[Span, ...] = ()
@@ -169,7 +168,7 @@ class Beyond:
             "worst_high95_mm": finite(self.rms_high_mm),
             "max_high95_mm": finite(self.max_high_mm),
             "folds": [vars(fold) for fold in self.folds],
-            "not_judged": None if self.missed is None else list(self.missed),
+            "not_judged": list(self.missed),
             "effects_sought_anew": self.sought,
             "without_suspects": vars(self.trusted) if self.trusted else None,
             "spans": [vars(span) for span in self.spans],

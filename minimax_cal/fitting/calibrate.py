@@ -205,7 +205,7 @@ def again(fit: Fit, progress: Progress = silent, **changes: object) -> Fit:
     changes: fields of `Options`.  Raises CalibrationError.
     """
     options = replace(fit.options, **changes)  # type: ignore[arg-type]
-    return fit_split(fit.before.robot, fit.data, fit.held, options, progress)
+    return fit_split(fit.nominal.robot, fit.data, fit.held, options, progress)
 
 
 def fit_split(

@@ -8,13 +8,14 @@ much as the largest error at the start.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from itertools import starmap
 
 import numpy as np
 
 from minimax_cal.fitting.minimax_problem import MinimaxProblem
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.facts import derived, fact
 from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.dual_bound import Rows, gap_of, lower_bound, of_squares
@@ -80,29 +81,35 @@ class PointCones:
         return self.worst.step(x, self.white @ d)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
+class DecidingPoint:
+    """A point that decides: target, line of the file, distance [m], multiplier."""
+
+    target: str
+    line: int
+    distance: float = field(metadata=fact(key="distance_mm", scale=1e3))
+    multiplier: float
+
+
+@dataclass(frozen=True)
 class Certificate:
     """Why no small change of the parameters makes the worst point better.
 
-    target, line: (a,) the points that decide, name and line of the file, the weightiest first.
-    multiplier: (a,) their shares, summing to one over all points.  distance: (a,) [m].
-    kkt: residuals of the optimality conditions, of the problem scaled to about one.
     value: the largest distance, weighted where the data tell the points' accuracy (`u95`) [m].
     bound: what the largest distance of the linearised problem cannot fall below, computed from the
     multipliers alone [m].  The problem itself is not convex: this is no statement about far ones,
     and near ones may be better by second-order terms, the size of the curvature times the step
     squared.
+    kkt: residuals of the optimality conditions, of the problem scaled to about one.
+    points: that decide, the weightiest first; the multipliers sum to one over all points.
     """
 
-    target: tuple[str, ...]
-    line: Array
-    multiplier: Array
-    distance: Array
+    value: float = field(metadata=fact(key="value_mm", scale=1e3))
+    bound: float = field(metadata=fact(key="bound_mm", scale=1e3))
     kkt: Kkt
-    value: float
-    bound: float
+    points: tuple[DecidingPoint, ...]
 
-    @property
+    @derived()
     def gap(self) -> float:
         """How much smaller the largest distance could be at most, to first order, relative."""
         return gap_of(self.value, self.bound)
@@ -113,29 +120,9 @@ class Certificate:
             f"points that decide: largest {1e3 * self.value:.4f} mm, to first order not below "
             f"{1e3 * self.bound:.4f} mm (gap {self.gap:.1e})"
         )
-        columns = (self.target, self.line.tolist(), (1e3 * self.distance).tolist())
-        rows = tuple(zip(*columns, self.multiplier.tolist(), strict=True))
+        rows = tuple((p.target, p.line, 1e3 * p.distance, p.multiplier) for p in self.points)
         header = ("target", "line", "distance mm", "multiplier")
         return Table(title, header, rows, ("", "d", ".4f", ".4f"))
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON, in millimetres."""
-        return {
-            "value_mm": 1e3 * self.value,
-            "bound_mm": 1e3 * self.bound,
-            "gap": self.gap,
-            "kkt": vars(self.kkt),
-            "points": [
-                {"target": target, "line": int(line), "distance_mm": mm, "multiplier": share}
-                for target, line, mm, share in zip(
-                    self.target,
-                    self.line,
-                    (1e3 * self.distance).tolist(),
-                    self.multiplier.tolist(),
-                    strict=True,
-                )
-            ],
-        }
 
 
 def certify(problem: MinimaxProblem, best: Optimum[State], line: Array) -> Certificate:
@@ -153,14 +140,13 @@ def certify(problem: MinimaxProblem, best: Optimum[State], line: Array) -> Certi
     chosen = chosen[np.argsort(-mu[chosen], kind="stable")]
     target, pose = np.argwhere(model.seen)[chosen].T
     distance = np.linalg.norm(model.error(best.x), axis=-1)
+    names = (model.names.target_names[i] for i in target)
+    numbers = (part.tolist() for part in (line[pose], distance[target, pose], mu[chosen]))
     return Certificate(
-        target=tuple(model.names.target_names[i] for i in target),
-        line=line[pose],
-        multiplier=mu[chosen],
-        distance=distance[target, pose],
-        kkt=optimality(gradients(rows), mu, given.lam, problem.lower, problem.upper),
         value=float(size * norms.max()),
         bound=float(size * lower_bound(rows, problem.lower, problem.upper, given)),
+        kkt=optimality(gradients(rows), mu, given.lam, problem.lower, problem.upper),
+        points=tuple(starmap(DecidingPoint, zip(names, *numbers, strict=True))),
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 from minimax_cal.ground.units import for_people
 from minimax_cal.modelling.effects.words import name_effect
@@ -47,10 +46,6 @@ class Change:
     amounts: tuple[Amount, ...]
     p_value: float
     text: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON, SI."""
-        return {**vars(self), "amounts": [dict(vars(amount)) for amount in self.amounts]}
 
     @property
     def when(self) -> str:

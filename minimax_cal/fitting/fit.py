@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from html import escape
-from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, overload
@@ -28,13 +27,13 @@ from minimax_cal.fitting.set_aside import WithThem, aside_sentence
 from minimax_cal.fitting.suspects import Suspect, aside, table_of
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, quantile
 from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.facts import derived, fact, facts_in_words
 from minimax_cal.ground.files import finite, json_text, write_whole
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import for_people, in_files, turned_for_people
-from minimax_cal.ground.words import list_counts
+from minimax_cal.ground.words import capitalise, list_counts
 from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.grouping import clusters, grouped
@@ -291,8 +290,8 @@ class KeptDistance:
     """A distance between two targets that the minimax keeps [m]."""
 
     pair: tuple[str, str]
-    measured: float
-    tolerance: float
+    measured: float = field(metadata=fact(key="measured_mm", scale=1e3))
+    tolerance: float = field(metadata=fact(key="tolerance_mm", scale=1e3))
     multiplier: float
 
 
@@ -306,12 +305,16 @@ class WorstCase:
 
     functions: tuple[str, ...]
     size: Array
-    multiplier: Array
+    multiplier: Array = field(metadata=fact(key="multipliers"))
     active: tuple[str, ...]
     distances: tuple[KeptDistance, ...]
     kkt: Kkt
     iterations: int
     trace: tuple[Step, ...]
+
+    def __post_init__(self) -> None:
+        if not len(self.functions) == len(self.size) == len(self.multiplier):
+            raise ValueError("functions, their sizes and multipliers differ in number")
 
     def table(self) -> Table:
         """Errors of targets or points, multipliers (they sum to one), activity."""
@@ -347,15 +350,18 @@ class Work:
 class Fit:
     """A calibrated robot and everything that is known about its fit.
 
+    A field that is a `fact` is in the file by itself, as is a property that is `derived`; what has
+    words is shown in the terminal, the report and the page.
+
     cell: the calibrated robot with base, targets and effects, all fitted together; it predicts.
-    nominal: the nominal robot with its best base and targets, None where an old file does not tell
-    it.
+    nominal: the nominal robot with its best base and targets.
     accuracy: nominal and holdout on the held-out poses, nominal_train and train on the training
     poses.  claim: looks for `beyond`.
-    uncertainty: of all parameters, base in its own axes [SI]; None in an old file.
+    uncertainty: of all parameters, base in its own axes [SI].
     minimax: what the worst rests on, if it was the objective.  certificate: how far the worst point
     is from its optimum.  trace: cost at each iterate of the least squares [m^2].
-    data: all m poses, with their history where effects need it; none in an old file.
+    data: all m poses, with their history where effects need it; none where the file was written
+    without them.
     held: (m,) True where held out.  error_nominal, error: (k, m, 3) measured minus predicted, NaN
     where not measured [m].
     loss: of the least squares.  suspects: training points that are outliers of the fit.
@@ -372,42 +378,42 @@ class Fit:
     """
 
     cell: Cell
-    nominal: Cell | None
-    objective: str
-    qp: str
-    status: Status
-    iterations: int
-    seconds: float
+    nominal: Cell
+    objective: str = field(metadata=fact())
+    qp: str = field(metadata=fact())
+    status: Status = field(metadata=fact())
+    iterations: int = field(metadata=fact("{} iterations"))
+    seconds: float = field(metadata=fact("{:.2f} s"))
     parameters: Parameters
     accuracy: Mapping[str, Accuracy]
     identification: Identification
-    uncertainty: Uncertainty | None
-    minimax: WorstCase | None
-    certificate: Certificate | None
-    trace: tuple[float, ...]
+    uncertainty: Uncertainty
+    minimax: WorstCase | None = field(metadata=fact())
+    certificate: Certificate | None = field(metadata=fact())
+    trace: tuple[float, ...] = field(metadata=fact(key="trace_mm2", scale=1e6))
     data: Measurements
     held: Array
     error_nominal: Array
     error: Array
-    notices: tuple[str, ...]
-    loss: str
-    suspects: tuple[Suspect, ...]
+    notices: tuple[str, ...] = field(metadata=fact())
+    loss: str = field(metadata=fact())
+    suspects: tuple[Suspect, ...] = field(metadata=fact())
     weights: Array
     share: Array
     prior: Array
-    widening: float
-    provenance: Provenance
+    widening: float = field(metadata=fact())
+    provenance: Provenance = field(metadata=fact())
     claim: Callable[[], Beyond]
     stated: Mapping[str, tuple[Interval, Interval]] | None = None
     error_crossed: Array = field(default_factory=NOT_CROSSED.copy)
-    set_aside: tuple[SetAside, ...] = ()
+    set_aside: tuple[SetAside, ...] = field(default=(), metadata=fact())
     with_them: WithThem | None = None
-    answered: Mapping[str, int] = field(default_factory=dict)
-    work: Work = Work()
+    answered: Mapping[str, int] = field(default_factory=dict, metadata=fact())
+    work: Work = field(default=Work(), metadata=fact())
     stated_geometric: Cell | None = None
     error_drawn_crossed: Array = field(default_factory=NOT_CROSSED.copy)
-    reason: str = ""
-    moved: tuple[Change, ...] = ()
+    reason: str = field(default="", metadata=fact())
+    moved: tuple[Change, ...] = field(default=(), metadata=fact(key="between_sessions"))
 
     def __repr__(self) -> str:
         after, known = self.within.after, sum(p.identifiable for p in self.parameters)
@@ -433,7 +439,7 @@ class Fit:
     @property
     def kept(self) -> Cell:
         """The arm to use: `geometric`, or the drawn one in its place where that is no better."""
-        return self.nominal if self.is_no_better and self.nominal else self.geometric
+        return self.nominal if self.is_no_better else self.geometric
 
     @property
     def is_no_better(self) -> bool:
@@ -466,7 +472,7 @@ class Fit:
 
     @property
     def spans(self) -> tuple[Span, ...]:
-        """How far each joint went in the training poses; none where a file does not tell."""
+        """How far each joint went in the training poses."""
         train = self.train
         return spans_of(self.cell.robot, train) if train.poses else self.beyond.spans
 
@@ -488,21 +494,17 @@ class Fit:
     @property
     def covariance(self) -> Array:
         """(p, p) of all parameters, NaN where not identified [SI, base in its own axes]."""
-        return self.known.covariance
+        return self.uncertainty.covariance
 
-    @property
-    def known(self) -> Uncertainty:
-        """The uncertainty of the parameters.  Raises CalibrationError where a file has none."""
-        if self.uncertainty is None:
-            raise CalibrationError(f"{self.provenance.data}: the fit does not hold a covariance")
-        return self.uncertainty
+    @derived("condition {:.3g}")
+    def condition(self) -> float:
+        """Condition number of what was identified."""
+        return self.identification.condition
 
-    @property
-    def before(self) -> Cell:
-        """The nominal cell.  Raises CalibrationError where a file does not tell it."""
-        if self.nominal is None:
-            raise CalibrationError("the fit does not tell its nominal robot; calibrate again")
-        return self.nominal
+    @derived()
+    def advice(self) -> str:
+        """What to do where it failed or is no better, else what its status advises."""
+        return self.reason or self.status.advice
 
     @property
     def options(self) -> Options:
@@ -528,9 +530,9 @@ class Fit:
     def estimator(self) -> Estimator:
         """How the fit weighed its poses, linear where it ended."""
         train, state = self.train, self.cell.state
-        model = model_of(self.before.robot, train)
+        model = model_of(self.nominal.robot, train)
         if self.cell.effects.terms:
-            model, _ = extended(model, self.before.robot, train, state, self.cell.effects.terms)
+            model, _ = extended(model, self.nominal.robot, train, state, self.cell.effects.terms)
         model = model.only(self.identification.active)
         model = model.with_prior(replace(model.prior, weight=self.prior))
         mix = pose_weights(train, self.options.lever) if self.objective == "pose" else NO_MIX
@@ -599,11 +601,6 @@ class Fit:
         ways of the arm [rad, m].  More: `Cell.inverse`; without effects: `Robot.inverse`.
         """
         return self.cell.inverse(pose, near)
-
-    def plot(self) -> Any:
-        """Errors before and after, as a matplotlib figure.  Raises OptionError without it."""
-        # reporting stands below; what it needs is imported when a picture is asked for
-        return import_module("minimax_cal.reporting.plots.figures").errors_figure(self)
 
     def accuracies(self) -> Iterator[tuple[str, Accuracy]]:
         """What the table of accuracy tells, with titles."""
@@ -687,9 +684,9 @@ class Fit:
         before, after, where = self.within.before, self.within.after, self.within.where
         count, identified = len(self.parameters), sum(p.identifiable for p in self.parameters)
         rest = ", the others stay nominal" if identified < count else ""
-        advice = "" if self.reason else self.status.advice
+        advice = "" if self.reason else self.advice
         every = (
-            f"{self.reason[:1].upper()}{self.reason[1:]}." if self.reason else "",
+            f"{capitalise(self.reason)}." if self.reason else "",
             f"RMS error {before.rms_mm:.3f} mm -> {after.rms_mm:.3f} mm, largest "
             f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}.",
             self.aside_sentence() if self.set_aside else "",
@@ -705,11 +702,8 @@ class Fit:
         return " ".join(self.sentences())
 
     def solution(self) -> str:
-        """How the fit was found: condition, steps, time, and who answered the QPs."""
-        return (
-            f"Condition {self.identification.condition:.3g}; {self.iterations} iterations, "
-            f"{self.seconds:.2f} s.{self.solved_by()}"
-        )
+        """How the fit was found: what its facts say, and who answered the QPs."""
+        return f"{capitalise(facts_in_words(self))}.{self.solved_by()}"
 
     def solved_by(self) -> str:
         """Who answered the quadratic programs, after a space; empty where there were none."""

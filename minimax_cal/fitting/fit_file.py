@@ -6,35 +6,23 @@ asks for.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
 
 from minimax_cal.fitting.beyond import Beyond, Fold, Trusted
-from minimax_cal.fitting.certificate import Certificate
-from minimax_cal.fitting.changed import Change
 from minimax_cal.fitting.crossed import NOT_CROSSED
-from minimax_cal.fitting.fit import (
-    Fit,
-    KeptDistance,
-    Parameter,
-    Parameters,
-    Provenance,
-    Work,
-    WorstCase,
-)
+from minimax_cal.fitting.fit import Fit, Parameter, Parameters
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval
 from minimax_cal.fitting.options import read_options
 from minimax_cal.fitting.set_aside import WithThem
-from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.fitting.uncertainty import uncertainty_from_dict
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, said
+from minimax_cal.ground.facts import derived_facts, from_file, in_file, stored_facts
 from minimax_cal.ground.files import finite, numbers, plain
 from minimax_cal.ground.records import (
     AGAIN,
@@ -50,22 +38,20 @@ from minimax_cal.ground.records import (
     Values,
     check_schema,
     checked,
+    part_with,
 )
 from minimax_cal.measuring.accuracy import Accuracy
-from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
 from minimax_cal.measuring.pose_rows import pose_rows, read_poses
 from minimax_cal.measuring.spans import Span
 from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.robots.frames import CONVENTION
-from minimax_cal.solvers.minimax import Kkt, Step
 from minimax_cal.solvers.status import Status
 
 SCHEMA = 1
-NO_KKT = Kkt(math.nan, math.nan, math.nan)
-POSE_BY_POSE = ("weights", "share", "crossed", "drawn crossed")
-EARLIER = "an earlier version wrote this file"
+CROSSED = ("crossed", "drawn crossed")
+POSE_BY_POSE = ("weights", "share", *CROSSED)
 NEAR = 1e-6  # a file's own errors come back to this, or it lacks columns of the measurements [m]
 
 
@@ -75,12 +61,12 @@ NEAR = 1e-6  # a file's own errors come back to this, or it lacks columns of the
 class ScoresPart(Part):
     """Accuracy on some poses, with its 95 % intervals where they are known [mm, mm^2]."""
 
-    rms_mm: Number = math.nan
-    max_mm: Number = math.nan
-    mean_mm: Number = math.nan
-    poses: Count = 0
-    sse_mm2: tuple[Square, ...] = ()
-    points: tuple[Count, ...] = ()
+    rms_mm: Number
+    max_mm: Number
+    mean_mm: Number
+    poses: Count
+    sse_mm2: tuple[Square, ...]
+    points: tuple[Count, ...]
     rms_ci95_mm: Ends = UNKNOWN
     max_ci95_mm: Ends = UNKNOWN
 
@@ -91,31 +77,36 @@ class ScoresPart(Part):
         )
 
 
+class GeometricPart(Part):
+    """The same of geometry alone [mm]."""
+
+    typical_mm: Number
+
+
 class BeyondPart(Part):
     """On parts that were left out [mm]."""
 
-    folds: tuple[Recorded[Fold], ...] = ()
-    typical_mm: Number = math.nan
-    geometric: dict[str, Number] = Field(default_factory=dict)
+    folds: tuple[Recorded[Fold], ...]
+    typical_mm: Number
+    geometric: GeometricPart
     reason: str = ""
-    worst_high95_mm: Number = math.nan
-    max_high95_mm: Number = math.nan
-    not_judged: tuple[str, ...] | None = None
-    effects_sought_anew: bool | None = None
-    without_suspects: Recorded[Trusted] | None = None
-    spans: tuple[Recorded[Span], ...] = ()
-    plan: str | None = None
+    worst_high95_mm: Number
+    max_high95_mm: Number
+    not_judged: tuple[str, ...]
+    effects_sought_anew: bool | None
+    without_suspects: Recorded[Trusted] | None
+    spans: tuple[Recorded[Span], ...]
+    plan: str | None
 
     def beyond(self) -> Beyond:
         """As the code has it."""
-        plain = self.geometric.get("typical_mm", math.nan)
-        high = self.worst_high95_mm, self.max_high95_mm
         return Beyond(
-            self.folds,
-            self.typical_mm,
-            plain,
-            self.reason,
-            *high,
+            folds=self.folds,
+            typical_mm=self.typical_mm,
+            geometric_typical_mm=self.geometric.typical_mm,
+            reason=self.reason,
+            rms_high_mm=self.worst_high95_mm,
+            max_high_mm=self.max_high95_mm,
             missed=self.not_judged,
             sought=self.effects_sought_anew,
             trusted=self.without_suspects,
@@ -132,7 +123,7 @@ class AccuraciesPart(Part):
     holdout: ScoresPart
     nominal_train: ScoresPart
     holdout_with_them: ScoresPart | None = None
-    beyond: BeyondPart = Field(default_factory=lambda: BeyondPart(reason=EARLIER))
+    beyond: BeyondPart
 
     def told(self) -> Iterator[tuple[str, ScoresPart]]:
         """All but `beyond`, with their names."""
@@ -142,84 +133,19 @@ class AccuraciesPart(Part):
 TableParameter = Annotated[Parameter, Gaps(required=("value",))]  # in its unit: mm, rad, ...
 
 
-class DistancePart(Part):
-    """A distance between two targets that the minimax keeps."""
+class OwnPart(Part):
+    """What of a fit's file is no fact by itself."""
 
-    pair: tuple[str, str]
-    measured_mm: Number
-    tolerance_mm: Number
-    multiplier: Number
-
-
-class MinimaxPart(Part):
-    """How the minimax ended."""
-
-    functions: tuple[str, ...] = ()
-    size: tuple[Number, ...] = ()
-    multipliers: tuple[Number, ...] = ()
-    active: tuple[str, ...] = ()
-    distances: tuple[DistancePart, ...] = ()
-    kkt: Recorded[Kkt] = NO_KKT
-    iterations: int = 0
-    trace: tuple[Recorded[Step], ...] = ()
-
-
-class PointPart(Part):
-    """A point that decides."""
-
-    target: str
-    line: int
-    distance_mm: Number
-    multiplier: Number
-
-
-class CertificatePart(Part):
-    """How far the worst point is from its optimum."""
-
-    value_mm: Number
-    bound_mm: Number
-    kkt: Recorded[Kkt] = NO_KKT
-    points: tuple[PointPart, ...] = ()
-
-
-class SuspectPart(Part):
-    """A point that does not fit the others.  together: all points of its pose are suspect."""
-
-    line: int
-    target: str
-    distance_mm: Number = math.nan
-    score: Number = math.nan
-    chance: Number = math.nan
-    together: bool = False
-    held: bool = False
-
-
-class FitPart(Part):
-    """The file of `minimax-cal calibrate -o`."""
-
-    objective: str
-    qp: str = ""
-    answered: dict[str, int] = Field(default_factory=dict)
-    work: Work = Work()
-    between_sessions: tuple[Change, ...] = ()
-    status: Status
-    iterations: int = 0
-    seconds: Number = math.nan
     parameters: tuple[TableParameter, ...]
     accuracy: AccuraciesPart
     cell: dict[str, Any]
-    condition: Number = math.nan
-    trace_mm2: tuple[Number, ...] = ()
-    minimax: MinimaxPart | None = None
-    certificate: CertificatePart | None = None
-    suspects: tuple[SuspectPart, ...] = ()
-    reason: str = ""
-    set_aside: tuple[Recorded[SetAside], ...] = ()
-    notices: tuple[str, ...] = ()
-    loss: str = "square"
-    widening: float = 1.0
-    provenance: Provenance
+    nominal_robot: dict[str, Any]
+    nominal_cell: dict[str, Any]
+    covariance: dict[str, Any]
     arrays: dict[str, Values]
+
+
+FitPart = part_with("FitPart", OwnPart, Fit)  # the file of `minimax-cal calibrate -o`
 
 
 # ---- writing -----------------------------------------------------------------------------------
@@ -231,91 +157,48 @@ def written(fit: Fit, *, poses: bool = True) -> dict[str, Any]:
     out["cell"] = {"effects": out.pop("effects")}
     if fit.kept is not fit.cell:
         out["cell"] = fit.cell.whole()
-    if fit.nominal:
-        out["nominal_robot"] = fit.nominal.robot.to_dict()
-        out["nominal_cell"] = fit.nominal.to_dict()
+    facts = in_file(fit, {**stored_facts(Fit), **derived_facts(Fit)})
     out |= {
+        "nominal_robot": fit.nominal.robot.to_dict(),
+        "nominal_cell": fit.nominal.to_dict(),
         "frames": {name: frame.to_dict() for name, frame in fit.frames.items()},
         "frames_convention": CONVENTION,
-        "objective": fit.objective,
-        "loss": fit.loss,
-        "suspects": [suspect.to_dict() for suspect in fit.suspects],
-        "set_aside": [point.to_dict() for point in fit.set_aside],
-        "qp": fit.qp,
-        "answered": dict(fit.answered),
-        "work": vars(fit.work),
-        "between_sessions": [change.to_dict() for change in fit.moved],
-        "status": str(fit.status),
-        "advice": fit.reason or fit.status.advice,
-        "reason": fit.reason,
-        "iterations": fit.iterations,
-        "seconds": finite(fit.seconds),
+        **{key: plain(value) for key, value in facts.items() if value is not None},
         "parameters": [p.to_dict() for p in fit.parameters],
         "accuracy": {
-            **{key: value.to_dict() | ends(fit, key) for key, value in fit.accuracy.items()},
+            **{
+                key: value.to_dict() | ends_in_mm(fit.intervals.get(key, ()))
+                for key, value in fit.accuracy.items()
+            },
             **({"holdout_with_them": fit.with_them.to_dict()} if fit.with_them else {}),
             "holdout_trusted": fit.trusted.to_dict(),
             "beyond": fit.beyond.to_dict(),
             **({"cv": crossed_to_dict(fit)} if fit.error_crossed.size else {}),
         },
-        "condition": finite(fit.identification.condition),
-        "trace_mm2": [value * 1e6 for value in fit.trace],
-        "notices": list(fit.notices),
-        "provenance": vars(fit.provenance),
+        "covariance": fit.uncertainty.to_dict(),
+        "arrays": arrays_of(fit, poses=poses),
     }
-    if fit.uncertainty:
-        out["covariance"] = fit.uncertainty.to_dict()
     if fit.data.poses and poses:
         errors = {"nominal": fit.error_nominal, "final": fit.error}
         out["poses"] = pose_rows(fit.data, fit.held, errors)
-    if fit.minimax:
-        out["minimax"] = minimax_to_dict(fit.minimax)
-    if fit.certificate:
-        out["certificate"] = fit.certificate.to_dict()
-    return out | {"widening": fit.widening, "arrays": arrays_of(fit, poses=poses)}
+    return out
 
 
-def ends(fit: Fit, key: str) -> dict[str, list[float | None]]:
-    """The intervals of some poses; nothing for training poses."""
-    names = ("rms_ci95_mm", "max_ci95_mm")
+def ends_in_mm(intervals: Sequence[Interval]) -> dict[str, list[float | None]]:
+    """Intervals of the RMS and of the largest error, where there are any."""
     return {
         name: [finite(1e3 * interval.low), finite(1e3 * interval.high)]
-        for name, interval in zip(names, fit.intervals.get(key, ()), strict=False)
+        for name, interval in zip(("rms_ci95_mm", "max_ci95_mm"), intervals, strict=False)
     }
 
 
 def crossed_to_dict(fit: Fit) -> dict[str, Any]:
     """The cross-validated accuracy."""
-    names = ("rms_ci95_mm", "max_ci95_mm")
-    return (
-        fit.within.after.to_dict()
-        | {"not_judged": [int(x) for x in fit.unjudged], "nominal": fit.within.before.to_dict()}
-        | {
-            name: [finite(1e3 * interval.low), finite(1e3 * interval.high)]
-            for name, interval in zip(names, (fit.within.rms, fit.within.largest), strict=True)
-        }
-    )
-
-
-def minimax_to_dict(worst: WorstCase) -> dict[str, Any]:
-    """How the minimax ended."""
     return {
-        "functions": list(worst.functions),
-        "size": worst.size.tolist(),
-        "multipliers": worst.multiplier.tolist(),
-        "active": list(worst.active),
-        "distances": [
-            {
-                "pair": list(kept.pair),
-                "measured_mm": kept.measured * 1e3,
-                "tolerance_mm": kept.tolerance * 1e3,
-                "multiplier": kept.multiplier,
-            }
-            for kept in worst.distances
-        ],
-        "kkt": vars(worst.kkt),
-        "iterations": worst.iterations,
-        "trace": [vars(step) for step in worst.trace],
+        **fit.within.after.to_dict(),
+        "not_judged": [int(x) for x in fit.unjudged],
+        "nominal": fit.within.before.to_dict(),
+        **ends_in_mm((fit.within.rms, fit.within.largest)),
     }
 
 
@@ -340,87 +223,64 @@ def arrays_of(fit: Fit, *, poses: bool) -> dict[str, Any]:
 
 
 def read(content: Mapping[str, Any], source: str) -> Fit:
-    """A fit from its JSON.  Raises CalibrationError."""
+    """A fit from its JSON.  Raises CalibrationError, or one of FAULTS."""
     check_schema(content, source, SCHEMA)
-    cell = cell_from_dict(content, source)
     part = checked(FitPart, content, source)
-    geometric = None
-    if cell.effects.causes and part.status is not Status.NO_BETTER:
-        geometric = cell_from_dict({**content, "cell": {}}, source)
+    facts = from_file(part, stored_facts(Fit))
+    read_options(facts["provenance"].settings)  # what later work rests on
+    cell = cell_from_dict(content, source)
+    drawn = {"robot": part.nominal_robot, **part.nominal_cell}
+    nominal = cell_from_dict(drawn, f"{source}: nominal_cell")
+    data, held, told = measured_poses(content, source, cell, "nominal")
+    known = uncertainty_from_dict(content, cell, source)
+    parameters = Parameters(tuple(in_si(p) for p in part.parameters), known.dof)
+    names = parameter_names(parameters, cell)
+    crossed, drawn_crossed = (
+        part.arrays.get(name, NOT_CROSSED) if data.poses else NOT_CROSSED for name in CROSSED
+    )
+    train, k = data.take(~held), len(cell.target_names)
+    check_numbers(part, cell, source)
+    check_shapes(part.arrays, names.count, train, data)
+    return Fit(
+        **facts,
+        cell=cell,
+        nominal=nominal,
+        parameters=parameters,
+        accuracy={key: scores.accuracy() for key, scores in part.accuracy.told()},
+        identification=identification_of(part, parameters, names),
+        uncertainty=known,
+        data=replace(data, digest=facts["provenance"].data_sha256),
+        held=held,
+        error_nominal=errors_of(nominal, data, told[0]),
+        error=errors_of(cell, data, told[1]),
+        weights=part.arrays.get("weights", train.seen.T.astype(float)),
+        share=part.arrays.get("share", np.ones(k)),
+        prior=part.arrays["prior"],
+        claim=part.accuracy.beyond.beyond,
+        stated=intervals_of(part.accuracy),
+        error_crossed=crossed,
+        error_drawn_crossed=drawn_crossed,
+        with_them=with_them_of(part.accuracy.holdout_with_them),
+        stated_geometric=geometric_of(content, source, cell, facts["status"]),
+    )
+
+
+def geometric_of(
+    content: Mapping[str, Any], source: str, cell: Cell, status: Status
+) -> Cell | None:
+    """The geometry fitted alone, where the file holds it beside a fit with effects."""
+    if not cell.effects.causes or status is Status.NO_BETTER:
+        return None
+    return cell_from_dict({**content, "cell": {}}, source)
+
+
+def check_numbers(part: OwnPart, cell: Cell, source: str) -> None:
+    """Raise CalibrationError for accuracies that are not of the cell's targets."""
     for name, scores in part.accuracy.told():
         if not len(scores.sse_mm2) == len(scores.points) == len(cell.target_names):
             raise CalibrationError(
                 f"{source}: accuracy.{name} is not of {len(cell.target_names)} targets; {AGAIN}"
             )
-    data, held, told = measured_poses(content, source, cell, "nominal")
-    data = replace(data, digest=part.provenance.data_sha256)
-    nominal = nominal_of(content, source)
-    before, after = errors_of(nominal, data, told[0]), errors_of(cell, data, told[1])
-    made = assembled(content, source, part, cell, nominal, data, held, before, after)
-    return replace(made, stated_geometric=geometric)
-
-
-def assembled(
-    content: Mapping[str, Any],
-    source: str,
-    part: FitPart,
-    cell: Cell,
-    nominal: Cell | None,
-    data: Measurements,
-    held: Array,
-    before: Array,
-    after: Array,
-) -> Fit:
-    """The fit from what was read.  Raises one of FAULTS."""
-    read_options(part.provenance.settings)  # what later work rests on
-    known = uncertainty_from_dict(content, cell, source) if "covariance" in content else None
-    parameters = Parameters(
-        tuple(in_si(p) for p in part.parameters), known.dof if known else math.nan
-    )
-    train = data.take(~held)
-    k, names = len(cell.target_names), parameter_names(parameters, cell)
-    arrays = part.arrays
-    check_shapes(arrays, names.count, train, data)
-    if missing := set(names.all) - {p.name for p in parameters}:
-        raise ValueError(f"parameters: {min(missing)} is missing, of {len(missing)}")
-    return Fit(
-        cell=cell,
-        nominal=nominal,
-        objective=part.objective,
-        qp=part.qp,
-        status=part.status,
-        iterations=part.iterations,
-        seconds=part.seconds,
-        parameters=parameters,
-        accuracy={key: scores.accuracy() for key, scores in part.accuracy.told()},
-        identification=identification_of(part, parameters, names),
-        uncertainty=known,
-        minimax=minimax_of(part),
-        certificate=certificate_of(part.certificate),
-        trace=tuple(1e-6 * value for value in part.trace_mm2),
-        data=data,
-        held=held,
-        error_nominal=before,
-        error=after,
-        notices=part.notices,
-        loss=part.loss,
-        suspects=tuple(suspect_of(suspect, data, held) for suspect in part.suspects),
-        weights=arrays.get("weights", train.seen.T.astype(float)),
-        share=arrays.get("share", np.ones(k)),
-        prior=arrays["prior"],
-        widening=part.widening,
-        provenance=part.provenance,
-        claim=part.accuracy.beyond.beyond,
-        stated=intervals_of(part),
-        error_crossed=arrays.get("crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
-        set_aside=part.set_aside,
-        with_them=with_them_of(part.accuracy.holdout_with_them),
-        answered=part.answered,
-        work=part.work,
-        moved=part.between_sessions,
-        error_drawn_crossed=arrays.get("drawn crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
-        reason=part.reason,
-    )
 
 
 def check_shapes(
@@ -447,14 +307,6 @@ def with_them_of(scores: ScoresPart | None) -> WithThem | None:
     if scores is None:
         return None
     return WithThem(scores.accuracy(), scores.rms_ci95_mm, scores.max_ci95_mm)
-
-
-def nominal_of(content: Mapping[str, Any], source: str) -> Cell | None:
-    """The nominal robot in its place; None where the file tells none."""
-    if "nominal_robot" not in content:
-        return None
-    whole = {"robot": content["nominal_robot"], **content["nominal_cell"]}
-    return cell_from_dict(whole, f"{source}: nominal_cell")
 
 
 def measured_poses(
@@ -521,7 +373,7 @@ def parameter_names(parameters: Parameters, cell: Cell) -> Names:
     return Names.of(cell.robot, cell.target_names, effects)
 
 
-def identification_of(part: FitPart, parameters: Parameters, names: Names) -> Identification:
+def identification_of(part: OwnPart, parameters: Parameters, names: Names) -> Identification:
     """What was identified, and why the rest was not."""
     active = np.zeros(names.count, dtype=bool)
     for p in parameters:
@@ -534,7 +386,7 @@ def identification_of(part: FitPart, parameters: Parameters, names: Names) -> Id
     )
 
 
-def intervals_of(part: FitPart) -> dict[str, tuple[Interval, Interval]]:
+def intervals_of(accuracy: AccuraciesPart) -> dict[str, tuple[Interval, Interval]]:
     """Of RMS and largest error on poses like those held out [m]."""
 
     def in_metres(ends: tuple[float, float]) -> Interval:
@@ -542,58 +394,5 @@ def intervals_of(part: FitPart) -> dict[str, tuple[Interval, Interval]]:
 
     return {
         name: (in_metres(scores.rms_ci95_mm), in_metres(scores.max_ci95_mm))
-        for name, scores in (("nominal", part.accuracy.nominal), ("holdout", part.accuracy.holdout))
+        for name, scores in (("nominal", accuracy.nominal), ("holdout", accuracy.holdout))
     }
-
-
-def minimax_of(part: FitPart) -> WorstCase | None:
-    """What the minimax rests on, where there was one."""
-    worst = part.minimax
-    if worst is None:
-        return None
-    size = worst.size or (math.nan,) * len(worst.functions)
-    if not len(worst.functions) == len(worst.multipliers) == len(size):
-        raise ValueError("minimax: functions and multipliers differ in number")
-    return WorstCase(
-        functions=worst.functions,
-        size=np.array(size),
-        multiplier=np.array(worst.multipliers),
-        active=worst.active,
-        distances=tuple(
-            KeptDistance(d.pair, 1e-3 * d.measured_mm, 1e-3 * d.tolerance_mm, d.multiplier)
-            for d in worst.distances
-        ),
-        kkt=worst.kkt,
-        iterations=worst.iterations,
-        trace=worst.trace,
-    )
-
-
-def certificate_of(part: CertificatePart | None) -> Certificate | None:
-    """Of the worst point, where it was the objective."""
-    if part is None:
-        return None
-    return Certificate(
-        target=tuple(point.target for point in part.points),
-        line=np.array([point.line for point in part.points], dtype=int),
-        multiplier=np.array([point.multiplier for point in part.points]),
-        distance=1e-3 * np.array([point.distance_mm for point in part.points]),
-        kkt=part.kkt,
-        value=1e-3 * part.value_mm,
-        bound=1e-3 * part.bound_mm,
-    )
-
-
-def suspect_of(part: SuspectPart, data: Measurements, held: Array) -> Suspect:
-    """A point that stands out."""
-    rows = np.flatnonzero(data.line[held == part.held] == part.line)
-    return Suspect(
-        line=part.line,
-        target=part.target,
-        pose=int(rows[0]) if len(rows) else -1,
-        distance=1e-3 * part.distance_mm,
-        score=part.score,
-        p_value=part.chance,
-        together=part.together,
-        held=part.held,
-    )

@@ -21,7 +21,7 @@ from minimax_cal.fitting.stations import MIN_FRAME_POINTS, moving
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
-from minimax_cal.ground.records import checked, reading
+from minimax_cal.ground.records import AGAIN, checked, reading
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
@@ -55,13 +55,13 @@ Result = Fit | Cell | Writes | Path | str
 
 @dataclass(frozen=True, eq=False)
 class Rung:
-    """A state of the arm: cell None where the file does not tell it.
+    """A state of the arm.
 
     error: (k, m, 3) of its poses as the file tells them [m], None where it does not.
     """
 
     name: str
-    cell: Cell | None
+    cell: Cell
     error: Array | None = None
 
 
@@ -97,14 +97,8 @@ class Opened:
 
     @property
     def cell(self) -> Cell:
-        """The arm of the rung.  Raises CalibrationError where the file does not tell it."""
-        rung = self.rungs[self.number]
-        if rung.cell is None:
-            raise CalibrationError(
-                f"{self.source}: does not hold the arm of step {self.number} ({rung.name}); "
-                "make the file again"
-            )
-        return rung.cell
+        """The arm of the rung."""
+        return self.rungs[self.number].cell
 
     @property
     def nominal(self) -> Cell | None:
@@ -224,7 +218,7 @@ def of_content(content: Mapping[str, Any], source: str) -> Opened:
 def of_fit(fit: Fit, source: str) -> Opened:
     """A calibration: nominal and calibrated."""
     rungs = (Rung(NOMINAL, fit.nominal, fit.error_nominal), Rung(CALIBRATED, fit.cell, fit.error))
-    fitted = bool(fit.data.poses) and fit.nominal is not None and not fit.is_after_check
+    fitted = bool(fit.data.poses) and not fit.is_after_check
     options = fit.options if fitted else None
     return Opened(
         source, rungs, 1, fit.data, fit.held, fit.provenance.data_sha256, fit.uncertainty,
@@ -253,21 +247,20 @@ def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
     from minimax_cal.fitting.fit_file import BeyondPart, measured_poses  # schemas: slow to build
 
     rungs = rungs_of(content, source)
-    first = next(rung.cell for rung in rungs if rung.cell)
+    first = rungs[0].cell
     data, held, (geometric, final) = measured_poses(content, source, first, "geometric")
     told = {GEOMETRIC: geometric, rungs[-1].name: final} if data.poses else {}
     rungs = tuple(Rung(r.name, r.cell, told.get(r.name)) for r in rungs)
     digest = str(content["provenance"]["data_sha256"])
-    status = Status(content["status"]) if "status" in content else None
-    spans = spans_of(first.robot, data.take(~held)) if first and data.poses else ()
-    settings = content["provenance"].get("settings", {})
-    last = rungs[-1].cell
-    known = last.effects.causes if last else ()
+    status = Status(content["status"])
+    spans = spans_of(first.robot, data.take(~held)) if data.poses else ()
+    settings = content["provenance"]["settings"]
+    known = rungs[-1].cell.effects.causes
     firm = {term.text for term in confirmed(content, known)}
     return Opened(
         source, rungs, len(rungs) - 1, data, held, digest, status=status, spans=spans,
         options=read_options(settings, objective="sum") if data.poses else None,
-        outside=checked(BeyondPart, content["gap"].get("beyond", {}), source).beyond,
+        outside=checked(BeyondPart, content["gap"]["beyond"], source).beyond,
         possible=frozenset(term.text for term in known) - firm,
     )  # fmt: skip
 
@@ -276,7 +269,7 @@ def rungs_of(content: Mapping[str, Any], source: str) -> tuple[Rung, ...]:
     """The rungs of a diagnosis' JSON.  Raises CalibrationError, or one of `records.FAULTS`."""
     listed = content.get("rungs")
     if not listed:
-        raise CalibrationError(f"{source}: holds no arm; write it again with this version")
+        raise CalibrationError(f"{source}: holds no arm; {AGAIN}")
     return tuple(
         Rung(str(each["name"]), cell_from_dict(each, f"{source}: rungs[{i}]"))
         for i, each in enumerate(listed)
@@ -315,8 +308,7 @@ def established(content: Mapping[str, Any], source: str) -> list[Term]:
     if content.get("kind") != "diagnosis":
         raise OptionError(f"{source}: is no diagnosis, so that it names no effects")
     with reading(source):
-        last = rungs_of(content, source)[-1].cell
-        return confirmed(content, last.effects.terms if last else ())
+        return confirmed(content, rungs_of(content, source)[-1].cell.effects.terms)
 
 
 def confirmed(content: Mapping[str, Any], known: Sequence[Term]) -> list[Term]:
@@ -324,8 +316,8 @@ def confirmed(content: Mapping[str, Any], known: Sequence[Term]) -> list[Term]:
     found = [
         (str(effect["effect"]), str(effect["place"]))
         for effect in content["effects"]
-        if effect.get("established", True)
+        if effect["established"]
         and effect["effect"] in EFFECTS
-        and not effect.get("lines")  # a fault of the data
+        and not effect["lines"]  # a fault of the data
     ]
     return [term for key in found for term in [t for t in known if t.key == key] or [Term(*key)]]

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 from scipy.special import betaln, fdtr, fdtrc, fdtri
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.facts import fact
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import Model
@@ -241,36 +242,23 @@ def unlikely(p_value: Array, level: float = FALSE_DISCOVERY_RATE) -> Array:
 class Suspect:
     """A point that stands out from the fit.
 
-    line: of the file.  pose: index of the row.  distance: from the prediction [m].  score: the
-    distance standardised by scale and leverage.  p_value: that an ordinary point scores as much.
-    together: whether all targets of the pose are suspects: then its joint values may be wrong.
-    held: whether the fit has not seen the pose; `pose` then counts those held out.
+    line: of the file.  distance: from the prediction [m].  score: the distance standardised by
+    scale and leverage.  p_value: that an ordinary point scores as much.  together: whether all
+    targets of the pose are suspects: then its joint values may be wrong.  held: whether the fit has
+    not seen the pose.
     """
 
     line: int
     target: str
-    pose: int
-    distance: float
+    distance: float = field(metadata=fact(key="distance_mm", scale=1e3))
     score: float
-    p_value: float
+    p_value: float = field(metadata=fact(key="chance"))
     together: bool
     held: bool = False
 
     def text(self, data: Measurements) -> str:
         """Which, and how far off, for people."""
         return f"{data.called(self.line)} {self.target} {1e3 * self.distance:.3g} mm"
-
-    def to_dict(self) -> dict[str, object]:
-        """For JSON, in millimetres."""
-        return {
-            "line": self.line,
-            "target": self.target,
-            "distance_mm": 1e3 * self.distance,
-            "score": self.score,
-            "chance": self.p_value,
-            "together": self.together,
-            "held": self.held,
-        }
 
 
 def suspects_of(
@@ -289,7 +277,6 @@ def suspects_of(
         Suspect(
             line=int(line[pose]),
             target=model.names.target_names[target],
-            pose=pose,
             distance=float(distance[target, pose]),
             score=float(score[target, pose]),
             p_value=float(p_value[target, pose]),

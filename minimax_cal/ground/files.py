@@ -11,7 +11,7 @@ import os
 import tempfile
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.facts import derived_facts, in_file, record_facts
 
 LARGEST = 1 << 30  # bytes of a file that is read: a million poses take a quarter of this
 SHORT = 40  # letters of a name that stand in that of its temporary neighbour
@@ -201,8 +202,8 @@ def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def plain(content: Any) -> Any:
     """Data as JSON holds them: arrays are lists, records their fields, null no finite number."""
-    if is_dataclass(content):
-        content = {field.name: getattr(content, field.name) for field in fields(content)}
+    if is_dataclass(content) and not isinstance(content, type):
+        content = in_file(content, {**record_facts(type(content)), **derived_facts(type(content))})
     if isinstance(content, Mapping):
         return {key: plain(value) for key, value in content.items()}
     if isinstance(content, np.ndarray | np.generic):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
-from typing import Annotated, Any, TypeVar
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import cache
+from types import NoneType, UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pydantic import (
     BaseModel,
@@ -14,15 +16,16 @@ from pydantic import (
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
-    GetJsonSchemaHandler,
     ValidationError,
     WithJsonSchema,
+    create_model,
 )
 from pydantic_core import CoreSchema
-from pydantic_core.core_schema import no_info_before_validator_function
+from pydantic_core.core_schema import no_info_after_validator_function
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, said
+from minimax_cal.ground.facts import from_file, record_facts, scaled, stored_facts
 from minimax_cal.ground.files import numbers, plain
 
 AGAIN = "write it again with minimax-cal"
@@ -75,10 +78,12 @@ def nullable(schema: Any) -> Any:
 
 def check_schema(content: Mapping[str, Any], source: str, known: int) -> None:
     """Raise CalibrationError for a file of another version."""
-    if content.get("schema", 1) != known:
+    if "schema" not in content:
+        raise CalibrationError(f"{source}: does not say of which schema it is; {AGAIN}")
+    if content["schema"] != known:
         raise CalibrationError(
-            f"{source}: is of schema {content['schema']!r}, this version knows {known}; update "
-            "minimax-cal"
+            f"{source}: is of schema {content['schema']!r}, this version knows {known}; {AGAIN} of "
+            "this version"
         )
 
 
@@ -88,46 +93,78 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
+Kind = TypeVar("Kind")
+Model = TypeVar("Model", bound=Part)
+
+
+def as_read(hint: Any) -> Any:
+    """A type as a file holds it: null where there is no number, records field by field."""
+    if hint is float:
+        return Number
+    if hint == Array:
+        return Values
+    if isinstance(hint, type) and is_dataclass(hint):
+        return Annotated[hint, Gaps()]
+    inner = tuple(part if part is ... else as_read(part) for part in get_args(hint))
+    if get_origin(hint) is tuple:
+        return tuple.__class_getitem__(inner)
+    if get_origin(hint) in (Union, UnionType):
+        return Union.__getitem__(inner)
+    return hint
+
+
+def part_with(name: str, base: type[Model], kind: type) -> type[Model]:
+    """A part of a file that holds the stored facts of a dataclass too: all but those that are None.
+
+    Such a fact may be missing in the file, as it is not written.
+    """
+    hints = get_type_hints(kind, include_extras=True)
+    own: dict[str, Any] = {}
+    for field, known in stored_facts(kind).items():
+        default: Any = None if NoneType in get_args(hints[field]) else ...
+        own[field] = (as_read(hints[field]), Field(default, alias=known.key or field))
+    return create_model(name, __base__=base, __module__=kind.__module__, **own)
+
+
+@cache
+def part_of(kind: type, required: tuple[str, ...] = ()) -> type[Part]:
+    """A part of a file that holds all fields of a dataclass.
+
+    Those with a default may miss there, and numbers too, which are NaN then, unless required.
+    """
+    hints, facts = get_type_hints(kind, include_extras=True), record_facts(kind)
+    own: dict[str, Any] = {}
+    for each in fields(kind):
+        known, hint = facts[each.name], as_read(hints[each.name])
+        default: Any = ...
+        if each.default is not MISSING:
+            default = scaled(each.default, known.scale)
+        elif hint is Number and each.name not in required:
+            default = math.nan
+        filled = {"default": default}
+        if each.default_factory is not MISSING:
+            filled = {"default_factory": each.default_factory}
+        own[each.name] = (hint, Field(alias=known.key or each.name, **filled))
+    return create_model(kind.__name__, __base__=Part, __doc__=kind.__doc__, **own)
+
+
 @dataclass(frozen=True)
 class Gaps:
-    """Numbers of a dataclass that are null in a file, or missing there unless required, are NaN."""
+    """How a dataclass stands in a file: see `part_of`."""
 
     required: tuple[str, ...] = ()
 
     def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """That of the dataclass, its gaps filled first."""
-        floats = {field.name for field in fields(kind) if field.type in ("float", float)}
-        unknown = dict.fromkeys(floats.difference(self.required), math.nan)
+        """That of its part of the file, which is made the dataclass."""
 
-        def filled(value: object) -> object:
-            if not isinstance(value, Mapping):
-                return value
-            null = {key: math.nan for key in floats if value.get(key, 0.0) is None}
-            return {**unknown, **value, **null}
+        def made(part: Part) -> Any:
+            return kind(**from_file(part, record_facts(kind)))
 
-        return no_info_before_validator_function(filled, handler(kind))
-
-    def __get_pydantic_json_schema__(
-        self, core: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> dict[str, Any]:
-        """That of the dataclass; only what is no number, or required, has to be there."""
-        made = handler(core)
-        inner: dict[str, Any] = handler.resolve_ref_schema(made)
-        numbers = {
-            name
-            for name, part in inner.get("properties", {}).items()
-            if part.get("type") == "number"
-        }
-        gone = numbers.difference(self.required)
-        inner["required"] = [name for name in inner.get("required", ()) if name not in gone]
-        return made
+        part = handler.generate_schema(part_of(kind, self.required))
+        return no_info_after_validator_function(made, part)
 
 
-Kind = TypeVar("Kind")
 Recorded = Annotated[Kind, Gaps()]  # a dataclass as it stands in a file, by its own annotations
-
-
-Model = TypeVar("Model", bound=Part)
 
 
 def checked(model: type[Model], content: Mapping[str, Any], source: str) -> Model:

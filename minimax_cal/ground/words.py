@@ -23,6 +23,11 @@ def name_first(names: Sequence[str], most: int = 8, mark: str = ", ") -> str:
     return mark.join(names[:most]) + more
 
 
+def capitalise(sentence: str) -> str:
+    """A sentence with a large first letter."""
+    return sentence[:1].upper() + sentence[1:]
+
+
 def list_counts(counts: Mapping[str, int]) -> str:
     """How many by whom, the most first, as 4 by daqp, 1 by highs."""
     most_first = sorted(counts.items(), key=lambda item: -item[1])

@@ -164,8 +164,6 @@ def beyond(found: Beyond) -> Claim:
 
 def open_of(found: Beyond) -> str:
     """What could not be judged outside the measured region."""
-    if found.missed is None:
-        return "an earlier version wrote this file and does not tell which parts were not judged"
     if not found.missed:
         return ""
     named = name_first(found.missed, MAX_NAMED)

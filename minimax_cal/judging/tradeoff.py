@@ -296,7 +296,7 @@ def tradeoff(
         return calibrate(robot, data, objective, qp, holdout=holdout, seed=seed, progress=progress)
 
     first = fit("sum")
-    if first.accuracy["train"].rms_mm > 1e3 * POOR_FIT * first.before.robot.reach():
+    if first.accuracy["train"].rms_mm > 1e3 * POOR_FIT * first.nominal.robot.reach():
         return hopeless(first, began, settings)
     last = fit("point")
     worst = problem_of(first)
@@ -328,7 +328,7 @@ def hopeless(fit: Fit, began: float, settings: dict[str, Any]) -> Tradeoff:
 
 def problem_of(fit: Fit) -> MinimaxProblem:
     """The worst-point problem on the training poses of a fit, with its identified parameters."""
-    robot, train, effects = fit.before.robot, fit.train, fit.cell.effects
+    robot, train, effects = fit.nominal.robot, fit.train, fit.cell.effects
     model = model_of(robot, train)
     if effects.terms:
         model, _ = extended(model, robot, train, fit.cell.state, effects.terms)
@@ -338,7 +338,7 @@ def problem_of(fit: Fit) -> MinimaxProblem:
 
 def choice_of(fit: Fit, name: str, compromise: Compromise) -> Choice:
     """A compromise as a cell, judged on the training and held-out poses of a fit."""
-    robot, names, sessions = fit.before.robot, fit.cell.target_names, fit.cell.sessions
+    robot, names, sessions = fit.nominal.robot, fit.cell.target_names, fit.cell.sessions
     scene = fit.cell.scene(fit.data)
     effects = fitted(fit.cell.effects.terms, scene, compromise.state.effects)
     cell = Cell.of(robot, compromise.state, names, effects, sessions)

@@ -179,8 +179,8 @@ def fit_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
     path = at.folder / FIT
     if not path.is_file():
         return None
-    headline, tiles, _ = fit_words(*mark(path))
-    return {"headline": headline, "tiles": tiles}
+    headline, tiles, _, solution = fit_words(*mark(path))
+    return {"headline": headline, "tiles": tiles, "solution": solution}
 
 
 def accuracy_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
@@ -190,8 +190,8 @@ def accuracy_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | Non
 
 
 @lru_cache(maxsize=KEPT)
-def fit_words(path: str, moment: int, size: int) -> tuple[str, list[Tile], Table]:
-    """Headline, numbers and accuracy of a calibration's file as it was at a moment."""
+def fit_words(path: str, moment: int, size: int) -> tuple[str, list[Tile], Table, str]:
+    """Headline, numbers, accuracy and facts of a calibration's file as it was at a moment."""
     fit = load_fit(path)
     seen = fit.within
     known = sum(parameter.identifiable for parameter in fit.parameters)
@@ -200,7 +200,7 @@ def fit_words(path: str, moment: int, size: int) -> tuple[str, list[Tile], Table
         ("largest", f"{seen.before.max_mm:.3f}", f"{seen.after.max_mm:.3f} mm"),
         ("parameters known", "", f"{known} of {len(fit.parameters)}"),
     ]
-    return fit.headline(), tiles, fit.accuracy_table()
+    return fit.headline(), tiles, fit.accuracy_table(), fit.solution()
 
 
 def points_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:

@@ -82,7 +82,7 @@ def causes_of(
         terms = carried_over(terms, robot)
         rows = replace(told.data, digest=told.provenance.data_sha256)
         fit = calibrate(robot, marked(rows, told.held), objective="sum")
-    elif not assumed(robot) and assumed(fit.before.robot):
+    elif not assumed(robot) and assumed(fit.nominal.robot):
         progress("fit with the masses of the model")
         terms = carried_over(terms, robot)
         fit = weighed(fit, chain, [t.label if not t.choice else t for t in terms])
@@ -103,7 +103,7 @@ def causes_of(
 
 def weighed(fit: Fit, chain: Chain, effects: Sequence[Term | str]) -> Fit:
     """The same fit, effects given, of a robot that has the masses of a simulator's model."""
-    nominal = fit.before.robot
+    nominal = fit.nominal.robot
     mass, com = told_masses(chain, nominal)
     settings = {**vars(fit.options), "effects": tuple(effects)}
     rows = marked(fit.data, fit.held)

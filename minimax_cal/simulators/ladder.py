@@ -182,7 +182,7 @@ class Run:
         self.rows = np.sort(np.concatenate([some, np.flatnonzero(causes.held)]))
         self.data = causes.data.take(self.rows)
         self.held = causes.held[self.rows]
-        self.nominal = causes.geometry.before
+        self.nominal = causes.geometry.nominal
         self.notices: list[str] = []
 
     def before(self) -> list[Rung]:

@@ -520,14 +520,12 @@ def test_command_tells_wrong_files(saved: Path, tmp_path: Path) -> None:
     assert run(saved, write(tmp_path / "bare.csv", DEGREES))[0] == 2
     assert run(saved, targets, "--frame", "moon")[0] == 2
     assert run(saved, targets, "-o", tmp_path / "no" / "folder.csv")[0] == 2
-    content = json.loads(saved.read_text())
-    del content["nominal_robot"]
-    old = tmp_path / "old.json"
-    old.write_text(json.dumps(content))
-    code, _, said = run(old, targets)
+    alone = tmp_path / "cell.json"
+    alone.write_text(json.dumps(mc.load_fit(saved).cell.whole()))
+    code, _, said = run(alone, targets)
     assert code == 2
-    assert f"{old}: does not tell its nominal robot; give nominal=" in said
-    assert run(old, targets, "--robot", "irb2600", "-q")[0] == 0
+    assert f"{alone}: does not tell its nominal robot; give nominal=" in said
+    assert run(alone, targets, "--robot", "irb2600", "-q")[0] == 0
 
 
 def test_command_through_main_where_it_is_registered(saved: Path, tmp_path: Path) -> None:

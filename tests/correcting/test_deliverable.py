@@ -133,7 +133,7 @@ def test_it_is_the_fit_of_exactly_that(soft: mc.Fit) -> None:
     ):
         split = np.where(soft.held, "holdout", "train")
         data = replace(soft.data, columns={**soft.data.columns, "split": split})
-        plain = mc.calibrate(soft.before.robot, data, "sum", **options)
+        plain = mc.calibrate(soft.nominal.robot, data, "sum", **options)
         found = mc.deliver(soft, to)
         assert_allclose(found.cell.robot.mdh, plain.cell.robot.mdh, rtol=0, atol=1e-8)
         assert found.figures.rms == pytest.approx(plain.within.after.rms_mm, rel=1e-4)
@@ -147,7 +147,7 @@ def test_priors_fixed_names_and_the_objective_stay() -> None:
     plain = mc.calibrate("ur10", made.data, **asked)
     joint = mc.calibrate("ur10", made.data, **asked, effects=EFFECTS)
     assert_allclose(joint.robot.mdh, plain.robot.mdh, rtol=0, atol=1e-8)
-    assert_array_equal(joint.robot.mdh[:, 4], joint.before.robot.mdh[:, 4])
+    assert_array_equal(joint.robot.mdh[:, 4], joint.nominal.robot.mdh[:, 4])
     assert mc.deliver(joint, "urdf").figures.rms == pytest.approx(plain.within.after.rms_mm)
 
 

@@ -313,7 +313,7 @@ def test_ros2_control_holds_the_offsets(name: str) -> None:
         for key in ("mechanical_reduction", "offset")
     )
     q = data.q[:5]
-    moved = fit.before.robot.pose(q / reduction + offset)
+    moved = fit.nominal.robot.pose(q / reduction + offset)
     assert_allclose(moved, fit.robot.pose(q), **EXACT)
     assert np.abs(offset).max() > 1e-5
     assert len(made.notices) == 1
@@ -498,16 +498,15 @@ def test_command_on_a_robot_and_its_errors(original: Path, tmp_path: Path) -> No
     assert "cannot be parsed" in str(run(tmp_path / "broken.json", "--to", "json").exception)
 
 
-def test_a_fit_from_before_nominal_robots(fit: tuple[Path, Simulation], tmp_path: Path) -> None:
-    content = json.loads(fit[0].read_text())
-    del content["nominal_robot"]
-    (tmp_path / "old.json").write_text(json.dumps(content))
-    found = exported(tmp_path / "old.json", "json")
+def test_an_arm_without_its_nominal_robot(fit: tuple[Path, Simulation], tmp_path: Path) -> None:
+    content = mc.load_fit(fit[0]).cell.whole()
+    (tmp_path / "cell.json").write_text(json.dumps(content))
+    found = exported(tmp_path / "cell.json", "json")
     assert json.loads(found.file.content) == content["robot"]
     assert found.delivered
     assert found.delivered.nominal is None
     assert "joint coupling" in found.notices[-1]
-    assert "does not tell its nominal robot" in found.notices[-1]
+    assert "holds no measurements" in found.notices[-1]
 
 
 def test_ur_yaml_of_another_make_is_told() -> None:

@@ -279,17 +279,14 @@ def test_a_program_goes_into_no_table_nor_a_table_into_a_program(
     assert len(err.splitlines()) == 1
 
 
-def test_a_fit_without_its_nominal_robot_asks_for_it(
+def test_an_arm_without_its_nominal_robot_asks_for_it(
     fit: mc.Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    fit.save(tmp_path / "fit.json")
-    content = json.loads((tmp_path / "fit.json").read_text())
-    del content["nominal_robot"]
-    (tmp_path / "old.json").write_text(json.dumps(content))
+    (tmp_path / "cell.json").write_text(json.dumps(fit.cell.whole()))
     (tmp_path / "a.csv").write_text("q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n1,2,3,4,50,6\n")
     (tmp_path / "a.src").write_text(f"PTP {JOINTS}")
     for targets in ("a.csv", "a.src"):
-        assert run("compensate", tmp_path / "old.json", tmp_path / targets) == 2
+        assert run("compensate", tmp_path / "cell.json", tmp_path / targets) == 2
         err = capsys.readouterr().err
-        assert err.endswith("old.json: does not tell its nominal robot; give --robot\n")
+        assert err.endswith("cell.json: does not tell its nominal robot; give --robot\n")
         assert len(err.splitlines()) == 1

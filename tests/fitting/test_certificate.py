@@ -17,6 +17,7 @@ from minimax_cal.fitting.minimax_problem import (
     measured_distances,
     minimax_problem,
 )
+from minimax_cal.ground import files
 from minimax_cal.modelling.model import Model, Prior
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import Simulation, simulate
@@ -147,7 +148,7 @@ def test_the_certificate_closes_at_an_optimum(
     _, optimum = linear_optimum(rows, problem.lower, problem.upper)
     assert proof.bound <= optimum * np.sqrt(here.worst.size) * (1 + 1e-8)
     assert_allclose(proof.bound, optimum * np.sqrt(here.worst.size), rtol=1e-7)
-    assert_allclose(proof.multiplier.sum(), 1.0, rtol=1e-6)
+    assert_allclose(sum(one.multiplier for one in proof.points), 1.0, rtol=1e-6)
     # distances that bind do so with a multiplier
     if name == "bound_by_distances":
         assert np.abs(best.lam).max() > 0.0
@@ -172,16 +173,16 @@ def test_the_points_that_decide_are_named(robot: mc.Robot, noisy: Simulation) ->
     error = here.model.error(best.x)
     distance = np.linalg.norm(error, axis=-1)
     assert_allclose(proof.value, np.nanmax(distance), rtol=1e-12)
-    assert_allclose(proof.distance, proof.value, rtol=1e-6)  # every active point is a largest one
-    for target, line, size in zip(proof.target, proof.line, proof.distance, strict=True):
-        pose = int(np.flatnonzero(data.line == line)[0])
-        assert_allclose(size, distance[data.target_names.index(target), pose], rtol=1e-12)
-    assert np.all(np.diff(proof.multiplier) <= 0)
-    assert np.count_nonzero(distance > proof.value * (1 - 1e-6)) == len(proof.line)
+    for one in proof.points:
+        assert_allclose(one.distance, proof.value, rtol=1e-6)  # every active point is a largest one
+        pose = int(np.flatnonzero(data.line == one.line)[0])
+        assert_allclose(one.distance, distance[data.target_names.index(one.target), pose])
+    assert np.all(np.diff([one.multiplier for one in proof.points]) <= 0)
+    assert np.count_nonzero(distance > proof.value * (1 - 1e-6)) == len(proof.points)
     text = proof.table().text()
     assert f"{1e3 * proof.value:.4f} mm" in text
-    content = proof.to_dict()
-    assert content["points"][0]["line"] == proof.line[0]
+    content = files.plain(proof)
+    assert content["points"][0]["line"] == proof.points[0].line
     assert_allclose(content["value_mm"], 1e3 * proof.value)
 
 
@@ -192,11 +193,12 @@ def test_weights_count_in_the_value_and_not_in_the_distances(
     best = here.sqp()
     proof = certify(here.worst, best, here.data.line)
     weight = here.model.weight[
-        [here.data.target_names.index(name) for name in proof.target],
-        [int(np.flatnonzero(here.data.line == line)[0]) for line in proof.line],
+        [here.data.target_names.index(one.target) for one in proof.points],
+        [int(np.flatnonzero(here.data.line == one.line)[0]) for one in proof.points],
     ]
-    assert np.ptp(proof.distance) > 1e-5
-    assert_allclose(np.sqrt(weight) * proof.distance, proof.value, rtol=1e-6)
+    distance = np.array([one.distance for one in proof.points])
+    assert np.ptp(distance) > 1e-5
+    assert_allclose(np.sqrt(weight) * distance, proof.value, rtol=1e-6)
 
 
 def test_a_certificate_does_not_depend_on_the_scaling(robot: mc.Robot, noisy: Simulation) -> None:
@@ -208,7 +210,9 @@ def test_a_certificate_does_not_depend_on_the_scaling(robot: mc.Robot, noisy: Si
     assert again.size != here.worst.size
     assert_allclose(two.value, one.value, rtol=1e-12)
     assert abs(two.gap) < 1e-8
-    assert_allclose(two.multiplier, one.multiplier, rtol=1e-6)
+    for same, other in zip(one.points, two.points, strict=True):
+        assert (same.target, same.line) == (other.target, other.line)
+        assert_allclose(other.multiplier, same.multiplier, rtol=1e-6)
 
 
 def test_cones_find_their_way_from_the_nominal_arm(robot: mc.Robot, noisy: Simulation) -> None:

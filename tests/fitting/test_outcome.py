@@ -137,7 +137,7 @@ def test_slips_are_judged_on_the_rows_that_tried_them() -> None:
 def test_points_of_the_controller_were_computed(robot: mc.Robot, noisy: Simulation) -> None:
     sound = mc.calibrate(robot, noisy.data, "sum")
     q = noisy.data.q
-    for cell, arm in ((sound.before, "the drawn arm"), (sound.cell, "the calibrated arm")):
+    for cell, arm in ((sound.nominal, "the drawn arm"), (sound.cell, "the calibrated arm")):
         y = np.round(cell.predict(q), 6)  # the controller shows a thousandth of a millimetre
         fit = mc.calibrate(robot, (q, y), "sum")
         assert fit.status == "failed"
@@ -194,7 +194,7 @@ def test_an_arm_that_is_no_better_keeps_the_drawn_one(robot: mc.Robot, tmp_path:
     assert "keep the drawn arm" in content["reason"]
     assert_allclose(mc.load_robot(out).mdh, robot.mdh, atol=1e-12)
     fit = mc.load_fit(out)
-    assert fit.robot is fit.before.robot
+    assert fit.robot is fit.nominal.robot
     assert not np.allclose(fit.cell.robot.mdh, robot.mdh, atol=1e-6)
     assert_allclose(fit.cell.error(fit.data), fit.error, atol=1e-9)
     again = json.loads(fit.json())
@@ -272,7 +272,7 @@ def test_a_point_that_only_the_calibrated_arm_misses_counts(robot: mc.Robot) -> 
     drawn, after = fit.error_nominal.copy(), fit.error.copy()
     after[0, row] += 0.1
     one = mc.calibrate(robot, fit.data, "sum").suspects
-    off = Suspect(int(fit.data.line[row]), "smr1", 0, 0.1, 99.0, 0.0, False, True)
+    off = Suspect(int(fit.data.line[row]), "smr1", 0.1, 99.0, 0.0, False, True)
     hidden = np.where(fit.held[:, None], 1.0, np.nan)
     found = improvement(drawn * hidden, after * hidden, np.arange(120), fit.data, (*one, off))
     assert not found.is_better
@@ -350,7 +350,7 @@ def sound_arm(seed: int) -> tuple[str, float, str]:
     robot = mc.load_robot(name)
     q = random_poses(robot, 300, np.random.default_rng(seed + 10**6), np.pi)
     y = made.cell.predict(q + compliance * gravity(made.cell.robot, q))
-    before, after = (np.linalg.norm(cell.predict(q) - y) for cell in (fit.before, fit.cell))
+    before, after = (np.linalg.norm(cell.predict(q) - y) for cell in (fit.nominal, fit.cell))
     case = f"{seed}: {name}, {poses} poses, {targets} targets, size {size:.2g}"
     return str(fit.status), float(1.0 - after / before), case
 

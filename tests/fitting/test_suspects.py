@@ -25,6 +25,7 @@ from minimax_cal.fitting.suspects import (
     unlikely,
 )
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import plain
 from minimax_cal.modelling.model import Prior
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.solvers.scalar import least_between
@@ -223,7 +224,8 @@ def test_a_list_tells_where_and_how_far(robot: mc.Robot) -> None:
     found = case.robust("tukey")
     state = state_of(found.fit)
     distance = np.linalg.norm(found.plain.error(state), axis=-1)
-    by_pose = {pose: [s for s in found.suspects if s.pose == pose] for pose in range(50)}
+    line = case.data.line
+    by_pose = {pose: [s for s in found.suspects if s.line == line[pose]] for pose in range(50)}
     assert [s.target for s in by_pose[alone]] == ["smr2"]
     assert not by_pose[alone][0].together
     assert by_pose[alone][0].distance == pytest.approx(2e-3, abs=5 * NOISE)
@@ -231,9 +233,8 @@ def test_a_list_tells_where_and_how_far(robot: mc.Robot) -> None:
         assert {s.target for s in by_pose[int(pose)]} == {"smr1", "smr2", "smr3"}
         assert all(s.together for s in by_pose[int(pose)])
     for one in found.suspects:
-        target = case.data.target_names.index(one.target)
-        assert one.line == case.data.line[one.pose]
-        assert one.distance == pytest.approx(distance[target, one.pose])
+        target, pose = case.data.target_names.index(one.target), list(line).index(one.line)
+        assert one.distance == pytest.approx(distance[target, pose])
         assert one.score == pytest.approx(one.distance / found.scale, rel=0.3)
     order = [one.p_value for one in found.suspects]
     assert order == sorted(order)
@@ -243,13 +244,13 @@ def test_a_list_tells_where_and_how_far(robot: mc.Robot) -> None:
 
 
 def test_the_table_has_a_row_a_suspect() -> None:
-    one = Suspect(7, "smr2", 5, 1.2e-3, 40.0, 1e-30, together=True)
+    one = Suspect(7, "smr2", 1.2e-3, 40.0, 1e-30, together=True)
     data = simulate("irb120", 10, seed=1).data
     table = table_of([one], data)
     assert table.rows == (
         (data.called(7), "smr2", pytest.approx(1.2), 40.0, 1e-30, "training", "all targets"),
     )
-    assert one.to_dict() == {
+    assert plain(one) == {
         "line": 7, "target": "smr2", "distance_mm": pytest.approx(1.2), "score": 40.0,
         "chance": 1e-30, "together": True, "held": False,
     }  # fmt: skip

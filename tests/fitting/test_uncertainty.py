@@ -518,7 +518,7 @@ def test_saved_uncertainty_comes_back(
     fit = mc.calibrate(robot, noisy.data, "sum", effects="joint_compliance:J2")
     fit.save(tmp_path / "fit.json")
     saved = mc.load_fit(tmp_path / "fit.json")
-    cell, known = saved.cell, saved.known
+    cell, known = saved.cell, saved.uncertainty
     assert known.names == fit.uncertainty.names
     assert known.units == fit.uncertainty.units
     assert known.source == fit.uncertainty.source == "poses"
@@ -589,7 +589,7 @@ def test_the_equivalent_truth_is_the_arm() -> None:
 
 def test_the_base_is_told_along_the_nominal_axes(robot: mc.Robot, noisy: Simulation) -> None:
     fit = mc.calibrate(robot, noisy.data, "sum", holdout=0.0)
-    axes, base, told = fit.before.base[:3, :3], fit.cell.base, fit.parameters
+    axes, base, told = fit.nominal.base[:3, :3], fit.cell.base, fit.parameters
     turn = Rotation.from_matrix(axes.T @ base[:3, :3]).as_rotvec()
     found = [told[f"base_{name}"].value for name in ("x", "y", "z", "rx", "ry", "rz")]
     assert_allclose(found, [*axes.T @ base[:3, 3], *turn], rtol=0, atol=1e-12)

@@ -65,7 +65,7 @@ def test_replicates_are_true_refits(objective: str, robot: mc.Robot, noisy: Simu
     change, good = stepped(one, draws, silent)
     assert good.all()
     active = one.identification.active
-    sigma = one.known.sigma[active]
+    sigma = one.uncertainty.sigma[active]
     for number in range(4):
         rows = np.repeat(np.arange(noisy.data.poses), draws.rows(number))
         assert len(rows) == noisy.data.poses
@@ -81,7 +81,7 @@ def test_replicates_heed_priors_and_weights(robot: mc.Robot, noisy: Simulation) 
     one, draws = inner(robot, data, "sum", priors={"a*": 1e-4})
     change, _ = stepped(one, draws, silent)
     active = one.identification.active
-    sigma = one.known.sigma[active]
+    sigma = one.uncertainty.sigma[active]
     for number in range(3):
         rows = np.repeat(np.arange(data.poses), draws.rows(number))
         end = refitted(one.estimator.at(rows), one.cell.state)
@@ -103,7 +103,7 @@ def test_replicates_of_a_robust_fit_give_way_as_it_does(robot: mc.Robot, noisy: 
     draws = draw(groups(data), 8, np.random.default_rng(1))
     cell = fit.cell
     state = cell.state
-    sigma = fit.known.sigma[found.place]
+    sigma = fit.uncertainty.sigma[found.place]
     ours, theirs = found.change / sigma, np.zeros(found.change.shape)
     for number in range(8):
         rows = np.repeat(np.arange(data.poses), draws.rows(number))

@@ -78,8 +78,6 @@ def test_nothing_is_passed_beyond_while_parts_could_not_be_judged() -> None:
     assert "only 1 of 2 parts could be judged, not joint 2 at its low end" in found.why
     assert "1 of 2 parts could be judged" in beyond(some).where
     assert judge(Limit("rms", 0.1), beyond(some)).verdict == NOT_PASSED  # seen is seen
-    old = judge(Limit("rms", 0.5), beyond(Beyond(folds, 0.2, 0.2, "", 0.3, 1.2, missed=None)))
-    assert (old.verdict, "earlier version" in old.why) == (NOT_STATED, True)
 
 
 def test_what_is_passed_does_not_hide_what_is_seen_beyond() -> None:

@@ -58,10 +58,10 @@ def test_the_tool_is_the_reflectors_as_one_body(fit: mc.Fit) -> None:
         np.array([0.01, -0.02, 0.03]),
         Rotation.from_euler("ZYX", [3.0, -2.0, 1.0], degrees=True),
     )
-    spots = fit.before.target_positions
+    spots = fit.nominal.target_positions
     middle = spots.mean(axis=0)
     there = (spots - middle) @ known[1].as_matrix().T + middle + known[0]
-    frames = frames_of(replace(fit.cell, target_positions=there), fit.before)
+    frames = frames_of(replace(fit.cell, target_positions=there), fit.nominal)
     assert_allclose(frames["tool_correction"].xyz_mm, 1e3 * known[0], rtol=0, atol=1e-9)
     assert_allclose(frames["tool_correction"].abc_deg, [3.0, -2.0, 1.0], rtol=0, atol=1e-9)
     assert_allclose(frames["tool"].xyz_mm, 1e3 * there.mean(axis=0), rtol=1e-12)
@@ -71,7 +71,7 @@ def test_the_tool_is_the_reflectors_as_one_body(fit: mc.Fit) -> None:
 def test_reflectors_that_tell_no_turn_make_no_tool(fit: mc.Fit) -> None:
     line = np.arange(3.0)[:, None] * [0.05, 0.02, 0.0]
     for spots in (line, line[:2]):
-        cells = [replace(cell, target_positions=spots) for cell in (fit.cell, fit.before)]
+        cells = [replace(cell, target_positions=spots) for cell in (fit.cell, fit.nominal)]
         assert list(frames_of(*cells)) == list(BASE)
     assert list(frames_of(fit.cell, None)) == ["base"]
 
@@ -79,7 +79,7 @@ def test_reflectors_that_tell_no_turn_make_no_tool(fit: mc.Fit) -> None:
 def test_a_further_session_has_its_instrument(fit: mc.Fit) -> None:
     away = transform(np.eye(3), np.array([0.5, 0.0, 0.0]))
     sessions = replace(fit.cell.sessions, frames={"monday": np.eye(4), "tuesday": away})
-    frames = frames_of(replace(fit.cell, sessions=sessions), fit.before)
+    frames = frames_of(replace(fit.cell, sessions=sessions), fit.nominal)
     assert frames["session tuesday"].xyz_mm == (500.0, 0.0, 0.0)
     assert "instrument of session tuesday" in [row[0] for row in tables_of(frames)[0].rows]
 

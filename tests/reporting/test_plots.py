@@ -31,7 +31,7 @@ def test_a_long_name_stays_in_its_picture() -> None:
     pytest.importorskip("matplotlib")
     robot = replace(ROBOT, name="A robot of a make and of a type with a name that goes on " * 3)
     fit = mc.calibrate(robot, simulate(ROBOT, 40).data, "sum")
-    figure = figures.errors_figure(fit)
+    figure = figures.plot_errors(fit)
     figure.canvas.draw()
     (title,) = [text for text in figure.texts if text.get_text().startswith("A robot")]
     box = title.get_window_extent()

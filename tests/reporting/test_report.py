@@ -266,7 +266,10 @@ def test_what_later_files_tell_is_shown(
     fit["covariance"] |= {
         "names": ["a1", "theta2"], "units": ["mm", "rad"], "rows": [[4.0, 3.0], [3.0, 9.0]]
     }  # fmt: skip
-    fit["suspects"] = [{"line": 7, "target": "smr2", "distance_mm": 1.5, "score": 9.25}]
+    fit["suspects"] = [
+        {"line": 7, "target": "smr2", "distance_mm": 1.5, "score": 9.25,
+         "chance": 1e-9, "together": False, "held": False}
+    ]  # fmt: skip
     seen = rendered(tmp_path, fit, gap)
     (row,) = table_of(seen, "95 % intervals")[1:]  # the file does not tell the nominal robot's
     assert [row[0], *row[2:4], *row[5:]] == ["calibrated", "0.1110", "0.2220", "0.2220", "-"]
@@ -289,7 +292,7 @@ def test_no_chapter_is_empty(results: Path, given: str, lacking: str) -> None:
 def test_files_without_poses_give_their_tables(
     tmp_path: Path, fit: dict[str, Any], gap: dict[str, Any]
 ) -> None:
-    for key in ("poses", "trace_mm2", "minimax", "advice"):
+    for key in ("poses", "minimax"):
         del fit[key]
     for key in ("poses", "curves"):
         del gap[key]

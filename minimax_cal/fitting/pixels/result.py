@@ -18,6 +18,7 @@ from minimax_cal.fitting.pixels.worst import WorstPixels
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.records import Number, Part, Recorded, checked
 from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.words import capitalise
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.robots.robot import Robot, robot_from_dict
@@ -153,7 +154,7 @@ class PixelCalibration(RelativeCalibration):
         if self.set_aside:
             text += f" {len(self.set_aside)} pixels set aside as wrong."
         if self.reason:
-            return f"{self.reason[:1].upper()}{self.reason[1:]}. {text}"
+            return f"{capitalise(self.reason)}. {text}"
         return text + (f" {self.status.advice}." if self.status.advice else "")
 
     def to_dict(self) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
     n = one.cell.robot.joints
     turn = np.eye(5 * n)
     turn[:, kept] -= motion
-    drawn = links_of(one.before.robot.mdh)
+    drawn = links_of(one.nominal.robot.mdh)
     value = [drawn + turn @ (links_of(fit.cell.robot.mdh) - drawn) for fit in fits]
     covariance = sum(turn @ links_covariance(fit) @ turn.T for fit in fits)
     told = [told_by(fit, kept, n) for fit in fits]
@@ -78,7 +78,7 @@ def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
     return Comparison(
         names=(names[0], names[1]),
         robot=one.cell.robot.name,
-        differences=tuple(each[i] for i in one.known.names.link_by_link[: 5 * n]),
+        differences=tuple(each[i] for i in one.uncertainty.names.link_by_link[: 5 * n]),
         changed=found,
         accuracy=tuple(on_common(one, other)),
         same=same,
@@ -92,17 +92,15 @@ def in_convention(robot: Robot, links: Array) -> Array:
 
 
 def check_alike(one: Fit, other: Fit) -> None:
-    """Raise OptionError unless both are of one kind of arm, and tell how sure they are."""
-    for fit in (one, other):
-        _ = fit.known, fit.before
+    """Raise OptionError unless both are of one kind of arm."""
     a, b = one.cell.robot, other.cell.robot
     if a.joints != b.joints or np.any(a.sign != b.sign) or np.any(a.prismatic != b.prismatic):
         raise OptionError(
             f"{a.name} ({a.joints} joints) and {b.name} ({b.joints}) differ in number, signs or "
             "types of joints; compare calibrations of one arm"
         )
-    apart = links_of(other.before.robot.mdh - one.before.robot.mdh)
-    if named := wild(one.known.names, apart, a.reach()):
+    apart = links_of(other.nominal.robot.mdh - one.nominal.robot.mdh)
+    if named := wild(one.uncertainty.names, apart, a.reach()):
         raise OptionError(
             f"{a.name} and {b.name} are drawn as different arms ({named}); compare calibrations "
             "that start from one drawing"
@@ -122,7 +120,7 @@ def gauge(fit: Fit) -> tuple[Array, Array]:
     state, n = replace(fit.cell.state, effects=np.zeros(0)), 5 * fit.cell.robot.joints
     model = identify.plenty_of_poses(fit.cell.robot, model_of(fit.cell.robot, fit.data))
     gram = identify.gram_of(model, state)
-    order = identify.drop_order(fit.before.robot, model.names)
+    order = identify.drop_order(fit.nominal.robot, model.names)
     everything = np.ones(model.names.count, dtype=bool)
     gone = np.array(identify.redundant(gram, everything, order, identify.RANK_TOLERANCE), dtype=int)
     size = np.sqrt(np.maximum(np.diag(gram), TINY))
@@ -134,7 +132,7 @@ def gauge(fit: Fit) -> tuple[Array, Array]:
 def links_covariance(fit: Fit) -> Array:
     """(5n, 5n) of the link parameters, by noise and by folds; zero where they were kept."""
     n = 5 * fit.cell.robot.joints
-    return np.nan_to_num(fit.known.covariance[:n, :n]) + folds_covariance(fit)[:n, :n]
+    return np.nan_to_num(fit.uncertainty.covariance[:n, :n]) + folds_covariance(fit)[:n, :n]
 
 
 def folds_covariance(fit: Fit) -> Array:
@@ -142,7 +140,7 @@ def folds_covariance(fit: Fit) -> Array:
 
     Zero where regions cannot be left out.
     """
-    out = np.zeros((fit.known.names.count,) * 2)
+    out = np.zeros((fit.uncertainty.names.count,) * 2)
     if not fit.train.poses:
         return out
     poses, label = Poses.of(fit.estimator, fit.cell.state), regions(fit.train)
@@ -155,7 +153,7 @@ def folds_covariance(fit: Fit) -> Array:
 
 def told_by(fit: Fit, kept: Array, joints: int) -> Array:
     """(5n,) True where a fit tells a parameter, or any other that moves the points alike."""
-    names = fit.known.names.all[: 5 * joints]
+    names = fit.uncertainty.names.all[: 5 * joints]
     reasons = {p.name: p.reason for p in fit.parameters}
     alike = identify.SAME_MOTION.partition("{")[0].strip()
     return np.array(
@@ -170,7 +168,7 @@ def differences(
     fit: Fit, value: list[Array], covariance: Array, kept: Array, told: list[Array]
 ) -> Iterator[Difference]:
     """Every link parameter, in the order of `Names`."""
-    names, sigma = fit.known.names, np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    names, sigma = fit.uncertainty.names, np.sqrt(np.maximum(np.diag(covariance), 0.0))
     for i in range(len(sigma)):
         missing = [which for which, known in zip("AB", told, strict=True) if not known[i]]
         reason = ""
@@ -231,7 +229,7 @@ def remarks(one: Fit, other: Fit) -> Iterator[str]:
         yield f"they hold different effects ({told}): geometry takes over part of what one lacks"
     change = links_of(other.cell.robot.mdh - one.cell.robot.mdh)
     change[zero_positions(one.cell.robot.prismatic)] = 0.0  # a service may set them anew
-    if named := wild(one.known.names, change, one.cell.robot.reach()):
+    if named := wild(one.uncertainty.names, change, one.cell.robot.reach()):
         yield f"implausibly large changes: {named}; are both of the same arm?"
-    if np.abs(one.before.robot.mdh - other.before.robot.mdh).max() > ALIKE:
+    if np.abs(one.nominal.robot.mdh - other.nominal.robot.mdh).max() > ALIKE:
         yield "they start from different drawings: what neither identifies differs by that alone"

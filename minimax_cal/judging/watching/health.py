@@ -154,7 +154,7 @@ def refused(fit: Fit, data: Measurements, missed: float) -> str:
 
     missed: `residual` of the new points [m].
     """
-    noise = math.sqrt(3.0 * fit.known.noise.variance), "the calibration's noise"
+    noise = math.sqrt(3.0 * fit.uncertainty.noise.variance), "the calibration's noise"
     return REFUSED.get(fit.status, "") or computed(data, missed, noise, "the calibrated arm")
 
 

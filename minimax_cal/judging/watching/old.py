@@ -68,26 +68,26 @@ def own_poses(fit: Fit) -> Old | None:
     poses, some = Poses.of(few, fit.cell.state), train.take(rows)
     best, least, near = None, np.inf, np.zeros(0)
     for share in SHARES:
-        old = old_at(fit, poses, some, share * fit.known.noise.jitter)
+        old = old_at(fit, poses, some, share * fit.uncertainty.noise.jitter)
         found = likeliest(alone(fit, old, near))
         near = found.factor
         if found.deviance + old.log_noise > least:
             break
         best, least = replace(old, factor=near), found.deviance + old.log_noise
-        if not fit.known.noise.jitter:
+        if not fit.uncertainty.noise.jitter:
             break
     return best
 
 
 def old_at(fit: Fit, poses: Poses, some: Measurements, jitter: float) -> Old:
     """The same with a noise of the joints [rad]."""
-    half = noise_root(poses, fit.known.noise.variance, jitter)
+    half = noise_root(poses, fit.uncertainty.noise.variance, jitter)
     error, every = poses.every
     white = np.linalg.solve(half, np.concatenate([error[..., None], every, poses.arm], axis=2))
     slope, model = white[..., 1 : 1 + every.shape[2]], poses.estimator.model
     kept = model.active & np.isin(model.names.all, fit.options.fix)
     active = model.active & ~kept
-    root = np.where(kept[:, None], fit.known.root, 0.0)[:, : None if kept.any() else 0]
+    root = np.where(kept[:, None], fit.uncertainty.root, 0.0)[:, : None if kept.any() else 0]
     return Old(
         names=tuple(name for name, free in zip(model.names.all, active, strict=True) if free),
         error=white[..., 0],

@@ -29,7 +29,7 @@ def watched_of(
     fit: Fit, data: Measurements, known: Sequence[str]
 ) -> tuple[Watched, tuple[str, ...]]:
     """The new measurements beside the calibration; what was left out.  Raises CalibrationError."""
-    known_by = fit.known
+    known_by = fit.uncertainty
     data = check_joints(fit.cell.robot, data)
     if len(np.unique(labels(data))) > 1:
         raise DataError(f"{data.source}: holds several sessions; check them one by one")
@@ -138,5 +138,5 @@ def foot_scatter(fit: Fit, data: Measurements) -> float:
 
 def in_names(fit: Fit, watched: Watched, flags: Array) -> Array:
     """(p,) flags by the names of the calibration as flags by those of now."""
-    old = dict(zip(fit.known.names.all, flags, strict=True))
+    old = dict(zip(fit.uncertainty.names.all, flags, strict=True))
     return np.array([bool(old.get(name, False)) for name in watched.names.all])

@@ -32,7 +32,7 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
     cell = Cell.of(
         watched.cell.robot, state, names.target_names, watched.cell.effects, watched.cell.sessions
     )
-    nominal = place(fit.before.robot, data)
+    nominal = place(fit.nominal.robot, data)
     before, after = nominal.error(data), cell.error(data)
     nobody = np.zeros(data.poses, dtype=bool)
     told = ", ".join(m.parameter for m in found.named) or "nothing but frame and targets"
@@ -66,7 +66,7 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
         share=np.ones(len(names.target_names)),
         prior=np.zeros(names.count),
         widening=1.0,
-        provenance=Provenance.of(fit.before.robot, data, settings_of(fit, rows, sure)),
+        provenance=Provenance.of(fit.nominal.robot, data, settings_of(fit, rows, sure)),
         claim=partial(Beyond, reason="few poses after a check: nothing is left out"),
         stated=None,
         error_crossed=np.zeros((0, 0, 3)),
@@ -87,7 +87,7 @@ def parameters_of(
     drawn = replace(nominal.state, effects=blank).along(axes, nominal.robot)
     end = cell.state.along(axes, cell.robot)
     every = link_by_link(names, sure.units, drawn, end, sure.sigma, known)
-    return Parameters(every, fit.known.dof)
+    return Parameters(every, fit.uncertainty.dof)
 
 
 def settings_of(fit: Fit, rows: Rows, sure: Uncertainty) -> dict[str, Any]:
@@ -126,7 +126,7 @@ def spread_of(fit: Fit, watched: Watched, found: Search) -> Uncertainty:
     known = in_names(fit, watched, fit.identification.active) | rows.active
     covariance[~known] = np.nan
     covariance[:, ~known] = np.nan
-    old = dict(zip(fit.known.names.all, fit.known.units, strict=True))
+    old = dict(zip(fit.uncertainty.names.all, fit.uncertainty.units, strict=True))
     own = zip(names.all, names.units, strict=True)
     units = tuple(old.get(name, unit) for name, unit in own)
-    return replace(fit.known, names=names, units=units, covariance=covariance)
+    return replace(fit.uncertainty, names=names, units=units, covariance=covariance)

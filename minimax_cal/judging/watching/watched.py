@@ -68,7 +68,7 @@ class Watched:
     @property
     def jitter(self) -> float:
         """Noise of the joints [rad]."""
-        return self.old.jitter if self.old else self.fit.known.noise.jitter
+        return self.old.jitter if self.old else self.fit.uncertainty.noise.jitter
 
     @cached_property
     def open(self) -> Array:

@@ -18,6 +18,7 @@ from minimax_cal.fitting.same_arm import wild
 from minimax_cal.fitting.set_aside import WithThem
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.words import capitalise
 from minimax_cal.judging.tolerance import (
     KINDS,
     NOT_PASSED,
@@ -147,7 +148,7 @@ def signed(
         model, claims = "calibration without coordinates", (claim_of_parts(sources),)
     own, fit = sources.fit or sources.gap or sources.relative, sources.fit
     claims = refused(claims, own.status) if own else claims
-    odd = changed(fit.before.robot, fit.cell.robot) if fit else ""
+    odd = changed(fit.nominal.robot, fit.cell.robot) if fit else ""
     rows = rows_of(sources, deliver, rung, limits, which, claims_of, claims)
     if row := governing(rows, bool(deliver)):
         model = with_effects(row.delivered.cell)
@@ -290,7 +291,7 @@ def claim_of_parts(sources: Sources) -> Claim:
 def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
     """Verdict, table, and a few lines."""
     kind = {PASSED: "passed", NOT_PASSED: "failed"}.get(found.verdict, "unstated")
-    banner = found.sentence[:1].upper() + found.sentence[1:] if found.verdict else NO_LIMIT
+    banner = capitalise(found.sentence) if found.verdict else NO_LIMIT
     kind = kind if found.sentence == found.verdict else "unstated"
     banner += f" {found.which} the measured region" if kind == "passed" else ""
     alarm = "caveat" if kind == "passed" else "warning"  # nothing is red under what is passed

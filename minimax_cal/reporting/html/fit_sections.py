@@ -33,10 +33,7 @@ from minimax_cal.reporting.html.verdict import fit_verdict, why_not
 
 SAME = 1e-6  # a file's own errors come back to this, or its effects need other columns [m]
 MOST_SUSPECTS = 50
-NO_POSES = (
-    "The file holds no poses, so that nothing can be drawn; write it again with this version of "
-    "minimax-cal."
-)
+NO_POSES = "The file holds no poses, so that nothing can be drawn; write it again with its poses."
 
 
 def filled(*tables: Table) -> tuple[Table, ...]:
@@ -114,7 +111,7 @@ def parameters(fit: Fit) -> Blocks:
             "correct the base of the drawn arm, along its own axes. Sigma is the standard "
             "deviation that measurement noise and the scatter of the residuals give the identified "
             "value; a dash means that the parameter was kept. Condition number of what was "
-            f"identified: {fit.identification.condition:.3g}."
+            f"identified: {fit.condition:.3g}."
         )
     )
     return [*blocks, *why_not(fit)]
@@ -122,8 +119,8 @@ def parameters(fit: Fit) -> Blocks:
 
 def correlated(fit: Fit) -> Blocks:
     """How the uncertainties hang together."""
-    if fit.uncertainty is None or not fit.uncertainty.active.any():
-        return [missing("The file holds no covariance of the parameters.")]
+    if not fit.uncertainty.active.any():
+        return [missing("No parameter was identified.")]
     note = text(
         "A correlation near 1 or -1 says that these poses tell the two parameters apart badly: "
         "each alone is uncertain, what they do together is not."
@@ -137,8 +134,7 @@ def solution(fit: Fit) -> Blocks:
     blocks: list[Block] = [
         text(
             f"Objective {fit.objective}, QP backend {fit.qp or 'none'}: "
-            f"{fit.status.replace('_', ' ')} after {fit.iterations} iterations, "
-            f"{fit.seconds:.2f} s."
+            f"{fit.status.replace('_', ' ')}. {fit.solution()}"
         )
     ]
     if fit.trace or fit.minimax:
@@ -167,8 +163,8 @@ def iso_values(fit: Fit) -> Blocks:
 
 
 def iso_tables(fit: Fit) -> tuple[Table, ...]:
-    """The tables of the values, none in an old file.  Raises CalibrationError."""
-    if fit.nominal is None or not fit.data.poses:
+    """The tables of the values, none without poses.  Raises CalibrationError."""
+    if not fit.data.poses:
         return ()
     if not np.nanmax(np.abs(fit.cell.error(fit.data) - fit.error), initial=0.0) <= SAME:
         raise CalibrationError(

@@ -13,6 +13,7 @@ from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.words import capitalise
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.reporting.html.charts import (
     LOOKS,
@@ -159,7 +160,7 @@ def curve_chart(name: str, curve: Curve, held: Array) -> Figure:
     traces = two_looks(x.ravel()[chosen], drawn, mask[chosen])
     layout = frame(xaxis=axis(label(curve.xlabel)), yaxis=yaxis)
     cut = f" {len(chosen)} of {x.size} points are drawn." if len(chosen) < x.size else ""
-    title = curve.title[:1].upper() + curve.title[1:]
+    title = capitalise(curve.title)
     says = f"{title}: {curve.ylabel} against {curve.xlabel}; {spread(views)}.{cut}{outside}"
     return figure(f"curve-{name}", title, says, traces, layout)
 

@@ -105,7 +105,7 @@ class Sources:
 
     @property
     def poses(self) -> Poses | None:
-        """Of the calibration, or else of the diagnosis; None in an old file."""
+        """Of the calibration, or else of the diagnosis; None where the file has none."""
         fit, gap = self.fit, self.gap
         if fit and fit.data.poses:
             return Poses(fit.data, fit.held, 1e3 * fit.error_nominal, 1e3 * fit.error)
@@ -116,7 +116,7 @@ class Sources:
 
     @property
     def cell(self) -> Cell | None:
-        """The arm to draw; None in an old file."""
+        """The arm to draw; None without points in space."""
         if self.fit:
             return self.fit.cell
         return self.gap.cells[-1] if self.gap and self.gap.cells else None

@@ -117,12 +117,32 @@ def scale_bar(part: FigureBase, shown: Any, panels: Array, label: str, side: str
 
 
 def save_errors(fit: Fit, path: Path) -> None:
-    """`errors_figure` as a file."""
-    save(errors_figure(fit), path)
+    """`plot_errors` as a file."""
+    save(plot_errors(fit), path)
 
 
-def errors_figure(fit: Fit) -> Figure:
-    """Errors before and after: pose by pose, and their distribution on held-out poses."""
+def plot_errors(fit: Fit) -> Figure:
+    """Errors before and after: pose by pose, and their distribution on held-out poses.
+
+    Parameters
+    ----------
+    fit
+        A calibration.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Errors in mm.
+
+    Raises
+    ------
+    OptionError
+        Without matplotlib.
+
+    Examples
+    --------
+    >>> mc.plot_errors(fit).savefig("errors.png")
+    """
     figure = new_figure(9, 4.0)
     from matplotlib.ticker import MaxNLocator
 

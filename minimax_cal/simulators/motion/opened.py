@@ -82,7 +82,7 @@ def calibrated(opened: Opened, fit: Fit) -> tuple[Opened, tuple[str, ...]]:
         weigh_drawn(document.root, fit.cell.robot)
         given = replace(opened.given, document=document)
         return opened.rebuilt(given), ()
-    nominal = fit.before.robot
+    nominal = fit.nominal.robot
     own = None if assumed(opened.chain.robot) else told_masses(opened.chain, nominal)
     arm = arm_of(fit.cell, fit.train.q, own)
     driven = any(opened.chain.servo(joint) >= 0 for joint in opened.chain.joints)
