@@ -42,9 +42,9 @@ def weighed_anew(study: Study, known: Array, *, each: bool = True) -> Study:
     rest = WholePoses.of(study, known, whole)
     turned, (along, across) = rest.products(joints), rest.products(sight)
     size, alike = (noise.jitter**2, noise.variance), turned.sum(axis=0)
-    least, _ = rest.likeliest([alike, along + across], np.array(size))
+    least, _ = rest.fit_variances([alike, along + across], np.array(size))
     parts = [*(turned if each else alike[None]), along, across]
-    most, found = rest.likeliest(parts, np.repeat(size, (len(parts) - 2, 2)))
+    most, found = rest.fit_variances(parts, np.repeat(size, (len(parts) - 2, 2)))
     if chi2.sf(least - most, len(parts) - 2) > UNLIKE:
         return study
     scatter = np.broadcast_to(np.sqrt(found[:-2]), len(turned))
@@ -114,7 +114,7 @@ class WholePoses:
             out.append(part @ np.swapaxes(part, 1, 2))
         return np.array(out)
 
-    def likeliest(self, parts: Sequence[Array], start: Array) -> tuple[float, Array]:
+    def fit_variances(self, parts: Sequence[Array], start: Array) -> tuple[float, Array]:
         """-2 log restricted likelihood at its least, and the variance (g,) of each part.
 
         start: (g,) variances near by.

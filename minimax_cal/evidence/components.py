@@ -28,7 +28,9 @@ class Components:
     moment: Array
 
 
-def likeliest(gram: Array, gradient: Array, square: float, dof: int, group: Array) -> Components:
+def fit_components(
+    gram: Array, gradient: Array, square: float, dof: int, group: Array
+) -> Components:
     """Restricted maximum likelihood by its fixed point [Harville 1977].
 
     gram: (c, c) products of the factors' columns, parameters taken out.  gradient: (c,) their

@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 
 from minimax_cal.evidence.limits import LEAST_NOISE_DOF
-from minimax_cal.evidence.ratios import likeliest
+from minimax_cal.evidence.ratios import find_ratio
 from minimax_cal.ground.arrays import Array
 
 RANK = 1e-5  # singular value of the scaled Jacobian below which a direction is no direction
@@ -143,7 +143,7 @@ def restricted(rows: Problem, known: Array) -> Noise:
         gram = np.array([half.T @ half for half in halves])
         return costs(gram, ratios, rows.variance_ratio, dof)
 
-    ratio = likeliest(lambda ratios: cost(ratios)[0])
+    ratio = find_ratio(lambda ratios: cost(ratios)[0])
     return noise_of(ratio, float(cost(np.array([ratio]))[1][0]) / dof, rows)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from minimax_cal.evidence.limits import LEAST_NOISE_DOF
 from minimax_cal.evidence.noise import Noise, Problem, costs, noise_of, triangles
-from minimax_cal.evidence.ratios import NODES, RATIOS, interpolation, likeliest, nodes
+from minimax_cal.evidence.ratios import NODES, RATIOS, find_ratio, interpolation, nodes
 from minimax_cal.ground.arrays import Array
 
 LEAST = 1e-13  # of a column's square: what is left of one that geometry imitates is no less
@@ -326,12 +326,12 @@ class Products:
             value, squares = costs(gram, ratios, varied, dof)
             return value + logs, squares
 
-        ratio = self.likeliest(lambda ratios: cost(ratios)[0])
+        ratio = self.find_ratio(lambda ratios: cost(ratios)[0])
         return noise_of(ratio, float(cost(np.array([ratio]))[1][0]) / dof, rows)
 
-    def likeliest(self, cost: Callable[[Array], Array]) -> float:
+    def find_ratio(self, cost: Callable[[Array], Array]) -> float:
         """The ratio of least cost."""
-        return likeliest(cost)
+        return find_ratio(cost)
 
     def gram(self, ratios: Array, index: Array) -> tuple[Array, Array]:
         """(s, q + 1, q + 1) products among candidates' columns (q,) and, last, the error.

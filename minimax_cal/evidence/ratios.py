@@ -53,7 +53,7 @@ def finely() -> tuple[Array, Array]:
     return x, interpolation(x, FEW)
 
 
-def likeliest(cost: Callable[[Array], Array]) -> float:
+def find_ratio(cost: Callable[[Array], Array]) -> float:
     """The ratio of least cost, 0 if none of RATIOS costs less.  cost: (g,) of ratios (g,)."""
     best = int(np.argmin(cost(RATIOS)))
     if not best:

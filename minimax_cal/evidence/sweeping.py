@@ -76,7 +76,7 @@ class Swept(Products):
         """(r, N) the geometry's columns, as the combinations that the rows tell apart."""
         return np.asarray(self.span.T @ self.columns.clear[: self.columns.fixed - 1])
 
-    def likeliest(self, cost: Callable[[Array], Array]) -> float:
+    def find_ratio(self, cost: Callable[[Array], Array]) -> float:
         """The ratio of least cost among those of the Grams."""
         return float(self.ratios[int(np.argmin(cost(self.ratios)))])
 

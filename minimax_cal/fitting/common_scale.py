@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtr
 
-from minimax_cal.evidence.components import likeliest
+from minimax_cal.evidence.components import fit_components
 from minimax_cal.fitting.start import BaseFit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
@@ -110,7 +110,7 @@ def with_lack(robot: Robot, model: Model, state: State) -> tuple[Array, Array]:
     back = np.linalg.pinv(rows)
     left = lack - rows @ (back @ lack)
     dof = max(len(error) - rows.shape[1], 1)
-    found = likeliest(left.T @ lack, left.T @ error, float(error @ error), dof, kind[:, 1])
+    found = fit_components(left.T @ lack, left.T @ error, float(error @ error), dof, kind[:, 1])
     moved = back @ lack
     spread = found.moment - np.outer(found.mean, found.mean)
     shift, covariance = np.zeros(p), np.zeros((p, p))

@@ -200,7 +200,7 @@ def student(mean_square: Array, directions: Array, edge: float, dof: float, usua
         if below:
             at, value = least_between(partial(loss, tail=tail), low, high)
         else:
-            at = min(max(likeliest(size, half, tail, math.log(usual)), low), high)
+            at = min(max(fit_log_scale(size, half, tail, math.log(usual)), low), high)
             value = loss(at, tail)
         doubt = MIN_TAIL_GAIN if tail < dof else 0.0
         spread = Spread(max(float(np.exp(at)), LEAST_SCALE), float(tail))
@@ -208,7 +208,7 @@ def student(mean_square: Array, directions: Array, edge: float, dof: float, usua
     return min(best, key=lambda trial: trial[0])[1]
 
 
-def likeliest(size: Array, half: Array, tail: float, log_scale: float) -> float:
+def fit_log_scale(size: Array, half: Array, tail: float, log_scale: float) -> float:
     """The log scale of `student` where no edge cuts points off: the loss is convex in it [Newton].
 
     size: (n,) squares [m^2], half: (n,) half their directions.

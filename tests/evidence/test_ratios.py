@@ -10,9 +10,9 @@ from minimax_cal.evidence.ratios import (
     FINE,
     NODES,
     RATIOS,
+    find_ratio,
     finely,
     interpolation,
-    likeliest,
     nodes,
     points,
     vertex,
@@ -59,7 +59,7 @@ def bowl(least: float, bent: float = 0.0) -> Array:
         off = np.log10(np.where(ratios > 0.0, ratios, 1.0)) - least
         return np.where(ratios > 0.0, off**2 + bent * off**4, 1e3)
 
-    return np.log10(likeliest(cost))
+    return np.log10(find_ratio(cost))
 
 
 @pytest.mark.parametrize("least", [-2.9, -2.02, -0.3, 0.0, 1.7183, 4.4, 4.95])
@@ -73,8 +73,8 @@ def test_beyond_the_ends_it_is_the_end() -> None:
 
 
 def test_it_is_none_where_none_is_better() -> None:
-    assert likeliest(lambda ratios: np.where(ratios > 0.0, 1.0, 0.0)) == 0.0
-    assert likeliest(lambda ratios: 0.0 * ratios) == 0.0
+    assert find_ratio(lambda ratios: np.where(ratios > 0.0, 1.0, 0.0)) == 0.0
+    assert find_ratio(lambda ratios: 0.0 * ratios) == 0.0
 
 
 def test_a_vertex_is_that_of_the_parabola() -> None:

@@ -17,7 +17,7 @@ from minimax_cal.fitting.suspects import (
     Scores,
     Spread,
     Suspect,
-    likeliest,
+    fit_log_scale,
     scores,
     spread_of,
     suspects_of,
@@ -142,7 +142,7 @@ def test_the_likeliest_scale_is_where_the_density_is_largest(
     rng: np.random.Generator, tail: float
 ) -> None:
     square = drawn(rng, 500, tail)[0]
-    found = likeliest(square, np.full(500, 1.5), tail, float(np.log(NOISE)) + 1.0)
+    found = fit_log_scale(square, np.full(500, 1.5), tail, float(np.log(NOISE)) + 1.0)
 
     def loss(log_scale: float) -> float:
         ratio = square / 3.0 / np.exp(2.0 * log_scale)

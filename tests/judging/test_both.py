@@ -10,8 +10,8 @@ from minimax_cal.judging.watching.both import (
     RIDGE,
     Both,
     Part,
+    fit_variances,
     inverse,
-    likeliest,
     solve,
 )
 
@@ -39,7 +39,7 @@ def drawn(rng: np.random.Generator, noise: float = NOISE) -> tuple[Both, list[np
 
 def test_variances_are_those_that_were_drawn() -> None:
     rng = np.random.default_rng(0)
-    found = [likeliest(drawn(rng)[0]) for _ in range(20)]
+    found = [fit_variances(drawn(rng)[0]) for _ in range(20)]
     assert np.mean([v.noise[OLD] for v in found]) == pytest.approx(NOISE, rel=0.05)
     assert np.mean([v.factor[0] for v in found]) == pytest.approx(FACTOR, rel=0.2)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from minimax_cal.evidence.components import likeliest
+from minimax_cal.evidence.components import fit_components
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.pixels.identify import gram_of_pixels, lengths_of
 from minimax_cal.ground.arrays import Array
@@ -89,7 +89,7 @@ def uncertainty_of(robot: Robot, fit: PixelFit, group: Array) -> Uncertainty:
     moved = cover @ (jacobian @ columns.T)
     left = columns - moved.T @ jacobian
     dof = max(2 * int((model.weight > 0.0).sum()) - len(gram), 1)
-    found = likeliest(left @ columns.T, left @ error, float(error @ error), dof, kind)
+    found = fit_components(left @ columns.T, left @ error, float(error @ error), dof, kind)
     size = (UNIT * joint_units(robot)) ** 2
     own = kind[functions:].reshape(robot.joints, -1)[:, 0]
     lack = Lack(found.moment, functions, found.variance[own] * size)

@@ -74,7 +74,7 @@ class Both:
     @cached_property
     def variances(self) -> Variances:
         """The likeliest, or those that are given."""
-        return self.found or likeliest(self)
+        return self.found or fit_variances(self)
 
     @property
     def noise_ratio(self) -> float:
@@ -221,7 +221,7 @@ def inverse(gram: Array) -> Array:
     return np.asarray((half + np.triu(half, 1).T) / np.outer(size, size))
 
 
-def likeliest(both: Both) -> Variances:
+def fit_variances(both: Both) -> Variances:
     """Restricted maximum likelihood by its fixed point [Harville 1977].
 
     The new poses are no less noisy than those of the calibration; those of the foot as is stated.

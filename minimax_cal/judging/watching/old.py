@@ -10,7 +10,7 @@ import numpy as np
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
-from minimax_cal.judging.watching.both import KNOWN, OLD, Both, Part, likeliest
+from minimax_cal.judging.watching.both import KNOWN, OLD, Both, Part, fit_variances
 from minimax_cal.measuring.grouping import groups, regions
 from minimax_cal.measuring.history import clock, is_timed
 from minimax_cal.measuring.measurements import Measurements
@@ -69,7 +69,7 @@ def own_poses(fit: Fit) -> Old | None:
     best, least, near = None, np.inf, np.zeros(0)
     for share in SHARES:
         old = old_at(fit, poses, some, share * fit.uncertainty.noise.jitter)
-        found = likeliest(alone(fit, old, near))
+        found = fit_variances(alone(fit, old, near))
         near = found.factor
         if found.deviance + old.log_noise > least:
             break
