@@ -19,7 +19,7 @@ from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.certificate import Certificate
 from minimax_cal.fitting.changed import Change
 from minimax_cal.fitting.crossed import NOT_CROSSED, Within, intervals_of
-from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.identify import Because, Identification, Reason, name_reason
 from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval, told
 from minimax_cal.fitting.minimax_problem import Distances, trusted_distances
 from minimax_cal.fitting.options import Options, read_options
@@ -43,7 +43,7 @@ from minimax_cal.measuring.spans import Span, spans_of
 from minimax_cal.modelling.cell import Cell, saved_content
 from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted
-from minimax_cal.modelling.effects.words import name_codes, name_effect
+from minimax_cal.modelling.effects.words import name_effect, name_parameter
 from minimax_cal.modelling.frames import frames_of, tables_of, with_effects
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, model_of, pose_weights
@@ -72,7 +72,11 @@ CORRECTIONS = {  # parameters that are no values but corrections, and of what
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter in SI; sigma is NaN where it is not identified, reason says why it is not."""
+    """One parameter in SI; sigma is NaN where it is not identified.
+
+    reason: why it is not; because: of which kind that is; like: the parameters that together move
+    the points as it does.
+    """
 
     name: str
     value: float
@@ -81,6 +85,8 @@ class Parameter:
     unit: str = ""
     identifiable: bool = True
     reason: str = ""
+    because: Because = Because.OTHER
+    like: tuple[str, ...] = ()
 
     @property
     def of_effect(self) -> bool:
@@ -112,6 +118,18 @@ class Parameter:
         """Why it was not identified, empty where it was."""
         return "" if self.identifiable else self.reason or "no reason was recorded"
 
+    @property
+    def why(self) -> Reason:
+        """Why it is not identified, in one."""
+        return Reason(self.reason, self.because, self.like)
+
+    @property
+    def why_in_words(self) -> str:
+        """`why_not`, with other parameters as people call them."""
+        if self.identifiable or not self.like:
+            return self.why_not
+        return name_reason(self.because, [name_parameter(name) for name in self.like])
+
     def to_dict(self) -> dict[str, Any]:
         """For JSON, lengths in millimetres."""
         scale, unit = self.written
@@ -125,7 +143,8 @@ class Parameter:
         }
         if self.corrects:
             out |= {"correction": (self.value - self.nominal) * scale, "corrects": self.corrects}
-        return out | ({"reason": self.reason} if self.reason else {})
+        why = {"reason": self.reason, "because": self.because, "like": list(self.like)}
+        return out | (why if self.reason else {})
 
 
 @dataclass(frozen=True, repr=False)
@@ -217,13 +236,12 @@ def link_by_link(
 
     units: of each, SI.  before, after, sigma: (p,) as drawn, as found and how sure [SI].
     """
-    order = names.link_by_link
+    order = names.link_by_link.tolist()
     numbers = (part[order].tolist() for part in (after, before, sigma, known.active))
+    whys = [known.reasons.get(names.all[i], Reason("")) for i in order]
     return tuple(
-        Parameter(
-            names.all[i], value, nominal, own, units[i], told, known.reasons.get(names.all[i], "")
-        )
-        for i, value, nominal, own, told in zip(order.tolist(), *numbers, strict=True)
+        Parameter(names.all[i], value, nominal, own, units[i], told, why.text, why.kind, why.like)
+        for i, value, nominal, own, told, why in zip(order, *numbers, whys, strict=True)
     )
 
 
@@ -248,11 +266,11 @@ def table_of_effects(parameters: Iterable[Parameter]) -> Table:
     """Of parameters those of effects, as in the files."""
     rows = tuple(
         (
-            name_codes(p.name),
+            name_parameter(p.name),
             p.written[1],
             p.value * p.written[0],
             p.sigma * p.written[0],
-            name_codes(p.why_not),
+            p.why_in_words,
         )
         for p in parameters
         if p.of_effect

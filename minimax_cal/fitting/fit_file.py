@@ -380,7 +380,7 @@ def identification_of(part: OwnPart, parameters: Parameters, names: Names) -> Id
         active[names.index(p.name)] = p.identifiable
     return Identification(
         active=active,
-        reasons={p.name: p.reason for p in parameters if p.reason},
+        reasons={p.name: p.why for p in parameters if p.reason},
         singular=part.arrays["singular"],
         scale=part.arrays["sensitivity"],
     )

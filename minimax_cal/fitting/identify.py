@@ -7,8 +7,9 @@ one member is left at its nominal value.  Which one is a matter of taste: predic
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -29,9 +30,44 @@ PARALLEL = np.sin(np.radians(5.0))  # neighbouring axes closer than this count a
 RANK_TOLERANCE = 1e-6
 RESOLUTION = 1e-3
 MAX_NAMED = 4  # names in a reason
-SAME_MOTION = "same motion as {}"
-NOT_TOLD = "these poses do not tell it from {}"
 TOGETHER = "all targets moved together"
+
+
+class Because(StrEnum):
+    """Why a parameter keeps its nominal value, as files call it."""
+
+    FIXED = "fixed"
+    NO_MOTION = "no_motion"
+    SAME_MOTION = "same_motion"
+    NOT_TOLD = "not_determined"
+    NO_SCALE = "no_scale"
+    OTHER = "other"
+
+
+WORDS = {  # {} for the parameters that move the points alike
+    Because.FIXED: "fixed by the user",
+    Because.NO_MOTION: "moves no measured point",
+    Because.SAME_MOTION: "same motion as {}",
+    Because.NOT_TOLD: "these poses do not tell it from {}",
+}
+BY_OTHERS = (Because.SAME_MOTION, Because.NOT_TOLD)
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why a parameter keeps its nominal value.
+
+    like: the identified parameters that together move the points as it does, the largest first.
+    """
+
+    text: str
+    kind: Because = Because.OTHER
+    like: tuple[str, ...] = ()
+
+
+def name_reason(kind: Because, like: Sequence[str]) -> str:
+    """A reason of BY_OTHERS in words."""
+    return WORDS[kind].format(name_first(like, MAX_NAMED))
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +80,7 @@ class Identification:
     """
 
     active: Array
-    reasons: Mapping[str, str]
+    reasons: Mapping[str, Reason]
     singular: Array
     scale: Array
 
@@ -58,17 +94,17 @@ class Identification:
 class Kept:
     """What is left while parameters are given up.
 
-    active: (p,) True where a parameter is kept.  reasons: why others are not, by name; {} stands
-    for the parameters that move the points alike.
+    active: (p,) True where a parameter is kept.  reasons: why others are not, by name; those of
+    BY_OTHERS do not say yet by which.
     """
 
     names: Names
     active: Array
-    reasons: Mapping[str, str]
+    reasons: Mapping[str, Reason]
 
-    def without(self, gone: Array | list[int], reason: str) -> Kept:
-        """Fewer.  gone: (p,) mask, or indices."""
-        active = self.active.copy()
+    def without(self, gone: Array | list[int], kind: Because, text: str = "") -> Kept:
+        """Fewer.  gone: (p,) mask, or indices.  text: of the reason, WORDS unless given."""
+        active, reason = self.active.copy(), Reason(text or WORDS[kind], kind)
         active[gone] = False
         lost = np.arange(len(active))[gone]
         named = dict.fromkeys((self.names.all[i] for i in lost), reason)
@@ -83,17 +119,18 @@ class Kept:
         are one thing to the reader, called `whole`.
         """
         reasons, active = dict(self.reasons), self.active
-        lost = [name for name, reason in reasons.items() if "{}" in reason]
+        lost = [name for name, reason in reasons.items() if reason.kind in BY_OTHERS]
         place = np.array([self.names.index(name) for name in lost], dtype=int)
         mixes = solve_normal(gram[np.ix_(active, active)], gram[active][:, place])
         for name, i, mix in zip(lost, place, mixes.T, strict=True):
-            shown = self.partners(np.abs(mix) * scale[active] / scale[i], stems, whole)
-            reasons[name] = reasons[name].format(shown)
+            like = self.partners(np.abs(mix) * scale[active] / scale[i], stems, whole)
+            kind = reasons[name].kind
+            reasons[name] = Reason(name_reason(kind, like), kind, like)
         scaled = gram[np.ix_(active, active)] / np.outer(scale[active], scale[active])
         singular = np.sqrt(np.maximum(np.linalg.eigvalsh(scaled)[::-1], 0.0))
         return Identification(active, reasons, singular, scale)
 
-    def partners(self, share: Array, stems: Iterable[str], whole: str) -> str:
+    def partners(self, share: Array, stems: Iterable[str], whole: str) -> tuple[str, ...]:
         """The kept parameters that together move the points as one does, largest first.
 
         share: (kept,) of the motion.
@@ -104,7 +141,7 @@ class Kept:
         spots = [name for name in shown if name.rsplit("_", 1)[0] in stems]
         if len({name.rsplit("_", 1)[0] for name in spots}) > 1:
             shown = [name for name in shown if name not in spots] + [whole]
-        return name_first(shown, MAX_NAMED)
+        return tuple(shown)
 
 
 def drop_order(robot: Robot, names: Names) -> Array:
@@ -164,14 +201,15 @@ def determined(
     """
     names, gram = model.names, gram_of(model, state)
     scale = np.sqrt(np.diag(gram) / max(int(model.counts.sum()), 1))
-    kept = Kept(names, allowed, {}).without(~allowed, "fixed by the user")
-    kept = kept.without(kept.active & (scale <= 1e-12), "moves no measured point")
+    kept = Kept(names, allowed, {}).without(~allowed, Because.FIXED)
+    kept = kept.without(kept.active & (scale <= 1e-12), Because.NO_MOTION)
     plain = gram_of(reference, replace(state, effects=np.zeros(0)))
     plain = np.pad(plain, (0, names.count - len(plain)))
     gone = redundant(plain, kept.active & geometric(names), order, RANK_TOLERANCE)
-    kept = kept.without(gone, SAME_MOTION)
+    kept = kept.without(gone, Because.SAME_MOTION)
     told = gram + np.diag(np.where(known, np.diag(gram), 0.0))
-    return kept.without(redundant(told, kept.active, order, resolution), NOT_TOLD), gram, scale
+    gone = redundant(told, kept.active, order, resolution)
+    return kept.without(gone, Because.NOT_TOLD), gram, scale
 
 
 def geometric(names: Names) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from minimax_cal.fitting import identify, start
 from minimax_cal.fitting.certificate import Certificate, certify
 from minimax_cal.fitting.checks import POOR_FIT
-from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.identify import Identification, Reason
 from minimax_cal.fitting.minimax_problem import Distances, minimax_problem, trusted_distances
 from minimax_cal.fitting.options import OFFSETS, Options, Progress, objective_of, silent, solver_of
 from minimax_cal.fitting.robust import Robust, flatness, robust_fit
@@ -453,7 +453,7 @@ def room_of(task: Task, model: Model, state: State, terms: tuple[Term, ...]) -> 
 def without_resting(known: Identification, names: Names, rests: Array) -> Identification:
     """The parameters that the poses tell, without those of effects (e,) that rest at a bound."""
     gone = np.pad(rests, (names.geometric, 0)) & known.active
-    said = dict.fromkeys((names.all[i] for i in np.flatnonzero(gone)), AT_BOUND)
+    said = dict.fromkeys((names.all[i] for i in np.flatnonzero(gone)), Reason(AT_BOUND))
     return replace(known, active=known.active & ~gone, reasons={**known.reasons, **said})
 
 

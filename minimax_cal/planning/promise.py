@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from minimax_cal.modelling.effects.words import name_codes
+from minimax_cal.modelling.effects.words import name_label
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Separation:
 
     def headline(self) -> str:
         """How far the poses get, in words."""
-        pair = name_codes(f"{self.one} and {self.other}")
+        pair = f"{name_label(self.one)} and {name_label(self.other)}"
         if self.alike:
             return (
                 f"{pair} move the targets alike at every pose: no pose tells them apart. "

@@ -29,10 +29,10 @@ def test_the_twelve_redundant_parameters(robot: mc.Robot, noisy: Simulation) -> 
     _, _, found = find(robot, noisy.data)
     assert set(found.reasons) == set(TWELVE.split())
     assert found.active.sum() == 33
-    assert found.reasons["d1"] == "same motion as base_z"
-    assert found.reasons["theta1"] == "same motion as base_rz"
-    assert found.reasons["d2"] == "same motion as d3"
-    assert found.reasons["theta6"] == "same motion as all targets moved together"
+    assert found.reasons["d1"].text == "same motion as base_z"
+    assert found.reasons["theta1"].text == "same motion as base_rz"
+    assert found.reasons["d2"].text == "same motion as d3"
+    assert found.reasons["theta6"].text == "same motion as all targets moved together"
 
 
 def test_one_target_leaves_27_of_39(robot: mc.Robot) -> None:

@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.fitting.identify import (
-    NOT_TOLD,
     RANK_TOLERANCE,
     RESOLUTION,
-    SAME_MOTION,
+    Because,
     Identification,
     Kept,
     drop_order,
@@ -123,7 +122,7 @@ def identified(
     plain, gram = reference.gram(x), stack.closed(robot, x).gram(x)
     stiff = stack.lawless
     size, scale = np.sqrt(np.diag(plain)), np.sqrt(np.diag(gram) / max(stack.points, 1))
-    kept = Kept(names, allowed, {}).without(~allowed & names.links, "fixed by the user")
+    kept = Kept(names, allowed, {}).without(~allowed & names.links, Because.FIXED)
     closing = all(block.kind == CLOSURES for block in stack.blocks)
     for motion_of, reason in (
         (size, ALIKE if closing else FRAMELESS),
@@ -131,18 +130,19 @@ def identified(
     ):
         still = np.zeros(names.count, dtype=bool)
         still[: len(motion_of)] = motion_of <= STILL * motion_of[:stiff].max()
-        kept = kept.without(kept.active & still, reason)
+        kept = kept.without(kept.active & still, Because.OTHER, reason)
     order = order_of(robot, stack)
     order = np.concatenate([order[~wanted[order]], order[wanted[order]]])
     no_length = open_scale(reference, x, plain, kept.active[:stiff], order[order < stiff])
     keeper = scale_keeper(robot, kept.active, wanted) if no_length else []
     order = np.array(list(dict.fromkeys([*keeper, *(int(i) for i in order)])))
     gone = redundant(plain, kept.active[:stiff], order[order < stiff], RANK_TOLERANCE)
-    kept = kept.without(gone, SAME_MOTION).without(
-        [i for i in gone if i in keeper], LENGTHS + "; ".join(SCALE.get(stack.blocks[0].kind, ()))
+    no_scale = LENGTHS + "; ".join(SCALE.get(stack.blocks[0].kind, ()))
+    kept = kept.without(gone, Because.SAME_MOTION).without(
+        [i for i in gone if i in keeper], Because.NO_SCALE, no_scale
     )
     told = gram + np.diag(np.where(known, np.maximum(np.diag(gram), RANK_TOLERANCE), 0.0))
-    kept = kept.without(redundant(told, kept.active, order, resolution), NOT_TOLD)
+    kept = kept.without(redundant(told, kept.active, order, resolution), Because.NOT_TOLD)
     whole = stack.blocks[0].whole if len(stack.blocks) == 1 else ALL_OWN
     own = names.effects[: stiff - names.geometric]
     stems = {name.rpartition("_")[0] for name in own if whole}

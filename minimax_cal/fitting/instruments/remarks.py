@@ -9,9 +9,10 @@ import numpy as np
 
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.fit import Parameter
+from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.fit import InstrumentFit
-from minimax_cal.fitting.instruments.identify import LENGTHS, SCALE
+from minimax_cal.fitting.instruments.identify import SCALE
 from minimax_cal.fitting.instruments.options import RelativeOptions
 from minimax_cal.fitting.instruments.poses import lever_of
 from minimax_cal.fitting.instruments.result import Measured, RelativeCalibration
@@ -47,9 +48,8 @@ def of_lever(
 
 def of_scale(fit: InstrumentFit) -> tuple[str, ...]:
     """What stands for the length standard that closures lack."""
-    kept = [
-        name for name, reason in fit.identification.reasons.items() if reason.startswith(LENGTHS)
-    ]
+    reasons = fit.identification.reasons
+    kept = [name for name, why in reasons.items() if why.kind is Because.NO_SCALE]
     if not kept:
         return ()
     kind = fit.stack.blocks[0].kind
@@ -102,9 +102,7 @@ def weak(
     expected_mm = 1e3 * result.position_sigma
     kinds = {block.kind for block in fit.stack.blocks}
     untold = [
-        p.name
-        for p in result.parameters
-        if not p.identifiable and TARGET in p.name and "these poses" in p.reason
+        p.name for p in result.parameters if TARGET in p.name and p.because is Because.NOT_TOLD
     ]
     if kinds & {"points", "poses", "pixels"} or (expected_mm <= WEAK * rms_mm and not untold):
         return ()

@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.fitting.identify import (
-    NOT_TOLD,
     RANK_TOLERANCE,
-    SAME_MOTION,
+    Because,
     Identification,
     Kept,
     drop_order,
@@ -100,23 +99,24 @@ def identified(
     plain = gram_of_bearings(reference_of(robot, model), x, ~lens & ~base)
     gram = gram_of_pixels(model, x, ~base)
     scale = np.sqrt(np.diag(gram) / max(len(model.pose), 1))
-    kept = Kept(names, allowed & ~base, {}).without(base, NO_BASE)
-    kept = kept.without(~allowed & names.links, "fixed by the user")
-    kept = kept.without(~allowed & lens, "held as the camera's file says")
+    kept = Kept(names, allowed & ~base, {}).without(base, Because.OTHER, NO_BASE)
+    kept = kept.without(~allowed & names.links, Because.FIXED)
+    kept = kept.without(~allowed & lens, Because.OTHER, "held as the camera's file says")
     size = np.sqrt(np.diag(plain))
     for motion, reason in ((size, "turns no direction"), (scale, "moves nothing at these poses")):
         part = kept.active & ~lens
-        kept = kept.without(part & (motion <= STILL * motion[~lens].max()), reason)
+        still = part & (motion <= STILL * motion[~lens].max())
+        kept = kept.without(still, Because.OTHER, reason)
     order = np.concatenate([drop_order(robot, names), np.arange(names.geometric, names.count)])
     order = np.concatenate([order[~wanted[order]], order[wanted[order]]])
     keeper = [] if len(model.board) else scale_keeper(robot, kept.active & names.links, wanted)
     order = np.array(list(dict.fromkeys([*keeper, *(int(i) for i in order)])))
     gone = redundant(plain, kept.active & ~lens, order, RANK_TOLERANCE)
     by_drawing = set(keeper) & set(gone)  # nothing but the drawing tells the scale
-    kept = kept.without([i for i in gone if i not in by_drawing], SAME_MOTION)
+    kept = kept.without([i for i in gone if i not in by_drawing], Because.SAME_MOTION)
     known = lens | (bool(by_drawing) & lengths_of(names))
     told = gram + np.diag(np.where(known, np.diag(gram), 0.0))
-    kept = kept.without(redundant(told, kept.active, order, resolution), NOT_TOLD)
+    kept = kept.without(redundant(told, kept.active, order, resolution), Because.NOT_TOLD)
     stems = {"board"} | {name.rpartition("_")[0] for name in names.all if "_" in name}
     found = kept.identification(told, scale, stems, "cameras and targets moved together")
     return Told(found, bool(by_drawing))

@@ -154,14 +154,9 @@ def folds_covariance(fit: Fit) -> Array:
 def told_by(fit: Fit, kept: Array, joints: int) -> Array:
     """(5n,) True where a fit tells a parameter, or any other that moves the points alike."""
     names = fit.uncertainty.names.all[: 5 * joints]
-    reasons = {p.name: p.reason for p in fit.parameters}
-    alike = identify.SAME_MOTION.partition("{")[0].strip()
-    return np.array(
-        [
-            bool(fit.identification.active[i]) or reasons.get(name, "").startswith(alike)
-            for i, name in enumerate(names)
-        ]
-    )
+    kinds = {p.name: p.because for p in fit.parameters}
+    alike = [kinds.get(name) is identify.Because.SAME_MOTION for name in names]
+    return np.asarray(fit.identification.active[: len(names)] | alike)
 
 
 def differences(

@@ -10,7 +10,7 @@ import numpy as np
 
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Fit, Parameters, Provenance, link_by_link
-from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.identify import Identification, Reason
 from minimax_cal.fitting.opened import place
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.judging.watching.moved import Search
@@ -21,6 +21,8 @@ from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.solvers.status import Status
+
+NOT_IDENTIFIED = Reason("not identified")
 
 
 def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
@@ -108,11 +110,10 @@ def geometric_of(fit: Fit, cell: Cell, data: Measurements) -> Cell:
 
 def identified(fit: Fit, rows: Rows, sure: Uncertainty) -> Identification:
     """What is known then, and why the rest is not."""
-    before = {p.name: p.reason for p in fit.parameters if p.reason}
     lost = [name for name, known in zip(sure.names.all, sure.active, strict=True) if not known]
     return Identification(
         sure.active,
-        {name: before.get(name, "not identified") for name in lost},
+        {name: fit.identification.reasons.get(name, NOT_IDENTIFIED) for name in lost},
         fit.identification.singular,
         np.linalg.norm(rows.jacobian, axis=0),
     )

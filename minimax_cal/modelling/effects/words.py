@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 
 from minimax_cal.evidence.remains import FOLLOWING
@@ -13,8 +12,6 @@ WHOLE = {"target": "of the targets", "tool": "of the tool"}  # what "all" is, by
 PLACED = ("foot", "frame", "tool")  # what moves where the name of an effect says so
 KINDS = {"J": "joint", "L": "link"}
 STEPS = {"nominal": "nominal arm", "geometric": "calibrated geometry"}
-CODE = re.compile(r"\b([a-z]+(?:_[a-z]+)+):(\w+)(?:\.(\w+))?")  # as joint_compliance:J2.c2
-PLACE = re.compile(r"\b([JL])(\d+)\b")
 
 
 def name_place(place: str, effect: str = "") -> str:
@@ -24,8 +21,13 @@ def name_place(place: str, effect: str = "") -> str:
         return WHOLE["target"] if effect in OF_TARGETS else WHOLE.get(moved, "of the whole arm")
     if place == "frame":
         return "of the base"
+    return f"at {name_part(place) or place}"
+
+
+def name_part(place: str) -> str:
+    """A part of the arm, as joint 2 for J2; '' where the place is none."""
     kind = KINDS.get(place[:1]) if place[1:].isdigit() else None
-    return f"at {kind} {place[1:]}" if kind else f"at {place}"
+    return f"{kind} {place[1:]}" if kind else ""
 
 
 def name_effect(effect: str, place: str = "") -> str:
@@ -40,22 +42,24 @@ def name_kinds(labels: Iterable[str]) -> str:
     return ", ".join(dict.fromkeys(name_effect(label.partition(":")[0]) for label in labels))
 
 
-def name_codes(text: str) -> str:
-    """A text in which code names, as joint_compliance:J2.c2, are words."""
+def name_label(label: str) -> str:
+    """An effect by its label, as joint_compliance:J2; anything else stays."""
+    effect, _, place = label.partition(":")
+    return name_effect(effect, place) if effect in EFFECTS else label
 
-    def named(code: re.Match[str]) -> str:
-        effect, place, parameter = code.groups()
-        if effect not in EFFECTS:
-            return code[0]
-        return name_effect(effect, place) + (f", {parameter}" if parameter else "")
 
-    return PLACE.sub(lambda at: f"{KINDS[at[1]]} {at[2]}", CODE.sub(named, text))
+def name_parameter(code: str) -> str:
+    """A parameter of an effect, as joint_compliance:J2.c2; one of geometry stays."""
+    label, _, parameter = code.rpartition(".")
+    return f"{name_label(label)}, {parameter}" if ":" in label else code
 
 
 def name_structure(text: str) -> str:
-    """What remains, as J2 following time, in words; another text stays but for its code names."""
-    place, _, driver = name_codes(text).partition(FOLLOWING)
-    return f"a motion of {place} that depends on {driver}" if driver else place
+    """What remains, as J2 following time; a text that says no driver stays."""
+    place, _, driver = text.partition(FOLLOWING)
+    part, mark, how = place.partition(" ")
+    moving = name_label(name_part(part) or part) + mark + how
+    return f"a motion of {moving} that depends on {driver}" if driver else text
 
 
 def name_step(step: str) -> str:

@@ -13,7 +13,7 @@ from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.accuracy import Accuracy
-from minimax_cal.modelling.effects.words import name_codes
+from minimax_cal.modelling.effects.words import name_parameter
 from minimax_cal.reporting.html.sources import Sources
 
 STRONG = 0.5  # correlations from here on have a row of their own
@@ -58,12 +58,17 @@ def correlations(known: Uncertainty) -> tuple[tuple[str, ...], Array]:
 
 def correlation_table(known: Uncertainty) -> Table:
     """The pairs of parameters that these poses tell apart worst."""
-    names, found = correlations(known)
+    codes, found = correlations(known)
+    names = [name_parameter(code) for code in codes]
     one, other = np.triu_indices(len(found), 1)
     size = np.abs(found[one, other])
     order = [int(i) for i in np.argsort(-np.nan_to_num(size), kind="stable")[:MOST_ROWS]]
     rows = tuple(
-        (name_codes(names[one[i]]), name_codes(names[other[i]]), float(found[one[i], other[i]]))
+        (
+            names[one[i]],
+            names[other[i]],
+            float(found[one[i], other[i]]),
+        )
         for i in order
         if size[i] >= STRONG
     )

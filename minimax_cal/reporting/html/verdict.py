@@ -6,6 +6,7 @@ import math
 
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.intervals import UNKNOWN, Interval
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.reporting.html.content import Note, caveat, text
@@ -104,26 +105,18 @@ def gap_verdict(gap: Diagnosis) -> tuple[Note, ...]:
     return (Note(verdict, "verdict"), *more, *trouble(gap.status, ""))
 
 
-REASONS = (
-    (
-        "same motion as",
-        "A parameter with the same motion as others moves every target in the same way as these "
-        "do, at all poses: only their sum can be known, and it is in the parameter that was kept "
-        "free. Nothing is lost for the positions of the targets.",
-    ),
-    (
-        "these poses do not tell",
-        "Where these poses do not tell it from others, the parameter could be known with more "
-        "poses, or over a wider range of the joints.",
-    ),
-    ("moves no measured point", "A parameter that moves no measured point has no effect on them."),
-    ("fixed by the user", "Some were kept nominal on purpose."),
-)
+REASONS = {
+    Because.SAME_MOTION: "A parameter with the same motion as others moves every target in the "
+    "same way as these do, at all poses: only their sum can be known, and it is in the parameter "
+    "that was kept free. Nothing is lost for the positions of the targets.",
+    Because.NOT_TOLD: "Where these poses do not tell it from others, the parameter could be known "
+    "with more poses, or over a wider range of the joints.",
+    Because.NO_MOTION: "A parameter that moves no measured point has no effect on them.",
+    Because.FIXED: "Some were kept nominal on purpose.",
+}
 
 
 def why_not(fit: Fit) -> tuple[Note, ...]:
     """The kinds of reasons that occur, explained."""
-    given = [p.reason for p in fit.parameters if not p.identifiable]
-    return tuple(
-        text(words) for start, words in REASONS if any(reason.startswith(start) for reason in given)
-    )
+    given = {p.because for p in fit.parameters if not p.identifiable}
+    return tuple(text(words) for kind, words in REASONS.items() if kind in given)
