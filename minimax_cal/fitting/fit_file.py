@@ -241,6 +241,8 @@ def read(content: Mapping[str, Any], source: str) -> Fit:
     train, k = data.take(~held), len(cell.target_names)
     check_numbers(part, cell, source)
     check_shapes(part.arrays, names.count, train, data)
+    if missing := set(names.all) - {p.name for p in parameters}:
+        raise ValueError(f"parameters: {min(missing)} is missing, of {len(missing)}")
     return Fit(
         **facts,
         cell=cell,

@@ -172,7 +172,7 @@ def test_files_that_are_no_fit(fit: Path, folder: Path, poses: Path) -> None:
     assert list(found["parts"]) == ["train"]
     assert any("all count as training poses" in n for n in found["notices"])
     gone = without(fit, folder, "nominal_robot")
-    assert "does not tell its nominal robot" in run(iso9283_command, gone)[2]
+    assert "nominal_robot" in run(iso9283_command, gone)[2]
 
 
 def test_poses_that_cannot_give_back_their_errors_are_refused(fit: Path, folder: Path) -> None:
@@ -275,11 +275,13 @@ def test_map_predicts_by_the_covariance_in_the_file(
     some = np.isfinite(medians[0])
     assert 0.01 < medians[0][some].min() < medians[0][some].max() < 1.0  # mm
     assert np.nanmax(np.abs(medians[0] - medians[1])) > 0.0
-    _, out, notes = run(map_command, without(fit, folder, "covariance"), *FAST)
-    assert "holds no covariance" in notes
-    assert " - " in out
-    broken = without(fit, folder, covariance={"names": ["a9"]})
-    assert run(map_command, broken, *FAST)[0] == 2
+    for broken in (
+        without(fit, folder, "covariance"),
+        without(fit, folder, covariance={"names": ["a9"]}),
+    ):
+        code, _, notes = run(map_command, broken, *FAST)
+        assert code == 2
+        assert "covariance" in notes
 
 
 @pytest.mark.parametrize(

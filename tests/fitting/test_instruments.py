@@ -24,6 +24,7 @@ from experiments.relative import (
     seen_from,
     spot_of,
 )
+from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.instruments import (
     RelativeCalibration,
     closures,
