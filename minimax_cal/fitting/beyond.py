@@ -24,7 +24,7 @@ from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import Region, groups
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.spans import Span, narrow, plan_that_mends, spans_in_words, spans_of
-from minimax_cal.modelling.model import moved
+from minimax_cal.modelling.model import SumOfSquares
 from minimax_cal.modelling.near import is_kept, nearby
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot
@@ -351,32 +351,25 @@ def one_step(
     """Where one step leads without a part, for parts after which a second would hardly matter.
 
     It would where it moved the part's points by more than MAX_SECOND_STEP of their error in the
-    whole fit.
+    whole fit.  That step is a simplified one of Newton, by the normal matrix of the first.
 
     parts: masks (m,), every: their sums.  allowed: (f,) False for parts that are not to be tried.
     Returns states by the number of the part.
     """
     model, whole, which = poses.estimator.model, poses.estimator.whole, np.flatnonzero(allowed)
-    held = np.diag(poses.prior)
+    if not len(which):
+        return {}
+    own, rest = every.gram[which], poses.normal_matrix - every.gram[which]
     left = poses.gradient - every.gradient[which] + poses.prior * poses.off
-    first = solve_normal(poses.normal_matrix - every.gram[which], left[..., None])[..., 0]
-    near = [moved(model, poses.state, step) for step in first]
-    gradient, (rest, own) = np.zeros(first.shape), np.zeros((2, *every.gram[which].shape))
-    for i, at in enumerate(near):
-        part = parts[which[i]]
-        off = (model.prior.mean - model.values(at))[model.active]
-        found = whole.take(~part).normal(at, model.active)
-        gradient[i] = found.gradient.sum(axis=0) + poses.prior * off
-        rest[i] = found.gram.sum(axis=0) + held
-        own[i] = whole.take(part).normal(at, model.active).gram.sum(axis=0)
+    first = solve_normal(rest, left[..., None])[..., 0]
+    near = SumOfSquares(model).step(poses.state.repeat(len(which)), first)
+    off = (model.prior.mean - model.values(near))[:, model.active]
+    gradient = whole.gradients(near, ~np.array(parts)[which]) + poses.prior * off
     more = solve_normal(rest, gradient[..., None])
     motion = (np.swapaxes(more, 1, 2) @ own @ more)[:, 0, 0]
     arrived = motion <= MAX_SECOND_STEP**2 * every.square[which]  # not where it is no number
-    return {
-        int(i): at
-        for i, at, done in zip(which, near, arrived, strict=True)
-        if done and is_kept(at, model.room)
-    }
+    found = {int(which[i]): near.take(np.array(i)) for i in np.flatnonzero(arrived)}
+    return {part: at for part, at in found.items() if is_kept(at, model.room)}
 
 
 def fit_of_rest(poses: Poses, part: Array, gone: Array) -> State | None:

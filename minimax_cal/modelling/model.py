@@ -248,6 +248,20 @@ class Model:
         found = sums.normal(kernels(), arrays_of(state), given, np.flatnonzero(self.active))
         return np.asarray(found[2][0].sum(axis=0))
 
+    def gradients(self, states: State, counted: Array) -> Array:
+        """J'We (B, p) by the free parameters at a batch of B states, each over poses of its own.
+
+        counted: (B, m) weight of each pose besides.
+        """
+        if not len(self.mix):
+            which = np.flatnonzero(self.active)
+            return sums.gradients(kernels(), arrays_of(states), self.sight, which, counted)
+        out = np.zeros((len(counted), int(self.active.sum())))
+        for i, weight in enumerate(counted):
+            for part, error, rows in self.rows(states.take(np.array(i))):
+                out[i] += np.einsum("kpac,kac->p", rows, error * weight[part])
+        return out
+
     def squares(self, state: State) -> tuple[Array, Array]:
         """Weighted squared distance of every point: (k, m) [m^2], and its derivative (k, m, p).
 

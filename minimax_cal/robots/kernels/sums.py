@@ -136,6 +136,26 @@ def rows(
     return error[0], out
 
 
+def gradients(own: ModuleType, at: At, sight: Sight, which: Array, counted: Array) -> Array:
+    """J'We (B, p) of all targets, each robot's over poses of its own.
+
+    counted: (B, m) weight of each pose besides.  As `normal`.
+    """
+    (B, k, _), m = at[3].shape, len(sight[0])
+    columns, out = Columns.of(at, which), np.zeros((B, len(which)))
+    s, end, first = columns.ends
+    t, axis = np.divmod(which[s:end] - first, 3)
+    for lo, hi in blocks(m, B * k, own.BLOCK):
+        error, J, root = columns.shared(own, at, sight, lo, hi)
+        error = error * counted[:, None, None, lo:hi]
+        pull = J.reshape(*J.shape[:3], -1) @ error.reshape(B, k, -1, 1)
+        pull = pull[..., 0].sum(axis=1)
+        out[:, :s] += pull[:, :s]
+        out[:, end:] += pull[:, s:]
+        out[:, s:end] += (error @ root[..., None])[:, t, axis, 0]
+    return out
+
+
 def squares(own: ModuleType, at: At, sight: Sight, which: Array) -> tuple[Array, Array]:
     """Weighted squared distance of every point (k, m) [m^2] and its derivative (k, m, p).
 
