@@ -37,7 +37,8 @@ MAX_P_VALUE, MAX_DOUBTFUL_P_VALUE = (
 )  # that lengths which are off at random agree so well on a share
 # sigmas of what the angles let expect, beside which doubtful agreement is enough
 MIN_CLEAR_SIGMAS = 3.0
-HALVINGS = 60  # of the range in which lengths are off at random
+PARTS = np.linspace(0.0, 1.0, 33)  # of the range in which lengths are off at random,
+ROUNDS = 12  # cut again in each round
 MEDIAN = 0.6745  # of a Gaussian's absolute value, in sigmas
 
 
@@ -74,21 +75,25 @@ def agreed(length: Array, more: Array, own: Array, least: float) -> tuple[float,
     own: (k, k) covariance of the changes.  least: sigma of what lengths are off at random, at
     least; as much as their disagreement asks for [Mandel and Paule 1970].
     """
-    spare = len(length) - 1
+    variance, axes = np.linalg.eigh(own)
+    along, turned = axes.T @ length, axes.T @ more
 
-    def at(size: float) -> tuple[float, float, float]:
-        inverse = np.linalg.inv(own + size**2 * np.eye(len(length)))
-        weight = float(length @ inverse @ length)
-        share = float(length @ inverse @ more) / weight
-        off = more - share * length
-        return float(off @ inverse @ off), share, weight**-0.5
+    def at(size: Array) -> tuple[Array, Array, Array]:
+        weight = 1.0 / (variance + size[:, None] ** 2)
+        total = weight @ along**2
+        share = weight @ (along * turned) / total
+        left = (weight * (turned - share[:, None] * along) ** 2).sum(axis=-1)
+        return left, share, total**-0.5
 
     low, high = 1e-9, float(np.sqrt(more @ more)) + 1e-9
-    if at(low)[0] > spare:
-        for _ in range(HALVINGS):
-            middle = np.sqrt(low * high)
-            low, high = (middle, high) if at(middle)[0] > spare else (low, middle)
-    return at(max(low, least))[1:]
+    for _ in range(ROUNDS):
+        tried = low * (high / low) ** PARTS
+        above = int((at(tried)[0] > len(length) - 1).sum())  # it falls with the size
+        if not above:
+            break
+        low, high = tried[above - 1], tried[min(above, len(tried) - 1)]
+    _, share, sigma = at(np.array([max(low, least)]))
+    return float(share[0]), float(sigma[0])
 
 
 def with_lack(robot: Robot, model: Model, state: State) -> tuple[Array, Array]:
