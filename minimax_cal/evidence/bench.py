@@ -285,7 +285,7 @@ class Fixed:
     @cached_property
     def rows(self) -> Array:
         """(f, N)."""
-        return np.concatenate([self.products.geometry(), self.products.clear(self.index)])
+        return np.concatenate([self.products.geometry, self.products.clear(self.index)])
 
     def gram(self, columns: Array, at: int) -> Array:
         """(d, d) products of columns (d, N), projected, at one of the ratios."""

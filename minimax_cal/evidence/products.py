@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from minimax_cal.evidence.limits import LEAST_NOISE_DOF
-from minimax_cal.evidence.noise import Noise, Problem, costs, noise_of, triangles
+from minimax_cal.evidence.noise import Noise, Problem, costs, noise_of, told_apart, triangles
 from minimax_cal.evidence.ratios import NODES, RATIOS, find_ratio, interpolation, nodes
 from minimax_cal.ground.arrays import Array
 
@@ -71,7 +71,8 @@ def grown(store: Array, count: int, axis: int = 0) -> Array:
     return np.concatenate([store, np.empty(shape)], axis=axis)
 
 
-Formed = Callable[[Array, int, int], Array]  # products (f, g, d) of columns (f,) with some
+Some = slice | Array  # columns, by where they stand
+Formed = Callable[[Array, Some], Array]  # products (f, g, d) of columns (f,) with some
 
 
 class Lines:
@@ -86,46 +87,76 @@ class Lines:
         self.place: dict[int, int] = {}
         self.width = 0
 
-    def places(self, form: Formed, index: Array, width: int) -> Array:
-        """(f,) where the products of columns are held, with so many others at least."""
-        known = len(self.place)
-        new = np.array([i for i in dict.fromkeys(index.tolist()) if i not in self.place], dtype=int)
+    def across(self, form: Formed, index: Array, some: slice) -> Array:
+        """(f, g, d) products of columns with those of a slice."""
+        known, width = len(self.place), some.stop
+        new = unknown(index, self.place)
         self.held = grown(grown(self.held, known + len(new)), width, axis=2)
         if width > self.width:
             if known:
-                old = np.array(list(self.place))
-                self.held[:known, :, self.width : width] = form(old, self.width, width)
+                late = slice(self.width, width)
+                self.held[:known, :, late] = form(np.array(list(self.place)), late)
             self.width = width
         if len(new):
-            self.held[known : known + len(new), :, : self.width] = form(new, 0, self.width)
+            self.held[known : known + len(new), :, : self.width] = form(new, slice(0, self.width))
             self.place.update(zip(new.tolist(), range(known, known + len(new)), strict=True))
-        return np.array([self.place[i] for i in index.tolist()], dtype=int)
+        return np.asarray(self.held[at_places(index, self.place), :, some])
 
-    def across(self, form: Formed, index: Array, start: int, stop: int) -> Array:
-        """(f, g, d) products of columns with those from a first to before a last."""
-        at = self.places(form, index, stop)
-        return np.asarray(self.held[at, :, start:stop])
 
-    def square(self, form: Formed, index: Array, width: int) -> Array:
-        """(g, f, f) products among columns."""
-        at = self.places(form, index, width)
-        return np.moveaxis(self.held[at[:, None], :, index[None]], -1, 0)
+class Squares:
+    """Products among some columns, at g ratios, each formed once; who asks brings what forms it."""
+
+    def __init__(self, depth: int) -> None:
+        self.held = np.empty((0, depth, 0))
+        self.place: dict[int, int] = {}
+
+    def across(self, form: Formed, index: Array, others: Array) -> Array:
+        """(f, g, d) products of columns with others."""
+        new = unknown(np.concatenate([index, others]), self.place)
+        if len(new):
+            known = len(self.place)
+            every = np.concatenate([np.array(list(self.place), dtype=int), new])
+            self.place.update(zip(new.tolist(), range(known, len(every)), strict=True))
+            self.held = grown(grown(self.held, len(every)), len(every), axis=2)
+            block = form(new, every)
+            self.held[known : len(every), :, : len(every)] = block
+            self.held[:known, :, known : len(every)] = np.swapaxes(block, 0, 2)[:known]
+        at, beside = at_places(index, self.place), at_places(others, self.place)
+        return np.moveaxis(self.held[at[:, None], :, beside[None]], -1, 1)
+
+
+def unknown(index: Array, place: dict[int, int]) -> Array:
+    """Columns that have no place yet, each once."""
+    return np.array([i for i in dict.fromkeys(index.tolist()) if i not in place], dtype=int)
+
+
+def at_places(index: Array, place: dict[int, int]) -> Array:
+    """(f,) the places of columns."""
+    return np.array([place[i] for i in index.tolist()], dtype=int)
 
 
 class Sums:
-    """Products at some ratios, summed over all rows.  ratios: (g,)."""
+    """Products at some ratios (g,), summed over rows.  some: (N,) True for those; None: all."""
 
-    def __init__(self, columns: Columns, ratios: Array) -> None:
+    def __init__(self, columns: Columns, ratios: Array, some: Array | None = None) -> None:
+        varied = columns.rows.variance_ratio
         self.columns, self.ratios = columns, ratios
-        self.weights = 1.0 / (1.0 + np.outer(ratios, columns.rows.variance_ratio))
-        self.alike = not columns.rows.variance_ratio.any()  # one noise: ratios change nothing
+        self.some = None if some is None else np.flatnonzero(some)
+        self.clear = None if some is None else columns.clear[:, self.some]
+        self.weights = 1.0 / (1.0 + np.outer(ratios, varied if some is None else varied[some]))
+        self.alike = not varied.any()  # one noise: ratios change nothing
         self.sets: dict[tuple[bytes, int], Array] = {}
         self.whole = np.zeros((0, len(ratios)))
 
-    def products(self, index: Array, start: int, stop: int) -> Array:
-        """(f, g, d) of columns with those from a first to before a last; the fewer are weighed."""
-        fields = self.columns.clear
-        there = fields[start:stop]
+    @property
+    def fields(self) -> Array:
+        """(p + 1 + D, n) the columns of `Columns.clear` at these rows."""
+        return self.columns.clear if self.clear is None else self.clear
+
+    def products(self, index: Array, others: Some) -> Array:
+        """(f, g, d) of columns with others; the fewer are weighed."""
+        fields = self.fields
+        there = fields[others]
         if len(there) < len(index):
             return np.swapaxes(self.spread(there, fields[index]), 0, 2)
         return self.spread(fields[index], there)
@@ -148,12 +179,13 @@ class Sums:
         """(c, d, d, g) products within each of c sets of columns (c, d)."""
         mark = (index.tobytes(), index.shape[1])
         if mark not in self.sets:
-            self.sets[mark] = within(self.columns.clear[index], self.weights)
+            self.sets[mark] = within(self.fields[index], self.weights)
         return self.sets[mark]
 
     def squares(self) -> Array:
         """(D, g) squares of candidates' columns as they are."""
         new = self.columns.plain[len(self.whole) : self.columns.count]
+        new = new if self.some is None else new[:, self.some]
         self.whole = np.concatenate([self.whole, new**2 @ self.weights.T])
         return self.whole
 
@@ -171,51 +203,56 @@ def within(fields: Array, weights: Array) -> Array:
 class Beside:
     """What is left of products at some ratios when the geometry is projected out.
 
-    factor: (g, p, p) lower triangles of the geometry's products.  logs: (g,) log determinants of
-    those.  error: (g,) squares of the error, unprojected.
+    span: (p, r) combinations of the geometry's columns that the rows tell apart.
+    factor: (g, r, r) lower triangles of these combinations' products.  logs: (g,) log determinants
+    of those.  error: (g,) squares of the error, unprojected.
     """
 
-    def __init__(self, sums: Sums) -> None:
-        self.sums, p = sums, sums.columns.fixed - 1
-        depth = len(sums.ratios)
-        self.factor = triangles(np.moveaxis(sums.products(np.arange(p), 0, p), 0, 1))
-        self.inverse = np.linalg.inv(self.factor)
+    def __init__(self, sums: Sums, *, some: bool = False) -> None:
+        """some: whether the rows may not tell all of the geometry's columns apart."""
+        p, depth = sums.columns.fixed - 1, len(sums.ratios)
+        self.sums = sums
+        gram = np.moveaxis(sums.products(np.arange(p), slice(0, p)), 0, 1)
+        self.span = told_apart(gram[0]) if some else np.eye(p)
+        gram = self.span.T @ gram @ self.span if some else gram
+        self.factor = triangles(gram)
+        self.inverse = np.linalg.inv(self.factor) @ self.span.T
         self.logs = 2.0 * np.log(np.einsum("grr->gr", self.factor)).sum(axis=1)
-        self.error = sums.products(np.array([p]), p, p + 1)[0, :, 0]
-        self.lines = Lines(depth)
+        self.error = sums.products(np.array([p]), slice(p, p + 1))[0, :, 0]
+        self.lines, self.pairs = Lines(depth), Squares(depth)
         self.sets: dict[tuple[bytes, int], Array] = {}
-        self.held = np.empty((depth, p, 0))
+        self.held = np.empty((depth, self.span.shape[1], 0))
         self.known = 0
 
     @property
     def width(self) -> int:
         """How many columns there are."""
-        return len(self.sums.columns.clear)
+        return self.sums.columns.fixed + self.sums.columns.count
 
     @property
     def part(self) -> Array:
-        """(g, p, p + 1 + D) coordinates of all columns in the geometry's span."""
+        """(g, r, p + 1 + D) coordinates of all columns in the geometry's span."""
         width, known = self.width, self.known
         if width > known:
             self.held = grown(self.held, width, axis=2)
-            raw = self.sums.products(np.arange(self.sums.columns.fixed - 1), known, width)
+            raw = self.sums.products(np.arange(len(self.span)), slice(known, width))
             self.held[:, :, known:width] = self.inverse @ np.moveaxis(raw, 0, 1)
             self.known = width
         return np.asarray(self.held[:, :, :width])
 
-    def left(self, index: Array, start: int, stop: int) -> Array:
-        """(f, g, d) products of columns with those from a first to before a last."""
+    def left(self, index: Array, others: Some) -> Array:
+        """(f, g, d) products of columns with others."""
         part = self.part
-        shared = np.swapaxes(part[:, :, index], 1, 2) @ part[:, :, start:stop]
-        return np.asarray(self.sums.products(index, start, stop) - np.moveaxis(shared, 0, 1))
+        shared = np.swapaxes(part[:, :, index], 1, 2) @ part[:, :, others]
+        return np.asarray(self.sums.products(index, others) - np.moveaxis(shared, 0, 1))
 
     def across(self, index: Array) -> Array:
         """(f, g, p + 1 + D) products of columns with all."""
-        return self.lines.across(self.left, index, 0, self.width)
+        return self.lines.across(self.left, index, slice(0, self.width))
 
     def square(self, index: Array) -> Array:
         """(g, f, f) products among columns."""
-        return self.lines.square(self.left, index, self.width)
+        return np.moveaxis(self.pairs.across(self.left, index, index), 1, 0)
 
     def among(self, index: Array) -> Array:
         """(c, d, d, g) products within each of c sets of columns (c, d)."""
@@ -348,6 +385,7 @@ class Products:
         gram[:, range(len(index)), range(len(index))] += least
         return gram, logs
 
+    @property
     def geometry(self) -> Array:
         """(p, N) the geometry's columns."""
         return self.columns.clear[: self.columns.fixed - 1]
@@ -359,11 +397,12 @@ class Products:
     def at(self, ratios: Array, index: Array) -> At:
         """Products at ratios (s,) of some candidates' columns (q,) and of the error."""
         s, q, p = len(ratios), len(index), self.columns.fixed - 1
+        r = self.rank
         fixed = np.concatenate([[p], p + 1 + index])
         lines = np.empty((s, 1 + q, len(self.columns.clear) - p))
         square, logs = np.empty(s), np.empty(s)
         whole = np.empty((s, self.columns.count))
-        factor, part = np.empty((s, p, p)), np.empty((s, p, 1 + q))
+        factor, part = np.empty((s, r, r)), np.empty((s, r, 1 + q))
         views = self.views(ratios)
         for here, beside, between in views:
             lines[here] = np.moveaxis(between @ beside.across(fixed)[:, :, p:], 1, 0)

@@ -1,18 +1,28 @@
 """Products of the rows of a part, from those of all rows at a few ratios of the noises.
 
-The products of all columns with each other are formed once at every ratio.  Those of a part are
-these less the products of the rows that it lacks; the nuisance columns are swept out of them at
-once, so that nothing that a search asks of a part looks at rows again.
+Products of all rows are formed once, when a search of some part first asks for them.  Those of the
+part are these less the products of the rows that it lacks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 
-from minimax_cal.evidence.noise import Noise, told_apart, triangles
-from minimax_cal.evidence.products import LEAST, At, Columns, Products
+from minimax_cal.evidence.noise import Noise
+from minimax_cal.evidence.products import (
+    Beside,
+    Columns,
+    Lines,
+    Products,
+    Some,
+    Squares,
+    Sums,
+    View,
+    within,
+)
 from minimax_cal.ground.arrays import Array
 
 COUNT = 7  # ratios beside 0, between those of the noises beside nothing and beside all effects
@@ -21,25 +31,21 @@ LOWER = 4  # ratios beside 0 at which a candidate is compared
 SMALL = 0.03  # of the largest ratio: the least that is not 0
 
 
-class Grams:
-    """Products (s, n, n) of geometry, error and candidates' columns, at ratios (s,), the least 0.
+class Grams(Sums):
+    """Products of all rows, at ratios (s,), the least 0, each kept for the searches of parts.
 
     noises: of all rows, beside some of the effects found, and beside all of them.
     """
 
     def __init__(self, columns: Columns, noises: list[Noise]) -> None:
-        self.columns, self.ratios = columns, ratios_about(noises)
-        self.products = self.among(np.ones(len(self.columns.rows.error), dtype=bool))
+        super().__init__(columns, ratios_about(noises))
+        self.lines, self.pairs = Lines(len(self.ratios)), Squares(len(self.ratios))
 
-    def among(self, some: Array) -> Array:
-        """(s, n, n) products of the rows (N,) that are True."""
-        weights = 1.0 / (1.0 + np.outer(self.ratios, self.columns.rows.variance_ratio[some]))
-        fields = self.columns.clear[:, some]
-        out = np.empty((len(self.ratios), len(fields), len(fields)))
-        for product, weight in zip(out, weights, strict=True):
-            half = fields * np.sqrt(weight)
-            product[:] = half @ half.T
-        return out
+    def products(self, index: Array, others: Some) -> Array:
+        """As `Sums.products`."""
+        if isinstance(others, slice):
+            return self.lines.across(super().products, index, others)
+        return self.pairs.across(super().products, index, others)
 
 
 def ratios_about(noises: list[Noise]) -> Array:
@@ -52,67 +58,53 @@ def ratios_about(noises: list[Noise]) -> Array:
     return np.concatenate([[0.0], np.geomspace(low, high, COUNT)])
 
 
-class Swept(Products):
-    """Products of the rows that are kept, geometry swept out: as `Products`, at the Grams' ratios.
+class Lacking(Sums):
+    """Products of all rows less those of the rows that a part lacks.  gone: (N,) True for these."""
 
-    kept: (N,) whether a row counts.  left: (s, 1 + D, 1 + D) of the error and candidates' columns.
+    def __init__(self, grams: Grams, gone: Array) -> None:
+        super().__init__(grams.columns, grams.ratios, gone)
+        self.grams = grams
+
+    def products(self, index: Array, others: Some) -> Array:
+        """As `Sums.products`."""
+        return np.asarray(self.grams.products(index, others) - super().products(index, others))
+
+    def among(self, index: Array) -> Array:
+        """As `Sums.among`."""
+        return np.asarray(self.grams.among(index) - within(self.fields[index], self.weights))
+
+    def squares(self) -> Array:
+        """As `Sums.squares`."""
+        return np.asarray(self.grams.squares() - super().squares())
+
+
+class Swept(Products):
+    """Products of the rows that are kept, at the ratios of Grams.  kept: (N,) whether a row counts.
+
+    swept: beside the combinations of the geometry's columns that these rows tell apart.
     """
 
     def __init__(self, grams: Grams, kept: Array) -> None:
         super().__init__(grams.columns, kept)
-        self.ratios, p = grams.ratios, self.rank
-        every = grams.products - grams.among(~kept)
-        self.span = told_apart(every[0, :p, :p])
-        self.rank = self.span.shape[1]
-        self.factor = triangles(self.span.T @ every[:, :p, :p] @ self.span)
-        self.logs = 2.0 * np.log(np.einsum("srr->sr", self.factor)).sum(axis=1)
-        self.part = np.linalg.inv(self.factor) @ (self.span.T @ every[:, :p, p:])
-        self.square = every[:, p, p].copy()
-        self.left = every[:, p:, p:] - np.swapaxes(self.part, 1, 2) @ self.part
-        weights = kept / (1.0 + np.outer(self.ratios, self.columns.rows.variance_ratio))
-        self.whole = weights @ self.columns.raw**2
+        self.ratios = grams.ratios
+        self.swept = Beside(Lacking(grams, ~kept), some=True)
+        self.rank = self.swept.span.shape[1]
 
+    @cached_property
     def geometry(self) -> Array:
         """(r, N) the geometry's columns, as the combinations that the rows tell apart."""
-        return np.asarray(self.span.T @ self.columns.clear[: self.columns.fixed - 1])
+        return np.asarray(self.swept.span.T @ self.columns.clear[: self.columns.fixed - 1])
+
+    def views(self, ratios: Array) -> list[View]:
+        """As `Products.views`."""
+        here = np.searchsorted(self.ratios, ratios)
+        return [(np.arange(len(ratios)), self.swept, np.eye(len(self.ratios))[here])]
 
     def find_ratio(self, cost: Callable[[Array], Array]) -> float:
         """The ratio of least cost among those of the Grams."""
         return float(self.ratios[int(np.argmin(cost(self.ratios)))])
 
-    def gram(self, ratios: Array, index: Array) -> tuple[Array, Array]:
-        """As `Products.gram`."""
-        here, each = np.searchsorted(self.ratios, ratios), range(len(index))
-        chosen = np.concatenate([1 + index, [0]])
-        gram = self.left[here[:, None, None], chosen[:, None], chosen]
-        gram[:, each, each] += LEAST * self.whole[here[:, None], index]
-        return gram, self.logs[here]
-
     def ratios_below(self, noise: Noise) -> Array:
         """(s,) the ratios at which candidates are compared beside a noise, the largest first."""
         below = self.ratios[self.ratios <= noise.ratio][::-1]
         return np.asarray(np.concatenate([below[:-1][:LOWER], below[-1:]]))
-
-    def at(self, ratios: Array, index: Array) -> At:
-        """Products at some of the ratios (s,), as `Products.at`."""
-        here = np.searchsorted(self.ratios, ratios)
-        chosen = np.concatenate([[0], 1 + index])
-        lines = self.left[here[:, None], chosen]
-        part = self.part[here][:, :, chosen]
-
-        def own(sets: Array) -> Array:
-            return np.asarray(
-                self.left[here[:, None, None, None], 1 + sets[..., None], 1 + sets[:, None]]
-            )
-
-        return At(
-            lines[:, 1:, 1:],
-            lines[:, 0],
-            self.square[here],
-            self.whole[here],
-            self.factor[here],
-            part,
-            self.logs[here],
-            lines[:, 1:, 0],
-            own,
-        )

@@ -64,7 +64,7 @@ def test_products_are_the_sums_over_rows(rough: Study) -> None:
     within = found.among(sets)
     for i, ratio in enumerate(RATIOS):
         weight = 1.0 / (1.0 + ratio * rough.rows.variance_ratio)
-        geometry, root = products.geometry() * np.sqrt(weight), np.sqrt(weight)
+        geometry, root = products.geometry * np.sqrt(weight), np.sqrt(weight)
         basis = np.linalg.qr(geometry.T)[0]
         every = clear[p:] * root
         rest = every - (every @ basis) @ basis.T

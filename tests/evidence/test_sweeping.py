@@ -19,7 +19,7 @@ from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import LEAST_NOISE_DOF
 from minimax_cal.evidence.noise import Noise, Problem, orthonormal, remaining, restricted
 from minimax_cal.evidence.selection import NOTHING, Choice, select, tuned_again
-from minimax_cal.evidence.sweeping import COUNT, Grams, Swept, ratios_about
+from minimax_cal.evidence.sweeping import COUNT, Swept, ratios_about
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.dictionary import arm_library
 
@@ -66,7 +66,7 @@ def test_products_of_a_part_are_sums_over_its_rows(swept: Swept, rough: Study, k
     for i, ratio in enumerate(ratios):
         weight = kept / (1.0 + ratio * rough.rows.variance_ratio)
         root = np.sqrt(weight)
-        geometry = swept.geometry() * root
+        geometry = swept.geometry * root
         basis = np.linalg.qr(geometry.T)[0]
         every = columns.clear[p:] * root
         rest = every - (every @ basis) @ basis.T
@@ -85,8 +85,8 @@ def test_products_of_a_part_are_sums_over_its_rows(swept: Swept, rough: Study, k
         assert_allclose(lower @ lower.T, geometry @ geometry.T, rtol=ROUNDING, atol=1e-9)
         shared = geometry @ every[np.concatenate([[0], 1 + index])].T
         assert_allclose(lower @ found.part[i], shared, rtol=ROUNDING, atol=ROUNDING * size.max())
-    assert_allclose(swept.span.T @ rough.rows.basis[kept].T @ rough.rows.basis[kept] @ swept.span,
-                    np.eye(swept.span.shape[1]), rtol=0, atol=ROUNDING)  # fmt: skip
+    span, basis = swept.swept.span, rough.rows.basis[kept]
+    assert_allclose(span.T @ basis.T @ basis @ span, np.eye(span.shape[1]), rtol=0, atol=ROUNDING)
 
 
 def test_the_noise_of_a_part_is_that_of_its_rows_alone(
@@ -247,10 +247,3 @@ def test_parts_leave_no_memory_behind(whole: Choice, kept: Array) -> None:
         assert held() is None
     finally:
         gc.enable()
-
-
-def test_products_of_all_rows_are_symmetric(whole: Choice) -> None:
-    grams = whole.grams
-    assert isinstance(grams, Grams)
-    assert_allclose(grams.products, np.swapaxes(grams.products, 1, 2), rtol=0,
-                    atol=ROUNDING * np.abs(grams.products).max())  # fmt: skip
