@@ -39,7 +39,7 @@ from experiments.pixel_cells import (
 )
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.instruments import flange_poses
-from minimax_cal.fitting.pixels.calibrate import fitted
+from minimax_cal.fitting.instruments.pixel_calibration import fitted
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.fit import ANY, by_depths, fit_drawn, known_of, reprojected
 from minimax_cal.fitting.pixels.identify import identified

@@ -34,8 +34,10 @@ from minimax_cal.fitting.instruments import (
     relative,
 )
 from minimax_cal.fitting.instruments.closing import CLOSED, reach
-from minimax_cal.fitting.instruments.data import wire_names
 from minimax_cal.fitting.instruments.identify import position_sigma
+from minimax_cal.fitting.instruments.poses import FlangePoses
+from minimax_cal.fitting.instruments.visits import Visits
+from minimax_cal.fitting.instruments.wires import Lengths, wire_names
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.grouping import split
@@ -281,13 +283,14 @@ def rank_of(arm: Arm, measured: Measured) -> int:
     """Rank of the plain model of a measurement, the sockets' places not counted."""
     data = measured.data
     q = arm.bent(data.at.q)
-    if data.kind == "poses":
+    if isinstance(data, FlangePoses):
         return rank_by_differences(arm, q, np.zeros(9), seen_poses)
-    if data.kind == "distances":
+    if isinstance(data, Lengths):
         anchors = arm.real.reach() * np.random.default_rng(0).normal(size=(len(data.wires), 3))
         seen = np.isfinite(data.length)
         return rank_by_differences(arm, q, anchors, partial(lengths, seen=seen))
-    labels, socket = np.unique(data.socket, return_inverse=True)
+    visits = data.socket if isinstance(data, Visits) else np.zeros(0)
+    labels, socket = np.unique(visits, return_inverse=True)
     at = place(arm.real, q, SPOT)
     centres = np.stack([at[socket == i].mean(axis=0) for i in range(len(labels))])
     # where closures miss by the noise's micrometres, even the scale seems told
@@ -450,7 +453,7 @@ def run_real(job: RealJob) -> RealOutcome:
     )
 
 
-def seen_from(data: Measurements, kind: str) -> RelativeData:
+def seen_from(data: Measurements, kind: str) -> Lengths:
     """Points as lengths: from three places around them, or from the tracker itself."""
     y = data.y[:, 0]
     around = np.array([[1.0, 0.2, -0.2], [-0.6, 0.9, 0.1], [-0.3, -1.0, 0.5]])
@@ -458,7 +461,7 @@ def seen_from(data: Measurements, kind: str) -> RelativeData:
     anchors = three if kind == "wires_3" else np.zeros((1, 3))
     length = np.linalg.norm(y[:, None] - anchors, axis=-1)
     at = replace(data, y=data.y[:, :0], target_names=())
-    return RelativeData(at, "distances", wire_names(range(1, len(anchors) + 1)), length)
+    return Lengths(at, wire_names(range(1, len(anchors) + 1)), length)
 
 
 def after_base(data: Measurements, robot: Robot, spot: Array) -> float:

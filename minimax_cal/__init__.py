@@ -21,9 +21,9 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.fitting.calibrate import calibrate
     from minimax_cal.fitting.fit import Fit, load_fit
     from minimax_cal.fitting.instruments.kinds import relative
+    from minimax_cal.fitting.instruments.pixel_calibration import calibrate_pixels
     from minimax_cal.fitting.many import calibrate_many
     from minimax_cal.fitting.options import Options
-    from minimax_cal.fitting.pixels.calibrate import calibrate_pixels
     from minimax_cal.ground.errors import (
         CalibrationError,
         CalibrationWarning,
@@ -158,7 +158,7 @@ MODULES = {  # name: where it is defined
     "Options": "fitting.options",
     "calibrate": "fitting.calibrate",
     "calibrate_many": "fitting.many",
-    "calibrate_pixels": "fitting.pixels.calibrate",
+    "calibrate_pixels": "fitting.instruments.pixel_calibration",
     "relative": "fitting.instruments.kinds",
     "bootstrap": "judging.bootstrap",
     "evaluate": "judging.saved",

@@ -132,7 +132,7 @@ def by_cameras(
     details: bool,
 ) -> int:
     """Calibrate from pixels.  Raises OptionError for what they do not know."""
-    from minimax_cal.fitting.pixels.calibrate import calibrate_pixels
+    from minimax_cal.fitting.instruments.pixel_calibration import calibrate_pixels
 
     if data:
         raise OptionError(

@@ -57,7 +57,7 @@ def relative_command(
     """
     files, every = PixelFiles(pixels, joints, tuple(camera), board), list[Given](data)
     if files.given:
-        from minimax_cal.fitting.pixels.data import detected
+        from minimax_cal.fitting.instruments.cameras import detected
 
         every.append(detected(*files.paths()))
     with to.stages() as progress:

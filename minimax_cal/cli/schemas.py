@@ -14,7 +14,11 @@ KINDS = {  # name: (module, class that reads such a file, title)
     "robot": ("robots.robot", "RobotSchema", "Robot file of minimax-cal"),
     "calibration": ("fitting.fit_file", "FitPart", "Result of minimax-cal calibrate"),
     "relative": ("fitting.instruments.result", "RelativePart", "Result of minimax-cal relative"),
-    "pixels": ("fitting.pixels.result", "PixelPart", "Result of minimax-cal calibrate by cameras"),
+    "pixels": (
+        "fitting.instruments.pixel_result",
+        "PixelPart",
+        "Result of minimax-cal calibrate by cameras",
+    ),
     "diagnosis": ("diagnosing.result_file", "DiagnosisPart", "Result of minimax-cal diagnose"),
     "simulator_gap": ("simulators.result", "GapPart", "Result of minimax-cal gap"),
     "motion_gap": (

@@ -163,6 +163,18 @@ def drop_order(robot: Robot, names: Names) -> Array:
     return np.array(list(dict.fromkeys(int(i) for i in order)))
 
 
+def scale_keeper(robot: Robot, allowed: Array, wanted: Array) -> list[int]:
+    """The link length to keep as drawn where nothing tells the scale: the longest.
+
+    An error of the drawing is then the smallest part of it.  allowed, wanted: (p,) what may be
+    fitted, and what the user wants fitted.
+    """
+    lengths = np.abs(robot.mdh[:, :2].T.reshape(-1))
+    chosen = np.flatnonzero(allowed[: len(lengths)])
+    preferred = [i for i in chosen if not wanted[i]] or list(chosen)
+    return [int(max(preferred, key=lambda i: lengths[i]))] if preferred else []
+
+
 def identify(
     model: Model,
     state: State,

@@ -13,12 +13,14 @@ import qp_backends
 from minimax_cal.fitting import identify
 from minimax_cal.fitting.minimax_problem import DISTANCE_FORMS
 from minimax_cal.fitting.robust import LOSSES, SQUARE, check_robust
+from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import option
 from minimax_cal.ground.stages import Progress as Progress
 from minimax_cal.ground.stages import silent as silent
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.parameters import Names
 from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.least_squares import AUTO, JOINT, METHODS
@@ -285,8 +287,7 @@ def check_options(options: Options) -> None:
     if options.only not in ("", OFFSETS):
         raise OptionError(f"only {options.only!r}: the only choice is {OFFSETS}")
     check_robust(options.loss, options.trim)
-    if not 0.0 <= options.resolution < 1.0:
-        raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")
+    check_resolution(options.resolution)
     for name, length in (
         ("lever", options.lever),
         ("distance tolerance", options.distance_tolerance),
@@ -294,6 +295,38 @@ def check_options(options: Options) -> None:
         if length is not None and not 0.0 < length < np.inf:
             raise OptionError(f"{name} {length:g} m: must be positive and finite")
     check_priors(options.priors)
+
+
+def check_resolution(resolution: float) -> None:
+    """Raise OptionError for a share that is none."""
+    if not 0.0 <= resolution < 1.0:
+        raise OptionError(f"resolution {resolution:g}: give 0 <= resolution < 1")
+
+
+def freed(names: Names, free: Sequence[str], allowed: Array) -> Array:
+    """(p,) True for what is to be given up last.  Raises OptionError for what is not allowed (p,).
+
+    free: names or patterns.
+    """
+    wanted = names.match(free, "free")
+    if (wanted & ~allowed).any():
+        name = names.all[int(np.argmax(wanted & ~allowed))]
+        raise OptionError(f"{name} is both fixed and freed; take it out of fix or free")
+    return wanted
+
+
+def known_within(names: Names, priors: Mapping[str, float], others: str) -> Array:
+    """(p,) sigma of each parameter's prior, infinite where nothing is known.  Raises OptionError.
+
+    priors: sigma by name or pattern [SI].  others: what is no link, in a message.
+    """
+    sigma = np.full(names.count, np.inf)
+    for pattern, value in priors.items():
+        chosen = names.match([pattern], "prior")
+        if (chosen & ~names.links).any():
+            raise OptionError(f"prior {pattern}: {others} have no nominal value to keep to")
+        sigma[chosen] = value
+    return sigma
 
 
 def check_priors(priors: Mapping[str, float]) -> None:

@@ -12,7 +12,16 @@ from minimax_cal.fitting.certificate import Certificate, certify
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.identify import Identification, Reason
 from minimax_cal.fitting.minimax_problem import Distances, minimax_problem, trusted_distances
-from minimax_cal.fitting.options import OFFSETS, Options, Progress, objective_of, silent, solver_of
+from minimax_cal.fitting.options import (
+    OFFSETS,
+    Options,
+    Progress,
+    freed,
+    known_within,
+    objective_of,
+    silent,
+    solver_of,
+)
 from minimax_cal.fitting.robust import Robust, flatness, robust_fit
 from minimax_cal.fitting.start import BaseFit
 from minimax_cal.fitting.stations import steps_of, turned_in
@@ -323,18 +332,10 @@ def wanted(robot: Robot, model: Model, options: Options) -> tuple[Array, Array, 
     if options.only == OFFSETS:
         zeros = np.isin(np.arange(names.count), zero_positions(robot.prismatic))
         allowed &= zeros | ~names.links
+    kept = freed(names, options.free, allowed)
     order = identify.drop_order(robot, names)
-    kept = names.match(options.free, "free")
-    if (kept & ~allowed).any():
-        name = names.all[int(np.argmax(kept & ~allowed))]
-        raise OptionError(f"{name} is both fixed and freed; take it out of fix or free")
     order = np.concatenate([order[~kept[order]], order[kept[order]]])
-    sigma = np.full(names.count, np.inf)
-    for pattern, value in options.priors.items():
-        chosen = names.match([pattern], "prior")
-        if (chosen & ~names.links).any():
-            raise OptionError(f"prior {pattern}: base and targets have no nominal value to keep to")
-        sigma[chosen] = value
+    sigma = known_within(names, options.priors, "base and targets")
     return allowed, order, sigma
 
 

@@ -12,6 +12,9 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell, Table
 
+# the accuracies of a result, and whether they are of held-out poses
+HELD = {"nominal": True, "train": False, "holdout": True, "nominal_train": False}
+
 
 @dataclass(frozen=True)
 class Accuracy:

@@ -449,6 +449,6 @@ def file_column(stem: str) -> tuple[str, float]:
         return f"{stem}_mm", 1e3
     if re.fullmatch(r"tau\d+", stem):
         return f"{stem}_Nm", 1.0
-    if re.fullmatch(r"qread\d+", stem):
+    if re.fullmatch(r"qread\d+|rotation_u95", stem):
         return f"{stem}_rad", 1.0
     return stem + exact.get(stem, ""), 1.0

@@ -26,6 +26,7 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.least_squares import solve_normal
 
 HEAVIEST = 100.0  # no u95 counts as more than so many times better than the typical one
+TARGET = "target"  # the one point on the flange of `arm_at`
 BLOCK = 768  # points a block: its Jacobian then fits the second-level cache
 
 
@@ -532,6 +533,22 @@ def model_of(robot: Robot, data: Measurements) -> Model:
         prismatic=robot.prismatic,
         y=np.where(seen[:, None], np.moveaxis(data.y, 0, 2), 0.0),
         weight=weight,
+        names=names,
+        active=np.ones(names.count, dtype=bool),
+        prior=Prior(mean, np.zeros(names.count)),
+    )
+
+
+def arm_at(robot: Robot, q: Array) -> Model:
+    """The arm with one point on its flange at joint values (m, n), as the controller gives them."""
+    names = Names.of(robot, (TARGET,))
+    mean = np.zeros(names.count)
+    mean[names.links] = links_of(robot.mdh)
+    return Model(
+        q=robot.turned(q),
+        prismatic=robot.prismatic,
+        y=np.zeros((1, 3, len(q))),
+        weight=np.ones((1, len(q))),
         names=names,
         active=np.ones(names.count, dtype=bool),
         prior=Prior(mean, np.zeros(names.count)),

@@ -23,8 +23,10 @@ from minimax_cal.fitting.instruments import (
     write_relative,
 )
 from minimax_cal.fitting.instruments.closing import reach
-from minimax_cal.fitting.instruments.probe import Contacts, fit_plane, fit_sphere
+from minimax_cal.fitting.instruments.options import RelativeOptions
+from minimax_cal.fitting.instruments.probe import Contacts
 from minimax_cal.fitting.instruments.rows import own_state
+from minimax_cal.fitting.instruments.shapes import fit_plane, fit_sphere
 from minimax_cal.fitting.instruments.stack import Stack
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.kinematics import forward, hat
@@ -152,7 +154,7 @@ def test_slopes_are_the_derivative_by_complex_step(name: str, rng: np.random.Gen
     surfaces = [Surface("A"), Surface("B", "sphere"), Surface("C", "plane", 0.1, FACES[0]),
                 Surface("D", "plane", np.nan, FACES[2]), Surface("E", "sphere", 0.3)]  # fmt: skip
     q, labels = random_poses(robot, 40, rng), [s.label for s in surfaces] * 8
-    block = Contacts.of(robot, contacts(q, labels, surfaces))
+    block = Contacts.of(robot, contacts(q, labels, surfaces), RelativeOptions())
     stack = Stack.of(robot, [block], [""])
     x = own_state(robot.mdh, 0.5 * rng.normal(size=len(block.own)))
     error, jacobian = stack.rows(x, stack.movable)

@@ -34,14 +34,14 @@ from minimax_cal.fitting.instruments import (
     relative,
 )
 from minimax_cal.fitting.instruments.closing import closing_poses, reach
-from minimax_cal.fitting.instruments.options import known_of
+from minimax_cal.fitting.instruments.options import RelativeOptions, known_of
 from minimax_cal.fitting.instruments.points import Points
-from minimax_cal.fitting.instruments.poses import spots_of
 from minimax_cal.fitting.instruments.rows import own_state
 from minimax_cal.fitting.instruments.sockets import Closures
-from minimax_cal.fitting.instruments.split import free_numbers, misclosures
 from minimax_cal.fitting.instruments.stack import Stack
+from minimax_cal.fitting.instruments.visits import free_numbers, misclosures
 from minimax_cal.fitting.instruments.wires import Wires
+from minimax_cal.fitting.reflectors import spots_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.parameters import State
@@ -78,7 +78,8 @@ def wires(robot: mc.Robot, rng: np.random.Generator) -> tuple[Stack, State]:
     length = rng.uniform(0.5, 2.0, (15, 3))
     length[rng.uniform(size=length.shape) < 0.3] = np.nan
     x = own_state(robot.mdh, np.append(SPOT, rng.normal(size=12)))
-    return Stack.of(robot, [Wires.of(robot, q, ("wire1", "wire2", "wire7"), length)], ["w"]), x
+    data = replace(distances(q, length), wires=("wire1", "wire2", "wire7"))
+    return Stack.of(robot, [Wires.of(robot, data, RelativeOptions())], ["w"]), x
 
 
 def sockets(robot: mc.Robot, rng: np.random.Generator) -> tuple[Stack, State]:

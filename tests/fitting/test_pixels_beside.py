@@ -21,10 +21,9 @@ from experiments.pixel_cells import (
     make_cell,
     write_cell,
 )
+from minimax_cal.fitting.instruments.cameras import Pixels, as_instrument, detected
+from minimax_cal.fitting.instruments.pixel_calibration import fitted
 from minimax_cal.fitting.instruments.rows import own_state
-from minimax_cal.fitting.pixels.block import Pixels
-from minimax_cal.fitting.pixels.calibrate import fitted
-from minimax_cal.fitting.pixels.data import as_instrument, detected
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements

@@ -28,7 +28,8 @@ from experiments.pixel_cells import (
     taken,
     write_cell,
 )
-from minimax_cal.fitting.pixels.calibrate import determined, fitted
+from minimax_cal.fitting.instruments.pixel_calibration import fitted
+from minimax_cal.fitting.pixels.determined import determined
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.planning import outlook

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
 from minimax_cal.fitting.fit import Parameter, link_by_link
 from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.instruments.data import LEAST_LENGTHS, RelativeData
 from minimax_cal.fitting.instruments.identify import (
     Alone,
     determined_alone,
@@ -22,20 +21,13 @@ from minimax_cal.fitting.instruments.options import (
     Progress,
     RelativeOptions,
     sigmas_of,
-    wishes,
 )
-from minimax_cal.fitting.instruments.points import Points, WholePoses
-from minimax_cal.fitting.instruments.poses import TOOL, lever_of, poses_as_targets
-from minimax_cal.fitting.instruments.probe import Contacts
-from minimax_cal.fitting.instruments.rows import Block
-from minimax_cal.fitting.instruments.sockets import Closures
 from minimax_cal.fitting.instruments.stack import Known, Squares, Stack
-from minimax_cal.fitting.instruments.wires import Wires
-from minimax_cal.fitting.pixels.options import PixelOptions
+from minimax_cal.fitting.instruments.table import instrument_of
+from minimax_cal.fitting.options import freed
 from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS, without_resting
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
-from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.effects.bounds import at_bounds
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.near import between, is_kept
@@ -52,7 +44,7 @@ class Train:
     """What is fitted: each instrument's training measurements and what the file is called."""
 
     label: str
-    data: RelativeData
+    data: Any  # of the instrument's own class
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,71 +79,10 @@ class InstrumentFit:
         return self.stack.part(self.nominal, i), self.stack.part(self.state, i)
 
 
-def by_socket(train: Train) -> Train:
-    """Visits of one socket together, as the rows of `Closures` have them."""
-    if train.data.kind != "closures":
-        return train
-    return replace(train, data=train.data.take(np.argsort(train.data.socket, kind="stable")))
-
-
-def wires_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Block:
-    """Lengths as a block."""
-    wires = Wires.of(robot, train.at.q, train.wires, train.length)
-    return replace(wires, with_offsets=options.offset)
-
-
-def closures_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Block:
-    """Visits to sockets as a block, with the distances that are known between them."""
-    labels, number = np.unique(train.socket, return_inverse=True)
-    place = {str(label): i for i, label in enumerate(labels)}
-    known = tuple(one for one in options.known_distances if set(one[:2]) <= set(place))
-    pairs = np.array([(place[a], place[b]) for a, b, _ in known], dtype=int).reshape(-1, 2)
-    distance = np.array([length for _, _, length in known])
-    made = Closures.of(robot, train.at.q, number, pairs, distance)
-    return replace(made, labels=train.sockets, known=known)
-
-
-def points_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Block:
-    """Points as a block."""
-    return Points.of(robot, train.at)
-
-
-def poses_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Block:
-    """Whole poses as a block."""
-    return WholePoses.seen(robot, train, lever_of(train, options.lever)[0])
-
-
-def contacts_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Block:
-    """Contacts as a block."""
-    return Contacts.of(robot, train)
-
-
-def pixels_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Block:
-    """Images as a block."""
-    from minimax_cal.fitting.pixels.block import Pixels  # it takes of a calibration by cameras
-
-    chosen = PixelOptions(
-        camera_on=options.camera_on, fix_camera=options.fix_camera,
-        camera_prior=options.camera_prior, holdout=0.0,
-    )  # fmt: skip
-    return Pixels.of(robot, train.images, chosen)
-
-
-BLOCKS = {
-    "contacts": contacts_of,
-    "distances": wires_of, "closures": closures_of, "points": points_of, "poses": poses_of,
-    "pixels": pixels_of,
-}  # fmt: skip
-
-
 def stack_of(robot: Robot, trains: Sequence[Train], options: RelativeOptions) -> Stack:
     """The training measurements as a least-squares problem."""
-    blocks = [BLOCKS[each.data.kind](robot, each.data, options) for each in trains]
-    if any(block.has_length for block in blocks if not isinstance(block, Closures)):
-        blocks = [
-            replace(block, sole_length=False) if isinstance(block, Closures) else block
-            for block in blocks
-        ]
+    alone = [instrument_of(each.data).block(robot, each.data, options) for each in trains]
+    blocks = [one.beside([*alone[:i], *alone[i + 1 :]]) for i, one in enumerate(alone)]
     stack = Stack.of(robot, blocks, [each.label for each in trains])
     given = [options.noises.get(label, np.nan) for label in stack.labels]
     of_rows = [sigma * block.row_noise for sigma, block in zip(given, blocks, strict=True)]
@@ -161,7 +92,8 @@ def stack_of(robot: Robot, trains: Sequence[Train], options: RelativeOptions) ->
 def allowed_of(stack: Stack, options: RelativeOptions) -> tuple[Array, Array]:
     """What may be fitted (p,), and what is to be given up last (p,); the base is no unknown."""
     names = stack.names
-    allowed, wanted = wishes(names, options)
+    allowed = ~names.match(options.fix, "fix")
+    wanted = freed(names, options.free, allowed)
     allowed[5 * names.joints : names.geometric] = False
     for i, block in enumerate(stack.blocks):
         allowed[stack.own(i)] &= [name not in block.held for name in block.own]
@@ -180,7 +112,7 @@ def fit_instruments(
 ) -> InstrumentFit:
     """Fit the identifiable parameters to the training measurements.  Raises DataError."""
     progress("start")
-    trains = [by_socket(train) for train in trains]
+    trains = [replace(train, data=train.data.in_block_order()) for train in trains]
     stack = stack_of(robot, trains, options)
     allowed, wanted = allowed_of(stack, options)
     known = Known(links_of(robot.mdh), sigmas_of(stack.names, options))
@@ -383,93 +315,40 @@ def covariance_of(problem: Squares, x: State, variance: Array) -> Array:
     return covariance
 
 
-def numbers_of(train: RelativeData) -> int:
-    """How many independent numbers were measured at different poses."""
-    pose = groups(train.at)
-    if train.kind == "closures":
-        labels = np.unique(train.socket)
-        different = [len(np.unique(pose[train.socket == label])) for label in labels]
-        return 3 * (sum(different) - len(labels))
-    if train.kind == "poses":
-        return 6 * len(np.unique(pose))
-    if train.kind == "contacts":
-        touched = [train.surface == surface.label for surface in train.surfaces]
-        return sum(len(np.unique(pose[here])) for here in touched)
-    if train.kind == "pixels":
-        return 6 * len(np.unique(pose[train.images.pose]))
-    of_each = 3 if train.kind == "points" else 1
-    seen = train.at.seen if train.kind == "points" else np.isfinite(train.length)
-    return of_each * sum(len(np.unique(pose[column])) for column in seen.T)
-
-
-CALLED = {
-    "distances": "lengths", "closures": "coordinates of visits", "contacts": "contacts",
-}  # fmt: skip
-
-
 def check_count(trains: Sequence[Train], stack: Stack, unknowns: int) -> None:
     """Raise DataError where the training measurements cannot determine the unknowns."""
-    for train in (each.data for each in trains):
-        for name, count in zip(train.wires, np.isfinite(train.length).sum(axis=0), strict=True):
-            if count < LEAST_LENGTHS:
-                raise DataError(
-                    f"{train.at.source}: {name} has {count} lengths in training, and needs "
-                    f"{LEAST_LENGTHS}; measure more or hold out fewer"
-                )
-    known = sum(len(block.pairs) for block in stack.blocks if isinstance(block, Closures))
-    different = sum(numbers_of(each.data) for each in trains) + known
-    shape = sum(6 for block in stack.blocks if isinstance(block, WholePoses))  # of reflectors
-    if different <= unknowns - shape:
-        where = " and ".join(each.data.at.source for each in trains)
-        what = CALLED.get(trains[0].data.kind, "numbers") if len(trains) == 1 else "numbers"
+    every = [each.data for each in trains]
+    for data in every:
+        data.check_training()
+    given = sum(block.given for block in stack.blocks)
+    different = sum(data.independent for data in every) + given
+    unknowns -= sum(block.costless for block in stack.blocks)
+    if different <= unknowns:
+        where = " and ".join(data.at.source for data in every)
+        what = instrument_of(every[0]).words.counted if len(every) == 1 else "numbers"
         raise DataError(
-            f"{where}: {different} independent {what} in training, but {unknowns - shape} unknown "
+            f"{where}: {different} independent {what} in training, but {unknowns} unknown "
             "parameters need more; measure at more poses, hold out fewer or fix parameters (fix)"
         )
 
 
 def parameters_of(robot: Robot, fit: InstrumentFit) -> tuple[Parameter, ...]:
     """Every parameter, link by link; then each instrument's own."""
+    every, names = every_parameter(robot, fit), fit.stack.names
+    own = (own_parameters(robot, fit, i) for i in range(len(fit.stack.blocks)))
+    return sum(own, every[: 5 * names.joints]) + every[fit.stack.lawless :]
+
+
+def every_parameter(robot: Robot, fit: InstrumentFit) -> tuple[Parameter, ...]:
+    """Links, those of all instruments as they are fitted, and last those of the laws."""
     names = fit.stack.names
     before, after = (x.along(np.eye(3), robot) for x in (fit.nominal, fit.state))
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
-    every = link_by_link(names, names.units, before, after, sigma, fit.identification)
-    out = every[: 5 * robot.joints]
-    for i, block in enumerate(fit.stack.blocks):
-        own = fit.stack.own(i)
-        listed = tuple(every[j] for j in own)
-        out += block.listed(listed, *fit.state_of(i), fit.covariance[np.ix_(own, own)])
-    return out + every[fit.stack.lawless :]
+    return link_by_link(names, names.units, before, after, sigma, fit.identification)
 
 
-def placed(fit: InstrumentFit, i: int) -> Mapping[str, object]:
-    """For JSON: what was fitted besides the robot, in the robot's base and last frame."""
-    block, (nominal, x) = fit.stack.blocks[i], fit.state_of(i)
-    out = block.placed(x, nominal)
-    if isinstance(block, Closures):
-        alone = len(fit.stack.blocks) == 1
-        out["scale"] = (
-            "known distance" if block.has_length else "as drawn" if alone else "other files"
-        )
-    return out
-
-
-def beyond_one(robot: Robot, fit: InstrumentFit, options: RelativeOptions) -> tuple[str, ...]:
-    """Parameters that whole poses tell, and one reflector at the pose's origin would not."""
-    block = fit.stack.blocks[0]
-    if len(fit.stack.blocks) > 1 or not isinstance(block, WholePoses):
-        return ()
-    train = poses_as_targets(fit.trains[0].data)
-    origin = replace(train, y=train.y.mean(axis=1, keepdims=True), target_names=("smr1",))
-    lone = Stack.of(robot, [Points.of(robot, origin)], [""])
-    tool = block.tool(block.arm_state(fit.state))
-    x = lone.state(fit.state.mdh, [np.append(fit.state.effects[:6], tool[:3, 3])])
-    allowed, wanted = allowed_of(lone, options)
-    alone = identified(
-        robot, lone, lone.reference(robot, x), x, allowed, wanted,
-        known=np.zeros(lone.names.count, dtype=bool), resolution=options.resolution,
-    )  # fmt: skip
-    rows = lone.names.geometric + 6
-    more = fit.identification.active[:rows] & ~alone.active[:rows]
-    place = [name for name, told in zip(TOOL[:3], alone.active[rows:], strict=True) if not told]
-    return (*(lone.names.all[i] for i in np.flatnonzero(more)), *place, *TOOL[3:])
+def own_parameters(robot: Robot, fit: InstrumentFit, i: int) -> tuple[Parameter, ...]:
+    """An instrument's own, as people read them."""
+    every, own = every_parameter(robot, fit), fit.stack.own(i)
+    fitted, covariance = tuple(every[j] for j in own), fit.covariance[np.ix_(own, own)]
+    return fit.stack.blocks[i].listed(fitted, *fit.state_of(i), covariance)

@@ -19,13 +19,16 @@ from minimax_cal.fitting.identify import (
     drop_order,
     plenty_of_poses,
     redundant,
+    scale_keeper,
 )
 from minimax_cal.fitting.instruments.laws import NO_LAWS, Laws
-from minimax_cal.fitting.instruments.rows import TARGET, motion
+from minimax_cal.fitting.instruments.record import FRAMELESS
+from minimax_cal.fitting.instruments.rows import motion
 from minimax_cal.fitting.instruments.stack import Stack
+from minimax_cal.fitting.instruments.table import instrument
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.cell import still
-from minimax_cal.modelling.model import Model
+from minimax_cal.modelling.model import TARGET, Model
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import hat
@@ -33,19 +36,7 @@ from minimax_cal.robots.robot import Robot
 
 STILL = 1e-7  # relative motion of a column that moves nothing
 SHARED = 0.05  # of a direction that others leave open: a parameter with less is known without it
-CLOSURES = "closures"
-FRAMELESS = "moves nothing that is measured"
-ALIKE = "moves or turns all sockets alike: closures know no base frame"
 LENGTHS = "all lengths together: "
-SCALE = {  # what lacks a length, and what gives it
-    CLOSURES: (
-        "a closure has no length standard", "one known length, as known_distances= A,B,MM, gives it"
-    ),
-    "contacts": (
-        "a contact has no length standard",
-        "a ball of known radius on a sphere or body of known size gives it, or a file of lengths",
-    ),
-}  # fmt: skip
 ALL_OWN = "all frames, anchors and targets of the files moved together"
 
 
@@ -89,18 +80,6 @@ def open_scale(reference: Stack, x: State, plain: Array, active: Array, order: A
     return missing[1] < missing[0]
 
 
-def scale_keeper(robot: Robot, allowed: Array, wanted: Array) -> list[int]:
-    """The link length to keep as drawn where nothing tells the scale: the longest.
-
-    An error of the drawing is then the smallest part of it.  allowed, wanted: (p,) what may be
-    fitted, and what the user wants fitted.
-    """
-    lengths = np.abs(robot.mdh[:, :2].T.reshape(-1))
-    chosen = np.flatnonzero(allowed[: len(lengths)])
-    preferred = [i for i in chosen if not wanted[i]] or list(chosen)
-    return [int(max(preferred, key=lambda i: lengths[i]))] if preferred else []
-
-
 def identified(
     robot: Robot,
     stack: Stack,
@@ -123,9 +102,9 @@ def identified(
     stiff = stack.lawless
     size, scale = np.sqrt(np.diag(plain)), np.sqrt(np.diag(gram) / max(stack.points, 1))
     kept = Kept(names, allowed, {}).without(~allowed & names.links, Because.FIXED)
-    closing = all(block.kind == CLOSURES for block in stack.blocks)
+    unmoved = {instrument(block.kind).unmoved for block in stack.blocks}
     for motion_of, reason in (
-        (size, ALIKE if closing else FRAMELESS),
+        (size, unmoved.pop() if len(unmoved) == 1 else FRAMELESS),
         (scale, "moves nothing at these poses"),
     ):
         still = np.zeros(names.count, dtype=bool)
@@ -137,7 +116,7 @@ def identified(
     keeper = scale_keeper(robot, kept.active, wanted) if no_length else []
     order = np.array(list(dict.fromkeys([*keeper, *(int(i) for i in order)])))
     gone = redundant(plain, kept.active[:stiff], order[order < stiff], RANK_TOLERANCE)
-    no_scale = LENGTHS + "; ".join(SCALE.get(stack.blocks[0].kind, ()))
+    no_scale = LENGTHS + "; ".join(instrument(stack.blocks[0].kind).scale)
     kept = kept.without(gone, Because.SAME_MOTION).without(
         [i for i in gone if i in keeper], Because.NO_SCALE, no_scale
     )

@@ -12,7 +12,8 @@ import numpy as np
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.identify import RESOLUTION
 from minimax_cal.fitting.instruments import fit, plausible, remarks
-from minimax_cal.fitting.instruments.data import RelativeData, points
+from minimax_cal.fitting.instruments.checks import check_given, check_noises, check_options
+from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.file import read_relative
 from minimax_cal.fitting.instruments.fit import InstrumentFit, Train
 from minimax_cal.fitting.instruments.identify import position_sigma
@@ -20,25 +21,22 @@ from minimax_cal.fitting.instruments.options import (
     Known,
     Progress,
     RelativeOptions,
-    check_noises,
-    check_options,
     read_noises,
     silent,
 )
-from minimax_cal.fitting.instruments.points import WholePoses
+from minimax_cal.fitting.instruments.points import points
 from minimax_cal.fitting.instruments.result import (
     SEVERAL,
     InstrumentResult,
     Measured,
     RelativeCalibration,
 )
-from minimax_cal.fitting.instruments.rows import TARGET
-from minimax_cal.fitting.instruments.split import before_and_after, count_numbers, held_back
+from minimax_cal.fitting.instruments.table import instrument_of
 from minimax_cal.fitting.intervals import rms_interval, told
 from minimax_cal.fitting.opened import Writes, listed_effects
 from minimax_cal.fitting.options import listed, sigmas_of
 from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.accuracy import HELD
 from minimax_cal.measuring.campaigns import session_names
 from minimax_cal.measuring.checks import check_joints, limit_notices
 from minimax_cal.measuring.grouping import groups
@@ -48,6 +46,7 @@ from minimax_cal.measuring.stations import Sessions
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.joint_fit import fitted
+from minimax_cal.modelling.model import TARGET
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.least_squares import AUTO
 from minimax_cal.solvers.status import Status
@@ -133,7 +132,7 @@ def relative(
         fix=listed(fix),
         free=listed(free),
         offset=offset,
-        known_distances=known_distances,
+        known_distances=tuple(known_distances),
         lever=lever,
         noises=read_noises(noises or {}),
         priors=sigmas_of(priors or {}),
@@ -146,8 +145,8 @@ def relative(
     )
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     given = [data] if isinstance(data, Given) else list(data)
-    every = sorted((loaded(each) for each in given), key=lambda data: data.kind == "pixels")
-    check_kinds(every)
+    every = sorted(map(loaded, given), key=lambda data: not instrument_of(data).on_arm)
+    check_given(every)
     check_options(every, chosen)
     every = [replace(each, at=with_history(check_joints(robot, each.at))) for each in every]
     return calibrate_instruments(robot, every, chosen, progress)
@@ -158,22 +157,6 @@ def loaded(data: Given) -> RelativeData:
     if isinstance(data, Measurements):
         return points(data)
     return data if isinstance(data, RelativeData) else read_relative(data)
-
-
-def check_kinds(every: Sequence[RelativeData]) -> None:
-    """Raise DataError where there is nothing but points of trackers, or nothing at all."""
-    if not every:
-        raise DataError("no file of measurements is given")
-    if all(data.kind == "pixels" for data in every):
-        raise DataError(
-            f"{every[0].at.source}: it holds pixels alone: give it to calibrate as pixels=, or add "
-            "files of other instruments"
-        )
-    if all(data.kind == "points" for data in every):
-        raise DataError(
-            f"{every[0].at.source}:1: it holds reflectors: use minimax-cal calibrate, or give "
-            "files of other instruments too"
-        )
 
 
 def labels_of(every: Sequence[RelativeData]) -> list[str]:
@@ -196,8 +179,8 @@ def calibrate_instruments(
     labels = labels_of(every)
     check_noises(labels, every, options)
     for data in every:
-        plausible.check_plausible(robot, data, options)
-    splits = [held_back(data, options) for data in every]
+        instrument_of(data).check_slips(robot, data, options)
+    splits = [instrument_of(data).held_back(data, options) for data in every]
     named = zip(labels, every, splits, strict=True)
     trains = [Train(label, data.take(~held)) for label, data, (held, _) in named]
     found = fit.fit_instruments(robot, trains, options, progress)
@@ -215,8 +198,9 @@ def calibrate_instruments(
     sources = ", ".join(data.at.source for data in every)
     source = replace(every[0].at, source=sources, digest=" ".join(d.at.digest for d in every))
     geometry = found.stiff or found
-    levers = [b.lever for b in found.stack.blocks if isinstance(b, WholePoses)]
-    settings = options.settings() | ({"lever": levers[0]} if levers else {})
+    settings = options.settings()
+    for block in reversed(found.stack.blocks):  # the first one's stand
+        settings |= block.choices
     result = RelativeCalibration(
         **vars(whole),
         robot=robot.with_mdh(geometry.state.mdh),
@@ -227,7 +211,7 @@ def calibrate_instruments(
         parameters=fit.parameters_of(robot, found),
         identification=found.identification,
         position_sigma=sigma_of_positions(robot, found),
-        beyond=fit.beyond_one(robot, found, options),
+        beyond=instrument_of(every[0]).beyond(robot, found, options) if single else (),
         notices=tuple(dict.fromkeys(notices)),
         provenance=Provenance.of(robot, source, settings),
         instruments=() if single else instruments_of(found, every, splits, measured),
@@ -246,15 +230,16 @@ def judged(
     options: RelativeOptions,
 ) -> RelativeCalibration:
     """The result with what the reader should know, failed where it is no calibration."""
-    offset = plausible.offset_told(robot, found, options)
-    wrong = plausible.contradiction(robot, every, found, measured, offset)
+    instruments = list(enumerate(map(instrument_of, every)))
+    unfitted = [one.unfitted(robot, found, i, options) for i, one in instruments]
+    wrong = plausible.contradiction(robot, every, found, measured, [mend for _, mend in unfitted])
     said = [
-        *remarks.of_lever(every, options, result),
+        *(remark for i, one in instruments for remark in one.remarks(robot, found, i, options)),
+        *remarks.of_beyond(result),
         *remarks.of_scale(found),
-        *remarks.of_offsets(found, result.parameters, options),
         *remarks.weak(found, result, measured),
         *remarks.unlikely(result, measured),
-        *filter(None, (offset, wrong)),
+        *filter(None, (*(notice for notice, _ in unfitted), wrong)),
     ]
     for data, (held, _), each in zip(every, splits, measured, strict=True):
         said += remarks.general(each, data, held)
@@ -274,23 +259,31 @@ def measured_by(
     pairs = list(zip(models, states, strict=True))
     nominal, calibrated = (block.errors(model, x, data, held) for model, x in pairs)
     turned = [block.turns(model, x, data)[None] for model, x in pairs]
-    turns = before_and_after(turned[0], turned[1], held) if turned[0].size else {}
+    turns = by_key(turned[0], turned[1], held) if turned[0].size else {}
+    counts = data.count(held)
     return Measured(
         kind=data.kind,
         parts=block.parts,
-        errors=before_and_after(nominal, calibrated, held),
-        numbers=count_numbers(data, held),
+        errors=by_key(nominal, calibrated, held),
+        numbers={key: counts[is_held] for key, is_held in HELD.items()},
         turns={key: (rms(t), float(t.max()) if t.size else np.nan)
                for key, t in turns.items()},
-        instrument=fit.placed(found, i),
+        instrument=block.placed(states[1], states[0]),
     )  # fmt: skip
+
+
+def by_key(nominal: Array, calibrated: Array, held: Array) -> dict[str, Array]:
+    """Errors (parts, m, ...) of all poses by the keys of a result.  held: (m,)."""
+    return {
+        key: (nominal if key.startswith("nominal") else calibrated)[:, held == is_held]
+        for key, is_held in HELD.items()
+    }
 
 
 def together(labels: Sequence[str], measured: Sequence[Measured]) -> Measured:
     """The errors of all files, one beside the other."""
-    names = ("nominal", "train", "holdout", "nominal_train")
     errors = {}
-    for key in names:
+    for key in HELD:
         parts = [each.errors[key] for each in measured]
         ends = np.cumsum([[0, 0], *(part.shape[:2] for part in parts)], axis=0)
         errors[key] = np.full((*ends[-1], 3), np.nan)
@@ -301,7 +294,7 @@ def together(labels: Sequence[str], measured: Sequence[Measured]) -> Measured:
         kind=SEVERAL,
         parts=tuple(f"{label} {part}" for label, each in stems for part in each.parts),
         errors=errors,
-        numbers={key: sum(each.numbers[key] for each in measured) for key in names},
+        numbers={key: sum(each.numbers[key] for each in measured) for key in HELD},
         turns={},
         instrument={},
     )

@@ -6,22 +6,18 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
-from minimax_cal.fitting.instruments.data import RelativeData
-from minimax_cal.fitting.options import Options, check_priors
+from minimax_cal.fitting.options import Options, check_priors, known_within
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import option
 from minimax_cal.ground.stages import Progress as Progress
 from minimax_cal.ground.stages import silent as silent
-from minimax_cal.measuring.measurements import FARTHEST
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import Names
-from minimax_cal.solvers.least_squares import AUTO, METHODS
 
 Known = tuple[str, str, float]
+FAR = 4.0  # sigmas of a prior that an arm may be off
 
 
 def known_of(text: str) -> Known:
@@ -118,77 +114,13 @@ class RelativeOptions:
                 "noises": dict(self.noises), "effects": effects}  # fmt: skip
 
 
-def check_options(every: Sequence[RelativeData], options: RelativeOptions) -> None:
-    """Raise OptionError for a choice that does not exist or does not suit the data."""
-    if options.method not in (AUTO, *METHODS):
-        raise OptionError(f"no method {options.method!r}; choose {', '.join((AUTO, *METHODS))}")
-    if not 0.0 <= options.resolution < 1.0:
-        raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")
-    kinds = [data.kind for data in every]
-    for kind, name, chosen in (
-        ("distances", "offset", options.offset),
-        ("closures", "known_distances", bool(options.known_distances)),
-        ("poses", "lever", options.lever is not None),
-    ):
-        if chosen and kind not in kinds:
-            holds = " and ".join(f"{data.at.source} holds {data.kind}" for data in every)
-            raise OptionError(f"{name}= is for {kind}; {holds}: leave it out")
-    sockets = [set(data.sockets) for data in every if data.kind == "closures"]
-    files = ", ".join(data.at.source for data in every if data.kind == "closures")
-    asked: set[frozenset[str]] = set()
-    for known in options.known_distances:
-        first, second, distance = known
-        said = known_text(known)
-        if {first, second} in asked:
-            raise OptionError(f"{said}: this distance is given twice; give it once")
-        asked.add(frozenset((first, second)))
-        for label in (first, second):
-            if not any(label in some for some in sockets):
-                raise OptionError(f"{said}: {files} has no socket {label!r}")
-        if first == second or not 0.0 < distance < FARTHEST:
-            raise OptionError(f"{said}: needs two different sockets and a positive length")
-        if sum({first, second} <= some for some in sockets) != 1:
-            raise OptionError(f"{said}: both sockets must be in one file, and in no other")
-
-
 def read_noises(noises: Mapping[str, float | str]) -> dict[str, float]:
     """Noises in metres, from numbers or texts.  Raises OptionError."""
     pairs = (noise_of(f"{k}={v}") if isinstance(v, str) else (k, v) for k, v in noises.items())
     return dict(pairs)
 
 
-def check_noises(
-    labels: Sequence[str], every: Sequence[RelativeData], options: RelativeOptions
-) -> None:
-    """Raise OptionError for the noise of a file that is not there, or that is none."""
-    kinds = dict(zip(labels, (data.kind for data in every), strict=True))
-    for name, sigma in options.noises.items():
-        if name not in labels:
-            raise OptionError(f"noise {name}: no file is called so; they are {', '.join(labels)}")
-        if kinds[name] == "pixels":
-            raise OptionError(f"noise {name}: of pixels the residuals say it; leave it out")
-        if not (np.isfinite(sigma) and sigma > 0.0):
-            raise OptionError(f"noise {name}: sigma {sigma:g} must be positive")
-
-
-def wishes(names: Names, options: RelativeOptions) -> tuple[Array, Array]:
-    """(p,) False for what the user fixed, and (p,) True for what is to be given up last."""
-    fixed, wanted = names.match(options.fix, "fix"), names.match(options.free, "free")
-    if (fixed & wanted).any():
-        name = names.all[int(np.argmax(fixed & wanted))]
-        raise OptionError(f"{name} is both fixed and freed; take it out of fix or free")
-    return ~fixed, wanted
-
-
 def sigmas_of(names: Names, options: RelativeOptions) -> Array:
     """(5 n,) sigma of each link's prior, infinite where nothing is known.  Raises OptionError."""
     check_priors(options.priors)
-    sigma = np.full(names.count, np.inf)
-    for pattern, value in options.priors.items():
-        chosen = names.match([pattern], "prior")
-        if (chosen & ~names.links).any():
-            raise OptionError(
-                f"prior {pattern}: targets and anchors have no nominal value to keep to"
-            )
-        sigma[chosen] = value
-    return sigma[names.links]
+    return known_within(names, options.priors, "targets and anchors")[names.links]

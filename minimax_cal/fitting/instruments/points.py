@@ -1,33 +1,62 @@
-"""Points of a tracker, and whole poses as virtual ones, in a frame of the instrument's own."""
+"""Points of a tracker, in a frame of the instrument's own."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 
-from minimax_cal.fitting.fit import Parameter
+from minimax_cal.fitting.checks import check_plausible
 from minimax_cal.fitting.identify import plenty_of_poses
-from minimax_cal.fitting.instruments.data import RelativeData
-from minimax_cal.fitting.instruments.poses import (
-    TOOL,
-    pose_errors,
-    posed,
-    poses_as_targets,
-    spots_of,
-)
+from minimax_cal.fitting.instruments.data import RelativeData, checked, different
+from minimax_cal.fitting.instruments.options import RelativeOptions
+from minimax_cal.fitting.instruments.record import Columns, Instrument, Words
 from minimax_cal.fitting.instruments.rows import Plain, of_laws
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.columns import TARGET, Rows
+from minimax_cal.measuring.measurements import Measurements, measurements_in
 from minimax_cal.modelling.cell import pose_to_dict
 from minimax_cal.modelling.model import Block as Poses
 from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.modelling.parameters import BASE_NAMES, State
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.kinematics import hat, right_jacobian, rotation_vector
+from minimax_cal.robots.kinematics import right_jacobian
 from minimax_cal.robots.robot import Robot
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked(RelativeData):
+    """Points of a tracker beside other instruments."""
+
+    kind = "points"
+
+    @property
+    def numbers(self) -> Array:
+        """(m,) three a point."""
+        return np.asarray(3 * self.at.seen.sum(axis=1))
+
+    @property
+    def independent(self) -> int:
+        """Those of different poses, of each target."""
+        return 3 * sum(different(self.at, seen) for seen in self.at.seen.T)
+
+    def check(self) -> None:
+        """Raise DataError where there are none."""
+        if not self.at.seen.any():
+            raise DataError(f"{self.at.source}: holds no measured point")
+
+
+def points(at: Measurements) -> Tracked:
+    """Points of a tracker beside other instruments."""
+    return checked(Tracked(at))
+
+
+def read(file: Rows) -> Tracked:
+    """The reflectors' columns.  Raises DataError."""
+    return Tracked(measurements_in(file))
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +72,6 @@ class Points(Plain):
     drawn: State
 
     kind = "points"
-    row_noise = 1.0
-    given_up: ClassVar[tuple[str, ...]] = ()
-    held: ClassVar[tuple[str, ...]] = ()
     whole = "all targets moved together"
     has_length = True
 
@@ -54,6 +80,11 @@ class Points(Plain):
         """Points of a robot."""
         model = model_of(robot, at)
         return Points(model, robot, fit_base(model, robot.mdh).state)
+
+    @staticmethod
+    def seen(robot: Robot, data: Tracked, options: RelativeOptions) -> Points:
+        """Points of a tracker."""
+        return Points.of(robot, data.at)
 
     @property
     def spots(self) -> slice:
@@ -138,11 +169,11 @@ class Points(Plain):
         error = self.model.error(self.arm_state(x))
         return float(np.nanmean((error**2).sum(axis=-1)))
 
-    def model_at(self, robot: Robot, data: RelativeData) -> Model:
+    def model_at(self, robot: Robot, data: Any) -> Model:
         """With the points there."""
         return model_of(robot, self.seen_at(data))
 
-    def errors(self, model: Model, x: State, data: RelativeData, held: Array) -> Array:
+    def errors(self, model: Model, x: State, data: Any, held: Array) -> Array:
         """Of the points, along the axes of the base."""
         return model.error(self.arm_state(x))
 
@@ -157,105 +188,16 @@ class Points(Plain):
         }
 
 
-@dataclass(frozen=True, eq=False)
-class WholePoses(Points):
-    """Whole poses of a frame on the flange, as virtual reflectors at the corners of a tetrahedron.
+def check(robot: Robot, data: Tracked, options: RelativeOptions) -> None:
+    """Raise DataError for slips."""
+    check_plausible(robot, data.at)
 
-    lever: that a radian counts as [m].
-    """
 
-    lever: float = 0.0
-
-    kind = "poses"
-    parts = ("position",)
-    row_noise = 2.0  # of the root of its four reflectors
-    whole = "the tool"
-
-    @staticmethod
-    def seen(robot: Robot, data: RelativeData, lever: float) -> WholePoses:
-        """Poses of a robot."""
-        model = model_of(robot, poses_as_targets(data, lever))
-        return WholePoses(model, robot, fit_base(model, robot.mdh).state, lever)
-
-    @property
-    def numbers(self) -> int:
-        """Six a pose, not the twelve of its reflectors.
-
-        With four reflectors their errors' covariance is 4 s^2 times the projector on rigid motions,
-        s^2 being the variance of a coordinate of the pose.  No other motion is in the fit's slopes,
-        so that its covariance is that of 4 s^2 I.  The reflectors' shape is known, and its
-        parameters take no number.
-        """
-        return 6 * len(self.model.q) + 3 * len(self.model.y) - 6
-
-    def shapeless(self, x: State) -> Array:
-        """What no rigid motion of the reflectors makes."""
-        state, k = self.arm_state(x), len(self.model.y)
-        links = kinematics.chain(state.mdh, self.model.q, self.model.prismatic)
-        arm = np.moveaxis(kinematics.points(links, state.target_positions), -1, 0)
-        arm = arm - arm.mean(axis=1, keepdims=True)
-        shift = np.broadcast_to(np.eye(3), (*arm.shape, 3))
-        rigid = np.concatenate([shift, -hat(arm)], axis=-1).reshape(len(arm), 3 * k, 6)
-        basis = np.linalg.qr(rigid)[0]
-        return np.asarray(np.eye(3 * k) - basis @ np.swapaxes(basis, 1, 2))
-
-    def tool(self, state: State) -> Array:
-        """Pose (4, 4) of the measured frame in the flange [m]."""
-        return posed(state.target_positions, spots_of(self.lever))
-
-    def seen_at(self, data: RelativeData) -> Measurements:
-        """With the virtual reflectors."""
-        return poses_as_targets(data, self.lever)
-
-    def predicted(self, model: Model, x: State) -> Array:
-        """(m, 4, 4) poses of the measured frame, nearest to where the model has its reflectors."""
-        state = self.arm_state(x)
-        links = kinematics.chain(state.mdh, model.q, model.prismatic)
-        point = kinematics.points(links, state.target_positions)
-        in_base = np.moveaxis(model.displaced(state, point, slice(None)), -1, 0)
-        return posed(in_base @ state.rotation.T + state.origin, spots_of(self.lever))
-
-    def errors(self, model: Model, x: State, data: RelativeData, held: Array) -> Array:
-        """Of positions, in the measurement frame."""
-        return pose_errors(self.predicted(model, x), data)[0][None]
-
-    def turns(self, model: Model, x: State, data: RelativeData) -> Array:
-        """(m,) angles between orientations [rad]."""
-        return pose_errors(self.predicted(model, x), data)[1]
-
-    def listed(
-        self, fitted: tuple[Parameter, ...], nominal: State, x: State, covariance: Array
-    ) -> tuple[Parameter, ...]:
-        """The base, and the tool instead of its reflectors."""
-        before, tool = (self.tool(self.arm_state(each)) for each in (nominal, x))
-        arm = spots_of(self.lever) @ tool[:3, :3].T  # in the flange's axes
-        k = len(arm)
-        rigid = np.concatenate([np.tile(np.eye(3), (k, 1)), -hat(arm).reshape(3 * k, 3)], axis=1)
-        back = np.linalg.pinv(rigid)
-        spread = back @ covariance[6:, 6:] @ back.T
-        turn = rotation_vector(tool[:3, :3] @ before[:3, :3].T)
-        was, found = [*before[:3, 3], *np.zeros(3)], [*tool[:3, 3], *turn]
-        told = all(each.identifiable for each in fitted[6:])
-        stem = fitted[0].name.removesuffix(BASE_NAMES[0])
-        return fitted[:6] + tuple(
-            Parameter(
-                name=stem + name,
-                value=float(found[i]),
-                nominal=float(was[i]),
-                sigma=float(np.sqrt(spread[i, i])) if told else np.nan,
-                unit="m" if i < 3 else "rad",
-                identifiable=told,
-                reason="" if told else "same motion as links and base",
-            )
-            for i, name in enumerate(TOOL)
-        )
-
-    def placed(self, x: State, nominal: State) -> dict[str, Any]:
-        """Base in the measurement frame, measured frame in the flange, and the lever."""
-        out: dict[str, Array] = {}
-        for stem, each in (("", x), ("nominal_", nominal)):
-            state = self.arm_state(each)
-            out |= {f"{stem}base": state.base, f"{stem}tool": self.tool(state)}
-        return {name: pose_to_dict(pose) for name, pose in out.items()} | {
-            "lever_mm": 1e3 * self.lever
-        }
+INSTRUMENT = Instrument(
+    name=Tracked.kind,
+    words=Words(quantity="point of the tracker", part="target", of_position=True),
+    block=Points.seen,
+    columns=Columns(TARGET, TARGET, "smr1_x_mm ...", read, yields=True),
+    check_slips=check,
+    alone="it holds reflectors: use minimax-cal calibrate, or give files of other instruments too",
+)

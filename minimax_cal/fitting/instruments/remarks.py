@@ -8,42 +8,26 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.fitting.checks import POOR_FIT
-from minimax_cal.fitting.fit import Parameter
 from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.fit import InstrumentFit
-from minimax_cal.fitting.instruments.identify import SCALE
-from minimax_cal.fitting.instruments.options import RelativeOptions
-from minimax_cal.fitting.instruments.poses import lever_of
 from minimax_cal.fitting.instruments.result import Measured, RelativeCalibration
-from minimax_cal.fitting.instruments.rows import TARGET
+from minimax_cal.fitting.instruments.table import instrument
 from minimax_cal.fitting.same_arm import WILD_ANGLE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring import checks
+from minimax_cal.modelling.model import TARGET
 from minimax_cal.robots.kinematics import MDH_NAMES
 
-MORE = {  # what helps where positions are told weakly
-    "closures": "more sockets, farther apart",
-    "distances": "more anchors, around it",
-    "contacts": "more surfaces, of other directions and farther apart",
-}
 WEAK = 3.0  # times what was measured: positions that are told worse are weakly told
 WILD_LENGTH = 0.02  # of the reach: no link is farther from its drawing
 
 
-def of_lever(
-    every: Sequence[RelativeData], options: RelativeOptions, result: RelativeCalibration
-) -> tuple[str, ...]:
-    """What a radian of whole poses counts as, and what they tell that one reflector does not."""
-    said = []
-    for data in every:
-        if data.kind == "poses":
-            lever, whence = lever_of(data, options.lever)
-            said.append(f"a radian counts as {1e3 * lever:.4g} mm ({whence})")
-    if result.beyond:
-        names = ", ".join(result.beyond)
-        said.append(f"identified beyond what one reflector at the pose's origin tells: {names}")
-    return tuple(said)
+def of_beyond(result: RelativeCalibration) -> tuple[str, ...]:
+    """What is told that one reflector would not tell."""
+    names = ", ".join(result.beyond)
+    what = "identified beyond what one reflector at the pose's origin tells"
+    return (f"{what}: {names}",) if names else ()
 
 
 def of_scale(fit: InstrumentFit) -> tuple[str, ...]:
@@ -52,32 +36,11 @@ def of_scale(fit: InstrumentFit) -> tuple[str, ...]:
     kept = [name for name, why in reasons.items() if why.kind is Because.NO_SCALE]
     if not kept:
         return ()
-    kind = fit.stack.blocks[0].kind
+    first = instrument(fit.stack.blocks[0].kind)
     return (
-        f"the scale is not identifiable from {kind}: {kept[0]} is kept as drawn, and if that is "
-        "wrong by a part in a thousand, so is every length; sigmas leave this out; "
-        + SCALE[kind][1],
-    )
-
-
-def of_offsets(
-    fit: InstrumentFit, parameters: tuple[Parameter, ...], options: RelativeOptions
-) -> tuple[str, ...]:
-    """How weakly the offsets of wires are determined."""
-    if not options.offset:
-        return ()
-    at = [block.kind for block in fit.stack.blocks].index("distances")
-    noise_mm = 1e3 * fit.noise[at]
-    told = [p for p in parameters if p.name.rpartition(".")[2].startswith("offset")]
-    each = ", ".join(
-        f"{p.name} {1e3 * p.value:+.3f} +- {1e3 * p.sigma:.3f} mm"
-        if p.identifiable
-        else f"{p.name} not identifiable"
-        for p in told
-    )
-    return (
-        f"offsets are weakly determined (a length is known to {noise_mm:.3f} mm): {each}; only how "
-        "the wires' directions vary tells an offset from the anchor's place",
+        f"the scale is not identifiable from {first.name}: {kept[0]} is kept as drawn, and if that "
+        "is wrong by a part in a thousand, so is every length; sigmas leave this out; "
+        + first.scale[-1],
     )
 
 
@@ -100,18 +63,17 @@ def weak(
     """A notice where positions are told far worse than what was measured."""
     rms_mm = min(each.accuracy["train"].rms_mm for each in measured)
     expected_mm = 1e3 * result.position_sigma
-    kinds = {block.kind for block in fit.stack.blocks}
+    more = [instrument(block.kind).words.more for block in fit.stack.blocks]
     untold = [
         p.name for p in result.parameters if TARGET in p.name and p.because is Because.NOT_TOLD
     ]
-    if kinds & {"points", "poses", "pixels"} or (expected_mm <= WEAK * rms_mm and not untold):
+    if not all(more) or (expected_mm <= WEAK * rms_mm and not untold):
         return ()
     where = f" ({', '.join(untold)} not at all)" if untold else ""
-    more = next(MORE[kind] for kind in MORE if kind in kinds)
     return (
         f"positions are poorly determined{where}: by the sigmas to {expected_mm:.3g} mm, "
         f"what was measured fits to {rms_mm:.3g} mm, and model error makes positions worse still; "
-        f"turn the flange more from pose to pose, and measure with {more}",
+        f"turn the flange more from pose to pose, and measure with {more[0]}",
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -21,6 +21,8 @@ from minimax_cal.fitting.fit import (
 )
 from minimax_cal.fitting.fit_file import SCHEMA, ScoresPart, TableParameter, in_si
 from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.instruments.record import Words
+from minimax_cal.fitting.instruments.table import INSTRUMENTS, instrument
 from minimax_cal.fitting.intervals import Interval
 from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.ground.arrays import Array, rms
@@ -36,29 +38,14 @@ from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.solvers.status import Status
 
 SEVERAL = "several"  # kind of a calibration from several files
-QUANTITY = {
-    "points": "point of the tracker",
-    "contacts": "gap between the probe's ball and its surface",
-    SEVERAL: "what every file measured",
-    "distances": "length of a wire",
-    "closures": "ball about its socket",
-    "poses": "position of the flange",
-    "pixels": "pixel at the target",
-}
-CAUTION = {
-    "points": "",
-    "contacts": "A gap is no error of position: what moves along the surface does not show in it. ",
-    SEVERAL: "Lengths, misclosures and positions are one number here; each file has its own. ",
-    "distances": "An error of lengths is no error of position: what lies across the wires does "
-    "not show in it. ",
-    "closures": "A misclosure is no error of position: what moves all visits of a socket alike "
-    "does not show in it. ",
-    "poses": "",
-    "pixels": "A pixel is no position: what moves along the line of sight does not show in it. ",
-}
-
-
-BY = {"distances": "by wire", "points": "by target", "contacts": "by surface"}
+ALL = Words(
+    quantity="what every file measured",
+    caution="Lengths, misclosures and positions are one number here; each file has its own. ",
+)
+if TYPE_CHECKING:
+    Kind = str
+else:  # of the table, which no type checker sees
+    Kind = Literal[(*INSTRUMENTS, SEVERAL)]
 
 
 class ErrorsPart(ScoresPart):
@@ -74,7 +61,7 @@ class ErrorsPart(ScoresPart):
 class MeasuredPart(Part):
     """What an instrument measured, and how well it is fitted, in a file."""
 
-    measured: Literal["distances", "closures", "poses", "points", "contacts", "pixels", "several"]
+    measured: Kind
     parts: tuple[str, ...]
     instrument: dict[str, Any] = Field(default_factory=dict)
     accuracy: dict[Literal["nominal", "holdout", "nominal_train", "train"], ErrorsPart]
@@ -140,7 +127,7 @@ class Stated(Identification):
 class Measured:
     """What was measured, and how well it is fitted.
 
-    kind: one of `data.KINDS`, or `SEVERAL`.  parts: what each row of the errors is, as wire1.
+    kind: name of an instrument, or `SEVERAL`.  parts: what each row of the errors is, as wire1.
     errors: by key nominal, holdout, nominal_train, train, (parts, m, 3) of the measured quantity,
     NaN where not measured [m]; a length's error stands first of three.  numbers: independent
     numbers behind each accuracy.  turns: RMS and largest error of orientation by key [rad], empty
@@ -154,6 +141,11 @@ class Measured:
     turns: Mapping[str, tuple[float, float]]
     instrument: Mapping[str, Any]
     stated: Mapping[str, Accuracy] | None = None
+
+    @property
+    def words(self) -> Words:
+        """What is said of it."""
+        return ALL if self.kind == SEVERAL else instrument(self.kind).words
 
     @cached_property
     def accuracy(self) -> Mapping[str, Accuracy]:
@@ -297,7 +289,7 @@ class RelativeCalibration(Measured):
 
     def accuracy_table(self) -> Table:
         """Accuracy of what was measured, before and after, training and held out."""
-        return self.scores(f"{self.robot.name}: {QUANTITY[self.kind]}")
+        return self.scores(f"{self.robot.name}: {self.words.quantity}")
 
     def files_table(self) -> Table:
         """Each of several files: held-out RMS before and after, and what it alone determines."""
@@ -328,13 +320,13 @@ class RelativeCalibration(Measured):
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
         parts = len(self.parts) > 1 and self.errors and not self.instruments
-        own: list[Table] = [self.parts_table(BY.get(self.kind, "by part"))] if parts else []
+        own: list[Table] = [self.parts_table(f"by {self.words.part}")] if parts else []
         own += tables_of(self.frames)
         for one in self.instruments:
-            own.append(one.scores(f"{one.name}: {QUANTITY[one.kind]}"))
+            own.append(one.scores(f"{one.name}: {one.words.quantity}"))
             own += tables_of(one.frames)
             if len(one.parts) > 1 and one.errors:
-                own.append(one.parts_table(f"{one.name}, {BY.get(one.kind, 'by part')}"))
+                own.append(one.parts_table(f"{one.name}, by {one.words.part}"))
         first = [self.files_table(), self.alone_table()] if self.instruments else [
             self.accuracy_table()
         ]  # fmt: skip
@@ -349,9 +341,9 @@ class RelativeCalibration(Measured):
         """The result in some sentences, with what it does not say."""
         before, after, where = self.before_and_after()
         text = (
-            f"{QUANTITY[self.kind].capitalize()}: RMS error {before.rms_mm:.3f} mm -> "
+            f"{self.words.quantity.capitalize()}: RMS error {before.rms_mm:.3f} mm -> "
             f"{after.rms_mm:.3f} mm, largest {before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, "
-            f"at {where}. {CAUTION[self.kind]}By the parameters' sigmas alone a position over the "
+            f"at {where}. {self.words.caution}By the parameters' sigmas alone a position over the "
             f"joints' range is good to {1e3 * self.position_sigma:.3f} mm RMS once a base is "
             f"fitted. {self.identified} of {len(self.parameters)} parameters identified (condition "
             f"{self.identification.condition:.3g}); {self.status} after {self.iterations} "

@@ -6,26 +6,23 @@ targets, surfaces) stands in the state where effects stand elsewhere.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol, Self, TypeVar, cast
 
 import numpy as np
 
 from minimax_cal.fitting.fit import Parameter
-from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.model import TARGET, Model, arm_at
 from minimax_cal.modelling.model import Block as Poses
-from minimax_cal.modelling.model import Model, Prior
-from minimax_cal.modelling.parameters import Names, State, links_of
+from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
 
-TARGET = "target"  # the point on the flange: of the wires, or the ball
-SPOT = tuple(f"{TARGET}_{axis}" for axis in "xyz")
+SPOT = tuple(f"{TARGET}_{axis}" for axis in "xyz")  # the point on the flange, or the ball
 LINEAR_RANK = 1e-6  # relative singular value below which a linear start says nothing
-NO_TURNS: Mapping[str, tuple[float, float]] = {}
 
 
 class Block(Protocol):
@@ -38,7 +35,7 @@ class Block(Protocol):
 
     @property
     def kind(self) -> str:
-        """One of `data.KINDS`."""
+        """Name of the instrument."""
 
     @property
     def model(self) -> Model:
@@ -77,6 +74,18 @@ class Block(Protocol):
         """(rows,) one each; more where a row weighs more than its noise says."""
 
     @property
+    def costless(self) -> int:
+        """Parameters that cost no number, which stand among the numbers."""
+
+    @property
+    def given(self) -> int:
+        """Numbers that are given besides those of the data."""
+
+    @property
+    def choices(self) -> Mapping[str, object]:
+        """What it has chosen where the user has not, for the record."""
+
+    @property
     def has_length(self) -> bool:
         """Whether something that it measures is a length."""
 
@@ -107,6 +116,12 @@ class Block(Protocol):
     def shapeless(self, x: State) -> Array:
         """(m, r, r) projector, pose by pose, on sums of its rows that hold no number."""
 
+    def beside(self, others: Sequence[Block]) -> Self:
+        """The instrument in one fit with all of some others."""
+
+    def size(self, x: State) -> float:
+        """By what a mean square is to be seen where an arm that hardly moves fits anything."""
+
     def start(self, robot: Robot, free: Array) -> Array:
         """(e,) that fit the arm as drawn best.  free: (e,) True where one may be fitted."""
 
@@ -122,19 +137,19 @@ class Block(Protocol):
     def mean_square(self, x: State) -> float:
         """Of the misses, as `errors` has them [m^2]."""
 
-    def seen_at(self, data: RelativeData) -> Measurements:
+    def seen_at(self, data: Any) -> Measurements:
         """Where the poses of data stand, with the points that the model compares."""
 
-    def model_at(self, robot: Robot, data: RelativeData) -> Model:
+    def model_at(self, robot: Robot, data: Any) -> Model:
         """The stiff arm as `model` has it, at all rows of the data."""
 
-    def errors(self, model: Model, x: State, data: RelativeData, held: Array) -> Array:
+    def errors(self, model: Model, x: State, data: Any, held: Array) -> Array:
         """Of all rows of the data: (parts, m, 3), NaN where not measured [m]; numbers first.
 
         model: the arm at these rows.
         """
 
-    def turns(self, model: Model, x: State, data: RelativeData) -> Array:
+    def turns(self, model: Model, x: State, data: Any) -> Array:
         """(m,) errors of orientation [rad], empty where none is measured."""
 
     def listed(
@@ -147,9 +162,55 @@ class Block(Protocol):
 
 
 class Plain:
-    """Of `Block`, what most instruments have: no orientations, and parameters listed as fitted."""
+    """Of `Block`, what most instruments have: rows of one noise, nothing given, no orientations."""
 
-    def turns(self, model: Model, x: State, data: RelativeData) -> Array:
+    row_noise = 1.0
+    whole = ""
+
+    @property
+    def given_up(self) -> tuple[str, ...]:
+        """None."""
+        return ()
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """None."""
+        return ()
+
+    @property
+    def costless(self) -> int:
+        """None."""
+        return 0
+
+    @property
+    def given(self) -> int:
+        """None."""
+        return 0
+
+    @property
+    def numbers(self: Block) -> int:
+        """One a point."""
+        return self.points
+
+    @property
+    def weights(self: Block) -> Array:
+        """(rows,) one each."""
+        return np.ones(self.points)
+
+    @property
+    def choices(self) -> Mapping[str, object]:
+        """None."""
+        return {}
+
+    def beside(self, others: Sequence[Block]) -> Self:
+        """The same."""
+        return self
+
+    def size(self, x: State) -> float:
+        """As it is."""
+        return 1.0
+
+    def turns(self, model: Model, x: State, data: Any) -> Array:
         """None."""
         return np.zeros(0)
 
@@ -165,15 +226,18 @@ class Plain:
         """Every row holds a number."""
         return np.zeros((len(self.model.q), 0, 0))
 
-    def seen_at(self, data: RelativeData) -> Measurements:
+    def seen_at(self, data: Any) -> Measurements:
         """As they are."""
-        return data.at
+        at: Measurements = data.at
+        return at
 
     def listed(
-        self, fitted: tuple[Parameter, ...], nominal: State, x: State, covariance: Array
+        self: Block, fitted: tuple[Parameter, ...], nominal: State, x: State, covariance: Array
     ) -> tuple[Parameter, ...]:
-        """As they are."""
-        return fitted
+        """Those that are not given."""
+        held = self.held
+        own = zip(fitted, self.own, strict=True)
+        return tuple(parameter for parameter, name in own if name not in held)
 
 
 class OnFlange(Plain):
@@ -185,9 +249,13 @@ class OnFlange(Plain):
         """The state of its model."""
         return with_spot(self.model, x)
 
-    def model_at(self, robot: Robot, data: RelativeData) -> Model:
+    def model_at(self, robot: Robot, data: Any) -> Model:
         """With the one target."""
         return arm_at(robot, data.at.q)
+
+    def spread(self: Block, x: State) -> float:
+        """Variance of the target's places, three axes together [m^2]."""
+        return max(float(places(self.model, x).var(axis=-1).sum()), 1e-12)
 
 
 Some = TypeVar("Some", bound=Block)
@@ -196,27 +264,6 @@ Some = TypeVar("Some", bound=Block)
 def through(block: Some, model: Model) -> Some:
     """The block with another arm at its poses.  Of an instrument that has its arm as a field."""
     return cast(Some, replace(cast(Any, block), model=model))
-
-
-def arm_at(robot: Robot, q: Array) -> Model:
-    """The arm with one point on its flange at joint values (m, n), as the controller gives them."""
-    names = Names.of(robot, (TARGET,))
-    mean = np.zeros(names.count)
-    mean[names.links] = links_of(robot.mdh)
-    return Model(
-        q=robot.turned(q),
-        prismatic=robot.prismatic,
-        y=np.zeros((1, 3, len(q))),
-        weight=np.ones((1, len(q))),
-        names=names,
-        active=np.ones(names.count, dtype=bool),
-        prior=Prior(mean, np.zeros(names.count)),
-    )
-
-
-def state_of(mdh: Array, target: Array, own: Array) -> State:
-    """A state with the base as the frame.  target: (3,) [m].  own: (e,) of effects."""
-    return State(mdh, np.eye(3), np.zeros(3), target[None], own)
 
 
 def own_state(mdh: Array, own: Array) -> State:

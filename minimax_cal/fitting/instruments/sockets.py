@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 
+from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.instruments.closing import closing_poses, reach
-from minimax_cal.fitting.instruments.data import RelativeData
+from minimax_cal.fitting.instruments.options import FAR, RelativeOptions, known_text, sigmas_of
+from minimax_cal.fitting.instruments.plausible import check_slips
+from minimax_cal.fitting.instruments.record import Columns, Instrument, Words
 from minimax_cal.fitting.instruments.rows import (
     LINEAR_RANK,
     SPOT,
+    Block,
     OnFlange,
-    arm_at,
     motion,
     own_state,
     places,
 )
-from minimax_cal.fitting.instruments.split import misclosures
+from minimax_cal.fitting.instruments.visits import SOCKET, Visits, held_back, misclosures, read
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.model import Model
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.measuring.measurements import FARTHEST
+from minimax_cal.modelling.model import Model, arm_at
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot
 
@@ -33,8 +39,9 @@ class Closures(OnFlange):
 
     model: the arm at the m poses, sorted by socket.  first: (g,) where each socket begins.
     pairs: (l, 2) sockets whose distance (l,) is known [m].  labels: (g,) of the sockets.
-    known: these distances as given.  sole_length: whether they are the only lengths of the fit.
-    loose: whether rows move with their own visit alone, the sockets standing where they do.
+    known: these distances as given.  sole_length: whether they are the only lengths of the fit;
+    alone: whether the closures are all of it.  loose: whether rows move with their own visit alone,
+    the sockets standing where they do.
     """
 
     model: Model
@@ -44,15 +51,23 @@ class Closures(OnFlange):
     labels: tuple[str, ...] = ()
     known: tuple[tuple[str, str, float], ...] = ()
     sole_length: bool = True
+    alone: bool = True
     loose: bool = False
 
     kind = "closures"
     own = SPOT
-    given_up: ClassVar[tuple[str, ...]] = ()
-    held: ClassVar[tuple[str, ...]] = ()
-    row_noise = 1.0
-    whole = ""
     parts = ("visits",)
+
+    @staticmethod
+    def seen(robot: Robot, data: Visits, options: RelativeOptions) -> Closures:
+        """Visits to sockets, with the distances that are known between them."""
+        labels, number = np.unique(data.socket, return_inverse=True)
+        place = {str(label): i for i, label in enumerate(labels)}
+        known = tuple(one for one in options.known_distances if set(one[:2]) <= set(place))
+        pairs = np.array([(place[a], place[b]) for a, b, _ in known], dtype=int).reshape(-1, 2)
+        distance = np.array([length for _, _, length in known])
+        made = Closures.of(robot, data.at.q, number, pairs, distance)
+        return replace(made, labels=data.sockets, known=known)
 
     @staticmethod
     def of(robot: Robot, q: Array, socket: Array, pairs: Array, distance: Array) -> Closures:
@@ -75,6 +90,20 @@ class Closures(OnFlange):
     def numbers(self) -> int:
         """Independent ones: three less for each socket's place; and known distances."""
         return 3 * (self.points - len(self.first)) + len(self.pairs)
+
+    @property
+    def given(self) -> int:
+        """The known distances."""
+        return len(self.pairs)
+
+    def beside(self, others: Sequence[Block]) -> Self:
+        """A length of any other instrument is as good as a known distance."""
+        lengths = any(block.has_length for block in others if not isinstance(block, Closures))
+        return replace(self, sole_length=not lengths, alone=not others)
+
+    def size(self, x: State) -> float:
+        """The target's spread: an arm that hardly moves closes anything."""
+        return self.spread(x)
 
     @property
     def weights(self) -> Array:
@@ -174,15 +203,101 @@ class Closures(OnFlange):
         off = self.centred(places(self.model, x))
         return float((off**2).sum(axis=0).mean())
 
-    def errors(self, model: Model, x: State, data: RelativeData, held: Array) -> Array:
+    def errors(self, model: Model, x: State, data: Visits, held: Array) -> Array:
         """Of visits about their socket."""
         return misclosures(places(model, x).T, data.socket, held)[None]
 
     def placed(self, x: State, nominal: State) -> dict[str, Any]:
         """Ball in the last frame, sockets in the robot's base."""
         centre = self.barycentres(places(self.model, x)).T
+        drawn = "as drawn" if self.alone else "other files"
         return {
             "target_mm": (1e3 * x.effects[:3]).tolist(),
             "sockets_mm": dict(zip(self.labels, (1e3 * centre).tolist(), strict=True)),
             "known_distances": [[a, b, 1e3 * length] for a, b, length in self.known],
+            "scale": "known distance" if self.pairs.size else drawn,
         }
+
+
+# ---- what is chosen and said of it -------------------------------------------------------------
+
+
+def check_options(every: Sequence[Visits], options: RelativeOptions) -> None:
+    """Raise OptionError for a known distance that is none of these files'."""
+    sockets = [set(data.sockets) for data in every]
+    files = ", ".join(data.at.source for data in every)
+    asked: set[frozenset[str]] = set()
+    for known in options.known_distances:
+        first, second, distance = known
+        said = known_text(known)
+        if {first, second} in asked:
+            raise OptionError(f"{said}: this distance is given twice; give it once")
+        asked.add(frozenset((first, second)))
+        for label in (first, second):
+            if not any(label in some for some in sockets):
+                raise OptionError(f"{said}: {files} has no socket {label!r}")
+        if first == second or not 0.0 < distance < FARTHEST:
+            raise OptionError(f"{said}: needs two different sockets and a positive length")
+        if sum({first, second} <= some for some in sockets) != 1:
+            raise OptionError(f"{said}: both sockets must be in one file, and in no other")
+
+
+def check(robot: Robot, data: Visits, options: RelativeOptions) -> None:
+    """Raise DataError for slips, of all visits; OptionError for known distances."""
+    near = check_slips(robot, data, options)
+    if near is not None:
+        check_known(robot, data, options, *near)
+
+
+def check_known(
+    robot: Robot, data: Visits, options: RelativeOptions, closures: Closures, x: State
+) -> None:
+    """Raise OptionError for a known distance that no arm like the drawn one can have."""
+    centre = closures.barycentres(places(closures.model, x)).T
+    limits = farthest(robot, options, closures, x)
+    for known, (a, b), limit in zip(closures.known, closures.pairs, limits, strict=True):
+        drawn, told = float(np.linalg.norm(centre[a] - centre[b])), known[2]
+        if abs(drawn - told) <= limit:
+            continue
+        metres = "; metres? give millimetres" if abs(drawn - 1e3 * told) <= limit else ""
+        raise OptionError(
+            f"{known_text(known)}: by the arm as drawn these sockets of {data.at.source} are "
+            f"{1e3 * drawn:.4g} mm apart{metres or '; check the labels and the length'}"
+        )
+
+
+def farthest(robot: Robot, options: RelativeOptions, closures: Closures, x: State) -> list[float]:
+    """By how much the drawn arm may miss each known distance: more where priors let it [m]."""
+    sigma = sigmas_of(closures.model.names, options)
+    free = np.pad(np.isfinite(sigma), (0, closures.model.names.count - len(sigma)))
+    limit = 4.0 * POOR_FIT * robot.reach()
+    if not (free.any() and len(closures.pairs)):
+        return [limit] * len(closures.pairs)
+    _, jacobian = closures.rows(x, free)
+    slope = jacobian[:, -len(closures.pairs) :] / np.sqrt(closures.weights[-1])
+    spread = np.linalg.norm(slope * sigma[np.isfinite(sigma)][:, None], axis=0)
+    return [limit + FAR * float(one) for one in spread]
+
+
+INSTRUMENT = Instrument(
+    name=Visits.kind,
+    words=Words(
+        quantity="ball about its socket",
+        caution="A misclosure is no error of position: what moves all visits of a socket alike "
+        "does not show in it. ",
+        counted="coordinates of visits",
+        check="the labels of the sockets",
+        more="more sockets, farther apart",
+    ),
+    block=Closures.seen,
+    columns=Columns(SOCKET, SOCKET, "socket", read),
+    check_slips=check,
+    options=("known_distances",),
+    check_options=check_options,
+    held_back=held_back,
+    unmoved="moves or turns all sockets alike: closures know no base frame",
+    scale=(
+        "a closure has no length standard",
+        "one known length, as known_distances= A,B,MM, gives it",
+    ),
+)

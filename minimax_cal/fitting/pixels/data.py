@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.fitting.instruments.data import RelativeData, check
-from minimax_cal.fitting.instruments.file import ANY_TARGET, optional_columns
-from minimax_cal.fitting.pixels.camera import Camera, read_camera
+from minimax_cal.fitting.pixels.camera import Camera
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.columns import TARGET, Rows, header_check, read_rows, whole_rows
-from minimax_cal.measuring.measurements import Measurements, check_columns
+from minimax_cal.measuring.columns import Rows, read_rows, whole_rows
+from minimax_cal.measuring.joint_rows import joint_rows
+from minimax_cal.measuring.measurements import Measurements
 
+POSE = re.compile("pose")
 NEEDED = ("pose", "camera", "target", "u_px", "v_px")
 BOARD = ("target", *(f"{axis}_{{}}" for axis in "xyz"))
 EDGE = 1.0  # a corner may lie so far outside the image, by its interpolation [px]
@@ -132,23 +133,6 @@ def read_pixels(
     return without_single(checked(data))
 
 
-def detected(
-    detections: Path | str,
-    joints: Path | str,
-    camera: Mapping[str, Path | str],
-    board: Path | str | None = None,
-) -> RelativeData:
-    """What cameras saw, for `relative`.  Files as `calibrate_pixels` takes them."""
-    cameras = [read_camera(name, path) for name, path in camera.items()]
-    return as_instrument(read_pixels(detections, joints, cameras, board))
-
-
-def as_instrument(data: PixelData) -> RelativeData:
-    """Pixels as one instrument of several."""
-    at = replace(data.at, source=data.source, digest=data.digest, notices=data.notices)
-    return check(RelativeData(at, "pixels", pixels=data))
-
-
 def digest_of(*parts: str) -> str:
     """SHA-256 of what several files hold together."""
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
@@ -184,11 +168,7 @@ def numbered(file: Rows, name: str, known: tuple[str, ...], fault: str) -> Array
 
 def read_joints(path: Path | str) -> tuple[Measurements, tuple[str, ...]]:
     """Joint values by pose, and the poses' names.  Raises DataError."""
-    file = read_rows(path)
-    header_check(
-        path, [name for name in file.header if not TARGET.fullmatch(name)] + list(ANY_TARGET)
-    )
-    file = whole_rows(file)
+    file, at = joint_rows(read_rows(path), POSE)
     header_of(file, ("pose",), "joints")
     labels = tuple(file.text("pose"))
     for row, label in enumerate(labels):
@@ -199,14 +179,7 @@ def read_joints(path: Path | str) -> tuple[Measurements, tuple[str, ...]]:
             raise DataError(
                 f"{path}:{file.line[row]}: pose {label[:60]!r} stands on line {first} too"
             )
-    q, sliding = file.joints()
-    columns, notices = optional_columns(file, "pixels")
-    columns = {name: column for name, column in columns.items() if name != "pose"}
-    nothing = np.zeros((len(q), 0, 3))
-    at = Measurements(
-        q, nothing, (), sliding, file.line, columns, {}, notices, str(path), file.digest
-    )
-    return check_columns(at), labels
+    return at, labels
 
 
 def read_board(path: Path | str) -> dict[str, Array]:

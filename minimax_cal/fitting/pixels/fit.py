@@ -7,14 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.instruments.options import Progress
+from minimax_cal.fitting.options import freed
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.identify import identified, lengths_of
 from minimax_cal.fitting.pixels.model import PixelModel, Scene, Sight
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import Started
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.stages import Progress
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.model import Prior
 from minimax_cal.modelling.parameters import Names, links_of
@@ -123,18 +124,6 @@ def fit_drawn(model: PixelModel, x: Scene) -> Scene:
     return x
 
 
-def wishes(names: Names, lenses: int, options: PixelOptions) -> tuple[Array, Array]:
-    """(p,) what may be fitted, and what is to be given up last.  Raises OptionError."""
-    fixed, wanted = names.match(options.fix, "fix"), names.match(options.free, "free")
-    if (fixed & wanted).any():
-        name = names.all[int(np.argmax(fixed & wanted))]
-        raise OptionError(f"{name} is both fixed and freed; take it out of fix or free")
-    allowed = ~fixed
-    if options.fix_camera:
-        allowed[-lenses:] = False
-    return allowed, wanted
-
-
 def known_of(robot: Robot, model: PixelModel, lens: Array, *, by_drawing: bool) -> Known:
     """What the files know of the lenses, and, where nothing else tells the scale, the drawing.
 
@@ -156,7 +145,10 @@ def fit_pixels(
     model, x = PixelModel.of(robot, train, started.on_flange), started.scene
     lenses = x.lens[0].size
     sigma = options.lens_sigma(model.intrinsic)
-    allowed, wanted = wishes(model.names, lenses, options)
+    allowed = ~model.names.match(options.fix, "fix")
+    wanted = freed(model.names, options.free, allowed)
+    if options.fix_camera:
+        allowed[-lenses:] = False
     nominal = fit_drawn(model, x)
     progress("lengths and angles at given depths")
     lens = np.arange(model.names.count) >= model.names.count - lenses

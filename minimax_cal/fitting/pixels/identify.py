@@ -17,8 +17,8 @@ from minimax_cal.fitting.identify import (
     Kept,
     drop_order,
     redundant,
+    scale_keeper,
 )
-from minimax_cal.fitting.instruments.identify import scale_keeper
 from minimax_cal.fitting.pixels.model import PixelModel, Scene
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.parameters import Names

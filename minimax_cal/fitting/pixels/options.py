@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from minimax_cal.fitting.options import Options, QpSolver, qp_name
+from minimax_cal.fitting.options import Options, QpSolver, check_resolution, qp_name
 from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
@@ -126,6 +126,5 @@ def check_options(options: PixelOptions) -> None:
         raise OptionError(f"drawn_prior= is for objective='{SUM}': leave one of them out")
     if options.camera_on not in ("", FLANGE, GROUND):
         raise OptionError(f"camera_on={options.camera_on!r}: give {FLANGE} or {GROUND}")
-    if not 0.0 <= options.resolution < 1.0:
-        raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")
+    check_resolution(options.resolution)
     doubts_of(options.camera_prior)

@@ -16,11 +16,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting.calibrate import calibrate
-from minimax_cal.fitting.instruments.data import RelativeData
-from minimax_cal.fitting.instruments.poses import posed, poses_as_targets, spots_of
 from minimax_cal.fitting.pixels.camera import undistorted
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.model import PixelModel, Scene, lens_of
+from minimax_cal.fitting.reflectors import LEVER, posed, reflectors, spots_of
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
@@ -35,7 +34,6 @@ IMAGES = 4  # whose poses tell where a camera and a board are
 FLAT = 1e-3  # of a board's size: what it may stick out of its plane
 REWEIGHED = 5  # rounds that take wrong corners, or wrong images, out
 ROBUST = 3.0  # times the typical error: beyond it a corner counts less
-LEVER = 0.1  # of the virtual reflectors at a measured pose [m]
 ROTATIONS = 600  # of a camera that are looked at, some 25 degrees from each other
 TARGETS = 6  # of unknown place, which tell one rotation from another
 ENOUGH, SCREENED = 300, 100  # of their pixels, for the few that go on and for all
@@ -98,7 +96,7 @@ def from_far(robot: Robot, data: PixelData, started: Started) -> Started:
     if len(rows) < IMAGES:
         return started
     pose = np.stack([image[first, row] for row in rows])
-    targets = reflectors(data, rows, np.linalg.inv(pose) if started.on_flange else pose)
+    targets = seen_reflectors(data, rows, np.linalg.inv(pose) if started.on_flange else pose)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CalibrationWarning)
         try:
@@ -227,7 +225,7 @@ def by_poses(
     pose = np.stack([image[camera, row] for row in rows])
     if model.on_flange:
         pose = np.linalg.inv(pose)
-    targets = reflectors(data, np.array(rows), pose)
+    targets = seen_reflectors(data, np.array(rows), pose)
     for _ in range(REWEIGHED):  # images that the arm contradicts are left out
         found = fit_base(model_of(robot, targets), robot.mdh).state
         error = np.linalg.norm(model_of(robot, targets).error(found), axis=-1).max(axis=0)
@@ -241,10 +239,10 @@ def by_poses(
     return place, board, data.board @ board[:3, :3].T + board[:3, 3]
 
 
-def reflectors(data: PixelData, rows: Array, pose: Array) -> Measurements:
+def seen_reflectors(data: PixelData, rows: Array, pose: Array) -> Measurements:
     """Poses (r, 4, 4) at some rows as virtual reflectors, which say the same [m]."""
     at = replace(data.at.take(rows), columns={})
-    return poses_as_targets(RelativeData(at, "poses", pose=pose), LEVER)
+    return reflectors(at, pose)
 
 
 # ---- anything else: a search over rotations --------------------------------------------------

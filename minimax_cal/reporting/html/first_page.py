@@ -279,7 +279,7 @@ def claim_of_parts(sources: Sources) -> Claim:
         raise CalibrationError("a report needs a result")
     before, after, where = told.before_and_after()
     claim = within(where, before, after)
-    if told.kind == "poses":
+    if told.words.of_position:
         return claim
     return Claim(claim.name, claim.rms, claim.largest, claim.poses, where, claim.before,
                  f"errors of {told.kind} are not errors of position")  # fmt: skip

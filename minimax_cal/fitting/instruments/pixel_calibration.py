@@ -4,50 +4,31 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.fit import Parameter, Provenance, link_by_link
 from minimax_cal.fitting.identify import RESOLUTION
-from minimax_cal.fitting.instruments.options import Progress, silent
+from minimax_cal.fitting.instruments.pixel_result import PIXELS, PixelCalibration
 from minimax_cal.fitting.options import QpSolver, listed, qp_name
-from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS, read_camera
+from minimax_cal.fitting.pixels.camera import FLANGE, read_camera
 from minimax_cal.fitting.pixels.data import PixelData, read_pixels
-from minimax_cal.fitting.pixels.drawing import Drawing, Scale, scale_of
-from minimax_cal.fitting.pixels.fit import (
-    PixelFit,
-    fit_pixels,
-    right,
-)
+from minimax_cal.fitting.pixels.determined import Determined, determined, judged_pixels, placed
+from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.pixels.judge import Claim, arms_apart, drawn_sigma, position_sigma
-from minimax_cal.fitting.pixels.model import PixelModel, Scene, units_of
+from minimax_cal.fitting.pixels.model import Scene, units_of
 from minimax_cal.fitting.pixels.options import SUM, PixelOptions, check_options
-from minimax_cal.fitting.pixels.plausible import (
-    check_start,
-    contradiction,
-    file_notices,
-    outlier_notices,
-)
-from minimax_cal.fitting.pixels.result import PIXELS, PixelCalibration
-from minimax_cal.fitting.pixels.start import from_far, start_scene
-from minimax_cal.fitting.pixels.uncertainty import Uncertainty, uncertainty_of
-from minimax_cal.fitting.pixels.worst import WorstPixels, fit_worst
+from minimax_cal.fitting.pixels.plausible import contradiction, file_notices, outlier_notices
+from minimax_cal.fitting.pixels.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.aside import TOOL, SetAside
 from minimax_cal.measuring.checks import check_joints, limit_notices
-from minimax_cal.measuring.grouping import groups, held_out
-from minimax_cal.modelling.cell import pose_to_dict
 from minimax_cal.robots.robot import Robot, load_robot
-from minimax_cal.robots.transforms import transform
 from minimax_cal.solvers.status import Status
-
-CLEARLY = 0.2  # of the error: cameras that fit so much better elsewhere are fixed there
-HELD = {"nominal": True, "holdout": True, "train": False, "nominal_train": False}
 
 
 def calibrate_pixels(
@@ -161,44 +142,6 @@ def fitted(
     return concluded(determined(robot, data, options, progress), options, began)
 
 
-@dataclass(frozen=True, eq=False)
-class Determined:
-    """What pixels determine.  held: (m,) poses left out.  drawing, scale: of the least squares."""
-
-    robot: Robot
-    data: PixelData
-    held: Array
-    fit: PixelFit
-    sure: Uncertainty
-    drawing: Drawing
-    scale: Scale | None
-    worst: WorstPixels | None
-    notices: tuple[str, ...]
-
-    @property
-    def train(self) -> PixelData:
-        """The pixels that were fitted."""
-        return self.data.some(~self.held[self.data.pose])
-
-
-def determined(
-    robot: Robot, data: PixelData, options: PixelOptions, progress: Progress = silent
-) -> Determined:
-    """The fit of pixels, and how sure it is."""
-    held, said = held_out(data.at, options.holdout, options.seed)
-    train = data.some(~held[data.pose])
-    progress("start")
-    fit = fitted_on(robot, train, options, progress)
-    fit, worst, more = fit_worst(train, fit, options)
-    progress("sigmas")
-    _, group = np.unique(groups(data.at)[train.pose], return_inverse=True)
-    sure = uncertainty_of(robot, fit, group.reshape(-1))
-    length = np.arange(5 * robot.joints) < 2 * robot.joints  # known already where by_drawing
-    drawing = Drawing.of(robot, fit, sure, ~(length & fit.by_drawing))
-    scale = scale_of(robot, fit, sure)
-    return Determined(robot, data, held, fit, sure, drawing, scale, worst, (*said, *more))
-
-
 def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCalibration:
     """The result: whether to use the arm, and how good it is.  began: by `time.perf_counter`."""
     robot, data, train, held = one.robot, one.data, one.train, one.held
@@ -274,92 +217,6 @@ def kept_because(claim: Claim) -> str:
     )
 
 
-def fitted_on(robot: Robot, data: PixelData, options: PixelOptions, progress: Progress) -> PixelFit:
-    """The fit with the cameras on what was given, or on what fits better.  Raises DataError."""
-    places = [options.camera_on] if options.camera_on else [FLANGE, GROUND]
-    both = [start_scene(robot, data, place == FLANGE) for place in places]
-    both.sort(key=lambda one: one.miss(robot, data))
-    miss = [one.miss(robot, data) for one in both]
-    if miss[0] <= POOR_FIT * robot.reach():
-        return fit_pixels(robot, data, both[0], options, progress)
-    both = [one for one, each in zip(both, miss, strict=True) if CLEARLY * each <= miss[0]]
-    for started in both:
-        check_start(robot, data, started)
-    begun = [from_far(robot, data, started) for started in both]
-    fits = [fit_pixels(robot, data, started, options, progress) for started in begun]
-    return min(fits, key=lambda fit: fit.noise)
-
-
-@dataclass(frozen=True, eq=False)
-class JudgedPixels:
-    """Errors at the targets, of all pixels.
-
-    errors: (parts, m, 3) by key, NaN where not measured or
-    set aside [m].  pixels: RMS and largest by key [px].  aside: (a,) rows set aside.  whole: of the
-    held-out poses, with them.
-    """
-
-    errors: dict[str, Array]
-    pixels: dict[str, tuple[float, float]]
-    aside: Array
-    whole: Array
-
-
-def judged_pixels(robot: Robot, data: PixelData, held: Array, fit: PixelFit) -> JudgedPixels:
-    """Errors of the drawn and the calibrated arm.  held: (m,)."""
-    model = PixelModel.of(robot, data, fit.model.on_flange)
-    known = np.ones(len(data.targets), dtype=bool)
-    if not len(data.board):
-        known = np.isin(np.arange(len(data.targets)), fit.model.target)
-    counts = known[data.target]
-    wrong = np.zeros(data.count, dtype=bool)
-    error = model.errors(fit.scene)
-    trained = ~held[data.pose]
-    wrong[trained] = fit.model.weight == 0.0
-    later = ~trained & counts
-    limit = np.linalg.norm(fit.model.errors(fit.scene)[:, fit.model.weight > 0.0], axis=0)
-    wrong[later] = right_beside(error[:, later], limit) == 0.0
-    tables = {
-        name: table_of(model, data, scene, counts) for name, scene in
-        (("drawn", fit.nominal), ("calibrated", fit.scene))
-    }  # fmt: skip
-    errors, pixels, whole = {}, {}, np.zeros(0)
-    rows = data.part
-    for key, is_held in HELD.items():
-        metres, image = tables["drawn" if key.startswith("nominal") else "calibrated"]
-        part = metres[:, held == is_held]
-        if key == "holdout":
-            whole = part.copy()
-        metres = metres.copy()
-        metres[rows[wrong], data.pose[wrong]] = np.nan
-        errors[key] = metres[:, held == is_held]
-        size = np.linalg.norm(image, axis=0)[counts & ~wrong & (held[data.pose] == is_held)]
-        pixels[key] = (
-            (float(np.sqrt((size**2).mean())), float(size.max())) if size.size else (np.nan,) * 2
-        )
-    return JudgedPixels(errors, pixels, np.flatnonzero(wrong), whole)
-
-
-def right_beside(error: Array, size: Array) -> Array:
-    """(N,) 0 where errors (2, N) stand out from those of sizes (t,) that the fit has seen [px]."""
-    seen = np.stack([size, np.zeros_like(size)])
-    both = np.concatenate([seen, error], axis=1)
-    weight = np.concatenate([np.ones(len(size)), np.zeros(error.shape[1])])
-    return right(both, weight)[len(size) :]
-
-
-def table_of(model: PixelModel, data: PixelData, x: Scene, counts: Array) -> tuple[Array, Array]:
-    """Errors at the targets (parts, m, 3) [m], NaN where not measured, and in the image (2, N)."""
-    error, depth = model.errors(x), model.seen(x).point[2]
-    focal = x.lens[0][data.camera, :2].T
-    out = np.full((len(data.parts), data.at.poses, 3), np.nan)
-    rows = data.part
-    at = np.flatnonzero(counts)
-    flat = (error * np.abs(depth) / focal)[:, at].T
-    out[rows[at], data.pose[at]] = np.concatenate([flat, np.zeros((len(at), 1))], axis=1)
-    return out, error
-
-
 def parameters_of(robot: Robot, fit: PixelFit, covariance: Array) -> tuple[Parameter, ...]:
     """Every parameter, link by link; then cameras, targets and lenses."""
     names, base = fit.model.names, np.zeros(6)
@@ -373,30 +230,6 @@ def parameters_of(robot: Robot, fit: PixelFit, covariance: Array) -> tuple[Param
         names, units_of(names), told(fit.nominal), told(fit.scene), sigma, fit.identification
     )
     return tuple(p for p in every if not p.name.startswith("base_"))
-
-
-def placed(data: PixelData, fit: PixelFit, scale: Scale | None) -> dict[str, Any]:
-    """For JSON: the cameras, the lenses, and the board or the targets."""
-    x = fit.scene
-    cameras = {}
-    for i, camera in enumerate(data.cameras):
-        fx, fy, cx, cy, *distortion = x.lens[0, i]
-        cameras[camera.name] = {
-            "pose": pose_to_dict(transform(x.turn[0, i], x.place[0, i])),
-            "camera_matrix": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
-            "distortion_coefficients": [*distortion, *camera.intrinsic[len(INTRINSICS) :]],
-        }
-    on, other = (FLANGE, "base") if fit.model.on_flange else ("base", FLANGE)
-    out: dict[str, Any] = {"cameras_in": on, "targets_in": other, "cameras": cameras}
-    out["noise_px"] = fit.noise
-    if len(data.board):
-        out["board"] = pose_to_dict(transform(x.board_turn[0], x.board_place[0]))
-    else:
-        out["targets_mm"] = dict(zip(data.targets, (1e3 * x.points[0]).tolist(), strict=True))
-        out["scale"] = "as drawn" if fit.by_drawing else "given"
-    if scale is not None:
-        out["lengths_over_drawn"] = {"share": scale.share, "sigma": scale.sigma}
-    return out
 
 
 def notices_of(fit: PixelFit, held: Array) -> list[str]:

@@ -1,38 +1,100 @@
-"""Which rows are held out, and what an error of a visit is about."""
+"""Visits of a ball to sockets: their file, which are held out, and what an error is about."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
 import numpy as np
 
-from minimax_cal.fitting.instruments.data import RelativeData
+from minimax_cal.fitting.instruments.data import (
+    RelativeData,
+    bare,
+    checked,
+    different,
+    without_blind,
+)
 from minimax_cal.fitting.instruments.options import RelativeOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.columns import Rows
 from minimax_cal.measuring.grouping import groups, held_out
+from minimax_cal.measuring.joint_rows import joint_rows
 
+SOCKET = re.compile("socket")
 WHOLE = 5  # sockets from which on whole ones are held out
 
 
-def held_back(data: RelativeData, options: RelativeOptions) -> tuple[Array, tuple[str, ...]]:
-    """(m,) True where a row is held out, as `grouping.held_out` chooses or as sockets need."""
-    if data.kind != "closures":
-        return held_out(data.at, options.holdout, options.seed)
+@dataclass(frozen=True, eq=False)
+class Visits(RelativeData):
+    """Visits to sockets.
+
+    socket: (m,) label of the socket that held the ball.
+    """
+
+    socket: Array
+
+    kind = "closures"
+    by_row = ("socket",)
+
+    @property
+    def sockets(self) -> tuple[str, ...]:
+        """The sockets' labels, in alphabetical order."""
+        return tuple(str(label) for label in np.unique(self.socket))
+
+    @property
+    def independent(self) -> int:
+        """Three for each different pose in a socket but the first."""
+        return sum(3 * (different(self.at, self.socket == label) - 1) for label in self.sockets)
+
+    def count(self, held: Array) -> tuple[int, int]:
+        """Three less for each barycentre."""
+        return free_numbers(self.socket, held)
+
+    def check(self) -> None:
+        """Raise DataError for a socket that was not visited again with other joint values."""
+        group = groups(self.at)
+        for label in self.sockets:
+            rows = np.flatnonzero(self.socket == label)
+            if len(np.unique(group[rows])) < 2:
+                often = "once" if len(rows) == 1 else "with the same joint values only"
+                raise DataError(
+                    f"{self.says(rows[0])}: column socket: {label!r} is visited {often}; visit it "
+                    "again with other joint values, or leave the cell empty"
+                )
+
+    def in_block_order(self) -> Self:
+        """Visits of one socket together."""
+        return self.take(np.argsort(self.socket, kind="stable"))
+
+    def columns(self) -> Mapping[str, Array]:
+        """The labels."""
+        return {"socket": self.socket}
+
+
+def closures(q: Array, socket: Array, **columns: Array) -> Visits:
+    """Sockets visited again, from arrays.  q: (m, n) [rad, m].  socket: (m,) labels."""
+    labels = np.asarray(socket).astype(str)
+    return checked(Visits(bare(q, columns, socket=labels), labels))
+
+
+def read(file: Rows) -> Visits:
+    """The sockets' labels.  Raises DataError."""
+    file, at = joint_rows(file, SOCKET)
+    labels = np.array(file.text("socket"))
+    return without_blind(Visits(at, labels), np.asarray(labels == ""))
+
+
+def held_back(data: Visits, options: RelativeOptions) -> tuple[Array, tuple[str, ...]]:
+    """(m,) True where a visit is held out; sockets of known distances stay."""
     needed = tuple(label for known in options.known_distances for label in known[:2])
     return split_sockets(data, options.holdout, options.seed, needed)
 
 
-def before_and_after(nominal: Array, calibrated: Array, held: Array) -> dict[str, Array]:
-    """Errors (parts, m, ...) of all poses by the keys of a result.  held: (m,)."""
-    return {
-        "nominal": nominal[:, held],
-        "train": calibrated[:, ~held],
-        "holdout": calibrated[:, held],
-        "nominal_train": nominal[:, ~held],
-    }
-
-
 def split_sockets(
-    data: RelativeData, holdout: float, seed: int, needed: tuple[str, ...]
+    data: Visits, holdout: float, seed: int, needed: tuple[str, ...]
 ) -> tuple[Array, tuple[str, ...]]:
     """(m,) True where a visit is held out, and a notice that says what was chosen.
 
@@ -70,7 +132,7 @@ def split_sockets(
     return held, (notice,)
 
 
-def spare_visits(data: RelativeData, holdout: float, rng: np.random.Generator) -> Array:
+def spare_visits(data: Visits, holdout: float, rng: np.random.Generator) -> Array:
     """(m,) True for a share of the visits; each socket keeps two different poses."""
     pose = groups(data.at)
     held = np.zeros(data.poses, dtype=bool)
@@ -114,26 +176,3 @@ def free_numbers(socket: Array, held: Array) -> tuple[int, int]:
     trained, left = np.unique(socket[~held]), np.unique(socket[held])
     alone = len(left) - int(np.isin(left, trained).sum())
     return 3 * (int((~held).sum()) - len(trained)), 3 * (int(held.sum()) - alone)
-
-
-def count_numbers(data: RelativeData, held: Array) -> dict[str, int]:
-    """Independent numbers behind the errors, by the keys of a result."""
-    if data.kind == "closures":
-        trained, left = free_numbers(data.socket, held)
-    else:
-        each = numbers_by_row(data)
-        trained, left = int(each[~held].sum()), int(each[held].sum())
-    return {"nominal": left, "holdout": left, "train": trained, "nominal_train": trained}
-
-
-def numbers_by_row(data: RelativeData) -> Array:
-    """(m,) how many numbers each row holds; of poses and points in space."""
-    if data.kind == "poses":
-        return np.full(data.poses, 6)
-    if data.kind == "pixels":
-        return 2 * np.bincount(data.images.pose, minlength=data.poses)
-    if data.kind == "points":
-        return np.asarray(3 * data.at.seen.sum(axis=1))
-    if data.kind == "contacts":
-        return np.ones(data.poses, dtype=int)
-    return np.asarray(np.isfinite(data.length).sum(axis=1))

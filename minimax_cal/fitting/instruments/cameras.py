@@ -1,4 +1,4 @@
-"""Pixels beside other instruments: a block of the fit of several, see `instruments.rows.Block`.
+"""What cameras saw, beside other instruments; alone it is `pixel_calibration`.
 
 Its own parameters are those of `PixelModel`: cameras, board or targets, lenses.  Pixels are rows in
 metres at a typical target; what the files know of the lenses is rows too.  Which pixels are wrong
@@ -7,26 +7,78 @@ and how noisy they are, the pixels say by themselves, in a fit of their own.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 
 from minimax_cal.fitting.fit import Parameter
-from minimax_cal.fitting.instruments.data import RelativeData
-from minimax_cal.fitting.instruments.rows import Plain, arm_at, own_state
-from minimax_cal.fitting.pixels.calibrate import fitted_on, judged_pixels, placed, table_of
-from minimax_cal.fitting.pixels.data import PixelData
+from minimax_cal.fitting.instruments.data import RelativeData, checked
+from minimax_cal.fitting.instruments.options import RelativeOptions
+from minimax_cal.fitting.instruments.record import Instrument, Words
+from minimax_cal.fitting.instruments.rows import Plain, own_state
+from minimax_cal.fitting.pixels.camera import read_camera
+from minimax_cal.fitting.pixels.data import PixelData, read_pixels
+from minimax_cal.fitting.pixels.determined import fitted_on, judged_pixels, placed, table_of
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.pixels.identify import reference_of
 from minimax_cal.fitting.pixels.model import LENS, PixelModel, Scene, units_of
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.model import Model
+from minimax_cal.measuring.grouping import groups
+from minimax_cal.modelling.model import Model, arm_at
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import right_jacobian
 from minimax_cal.robots.robot import Robot
+
+
+@dataclass(frozen=True, eq=False)
+class Images(RelativeData):
+    """Pixels, at these poses."""
+
+    pixels: PixelData
+
+    kind = "pixels"
+    by_row = ()
+
+    @property
+    def images(self) -> PixelData:
+        """The pixels at these poses."""
+        return replace(self.pixels, at=self.at)
+
+    @property
+    def numbers(self) -> Array:
+        """(m,) two a pixel."""
+        return 2 * np.bincount(self.pixels.pose, minlength=self.poses)
+
+    @property
+    def independent(self) -> int:
+        """Six for each different pose: many targets in an image are one pose of a camera."""
+        return 6 * len(np.unique(groups(self.at)[self.pixels.pose]))
+
+    def take(self, rows: Array) -> Images:
+        """The images at some poses only.  rows: indices or a mask."""
+        return replace(self, at=self.at.take(rows), pixels=self.pixels.take(rows))
+
+
+def detected(
+    detections: Path | str,
+    joints: Path | str,
+    camera: Mapping[str, Path | str],
+    board: Path | str | None = None,
+) -> Images:
+    """What cameras saw, for `relative`.  Files as `calibrate_pixels` takes them."""
+    cameras = [read_camera(name, path) for name, path in camera.items()]
+    return as_instrument(read_pixels(detections, joints, cameras, board))
+
+
+def as_instrument(data: PixelData) -> Images:
+    """Pixels as one instrument of several."""
+    at = replace(data.at, source=data.source, digest=data.digest, notices=data.notices)
+    return checked(Images(at, data))
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +97,6 @@ class Pixels(Plain):
     bearings: bool = False
 
     kind = "pixels"
-    row_noise = 1.0
-    given_up: ClassVar[tuple[str, ...]] = ()
-    held: ClassVar[tuple[str, ...]] = ()
     whole = "cameras and targets moved together"
     spots = slice(0, 0)
 
@@ -58,6 +107,17 @@ class Pixels(Plain):
         depth = fit.model.seen(fit.nominal).point[2]
         metre = float(np.median(depth / fit.model.intrinsic[fit.model.camera, 0]))
         return Pixels(data, robot, fit, fit.model, metre)
+
+    @staticmethod
+    def beside_others(robot: Robot, data: Images, options: RelativeOptions) -> Pixels:
+        """Pixels among other instruments.  Raises DataError."""
+        chosen = PixelOptions(
+            camera_on=options.camera_on,
+            fix_camera=options.fix_camera,
+            camera_prior=options.camera_prior,
+            holdout=0.0,
+        )
+        return Pixels.of(robot, data.images, chosen)
 
     @property
     def model(self) -> Model:
@@ -199,11 +259,11 @@ class Pixels(Plain):
         """u of all pixels, v of all; lenses with the first pose."""
         return np.concatenate([np.tile(self.seen.pose, 2), np.zeros(self.lens_rows, dtype=int)])
 
-    def model_at(self, robot: Robot, data: RelativeData) -> Model:
+    def model_at(self, robot: Robot, data: Images) -> Model:
         """The arm alone."""
         return arm_at(robot, data.at.q)
 
-    def errors(self, model: Model, x: State, data: RelativeData, held: Array) -> Array:
+    def errors(self, model: Model, x: State, data: Images, held: Array) -> Array:
         """At the targets, of all images; wrong pixels are left out."""
         robot, pixels = self.robot, data.images
         every = PixelModel.of(robot, pixels, self.seen.on_flange)
@@ -224,3 +284,18 @@ class Pixels(Plain):
         """Cameras, lenses, and the board or the targets."""
         scene = self.scene_of(x.mdh, x.effects)
         return placed(self.data, replace(self.fit, scene=scene), None)
+
+
+INSTRUMENT = Instrument(
+    name=Images.kind,
+    words=Words(
+        quantity="pixel at the target",
+        caution="A pixel is no position: what moves along the line of sight does not show in it. ",
+    ),
+    block=Pixels.beside_others,
+    options=("camera_on", "fix_camera", "camera_prior"),
+    alone="it holds pixels alone: give it to calibrate as pixels=, or add files of other "
+    "instruments",
+    on_arm=False,
+    noise_given=False,
+)
