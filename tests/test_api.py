@@ -189,6 +189,14 @@ def test_version_and_help_import_no_command() -> None:
         assert not any(after(code, *heavy).values()), option
 
 
+def test_no_command_waits_for_what_its_help_does_not_need() -> None:
+    heavy = ("scipy.stats", "scipy.optimize", "scipy.interpolate", "scipy.signal", "scipy.ndimage")
+    heavy += ("cvxpy", "qpsolvers", "numba", "matplotlib", "plotly", "jinja2", "mujoco", "pandas")
+    code = "import minimax_cal.cli.running as r\nfor name in r.ENTRIES:\n    r.cli.commands[name]"
+    imported = after(code, *heavy, "minimax_cal.cli.diagnose")
+    assert [name for name, here in imported.items() if here] == ["minimax_cal.cli.diagnose"]
+
+
 def test_the_list_says_what_the_commands_say() -> None:
     context = click.Context(cli)
     assert cli.list_commands(context) == list(cli.commands) == list(ENTRIES)

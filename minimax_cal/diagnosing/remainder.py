@@ -16,7 +16,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy import stats
+import scipy
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.spatial.distance import cdist
 
@@ -186,8 +186,8 @@ def gain_chance(before: Beside, after: Beside, group: Array) -> float:
     gains = np.bincount(names, (before.error**2 - after.error**2).sum(axis=1))
     if len(gains) < FEWEST or not gains.sum() > 0.0:
         return 1.0
-    mean = stats.ttest_1samp(gains, 0.0, alternative="greater").pvalue
-    ranks = stats.wilcoxon(gains, alternative="greater").pvalue
+    mean = scipy.stats.ttest_1samp(gains, 0.0, alternative="greater").pvalue
+    ranks = scipy.stats.wilcoxon(gains, alternative="greater").pvalue
     return min(2.0 * float(min(mean, ranks)), 1.0)
 
 

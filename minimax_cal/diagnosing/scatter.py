@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.stats import chi2
+import scipy
 
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.limits import LEAST_DOF, UNLIKE
@@ -45,7 +44,7 @@ def weighed_anew(study: Study, known: Array, *, each: bool = True) -> Study:
     least, _ = rest.fit_variances([alike, along + across], np.array(size))
     parts = [*(turned if each else alike[None]), along, across]
     most, found = rest.fit_variances(parts, np.repeat(size, (len(parts) - 2, 2)))
-    if chi2.sf(least - most, len(parts) - 2) > UNLIKE:
+    if scipy.stats.chi2.sf(least - most, len(parts) - 2) > UNLIKE:
         return study
     scatter = np.broadcast_to(np.sqrt(found[:-2]), len(turned))
     return weighed(study, scatter, sight, found[-2:])
@@ -122,7 +121,9 @@ class WholePoses:
         begin = np.log(np.maximum(start, LEAST**2))
         whole = np.array(parts)
         room = [(x - ROOM, x + ROOM) for x in begin]
-        found = minimize(self.cost, begin, (whole,), jac=True, method="L-BFGS-B", bounds=room)
+        found = scipy.optimize.minimize(
+            self.cost, begin, (whole,), jac=True, method="L-BFGS-B", bounds=room
+        )
         return float(found.fun), np.asarray(np.exp(found.x))
 
     def cost(self, logs: Array, parts: Array) -> tuple[float, Array]:

@@ -14,8 +14,8 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
+import scipy
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.interpolate import CubicSpline
 from scipy.linalg import toeplitz
 from scipy.sparse import block_diag, coo_array, csr_array
 
@@ -216,7 +216,7 @@ class Logs:
         """The logs with torques that were logged so much after the motion [s] put back in time."""
         ends = zip(self.start[:-1], self.start[1:], strict=True)
         moved = [
-            CubicSpline(self.since[a:b], self.torque[a:b])(
+            scipy.interpolate.CubicSpline(self.since[a:b], self.torque[a:b])(
                 np.clip(self.since[a:b] + late, self.since[a], self.since[b - 1])
             )
             for a, b in ends
@@ -249,7 +249,7 @@ def prepare_run(run: Run) -> Logs:
     every = int(rate / SAMPLE_HZ)
 
     def even(values: Array) -> Array:
-        return np.asarray(CubicSpline(run.time, values)(time))
+        return np.asarray(scipy.interpolate.CubicSpline(run.time, values)(time))
 
     q = smooth(even(run.q), rate)
     qd = slope(q, rate) if run.qd is None else smooth(even(run.qd), rate)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+import scipy
 from scipy.spatial import cKDTree
-from scipy.stats import binned_statistic_2d, binom
 
 from minimax_cal.fitting.uncertainty import FRAMES, Uncertainty, holding_radius, position_factor
 from minimax_cal.ground.arrays import Array
@@ -320,7 +320,7 @@ def section(
         values: Array, statistic: Literal["count", "mean", "median", "max"], mask: Array = every
     ) -> Array:
         x, y = (part[mask] for part in at)
-        found = binned_statistic_2d(x, y, values[mask], statistic=statistic, bins=edges)
+        found = scipy.stats.binned_statistic_2d(x, y, values[mask], statistic=statistic, bins=edges)
         return np.asarray(found.statistic, dtype=float)
 
     count = binned(some.radius, "count")
@@ -412,7 +412,7 @@ def remarks(robot: Robot, train: Array, inside: tuple[int, int]) -> list[str]:
     """Notices about what was sampled, and about a prediction that the held-out poses belie."""
     out = []
     count, of = inside
-    if binom.cdf(count, of, LEVEL) < DOUBT:
+    if scipy.stats.binom.cdf(count, of, LEVEL) < DOUBT:
         out.append(
             f"the predicted radius, made wider for the noise of a measurement, holds {count} of "
             f"{of} held-out poses, not {100 * LEVEL:.0f} %: what the model leaves out is not in "

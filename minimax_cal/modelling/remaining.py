@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from minimax_cal.evidence.remains import Component, Fading
 from minimax_cal.ground.arrays import Array
@@ -230,7 +230,9 @@ def randomly(q: Array) -> Array:
 def faded(x: Array) -> Array:
     """(f, m) what is left of the past of values (m,) in the order of the rows, at several rates."""
     before = np.append(0.0, x[:-1])
-    return np.array([(1.0 - keep) * lfilter([1.0], [1.0, -keep], before) for keep in KEEPS])
+    return np.array(
+        [(1.0 - keep) * scipy.signal.lfilter([1.0], [1.0, -keep], before) for keep in KEEPS]
+    )
 
 
 def wound(move: Array) -> Array:

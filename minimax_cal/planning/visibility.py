@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from scipy.stats import qmc
+import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
@@ -50,7 +50,9 @@ class Sight:
 
     def proposals(self, room: Room, seed: int) -> Iterator[Array]:
         """(b, n) joint values within the limits, again and again: a Sobol sequence."""
-        sequence = qmc.Sobol(len(room.lower), scramble=True, rng=np.random.default_rng(seed))
+        sequence = scipy.stats.qmc.Sobol(
+            len(room.lower), scramble=True, rng=np.random.default_rng(seed)
+        )
         while True:
             yield room.lower + (room.upper - room.lower) * sequence.random(BATCH)
 

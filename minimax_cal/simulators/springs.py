@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.optimize import least_squares, nnls
+import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.bending import TOOL_FLEX, bent, tilted
@@ -97,7 +97,7 @@ def springs_of(
     if kinds:
         each = np.einsum("l,elr->re", moments(mass, com), clear)
         felt = np.linalg.norm(each, axis=0)
-        soft = nnls(each * (felt > FELT * felt.max()), goal)[0]
+        soft = scipy.optimize.nnls(each * (felt > FELT * felt.max()), goal)[0]
     if kinds and not fixed:
         soft = started(soft, [kind for kind, _ in kinds])
         soft, mass, com = together(clear, goal, soft, masses, points)
@@ -227,7 +227,7 @@ def together(
         return np.vstack([np.concatenate([by_soft, by_mass, by_com]).T, weight * np.eye(len(x))])
 
     ends = np.concatenate([np.full(e, 2.0 * np.log(MOST)), np.full(4 * n, 3.0)])
-    found = least_squares(
+    found = scipy.optimize.least_squares(
         residual, start, jacobian, bounds=(start - ends, start + ends), max_nfev=300
     )
     return split(found.x)

@@ -25,6 +25,7 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import gravity
 from minimax_cal.planning import plan as module
 from minimax_cal.planning import separating, task
+from minimax_cal.planning.designs.convex import capped
 from minimax_cal.planning.designs.criteria import (
     Criterion,
     Determinant,
@@ -36,7 +37,7 @@ from minimax_cal.planning.designs.criteria import (
     sizes_of,
 )
 from minimax_cal.planning.designs.exchange import Menu, exchange, floor, greedy, polar
-from minimax_cal.planning.designs.relaxation import capped, relax
+from minimax_cal.planning.designs.relaxation import relax
 from minimax_cal.planning.designs.search import best_design, first_design, worth
 from minimax_cal.planning.observability import observability
 from minimax_cal.planning.outlook import sigmas

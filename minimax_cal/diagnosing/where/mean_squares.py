@@ -6,7 +6,7 @@ import math
 from itertools import combinations
 
 import numpy as np
-from scipy.stats import chi2, f
+import scipy
 
 from minimax_cal.diagnosing.where.answer import CANNOT_TELL, Part, Triage
 from minimax_cal.diagnosing.where.residual import Residual
@@ -71,7 +71,9 @@ def above(energy: float, free: float, variance: float, behind: float) -> float:
     """p that energy / free is that large if its expectation is variance, known from `behind`."""
     ratio = energy / variance
     return float(
-        f.sf(ratio / free, free, behind) if math.isfinite(behind) else chi2.sf(ratio, free)
+        scipy.stats.f.sf(ratio / free, free, behind)
+        if math.isfinite(behind)
+        else scipy.stats.chi2.sf(ratio, free)
     )
 
 

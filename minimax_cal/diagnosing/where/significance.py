@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.stats import chi2, norm
+import scipy
 
 from minimax_cal.diagnosing.where.residual import Residual, flat_of
 from minimax_cal.ground.arrays import Array
@@ -85,6 +85,6 @@ def pearson(excess: float, second: float, third: float) -> float:
         return 1.0
     skew = third / second**1.5
     if skew < 1e-3:
-        return float(norm.sf(excess / math.sqrt(2.0 * second)))
+        return float(scipy.stats.norm.sf(excess / math.sqrt(2.0 * second)))
     dof = skew**-2.0
-    return float(chi2.sf(dof + excess / math.sqrt(second) * math.sqrt(dof), dof))
+    return float(scipy.stats.chi2.sf(dof + excess / math.sqrt(second) * math.sqrt(dof), dof))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.pixels.judge import drawn_covariance
@@ -102,4 +102,4 @@ def scale_of(robot: Robot, fit: PixelFit, sure: Uncertainty) -> Scale | None:
     share = float(white[:, 0] @ white[:, 1]) / told
     left = float(((white[:, 1] - share * white[:, 0]) ** 2).sum()) / dof
     sigma = float(np.sqrt(max(left, 1.0) / told))
-    return Scale(share, sigma, float(2.0 * stats.t.sf(abs(share) / sigma, dof)))
+    return Scale(share, sigma, float(2.0 * scipy.stats.t.sf(abs(share) / sigma, dof)))

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
+import scipy
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting.calibrate import calibrate
@@ -358,7 +358,9 @@ def refined(rays: Rays, view: Array) -> Array:
     def errors(turn: Array) -> Array:
         return rays.solved(kinematics.rotation(turn) @ view)[2].reshape(-1)
 
-    found = least_squares(errors, np.zeros(3), loss="soft_l1", f_scale=SOFT, max_nfev=STEPS)
+    found = scipy.optimize.least_squares(
+        errors, np.zeros(3), loss="soft_l1", f_scale=SOFT, max_nfev=STEPS
+    )
     return np.asarray(kinematics.rotation(found.x) @ view)
 
 

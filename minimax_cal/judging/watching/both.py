@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import stats
+import scipy
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotrf, dpotri
 
@@ -275,4 +275,4 @@ def log_determinant(gram: Array) -> float:
 
 def critical(level: Array, dof: Array) -> Array:
     """Sigmas that chance exceeds, either way, with the probabilities given [Student]."""
-    return np.asarray(stats.t.isf(0.5 * level, dof))
+    return np.asarray(scipy.stats.t.isf(0.5 * level, dof))

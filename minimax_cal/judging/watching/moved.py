@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
@@ -160,7 +160,7 @@ class Candidates:
 def tested(by: Array, sigma: Array, dof: Array) -> tuple[Array, Array]:
     """How large a change is, in sigmas, and its p-value [Student]."""
     size = np.abs(by) / sigma
-    return np.asarray(size), np.asarray(2.0 * stats.t.sf(size, dof))
+    return np.asarray(size), np.asarray(2.0 * scipy.stats.t.sf(size, dof))
 
 
 def helps(gains: Array) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from minimax_cal.dynamics.rows import EDGE_S, Logs
 from minimax_cal.dynamics.run import Run
@@ -75,7 +75,7 @@ def follow_torques(
     right, the arm follows the log by the measured torques alone.
     """
     model, at, dofs = chain.model, chain.places, chain.dofs
-    wanted = CubicSpline(run.time, run.q)
+    wanted = scipy.interpolate.CubicSpline(run.time, run.q)
     time = steps_of(run.time, chain)
     q, qd, ahead = wanted(time), wanted(time, 1), on_steps(run.time, torque, chain)
     pull = by_gains(hold) if isinstance(hold, Gains) else by_inertia(hold)
@@ -156,7 +156,7 @@ def stepped(chain: Chain, run: Run, drive: Callable[[Any, int], None], source: s
     """(m, n) joint values at the times of a run.  drive: sets what acts at a step."""
     mj, model = mujoco(), chain.model
     data, (at, dofs) = mj.MjData(model), (chain.places, chain.dofs)
-    start = CubicSpline(run.time, run.q)
+    start = scipy.interpolate.CubicSpline(run.time, run.q)
     data.qpos[at], data.qvel[dofs] = start(run.time[0]), start(run.time[0], 1)
     time = steps_of(run.time, chain)
     out = np.empty((len(time), run.joints))
