@@ -17,7 +17,7 @@ import numpy as np
 from minimax_cal.diagnosing.sizes import unsized, weights_of
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.limits import MAX_RISE
-from minimax_cal.fitting.beyond import needed, step_without
+from minimax_cal.fitting.beyond import are_needed, step_without
 from minimax_cal.fitting.uncertainty import Estimator, Linearised, Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.bounds import at_bounds, bounds
@@ -46,9 +46,11 @@ class Predicting(ABC):
 
     def spared(self, folds: Sequence[Array]) -> list[Array]:
         """The folds, masks (m,) of the poses, without which the fit keeps all of its parameters."""
-        for fold in folds:
-            if fold.tobytes() not in self.needs:
-                self.needs[fold.tobytes()] = needed(self.poses, fold)
+        new = {fold.tobytes(): fold for fold in folds if fold.tobytes() not in self.needs}
+        if new:
+            grams = np.array([self.poses.gram_of(fold) for fold in new.values()])
+            found = are_needed(self.poses.normal_matrix, grams)
+            self.needs.update(zip(new, found.tolist(), strict=True))
         return [fold for fold in folds if not self.needs[fold.tobytes()]]
 
     def cross_validated(self, folds: Sequence[Array]) -> float:

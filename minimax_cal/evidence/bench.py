@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -212,14 +212,8 @@ class Bench:
         """By how much rows are noisier along a candidate than all together."""
         at = int(np.argmax(self.settings.ratios == one.ratio))
         motion = one.value @ self.library.fields(one.candidate)[: len(one.value)]
-        field, rest = self.fixed.white(motion[None], at)[0], self.errors[at]
-        return inflation(field, rest, self.library.rows.group, self.dof)
-
-    @cached_property
-    def errors(self) -> Array:
-        """(s, N) the error at each ratio, projected, its rows of the same variance."""
-        error, ratios = self.fixed.error[None], range(len(self.settings.ratios))
-        return np.concatenate([self.fixed.white(error, at) for at in ratios])
+        own, rest = self.fixed.white(motion[None], at)[0], self.fixed.left(at)
+        return inflation(own, rest, self.library.rows.group, self.dof)
 
     def likeness(self, one: Added, other: Candidate) -> tuple[float, float]:
         """lambda of an effect found, and rho^2: the share of its motion that another imitates."""
@@ -281,6 +275,13 @@ class Fixed:
     weights: Array
     before: Array
     error: Array
+    lefts: dict[int, Array] = field(default_factory=dict)
+
+    def left(self, at: int) -> Array:
+        """(N,) the error at one of the ratios, projected, its rows of the same variance."""
+        if at not in self.lefts:
+            self.lefts[at] = self.white(self.error[None], at)[0]
+        return self.lefts[at]
 
     @cached_property
     def rows(self) -> Array:
@@ -364,8 +365,7 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
         np.concatenate([at.part[:, :, 0], before], axis=1),
         rows.error,
     )
-    tries = float(sum(not c.is_line for c in lib.candidates))
-    return Bench(lib, tuple(chosen), noise, settings, held, dof, tries)
+    return Bench(lib, tuple(chosen), noise, settings, held, dof, float(lib.laws))
 
 
 def beside_priors(at: At, index: Array, ridge: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -145,6 +145,11 @@ class Library:
         """The problem."""
         return self.dictionary.problem
 
+    @cached_property
+    def laws(self) -> int:
+        """How many candidates were not found by a search over frequencies."""
+        return sum(not c.is_line for c in self.candidates)
+
     @property
     def columns(self) -> Array:
         """(N, D) fields of all candidates as rows."""
@@ -195,11 +200,9 @@ class Library:
 
     def shown(self) -> Library:
         """The library without candidates that geometry imitates."""
-        products, count = self.products, self.products.columns.count
-        at = products.at(np.zeros(1), np.zeros(0, dtype=int))
-        whole, left = at.whole, at.among(np.arange(count)[:, None])[0, :, 0, 0]
-        every = (products.columns.raw**2).sum(axis=0)  # what a part shows less of is rounding
-        clear = (left > FAINT * whole[0]) & (whole[0] > GONE * every)
+        whole, left = self.products.shown()
+        every = (self.columns**2).sum(axis=0)  # what a part shows less of is rounding
+        clear = (left > FAINT * whole) & (whole > GONE * every)
         shown = tuple(c for c in self.candidates if clear[c.main].all())
         gone = {c.family for c in self.candidates} - {c.family for c in shown}
         lacking = [(name, "poses at which geometry does not imitate it") for name in sorted(gone)]

@@ -13,7 +13,7 @@ import numpy as np
 
 from minimax_cal.evidence.limits import LEAST_NOISE_DOF
 from minimax_cal.evidence.noise import Noise, Problem, costs, noise_of, told_apart, triangles
-from minimax_cal.evidence.ratios import NODES, RATIOS, find_ratio, interpolation, nodes
+from minimax_cal.evidence.ratios import NODES, RATIOS, ZERO, find_ratio, interpolation, nodes
 from minimax_cal.ground.arrays import Array
 
 LEAST = 1e-13  # of a column's square: what is left of one that geometry imitates is no less
@@ -222,28 +222,31 @@ class Beside:
         self.lines, self.pairs = Lines(depth), Squares(depth)
         self.sets: dict[tuple[bytes, int], Array] = {}
         self.held = np.empty((depth, self.span.shape[1], 0))
-        self.known = 0
+        self.known = np.zeros(0, dtype=bool)
 
     @property
     def width(self) -> int:
         """How many columns there are."""
         return self.sums.columns.fixed + self.sums.columns.count
 
-    @property
-    def part(self) -> Array:
-        """(g, r, p + 1 + D) coordinates of all columns in the geometry's span."""
-        width, known = self.width, self.known
-        if width > known:
-            self.held = grown(self.held, width, axis=2)
-            raw = self.sums.products(np.arange(len(self.span)), slice(known, width))
-            self.held[:, :, known:width] = self.inverse @ np.moveaxis(raw, 0, 1)
-            self.known = width
-        return np.asarray(self.held[:, :, :width])
+    def part(self, some: Some) -> Array:
+        """(g, r, d) coordinates of columns in the geometry's span, each formed once."""
+        width = self.width
+        self.held = grown(self.held, width, axis=2)
+        self.known = np.pad(self.known, (0, width - len(self.known)))
+        index = np.arange(width)[some]
+        new = np.unique(index[~self.known[index]])
+        if len(new):
+            run = slice(int(new[0]), int(new[-1]) + 1)  # which needs no copy of the columns
+            missing = run if run.stop - run.start == len(new) else new
+            raw = self.sums.products(np.arange(len(self.span)), missing)
+            self.held[:, :, missing] = self.inverse @ np.moveaxis(raw, 0, 1)
+            self.known[missing] = True
+        return np.asarray(self.held[:, :, some])
 
     def left(self, index: Array, others: Some) -> Array:
         """(f, g, d) products of columns with others."""
-        part = self.part
-        shared = np.swapaxes(part[:, :, index], 1, 2) @ part[:, :, others]
+        shared = np.swapaxes(self.part(index), 1, 2) @ self.part(others)
         return np.asarray(self.sums.products(index, others) - np.moveaxis(shared, 0, 1))
 
     def across(self, index: Array) -> Array:
@@ -258,8 +261,8 @@ class Beside:
         """(c, d, d, g) products within each of c sets of columns (c, d)."""
         mark = (index.tobytes(), index.shape[1])
         if mark not in self.sets:
-            part = self.part[:, :, index]  # (g, r, c, d)
-            part = np.moveaxis(part, 1, -1)
+            part = self.part(index.ravel())
+            part = np.moveaxis(part.reshape(*part.shape[:2], *index.shape), 1, -1)
             shared = part @ np.swapaxes(part, -1, -2)
             self.sets[mark] = self.sums.among(index) - np.moveaxis(shared, 0, -1)
         return self.sets[mark]
@@ -326,18 +329,23 @@ class Products:
         """Which ratios (s,), of which products, and how (s, g) combined."""
         if ratios is RATIOS:
             return [(np.arange(len(RATIOS)), self.beside(None), np.eye(len(RATIOS)))]
-        logs = np.log10(np.maximum(ratios, 1e-300))
+        logs = np.log10(np.maximum(ratios, 10.0**ZERO))
         numbers = np.floor(logs).astype(int)
         out: list[View] = []
         for number in map(int, np.unique(numbers)):
             here = np.flatnonzero(numbers == number)
-            if ratios[here[0]] == 0.0:
-                first = np.broadcast_to(np.eye(1, len(RATIOS)), (len(here), len(RATIOS)))
-                out.append((here, self.beside(None), first))
-            else:
-                between = interpolation(logs[here] - number, NODES)
-                out.append((here, self.beside(number), between))
+            alone = np.ones((len(here), 1))
+            between = interpolation(logs[here] - number, NODES) if number > ZERO else alone
+            out.append((here, self.beside(number), between))
         return out
+
+    def shown(self) -> tuple[Array, Array]:
+        """(D,) squares of the candidates' columns, all rows alike, and of what geometry leaves."""
+        columns = self.columns
+        own = (columns.clear[columns.fixed :] ** 2) @ self.kept
+        ((_, beside, between),) = self.views(np.zeros(1))
+        part = np.tensordot(between[0], beside.part(slice(columns.fixed, beside.width)), 1)
+        return columns.plain[: columns.count] ** 2 @ self.kept, own - (part**2).sum(axis=0)
 
     def dof(self, index: Array) -> int:
         """Degrees of freedom beside the geometry and some of the candidates' columns."""
@@ -409,7 +417,7 @@ class Products:
             whole[here] = between @ beside.sums.squares().T
             square[here], logs[here] = between @ beside.error, between @ beside.logs
             factor[here] = np.tensordot(between, beside.factor, 1)
-            part[here] = np.tensordot(between, beside.part[:, :, fixed], 1)
+            part[here] = np.tensordot(between, beside.part(fixed), 1)
 
         def among(sets: Array) -> Array:
             out = np.empty((s, *sets.shape, sets.shape[1]))

@@ -16,6 +16,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 
 RATIOS = np.concatenate([[0.0], np.logspace(-3, 5, 9)])  # among which the likeliest is sought
+ZERO = -300  # the decade of the ratio 0
 NODES = 18  # points in a decade of ratios: products to rounding
 FEW = 14  # points in two decades where a likelihood is least: to 1e-7 of it
 FINE = 401  # points between which a polynomial's least value is sought
@@ -28,8 +29,8 @@ def points(count: int) -> Array:
 
 
 def nodes(number: int) -> Array:
-    """(g,) ratios in a decade."""
-    return np.asarray(10.0 ** (number + points(NODES)))
+    """(g,) ratios in a decade; in ZERO the ratio 0 alone."""
+    return np.asarray(10.0 ** (number + points(NODES))) if number > ZERO else np.zeros(1)
 
 
 def interpolation(x: Array, count: int) -> Array:

@@ -208,7 +208,7 @@ def addition(
     for one in table.everyone:
         if one.evidence <= 0.0 or len(one.candidate.main) > room:
             continue
-        if best and one.evidence < best.evidence - max(NEAR, NEAR_SHARE * best.gain):
+        if best and one.evidence < best.evidence - may_gain(lib, best):
             break
         if one.candidate.key in seen or repeated(one.candidate, table.chosen):
             continue
@@ -224,6 +224,11 @@ def addition(
         return lib, []
     lib, stored = lib.stored(best.candidate)
     return lib, [replace(best, candidate=stored)]
+
+
+def may_gain(lib: Library, best: Added) -> float:
+    """Evidence that a candidate tuned may win upon the best one; of a part nothing is tuned."""
+    return 0.0 if lib.is_part else max(NEAR, NEAR_SHARE * best.gain)
 
 
 def signed(lib: Library, fits: Sequence[Added], one: Added, least: float, table: Bench) -> Added:

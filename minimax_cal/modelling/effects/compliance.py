@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -133,19 +133,35 @@ def tool_torques(scene: Scene) -> Array:
     return np.stack([along_x - amid, along_y - amid])
 
 
-def torque_of(scene: Scene, joint: int, group: int, *, assumed: bool = False) -> Array:
-    """(m,) gravity's torque of some of the links about a joint [N m].
+def torque_of(scene: Scene, joint: int, group: int) -> Array:
+    """(m,) gravity's torque of some of the links about a joint [N m]."""
+    return np.asarray(torques_of(scene, group)[joint])
+
+
+def torques_of(scene: Scene, group: int, *, assumed: bool = False) -> Array:
+    """(n, m) gravity's torques of some of the links about all joints [N m].
 
     assumed: computed in any case, also where torques are measured.
     """
-    if group == WHOLE and assumed:
-        return np.asarray((scene.torque(*scene.masses) + scene.payload)[joint])
     if group == WHOLE:
-        return np.asarray(scene.gravity[joint])
+        return scene.torque(*scene.masses) + scene.payload if assumed else scene.gravity
     mass, com = scene.masses
     groups = np.minimum(np.arange(scene.joints) // 2, len(GROUPS) - 1)
-    torque = scene.torque(np.where(groups == group, mass, 0.0), com)[joint]
-    return np.asarray(torque + scene.payload[joint] * (group == len(GROUPS) - 1))
+    torque = scene.torque(np.where(groups == group, mass, 0.0), com)
+    return np.asarray(torque + scene.payload * (group == len(GROUPS) - 1))
+
+
+def differing(joint: int, about: int, slope: Array | float = 1.0) -> Callable[[Scene], Array]:
+    """How a joint's turn by the torque about one may differ with the masses: asked for rarely.
+
+    slope: (m,) of the turn by the torque.
+    """
+
+    def doubt(scene: Scene) -> Array:
+        shapes = principal(scene.gravity_parts[:, about] * slope)
+        return np.asarray(np.einsum("rm,kcm->rkcm", shapes, scene.jacobian[joint]))
+
+    return doubt
 
 
 def columns(scene: Scene, place: str, choice: Choice) -> Columns:
@@ -154,19 +170,18 @@ def columns(scene: Scene, place: str, choice: Choice) -> Columns:
     Or dq_j = c_j t tanh(tau_j / t), t = within: a gear that is soft while its teeth take the load
     up, and stiff beyond.
     """
-    turns, names, doubts = [], [], []
-    within = choice.get("within", np.inf)
-    for part in unmasked(choice["parts"]):
+    turns, names, doubts = [], [], {}
+    within, parts = choice.get("within", np.inf), unmasked(choice["parts"])
+    groups = {part % 4 for part in parts}
+    torques = {group: torques_of(scene, group, assumed="assumed" in choice) for group in groups}
+    for number, part in enumerate(parts):
         j, group = divmod(part, 4)
-        torque, slope = taken_up(torque_of(scene, j, group, assumed="assumed" in choice), within)
+        torque, slope = taken_up(torques[group][j], within)
         turns.append(one_joint(scene, j, torque[None]))
         whole = group == WHOLE
         names.append(f"c{j + 1}" + ("" if whole else f" ({GROUPS[group]})"))
-        shapes = scene.gravity_parts[:, j] * slope if whole else np.zeros((0, scene.poses))
-        shapes = principal(shapes)
-        one = [one_joint(scene, j, shape[None]) for shape in shapes]
-        nothing = np.zeros((0, scene.joints, scene.poses))
-        doubts.append(np.concatenate([nothing, *one]))
+        if whole:
+            doubts[number] = differing(j, j, slope)
     positive = len(names)
     levers = unmasked(choice.get("tool", 0.0))
     tool = tool_torques(scene) if levers else np.zeros((2, 0, 0))
@@ -174,12 +189,11 @@ def columns(scene: Scene, place: str, choice: Choice) -> Columns:
         j, axis = divmod(number, 2)
         turns.append(one_joint(scene, j, tool[axis, j][None]))
         names.append(f"c{j + 1} (tool {'xy'[axis]})")
-        doubts.append(np.zeros((0, scene.joints, scene.poses)))
     return Columns(
         tuple(names),
         ("rad/(N m)",) * len(names),
         np.concatenate(turns),
-        doubt=tuple(doubts),
+        doubt=doubts,
         either=np.arange(len(names)) >= positive,
         fixed={told_as(scene): within} if stiffens(choice) else {},
     )
@@ -231,10 +245,8 @@ def crossed(scene: Scene, place: str, choice: Choice) -> Columns:
     """dq_j = c tau_i, i = source."""
     j, i = joint_of(place), int(choice["source"]) - 1
     turn = one_joint(scene, j, scene.gravity[i][None])
-    shapes = principal(scene.gravity_parts[:, i])
-    doubt = np.concatenate([turn[:0], *(one_joint(scene, j, shape[None]) for shape in shapes)])
-    fixed = {"source_joint": i + 1.0}
-    return Columns((f"c{j + 1}{i + 1}",), ("rad/(N m)",), turn, doubt=(doubt,), fixed=fixed)
+    doubt, fixed = {0: differing(j, i)}, {"source_joint": i + 1.0}
+    return Columns((f"c{j + 1}{i + 1}",), ("rad/(N m)",), turn, doubt=doubt, fixed=fixed)
 
 
 CROSS_COMPLIANCE = Effect(

@@ -258,8 +258,8 @@ class Columns:
     names, units: d of each; units are SI.
     turn: (d, n, m) by how much each joint turns or slides [rad or m per unit]; empty for none.
     shift: (d, k, 3, m) by how much each target moves besides [m per unit]; empty for none.
-    doubt: for each parameter (r, n, m) how `turn` may differ, one sigma each; empty for none.
-    doubt_shift: for each parameter (r, k, 3, m) of a scene, once called, how `shift` may differ.
+    doubt: of a parameter (r, k, 3, m) of a scene, once called, how its field may differ, one sigma
+    each.
     fixed: what was chosen and not fitted (turns per revolution, time constants), for the report.
     ridge: (d,) weight of a prior of mean zero, (BESIDE / sigma)^2 [m^2 per unit^2]; empty for none.
     either: (d,) True for parameters of a positive effect that may have either sign; empty for none.
@@ -269,8 +269,7 @@ class Columns:
     units: tuple[str, ...]
     turn: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     shift: Array = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
-    doubt: tuple[Array, ...] = ()
-    doubt_shift: tuple[Callable[[Scene], Array], ...] = ()
+    doubt: Mapping[int, Callable[[Scene], Array]] = field(default_factory=dict)
     fixed: Mapping[str, float] = field(default_factory=dict)
     ridge: Array = field(default_factory=lambda: np.zeros(0))
     either: Array = field(default_factory=lambda: np.zeros(0, dtype=bool))
@@ -291,13 +290,8 @@ class Columns:
 
     def doubts(self, scene: Scene) -> list[tuple[int, Array]]:
         """Parameter and (r, k, 3, m) displacements that its field may differ by, one sigma each."""
-        turned = [
-            (owner, np.einsum("dnm,nkcm->dkcm", part, scene.jacobian, optimize=True))
-            for owner, part in enumerate(self.doubt)
-            if len(part)
-        ]
-        shifted = [(owner, doubt(scene)) for owner, doubt in enumerate(self.doubt_shift)]
-        return turned + [(owner, part) for owner, part in shifted if len(part)]
+        found = [(owner, doubt(scene)) for owner, doubt in self.doubt.items()]
+        return [(owner, part) for owner, part in found if len(part)]
 
 
 DOUBTS = 3  # independent ways in which a law may differ from the one computed
