@@ -4,7 +4,7 @@ FROM python:3.12-slim
 WORKDIR /minimax-cal
 COPY . .
 RUN python3 -m venv .venv && .venv/bin/pip install --quiet ".[all]" && .venv/bin/minimax-cal calibrate irb2600 examples/irb2600.csv --figure errors.svg
-RUN python3 -m venv .venv && .venv/bin/pip install --quiet -e ".[dev]" && .venv/bin/pytest -n auto
+RUN python3 -m venv .venv && .venv/bin/pip install --quiet -e ".[test]" && .venv/bin/pytest -n auto
 ENV PATH="/minimax-cal/.venv/bin:$PATH"
 ENTRYPOINT ["minimax-cal"]
 CMD ["--help"]

@@ -16,6 +16,7 @@ from browsing import browsing  # stands beside this
 import minimax_cal as mc
 from minimax_cal.cli import main, progress
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+from minimax_cal.planning import outlook, plan
 
 progress.FIRST = 60.0  # tests compare stderr, and a busy machine takes more than a second
 
@@ -75,6 +76,17 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     mc.calibrate("ur10", data).save(folder / "fit.json")
     mc.diagnose("ur10", data).save(folder / "gap.json")
     return folder
+
+
+@pytest.fixture(scope="module")
+def few_candidates() -> Iterator[None]:
+    """Plans of cameras sooner: what is seen and promised is the same; poses need not be best."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "STEPS", (0.05,))
+        patch.setattr(plan, "KEPT", 60)
+        patch.setattr(outlook, "GROWTH", (0.5, 1.0))
+        patch.setattr(outlook, "DRAWS", 20)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -18,6 +18,18 @@ MADE = ("pyproject.toml", "CITATION.cff", "codemeta.json", ".zenodo.json", "pape
         "README.md", "CODE_OF_CONDUCT.md", "SECURITY.md", "packaging/conda/meta.yaml")  # fmt: skip
 
 
+def test_what_the_extra_test_lacks_is_marked() -> None:
+    """`.ci/run` runs by their mark the tests that skip after the README's second command."""
+    extras = PROJECT["optional-dependencies"]
+    alone = {re.split("[>;[]", need)[0] for need in extras["dev"]} - {"minimax-cal"}
+    asks = re.compile(r'importorskip\("(\w+)')
+    for path in (ROOT / "tests").rglob("test_*.py"):
+        text = path.read_text()
+        asked = {{"pinocchio": "pin"}.get(name, name) for name in asks.findall(text)}
+        if asked & alone:
+            assert re.search(r"mark\.(dev|slow)", text), path.name
+
+
 def checked(root: Path, *words: str) -> tuple[int, list[str]]:
     command = [sys.executable, root / ".ci" / "placeholders", *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -107,6 +107,7 @@ def run(*arguments: object) -> Result:
 ROBOTS = ("irb120", "fanuc_r2000ic_165f", "ur10", "scara_600", "meca500")
 
 
+@pytest.mark.dev
 @pytest.mark.parametrize("name", ROBOTS)
 def test_new_urdf(name: str) -> None:
     pinocchio = pytest.importorskip("pinocchio")
@@ -158,6 +159,7 @@ def theirs_at(text: str, q: np.ndarray, frame: str) -> np.ndarray:
     return np.array(out)
 
 
+@pytest.mark.dev
 @pytest.mark.parametrize("last", [False, True])
 def test_original_urdf_with_corrected_origins(original: Path, last: bool) -> None:
     nominal = mc.load_robot(original)
@@ -177,6 +179,7 @@ def test_original_urdf_with_corrected_origins(original: Path, last: bool) -> Non
     assert export(nothing, "urdf").content == original.read_bytes()
 
 
+@pytest.mark.dev
 def test_fit_of_the_builtin_robot_on_a_urdf_with_other_frames(original: Path) -> None:
     nominal = mc.load_robot("ur10")
     robot = bent(nominal)
@@ -188,6 +191,7 @@ def test_fit_of_the_builtin_robot_on_a_urdf_with_other_frames(original: Path) ->
     assert any("base_link to the robot's base" in notice for notice in made.notices)
 
 
+@pytest.mark.dev
 def test_urdf_that_is_rounded_still_gives_the_calibrated_poses(original: Path) -> None:
     nominal = mc.load_robot("ur10")
     robot, rounded = bent(nominal), original.read_bytes().replace(HALF.encode(), b"1.5708")
@@ -211,6 +215,7 @@ def base_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return shared_base(one @ inverse(one[0]), other @ inverse(other[0]))
 
 
+@pytest.mark.dev
 def test_urdf_without_a_fixed_joint_after_the_last(original: Path) -> None:
     urdf = parse_urdf(original.read_bytes(), "ur10.urdf")
     nominal = robot_from_dict(to_robot(urdf, "wrist_3_link").content)
@@ -441,6 +446,7 @@ def fit(tmp_path_factory: pytest.TempPathFactory, original: Path) -> tuple[Path,
     return path, made
 
 
+@pytest.mark.dev
 def test_a_calibrated_ur10_by_command_in_an_independent_reader(
     fit: tuple[Path, Simulation], original: Path, tmp_path: Path
 ) -> None:

@@ -83,6 +83,7 @@ def by_pinocchio(robot: mc.Robot, moved: Motion) -> Array:
     return np.array([pin.rnea(model, data, *part) for part in parts]) * robot.sign
 
 
+@pytest.mark.dev
 @pytest.mark.parametrize("slides", [(), (0,), (2, 4)])
 @pytest.mark.parametrize("seed", range(4))
 def test_torques_are_those_of_pinocchio(seed: int, slides: tuple[int, ...]) -> None:
@@ -93,6 +94,7 @@ def test_torques_are_those_of_pinocchio(seed: int, slides: tuple[int, ...]) -> N
     assert_allclose(ours, theirs, rtol=0, atol=EXACT * np.abs(theirs).max())
 
 
+@pytest.mark.dev
 def test_a_urdf_has_the_torques_of_pinocchio(tmp_path: Path) -> None:
     """Inertias in turned frames, a body fixed to a link, an axis that points down."""
     pin = pytest.importorskip("pinocchio")

@@ -49,6 +49,7 @@ def test_weak_pixels_leave_the_drawn_arm() -> None:
     assert np.allclose(row[5], 1.0)
 
 
+@pytest.mark.usefixtures("few_candidates")
 def test_planned_poses_lower_the_bound() -> None:
     given, planned = (
         run(Job(way, 0, True))

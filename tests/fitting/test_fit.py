@@ -218,6 +218,7 @@ def test_results_show_themselves(robot: mc.Robot, noisy: Simulation) -> None:
         fit.parameters["a9"]
 
 
+@pytest.mark.dev
 def test_a_frame_of_parameters(robot: mc.Robot, noisy: Simulation) -> None:
     pytest.importorskip("pandas", reason="pandas is not installed: no frame to look at")
     frame = mc.calibrate(robot, noisy.data, "sum").parameters.frame()

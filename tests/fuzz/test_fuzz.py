@@ -30,7 +30,7 @@ from .known import FATAL, HARMLESS, disagreement, with_known
 from .material import material
 from .running import GOOD, Outcome, judged, outcomes
 
-CASES, SEED = 80, 20260101
+CASES, SEED = 40, 20260101
 MANY, FRESH = 10_000, 20260707
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="limits are those of POSIX")

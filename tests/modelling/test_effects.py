@@ -215,6 +215,7 @@ def test_torque_is_minus_the_slope_of_the_potential_energy(which: str) -> None:
         assert_allclose(scene.gravity[j], -jacobian, rtol=0, atol=EXACT * 1e4)
 
 
+@pytest.mark.dev
 def test_torque_is_the_one_of_pinocchio() -> None:
     pin = pytest.importorskip("pinocchio")
     data = replace(DATA, columns={k: v for k, v in DATA.columns.items() if k != "payload"})

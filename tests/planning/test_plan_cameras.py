@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,8 +31,6 @@ from minimax_cal.fitting.instruments.pixel_calibration import fitted
 from minimax_cal.fitting.pixels.determined import determined
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.ground.arrays import Array
-from minimax_cal.planning import outlook
-from minimax_cal.planning import plan as module
 from minimax_cal.planning.camera_options import frame
 from minimax_cal.planning.result import Plan
 from minimax_cal.robots.frames import Frame
@@ -47,15 +44,7 @@ TWO = (
 )
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _few_candidates() -> Iterator[None]:
-    """What is seen and promised is the same; the poses need not be the best."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "STEPS", (0.05,))
-        patch.setattr(module, "KEPT", 60)
-        patch.setattr(outlook, "GROWTH", (0.5, 1.0))
-        patch.setattr(outlook, "DRAWS", 20)
-        yield
+pytestmark = pytest.mark.usefixtures("few_candidates")
 
 
 def planned(cell: Cell, folder: Path, **more: object) -> Plan:
@@ -78,7 +67,7 @@ def cell(request: pytest.FixtureRequest) -> Cell:
 
 
 @pytest.fixture(scope="module")
-def plan(cell: Cell, tmp_path_factory: pytest.TempPathFactory) -> Plan:
+def plan(cell: Cell, few_candidates: None, tmp_path_factory: pytest.TempPathFactory) -> Plan:
     return planned(cell, tmp_path_factory.mktemp("plan"))
 
 

@@ -720,13 +720,16 @@ def places(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [spot for key, part in parts for spot in ((*at, key), *places(part, (*at, key)))]
 
 
+@pytest.mark.parametrize("slips", [20, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["fit.json", "gap.json"])
-def test_no_slip_in_a_file_is_a_traceback(name: str, results: Path, tmp_path: Path) -> None:
+def test_no_slip_in_a_file_is_a_traceback(
+    name: str, slips: int, results: Path, tmp_path: Path
+) -> None:
     rng = np.random.default_rng(1)
     whole = json.loads((results / name).read_text())
     spots = places(whole)
     odd = [None, "x", -1, 1e30, [], {}, [None], True]
-    for _ in range(60):
+    for _ in range(slips):
         content = copy.deepcopy(whole)
         *way, last = spots[rng.integers(len(spots))]
         part = content

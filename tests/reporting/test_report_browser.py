@@ -72,6 +72,7 @@ def sent(driver: Any) -> list[str]:
     ]
 
 
+@pytest.mark.dev
 def test_opens_without_a_complaint_and_asks_for_nothing(opened: Any, folder: Path) -> None:
     assert opened.execute_script("return document.body.dataset.drawn") == "yes"
     assert [e for e in opened.get_log("browser") if e["level"] == "SEVERE"] == []
@@ -80,6 +81,7 @@ def test_opens_without_a_complaint_and_asks_for_nothing(opened: Any, folder: Pat
     assert not [url for url in asked[1:] if not url.startswith(("data:", "blob:"))]
 
 
+@pytest.mark.dev
 def test_every_section_shows_the_numbers_of_the_files(opened: Any, results: Path) -> None:
     files = [results / name for name in ("fit.json", "gap.json")]
     for section in compose(read_sources(files), WORDING).sections:
@@ -92,6 +94,7 @@ def test_every_section_shows_the_numbers_of_the_files(opened: Any, results: Path
         assert rows == [[t.title, [list(t.header), *t.cells()]] for t in own]
 
 
+@pytest.mark.dev
 def test_every_chart_is_drawn(opened: Any, results: Path) -> None:
     files = [results / name for name in ("fit.json", "gap.json")]
     report = compose(read_sources(files), WORDING)
@@ -108,6 +111,7 @@ def test_every_chart_is_drawn(opened: Any, results: Path) -> None:
     assert opened.execute_script("return document.querySelectorAll('.waiting').length") == 0
 
 
+@pytest.mark.dev
 def test_the_view_in_space_is_not_empty(opened: Any) -> None:
     image = pytest.importorskip("PIL.Image", reason="pillow reads the screenshot")
     chart = opened.find_element("id", "chart-workspace")
@@ -125,6 +129,7 @@ def test_the_view_in_space_is_not_empty(opened: Any) -> None:
     opened.find_element("css selector", "input[name=shown][value='1']").send_keys(" ")
 
 
+@pytest.mark.dev
 def test_controls_work_by_keyboard(opened: Any) -> None:
     keys = pytest.importorskip("selenium.webdriver.common.keys").Keys
     for name in ("times", "pose"):
@@ -144,6 +149,7 @@ def test_controls_work_by_keyboard(opened: Any) -> None:
     assert drawn[1] > 100
 
 
+@pytest.mark.dev
 def test_dark_and_light_follow_system_and_button(opened: Any) -> None:
     keys = pytest.importorskip("selenium.webdriver.common.keys").Keys
 
@@ -167,6 +173,7 @@ def test_dark_and_light_follow_system_and_button(opened: Any) -> None:
     opened.execute_script("delete document.documentElement.dataset.theme")
 
 
+@pytest.mark.dev
 def test_paper_is_light_and_shows_the_still_view(opened: Any) -> None:
     shown = "return getComputedStyle(document.querySelector(arguments[0])).display"
     scheme(opened, "dark", "print")
@@ -186,6 +193,7 @@ def test_paper_is_light_and_shows_the_still_view(opened: Any) -> None:
     assert opened.execute_script(shown, ".view .flat") == "none"
 
 
+@pytest.mark.dev
 def test_narrow_pages_scroll_in_their_tables_alone(opened: Any) -> None:
     """As wide as a phone, light and dark: nothing stands out of the page."""
     size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
@@ -201,6 +209,7 @@ def test_narrow_pages_scroll_in_their_tables_alone(opened: Any) -> None:
     assert clear
 
 
+@pytest.mark.dev
 def test_the_page_itself_forbids_scripts_and_requests(opened: Any) -> None:
     found = opened.execute_async_script(
         """
@@ -220,6 +229,7 @@ def test_the_page_itself_forbids_scripts_and_requests(opened: Any) -> None:
     opened.get_log("browser")
 
 
+@pytest.mark.dev
 def test_the_first_page_is_one_sheet_with_all_that_is_signed(
     driver: Any, results: Path, tmp_path: Path
 ) -> None:
@@ -249,6 +259,7 @@ def test_the_first_page_is_one_sheet_with_all_that_is_signed(
     assert "Contents" not in text
 
 
+@pytest.mark.dev
 def test_a_phone_shows_the_verdict_and_charts_whole(driver: Any, folder: Path) -> None:
     """The table that is signed needs no scrolling, no button lies on a legend, maps have room."""
     size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
@@ -265,6 +276,7 @@ def test_a_phone_shows_the_verdict_and_charts_whole(driver: Any, folder: Path) -
     assert map_wide > 195  # half of the screen; names and scale beside it had left it 40
 
 
+@pytest.mark.dev
 def test_hostile_names_are_shown_and_do_nothing(driver: Any, folder: Path) -> None:
     open_page(driver, folder / "bad.html")
     with pytest.raises(Exception, match="alert"):
@@ -281,6 +293,7 @@ def test_hostile_names_are_shown_and_do_nothing(driver: Any, folder: Path) -> No
     assert driver.execute_script("return document.querySelectorAll('svg a').length") == 0
 
 
+@pytest.mark.dev
 def test_without_depth_the_still_view_stands(driver: Any, folder: Path) -> None:
     blind = "HTMLCanvasElement.prototype.getContext = ((old) => function (kind, ...rest) {" \
         "return /webgl/.test(kind) ? null : old.call(this, kind, ...rest); })(" \
@@ -295,6 +308,7 @@ def test_without_depth_the_still_view_stands(driver: Any, folder: Path) -> None:
         driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
 
 
+@pytest.mark.dev
 def test_without_scripts_the_tables_and_the_still_view_stand(driver: Any, folder: Path) -> None:
     driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     try:

@@ -58,6 +58,7 @@ def pinocchio_model(robot: mc.Robot):  # type: ignore[no-untyped-def]
     return pin, model, model.addFrame(frame)
 
 
+@pytest.mark.dev
 @pytest.mark.parametrize("name", ["irb2600", "irb120", "ur5e", "scara_600", "fanuc_r2000ic_165f"])
 def test_forward_agrees_with_pinocchio(name: str, rng: np.random.Generator) -> None:
     robot = mc.load_robot(name)

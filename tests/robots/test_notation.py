@@ -219,6 +219,7 @@ def test_joints_that_bring_a_linked_arm_to_a_pose(rng: np.random.Generator) -> N
         assert not found[:, robot.passive].any()
 
 
+@pytest.mark.dev
 def test_a_urdf_of_a_linked_arm_follows_by_mimic(rng: np.random.Generator, tmp_path: Path) -> None:
     pinocchio = pytest.importorskip("pinocchio")
     for content in (LINKED, PALLETISER, TURNED):
@@ -260,6 +261,7 @@ MIMIC = """<robot name="linked">
 </robot>"""
 
 
+@pytest.mark.dev
 def test_mimic_of_a_urdf_is_read_and_corrected(rng: np.random.Generator, tmp_path: Path) -> None:
     pinocchio = pytest.importorskip("pinocchio")
     path = tmp_path / "linked.urdf"

@@ -62,6 +62,7 @@ def test_a_chain_of_every_joint() -> None:
     assert np.abs(robot.mdh[:, :2]).max() < 2  # nearly parallel axes do not explode
 
 
+@pytest.mark.dev
 def test_pinocchio_reads_the_same_poses() -> None:
     pinocchio = pytest.importorskip("pinocchio")
     text = urdf_of([row for row in ARM if row[0] != "continuous"])

@@ -17,6 +17,7 @@ import minimax_cal as mc
 from minimax_cal.serving.sessions import GIVEN
 
 pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[app]")
+pytestmark = pytest.mark.dev
 PHONE = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
 POSES, TARGETS = 30, 2
 DIGITS = 1e-8  # of measurements that import writes: half a nanometre and a nanoradian [m]

@@ -228,7 +228,7 @@ def driven(path: Path, fit: mc.Fit, asked: Callable[[np.ndarray], np.ndarray]) -
 def test_what_makes_the_simulator_worse_is_not_written(
     stiffening: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ladder, "TRAINING", 24)
+    monkeypatch.setattr(ladder, "TRAINING", 12)
     monkeypatch.setattr(ladder, "WORSE", -0.9)  # no rung is so much better
     monkeypatch.setattr(ladder, "AGREES_MM", -1.0)
     gap = mc.simulator_gap(

@@ -251,6 +251,7 @@ def test_a_basis_across_itself_is_found() -> None:
     assert_allclose(np.diag(basis @ matrix @ basis.T), 0.0, atol=1e-12)
 
 
+@pytest.mark.dev
 @pytest.mark.parametrize("name", ROBOTS)
 def test_simulators_load_every_urdf(name: str) -> None:
     robot = robot_called(name)

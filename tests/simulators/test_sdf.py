@@ -15,6 +15,7 @@ import minimax_cal as mc
 
 mujoco = pytest.importorskip("mujoco")
 pin = pytest.importorskip("pinocchio")
+pytestmark = pytest.mark.dev
 
 KINDS = {
     "revolute": pin.JointModelRevoluteUnaligned,
