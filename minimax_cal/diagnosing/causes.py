@@ -16,7 +16,7 @@ from minimax_cal.diagnosing.study import Study
 from minimax_cal.diagnosing.what_remains import left_by, loudest
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
-from minimax_cal.evidence.bench import Added
+from minimax_cal.evidence.bench import Added, Bench
 from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import ENOUGH
 from minimax_cal.evidence.remains import Remains, rest_of
@@ -91,7 +91,7 @@ def causes_of(
 def found_again(study: Study, causes: Causes) -> Causes:
     """The causes with their effects as findings: rivals, and how often each is found again."""
     choice = causes.choice
-    found = merged([finding(study, choice, i) for i in by_weight(choice)])
+    found = merged(findings(study, choice))
     found = [with_untested(one, study.scene, causes.exclude) for one in found]
     effects = judged_again(found, choice, study, causes.jobs, causes.cluster)
     change = asked(effects) and mostly_loose(effects, [f for f in effects if f.established])
@@ -196,15 +196,26 @@ def entire(terms: Sequence[Term], every: Sequence[Term]) -> tuple[Term, ...]:
     return tuple(terms) if law is found else tuple(replace(first, choice=one) for one in law)
 
 
-def finding(study: Study, choice: Choice, number: int) -> Finding:
-    """An effect with its rivals, and what would tell the nearest of them apart."""
-    one, table = choice.fits[number], choice.benches[number]
+def findings(study: Study, choice: Choice) -> list[Finding]:
+    """Each effect with its rivals, in the order of `by_weight`."""
+    beside = [choice.beside_others(number) for number in range(len(choice.found))]
+    fits = [one for _, one in beside]
+    return [finding(study, choice, *beside[number], fits) for number in by_weight(choice)]
+
+
+def finding(
+    study: Study, choice: Choice, table: Bench, one: Added, fits: Sequence[Added]
+) -> Finding:
+    """An effect with its rivals, and what would tell the nearest of them apart.
+
+    table, one: it beside the others.  fits: of every effect.
+    """
     found = alternatives(table, one)
     advice = [""] * len(found)
     unclear = [i for i, (_, _, power) in enumerate(found) if power < ENOUGH][:ADVISED]
     if unclear:
         site = Site(study.scene, study.model, study.fit.state, choice.noise)
-        others = [(f.candidate.term, f.value) for f in choice.fits if f is not one]
+        others = [(f.candidate.term, f.value) for f in fits if f is not one]
         for i in unclear:
             rival = found[i][0].candidate.term
             advice[i] = separate_with(site, Pair(one.candidate.term, one.value, rival, others))

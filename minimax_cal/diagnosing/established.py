@@ -54,7 +54,7 @@ def stands_for(finding: Finding, repeats: Repeats) -> set[Key]:
 def as_alternative(finding: Finding, whole: Choice, key: Key) -> list[Alternative]:
     """A name that takes an effect's place, as its alternative; none if all rows exclude it."""
     at = [c.term for c in whole.chosen].index(finding.term)
-    one, table = whole.fits[at], whole.benches[at]
+    table, one = whole.beside_others(at)
     other = next((other for other in table.everyone if other.candidate.key == key), None)
     if other is None:
         return []

@@ -166,13 +166,12 @@ def climbed(left: Left) -> tuple[list[Beside], list[str]]:
     for blocks in (by_joint(left), by_all(left)):
         waiting = list(blocks)
         while waiting:
-            tried = [rungs[-1].with_block(block) for block in waiting]
-            best = min(range(len(tried)), key=lambda i: tried[i].square)
-            if gain_chance(rungs[-1], tried[best], left.group) > GAIN_LEVEL:
+            tried = ((rungs[-1].with_block(block), block.place) for block in waiting)
+            best, place = min(tried, key=lambda pair: pair[0].square)
+            if gain_chance(rungs[-1], best, left.group) > GAIN_LEVEL:
                 break
-            place = waiting[best].place
             waiting = [block for block in waiting if block.place != place]
-            rungs.append(tried[best])
+            rungs.append(best)
             places.append(place)
     return rungs, places
 

@@ -349,7 +349,7 @@ def parameters_of(term: Term, value: Array, sigma: Array, scene: Scene) -> tuple
 
 def others_of(choice: Choice, number: int) -> tuple[Alternative, ...]:
     """What else could be an effect that was found."""
-    found = alternatives(choice.benches[number], choice.fits[number])
+    found = alternatives(*choice.beside_others(number))
     out = []
     for other, rho2, _ in found:
         term = other.candidate.term

@@ -283,10 +283,10 @@ class Fixed:
             self.lefts[at] = self.white(self.error[None], at)[0]
         return self.lefts[at]
 
-    @cached_property
+    @property
     def rows(self) -> Array:
         """(f, N)."""
-        return np.concatenate([self.products.geometry, self.products.clear(self.index)])
+        return self.products.beside_geometry(self.index)
 
     def gram(self, columns: Array, at: int) -> Array:
         """(d, d) products of columns (d, N), projected, at one of the ratios."""

@@ -17,7 +17,7 @@ from minimax_cal.evidence.ratios import NODES, RATIOS, ZERO, find_ratio, interpo
 from minimax_cal.ground.arrays import Array
 
 LEAST = 1e-13  # of a column's square: what is left of one that geometry imitates is no less
-BLOCK = 4_000_000  # weighed numbers that are held at once
+BLOCK = 1_000_000  # weighed numbers that are held at once
 SHRINK = np.array([1.0, 0.4, 0.12, 0.03, 0.0])  # of the ratio, when an effect is added
 
 
@@ -66,7 +66,7 @@ def grown(store: Array, count: int, axis: int = 0) -> Array:
     """The store with room for so many along an axis."""
     if count <= store.shape[axis]:
         return store
-    room = max(count, 3 * store.shape[axis] // 2) - store.shape[axis]
+    room = max(count, 5 * store.shape[axis] // 4) - store.shape[axis]
     shape = (*store.shape[:axis], room, *store.shape[axis + 1 :])
     return np.concatenate([store, np.empty(shape)], axis=axis)
 
@@ -203,6 +203,7 @@ def within(fields: Array, weights: Array) -> Array:
 class Beside:
     """What is left of products at some ratios when the geometry is projected out.
 
+    Columns count from the error, 0: the candidates' follow, the geometry's leave nothing.
     span: (p, r) combinations of the geometry's columns that the rows tell apart.
     factor: (g, r, r) lower triangles of these combinations' products.  logs: (g,) log determinants
     of those.  error: (g,) squares of the error, unprojected.
@@ -210,8 +211,8 @@ class Beside:
 
     def __init__(self, sums: Sums, *, some: bool = False) -> None:
         """some: whether the rows may not tell all of the geometry's columns apart."""
-        p, depth = sums.columns.fixed - 1, len(sums.ratios)
-        self.sums = sums
+        self.fixed = p = sums.columns.fixed - 1
+        self.sums, depth = sums, len(sums.ratios)
         gram = np.moveaxis(sums.products(np.arange(p), slice(0, p)), 0, 1)
         self.span = told_apart(gram[0]) if some else np.eye(p)
         gram = self.span.T @ gram @ self.span if some else gram
@@ -227,7 +228,7 @@ class Beside:
     @property
     def width(self) -> int:
         """How many columns there are."""
-        return self.sums.columns.fixed + self.sums.columns.count
+        return 1 + self.sums.columns.count
 
     def part(self, some: Some) -> Array:
         """(g, r, d) coordinates of columns in the geometry's span, each formed once."""
@@ -238,19 +239,26 @@ class Beside:
         new = np.unique(index[~self.known[index]])
         if len(new):
             run = slice(int(new[0]), int(new[-1]) + 1)  # which needs no copy of the columns
-            missing = run if run.stop - run.start == len(new) else new
-            raw = self.sums.products(np.arange(len(self.span)), missing)
+            missing = run if 2 * len(new) > run.stop - run.start else new
+            raw = self.sums.products(np.arange(self.fixed), self.shifted(missing))
             self.held[:, :, missing] = self.inverse @ np.moveaxis(raw, 0, 1)
             self.known[missing] = True
         return np.asarray(self.held[:, :, some])
 
+    def shifted(self, some: Some) -> Some:
+        """Where columns stand behind the geometry's."""
+        if isinstance(some, slice):
+            return slice(some.start + self.fixed, some.stop + self.fixed)
+        return some + self.fixed
+
     def left(self, index: Array, others: Some) -> Array:
         """(f, g, d) products of columns with others."""
         shared = np.swapaxes(self.part(index), 1, 2) @ self.part(others)
-        return np.asarray(self.sums.products(index, others) - np.moveaxis(shared, 0, 1))
+        whole = self.sums.products(index + self.fixed, self.shifted(others))
+        return np.asarray(whole - np.moveaxis(shared, 0, 1))
 
     def across(self, index: Array) -> Array:
-        """(f, g, p + 1 + D) products of columns with all."""
+        """(f, g, 1 + D) products of columns with all."""
         return self.lines.across(self.left, index, slice(0, self.width))
 
     def square(self, index: Array) -> Array:
@@ -264,7 +272,7 @@ class Beside:
             part = self.part(index.ravel())
             part = np.moveaxis(part.reshape(*part.shape[:2], *index.shape), 1, -1)
             shared = part @ np.swapaxes(part, -1, -2)
-            self.sets[mark] = self.sums.among(index) - np.moveaxis(shared, 0, -1)
+            self.sets[mark] = self.sums.among(index + self.fixed) - np.moveaxis(shared, 0, -1)
         return self.sets[mark]
 
 
@@ -308,6 +316,17 @@ class Products:
         self.formed: dict[int | None, Beside] = {}
         self.summed: dict[int | None, Sums] = {}
         self.noises: dict[bytes, Noise] = {}
+        self.last: tuple[bytes, Array] = (b"", np.empty(0))
+
+    def beside_geometry(self, index: Array) -> Array:
+        """(p + q, N) the geometry's columns and some of the candidates' (q,), as `clear` has them.
+
+        Those asked for last are held: of all effects together they would fill the memory.
+        """
+        mark = index.tobytes()
+        if self.last[0] != mark or not self.last[1].size:
+            self.last = mark, np.concatenate([self.geometry, self.clear(index)])
+        return self.last[1]
 
     def clear(self, index: Array) -> Array:
         """(d, N) candidates' columns less what geometry imitates."""
@@ -344,7 +363,7 @@ class Products:
         columns = self.columns
         own = (columns.clear[columns.fixed :] ** 2) @ self.kept
         ((_, beside, between),) = self.views(np.zeros(1))
-        part = np.tensordot(between[0], beside.part(slice(columns.fixed, beside.width)), 1)
+        part = np.tensordot(between[0], beside.part(slice(1, beside.width)), 1)
         return columns.plain[: columns.count] ** 2 @ self.kept, own - (part**2).sum(axis=0)
 
     def dof(self, index: Array) -> int:
@@ -383,7 +402,7 @@ class Products:
 
         Geometry is projected out at ratios (s,); and (s,) log determinants of its products.
         """
-        chosen = np.concatenate([self.columns.fixed + index, [self.columns.fixed - 1]])
+        chosen = np.append(1 + index, 0)
         gram = np.empty((len(ratios), len(chosen), len(chosen)))
         logs, least = np.empty(len(ratios)), np.empty((len(ratios), len(index)))
         for here, beside, between in self.views(ratios):
@@ -404,16 +423,15 @@ class Products:
 
     def at(self, ratios: Array, index: Array) -> At:
         """Products at ratios (s,) of some candidates' columns (q,) and of the error."""
-        s, q, p = len(ratios), len(index), self.columns.fixed - 1
-        r = self.rank
-        fixed = np.concatenate([[p], p + 1 + index])
-        lines = np.empty((s, 1 + q, len(self.columns.clear) - p))
+        s, q, r = len(ratios), len(index), self.rank
+        fixed = np.append(0, 1 + index)
+        lines = np.empty((s, 1 + q, 1 + self.columns.count))
         square, logs = np.empty(s), np.empty(s)
         whole = np.empty((s, self.columns.count))
         factor, part = np.empty((s, r, r)), np.empty((s, r, 1 + q))
         views = self.views(ratios)
         for here, beside, between in views:
-            lines[here] = np.moveaxis(between @ beside.across(fixed)[:, :, p:], 1, 0)
+            lines[here] = np.moveaxis(between @ beside.across(fixed), 1, 0)
             whole[here] = between @ beside.sums.squares().T
             square[here], logs[here] = between @ beside.error, between @ beside.logs
             factor[here] = np.tensordot(between, beside.factor, 1)
@@ -422,7 +440,7 @@ class Products:
         def among(sets: Array) -> Array:
             out = np.empty((s, *sets.shape, sets.shape[1]))
             for here, beside, between in views:
-                own = beside.among(sets + beside.sums.columns.fixed)
+                own = beside.among(1 + sets)
                 out[here] = np.moveaxis(own @ between.T, -1, 0)
             return out
 

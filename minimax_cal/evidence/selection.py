@@ -63,17 +63,13 @@ class Choice:
         """The candidates."""
         return tuple(one.candidate for one in self.found)
 
-    @cached_property
-    def benches(self) -> tuple[Bench, ...]:
-        """Of each effect, for its rivals: beside the others."""
-        every = range(len(self.found))
-        return tuple(bench(self.library, *without(self.found, number)) for number in every)
+    def beside_others(self, number: int) -> tuple[Bench, Added]:
+        """Where an effect is compared with its rivals, beside the others, and the effect there.
 
-    @cached_property
-    def fits(self) -> tuple[Added, ...]:
-        """Each effect beside the others."""
-        pairs = zip(self.benches, self.chosen, strict=True)
-        return tuple(table.added(candidate) for table, candidate in pairs)
+        Of no effect it is held here: those of all would fill the memory.
+        """
+        table = bench(self.library, *without(self.found, number))
+        return table, table.added(self.found[number].candidate)
 
     @cached_property
     def estimates(self) -> tuple[tuple[Array, Array], ...]:
@@ -266,8 +262,7 @@ def tuned(table: Bench, best: Added) -> Added:
 
 def tuned_again(choice: Choice) -> Choice:
     """The choice of a part of the rows, each effect tuned by these alone, and stored nowhere."""
-    pairs = zip(choice.benches, choice.fits, strict=True)
-    best = [tuned(table, one) for table, one in pairs]
+    best = [tuned(*choice.beside_others(number)) for number in range(len(choice.found))]
     found = (
         replace(one, candidate=replace(one.candidate, term=other.candidate.term))
         for one, other in zip(choice.found, best, strict=True)

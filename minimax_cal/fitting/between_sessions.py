@@ -76,10 +76,11 @@ def changes(robot: Robot, data: Measurements, solved: Solved) -> tuple[Change, .
         return ()
     again = stability.repeated(choice, np.repeat(clusters(data), rows.width))
     names, out = list(data.frames), []
-    for one, table in zip(choice.fits, choice.benches, strict=True):
-        term = one.candidate.term
+    for number, candidate in enumerate(choice.chosen):
+        term = candidate.term
         if "session" not in term.choice or again.frequency([term.key]) < CONFIRMED:
             continue
+        table, one = choice.beside_others(number)
         columns = term.columns(scene)
         half = quantile(0.95, table.dof) * one.sigma
         found = amounts(columns.names, columns.units, one.value, one.sigma, half)

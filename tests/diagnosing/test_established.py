@@ -67,8 +67,8 @@ def geared() -> Choice:
 
 
 def test_what_takes_the_place_of_a_name_is_its_alternative(geared: Choice) -> None:
-    (one,) = geared.fits
-    effect = replace(found("gear_error", "J1"), terms=(one.candidate.term,))
+    (term,) = (candidate.term for candidate in geared.chosen)
+    effect = replace(found("gear_error", "J1"), terms=(term,))
     gain, play = ("encoder_gain", "J1"), ("backlash", "J6")
     own = named(effect.term.key)
     repeats = Repeats((own, own, own, named(gain), named(gain), named(play)), 6)

@@ -112,8 +112,8 @@ def test_rivals_hold_the_truth_where_it_cannot_be_told() -> None:
     """A tilting base looks like a yielding second joint: whatever is named, both are in the set."""
     for seed in (1, 2, 3):
         choice = chosen(opened(Cause("base_flex", "frame", 60.0), seed=seed), ())
-        named = choice.fits[0]
-        found = alternatives(choice.benches[0], named)
+        table, named = choice.beside_others(0)
+        found = alternatives(table, named)
         names = {named.candidate.key, *(other.candidate.key for other, _, _ in found)}
         assert ("base_flex", "frame") in names
         for _, rho2, power in found:
@@ -153,7 +153,7 @@ def test_lambda_is_the_one_that_was_asked_for() -> None:
     """The generator's detectability and the diagnosis' agree to 35 %, masses being 15 % off."""
     made = opened(Cause("joint_compliance", "J3", 400.0), seed=6)
     choice = chosen(made, ())
-    one, table = choice.fits[0], choice.benches[0]
+    table, one = choice.beside_others(0)
     size, rho2 = table.likeness(one, one.candidate)
     assert abs(size / 400.0 - 1.0) < 0.35
     assert rho2 > 1.0 - 1e-6
