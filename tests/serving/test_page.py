@@ -296,7 +296,7 @@ def test_the_whole_work_in_two_browsers(
         click(left, "[data-run=diagnose]")
         rung = "return document.querySelector('[data-panel=ladder] tbody th')?.textContent"
         grown = until(lambda: left.execute_script(rung), "no rung was shown while it worked")
-        assert grown == "nominal"
+        assert grown == "nominal arm"
         assert state(left, "diagnose") == "working"
         wait_for(left, "diagnose")
         until(lambda: one(left, "#chart-ladder").get_attribute("data-drawn"), "no ladder")
