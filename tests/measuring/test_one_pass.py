@@ -4,13 +4,35 @@ import re
 
 import pytest
 
-from minimax_cal.measuring.importers import krl, rapid, urscript
+from minimax_cal.measuring.importers import cmm, programs, words
 
-TEXTS = ("9" * 200_000, "{ " * 100_000, "[" + " " * 200_000, "x = [" + "1, " * 60_000)
+TEXTS = (
+    "9" * 200_000,
+    "P[1]{ " * 40_000,
+    "x = {X 1 " * 30_000,
+    "{ " * 100_000,
+    "[" + " " * 200_000,
+    "x = [" + "1, " * 60_000,
+)
 
 
-@pytest.mark.parametrize("text", TEXTS, ids=["digits", "braces", "blanks", "numbers"])
-@pytest.mark.parametrize("pattern", [krl.TARGET, krl.AXIS, urscript.LIST, rapid.VALUES])
+WORDS = {found for found in vars(words).values() if isinstance(found, re.Pattern)}
+PATTERNS = [found for module in (cmm, programs) for found in vars(module).values()
+            if isinstance(found, re.Pattern) and found not in WORDS]  # fmt: skip
+PATTERNS += [language.cartesian for language in programs.LANGUAGES]
+
+
+@pytest.mark.parametrize(
+    "text", TEXTS, ids=["digits", "positions", "poses", "braces", "blanks", "numbers"]
+)
+@pytest.mark.parametrize("pattern", PATTERNS)
 def test_no_text_takes_more_than_one_pass(pattern: re.Pattern[str], text: str) -> None:
     """Each would take minutes, were its time to grow with the square of its length."""
-    assert pattern.search(text) is None
+    assert sum(1 for _ in pattern.finditer(text)) <= len(text)
+
+
+@pytest.mark.parametrize("cell", ["x_" * 20_000, "pos_x" * 10_000, "x_pos_" * 10_000, "9" * 40_000])
+@pytest.mark.parametrize("pattern", sorted(WORDS, key=lambda found: found.pattern))
+def test_no_name_takes_more_than_one_pass(pattern: re.Pattern[str], cell: str) -> None:
+    """Words are compared with whole cells."""
+    assert pattern.fullmatch(cell + "!") is None

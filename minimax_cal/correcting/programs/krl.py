@@ -17,9 +17,9 @@ from minimax_cal.correcting.programs.points import Number, Point, Text, checked,
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import blanked
+from minimax_cal.measuring.importers.programs import KRL_ASIDE
 
 __all__ = ["ORIGINS", "used"]  # of the language, beside what stands here
-ASIDE = re.compile(r'"[^"\r\n]*"|;[^\r\n]*')
 AGGREGATE = re.compile(r"\{\s*(?:(E6POS|POS|FRAME|E6AXIS|AXIS)\s*:)?([^{}]*)\}", re.IGNORECASE)
 ENTRY = re.compile(r"\s*([A-Za-z]\w{0,3})\s+([^,\s]+)\s*")
 BEFORE = re.compile(
@@ -45,7 +45,7 @@ MIN_COSINE_B = 1e-7  # cosine of B below which A and C turn about one axis
 
 def read(text: str, source: str) -> Text:
     """A program or its data list."""
-    return Text(text, blanked(text, ASIDE), source)
+    return Text(text, blanked(text, KRL_ASIDE), source)
 
 
 def points(program: Text) -> Iterator[Point]:

@@ -25,7 +25,7 @@ from minimax_cal.correcting.programs.rapid_moves import displaced, moves
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import blanked
-from minimax_cal.measuring.importers.rapid import ASIDE
+from minimax_cal.measuring.importers.programs import RAPID_ASIDE
 
 DECLARED = re.compile(
     r"\b(robtarget|jointtarget)\s+(\w{1,32})\s*(?:\{[^}]{0,40}\}\s*)?:=\s*", re.IGNORECASE
@@ -56,7 +56,7 @@ LOOK = 40  # letters before a name in which its declaration would stand
 
 def read(text: str, source: str) -> Text:
     """A module."""
-    return Text(text, blanked(text, ASIDE), source)
+    return Text(text, blanked(text, RAPID_ASIDE), source)
 
 
 def points(program: Text) -> Iterator[Point]:

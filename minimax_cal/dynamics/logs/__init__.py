@@ -17,8 +17,8 @@ from minimax_cal.dynamics.run import Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring.importers import units_of
-from minimax_cal.measuring.importers.reading import along_arm
 from minimax_cal.measuring.importers.sheet import cut, open_text
+from minimax_cal.measuring.importers.words import along_arm
 
 __all__ = ["LogFiles", "are_logs", "import_logs", "read_runs", "runs_text"]
 

@@ -1,11 +1,10 @@
-"""Files of trackers and controllers as they are, one format a module."""
+"""Files of trackers and controllers as they are."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -14,36 +13,20 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.importers import cmm, headed, programs
+from minimax_cal.measuring.importers import columns as mapped
 from minimax_cal.measuring.importers.assemble import Assembly, Meaning, assemble
-from minimax_cal.measuring.importers.reading import (
-    ANGLES,
-    LENGTHS,
-    TEMPERATURES,
-    TIMES,
-    Reading,
-    Told,
-)
+from minimax_cal.measuring.importers.reading import Given, Reading
 from minimax_cal.measuring.importers.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
+from minimax_cal.measuring.importers.words import ANGLES, LENGTHS, TEMPERATURES, TIMES
 from minimax_cal.measuring.measurements import Measurements, measurements_text
 from minimax_cal.measuring.set_aside import whole
 
-__all__ = ["IMPORTERS", "Imported", "csv_of", "import_files", "read_any", "save", "units_of"]
+__all__ = ["Imported", "csv_of", "import_files", "read_any", "save", "units_of"]
 
-# Tried in this order.  `text`: looks at the text alone; `rows`: at header and cells.
-IMPORTERS = {
-    "rapid": "text",
-    "krl": "text",
-    "urscript": "text",
-    "leica": "rows",
-    "robodk": "rows",
-    "tracker6d": "rows",
-    "contract": "rows",
-    "figaroh": "rows",
-    "named": "rows",
-    "joint_rows": "rows",
-    "smr_files": "rows",
-    "columns": "rows",
-}
+# The first that fits a file is taken: of the text alone, then of its rows and columns.
+OF_TEXT = (programs, cmm)
+OF_ROWS = (cmm, headed)
 MEASURED = re.compile(r"q\d*|(?:smr|base)\d*(?:_[xyz])?|qread\d*|u95|temperature|time")
 OF_JOINTS = re.compile(r"(?:^|[,=])\s*q\d*(?:_|\s*(?:,|$))")
 LAYOUTS = ("", "pose", "target")
@@ -136,26 +119,28 @@ def units_of(texts: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def read_any(path: Path | str, told: Told, *, joints: bool = False) -> Reading:
+def read_any(path: Path | str, given: Given, *, joints: bool = False) -> Reading:
     """A file in the first format that fits.  joints: the user said that it holds joint values.
 
     Raises DataError with what to add.
     """
-    sheet: Sheet = open_text(path)
-    whole = False
-    columns = told.joint_columns if joints else told.columns
-    told = replace(told, columns=columns)
-    for name, looks_at in IMPORTERS.items():
-        module = import_module(f"minimax_cal.measuring.importers.{name}")
-        if looks_at == "rows" and not whole:
-            sheet, whole = cut(sheet, told.decimal), True
-        mapped = name == "columns" and told.columns
-        if mapped or (module.fits(sheet, joints) and not told.columns):
-            reading: Reading = module.read(sheet, told)
-            above = [str(line) for line in reading.sheet.preamble]
-            said = f"above the table, and left out: line {', '.join(above)}"
-            return reading.saying(said) if above else reading
-    raise DataError(unknown(sheet))
+    sheet = open_text(path)
+    given = replace(given, columns=given.joint_columns if joints else given.columns)
+    if not given.columns:
+        for module in OF_TEXT:
+            if module.fits(sheet, joints):
+                found: Reading = module.read(sheet, given, joints)
+                return found
+    sheet = cut(sheet, given.decimal)
+    fitting = [mapped] if given.columns else [m for m in OF_ROWS if m.fits(sheet, joints)]
+    if not fitting:
+        raise DataError(unknown(sheet))
+    reading: Reading = fitting[0].read(sheet, given, joints)
+    for where, lines in (("above", sheet.above), ("below", sheet.below)):
+        if lines:
+            left_out = ", ".join(map(str, lines))
+            reading = reading.saying(f"{where} the table, and left out: line {left_out}")
+    return reading
 
 
 def unknown(sheet: Sheet) -> str:
@@ -212,13 +197,13 @@ def import_files(
     """
     if not files:
         raise OptionError("name a file to import")
-    told = told_by(columns, units, layout, decimal, apart=joints is not None)
-    readings = [read_any(path, told) for path in files]
+    given = given_by(columns, units, layout, decimal, apart=joints is not None)
+    readings = [read_any(path, given) for path in files]
     check_twice(readings)
     points = [reading for reading in readings if reading.smrs]
     turns = [reading for reading in readings if reading.joints]
     if joints is not None:
-        held = file_of_joints(joints, turns, told)
+        held = file_of_joints(joints, turns, given)
     elif len(turns) == 1:
         held = turns[0]
     elif turns:
@@ -236,7 +221,7 @@ def import_files(
     if neither:
         raise DataError(f"{neither[0].sheet.path}: holds neither points nor joint values")
     if held not in points or len(points) == 1:
-        assembly = assemble(points, held, told)
+        assembly = assemble(points, held, given)
         return Imported(assembly.data, assembly)
     other = next(r for r in points if r is not held)
     raise DataError(
@@ -255,14 +240,14 @@ def check_twice(readings: Sequence[Reading]) -> None:
             raise DataError(f"{path}: {what}; give each target's file once")
 
 
-def told_by(
+def given_by(
     columns: str | Sequence[str],
     units: str | Sequence[str] | Mapping[str, str],
     layout: str,
     decimal: str,
     *,
     apart: bool = False,
-) -> Told:
+) -> Given:
     """What the user says about files.  Raises OptionError."""
     if layout not in LAYOUTS:
         raise OptionError(f"layout={layout!r}: write pose or target")
@@ -281,12 +266,12 @@ def told_by(
             "columns=: two mappings of one file; give one for the points and, with joints=, one "
             "for the joints"
         )
-    return Told("".join(others), "".join(of_joints), units, layout, sign)
+    return Given("".join(others), "".join(of_joints), units, layout, sign)
 
 
-def file_of_joints(path: Path | str, turns: Sequence[Reading], told: Told) -> Reading:
+def file_of_joints(path: Path | str, turns: Sequence[Reading], given: Given) -> Reading:
     """The file named for joint values.  turns: other files that hold some.  Raises DataError."""
-    held = read_any(path, told, joints=True)
+    held = read_any(path, given, joints=True)
     if not held.joints:
         raise DataError(f"{path}: holds no joint values; name its columns q1_deg, q2_deg ...")
     if turns:

@@ -12,17 +12,19 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.aside import FILE
 from minimax_cal.measuring.columns import is_simulated
-from minimax_cal.measuring.importers import contract
+from minimax_cal.measuring.importers.headed import KEPT
 from minimax_cal.measuring.importers.join import (
     Places,
     in_file_order,
     place,
     poses_of,
     settled,
+    with_keys,
 )
-from minimax_cal.measuring.importers.reading import ANGLES, LENGTHS, Column, Reading, Told
+from minimax_cal.measuring.importers.reading import Column, Given, Reading
 from minimax_cal.measuring.importers.times import STAMPED, celsius, seconds
 from minimax_cal.measuring.importers.units import decide
+from minimax_cal.measuring.importers.words import ANGLES, LENGTHS
 from minimax_cal.measuring.measurements import Measurements, check_finite
 from minimax_cal.measuring.set_aside import COLUMN, from_column, set_aside, sound
 from minimax_cal.measuring.tools import by_tool
@@ -54,20 +56,20 @@ class Assembly:
     matched: tuple[str, ...]
 
 
-def unit_of(column: Column, told: Told) -> tuple[str, str]:
+def unit_of(column: Column, given: Given) -> tuple[str, str]:
     """A column's unit and how it is known; '' where it is not."""
     for name in (column.meaning, column.meaning.partition("_")[0], column.family):
-        if name in told.units:
+        if name in given.units:
             also = f", though {column.known} says {column.unit}" if column.unit else ""
-            return told.units[name], "told" + (also if column.unit != told.units[name] else "")
+            return given.units[name], "given" + (also if column.unit != given.units[name] else "")
     return column.unit, column.known
 
 
 def one_unit(
-    columns: Sequence[tuple[Reading, Column]], told: Told, kinds: Mapping[str, float]
+    columns: Sequence[tuple[Reading, Column]], given: Given, kinds: Mapping[str, float]
 ) -> str:
     """The unit that columns of one kind share, '' where unknown, or MIXED.  Raises DataError."""
-    found = {unit_of(column, told)[0]: (reading, column) for reading, column in columns}
+    found = {unit_of(column, given)[0]: (reading, column) for reading, column in columns}
     for unit, (reading, column) in found.items():
         if unit and unit not in kinds:
             raise DataError(
@@ -102,7 +104,7 @@ class Part:
     targets: Mapping[str, str]
 
 
-def assemble(points: Sequence[Reading], joints: Reading, told: Told) -> Assembly:
+def assemble(points: Sequence[Reading], joints: Reading, given: Given) -> Assembly:
     """Measurements from files of points and the file of joints (which may be one).
 
     Raises DataError.
@@ -110,17 +112,18 @@ def assemble(points: Sequence[Reading], joints: Reading, told: Told) -> Assembly
     alone = joints not in points
     if not alone and (apart := poses_of(joints)):
         joints, alone = apart, True
-    points = [settled(reading, joints, told.layout) for reading in in_file_order(list(points))]
+    points = [with_keys(reading, joints) for reading in in_file_order(list(points))]
+    points = [settled(reading, joints, given.layout) for reading in points]
     joints = joints if alone else points[0]
-    placed = [place(reading, joints, told.layout) for reading in points]
+    placed = [place(reading, joints, given.layout) for reading in points]
     points, places = [reading for reading, _ in placed], [spot for _, spot in placed]
     poses = len(joints.line)
-    raw = raw_of(points, places, joints, told)
+    raw = raw_of(points, places, joints, given)
     called = callings(points, places)
     parts = [Part(r, at.pose, c) for r, at, c in zip(points, places, called, strict=True)]
     if alone:
         parts.append(Part(without_points(joints), np.arange(poses), {}))
-    columns, unknown, meanings = gathered(parts, told, raw.scales, poses)
+    columns, unknown, meanings = gathered(parts, given, raw.scales, poses)
     targets = target_names(points, places)
     names = zip(targets, raw.names, strict=True)
     unknown |= {f"{target}_target": np.full(poses, name) for target, name in names if name}
@@ -171,19 +174,21 @@ class Raw:
     scales: Scales
 
 
-def raw_of(points: Sequence[Reading], places: Sequence[Places], joints: Reading, told: Told) -> Raw:
+def raw_of(
+    points: Sequence[Reading], places: Sequence[Places], joints: Reading, given: Given
+) -> Raw:
     """The numbers of joints and points, their units decided.  Raises DataError."""
-    q_units = [unit_of(column, told)[0] for column in joints.joints]
+    q_units = [unit_of(column, given)[0] for column in joints.joints]
     sliding = np.array([unit in LENGTHS for unit in q_units])
     turning = [(joints, c) for c, slides in zip(joints.joints, sliding, strict=True) if not slides]
-    q_unit = one_unit(turning, told, ANGLES)
+    q_unit = one_unit(turning, given, ANGLES)
     coordinates = [(r, c) for r in points for c in r.columns if c.family == "smr"]
-    y_unit = one_unit(coordinates, told, LENGTHS)
+    y_unit = one_unit(coordinates, given, LENGTHS)
     if q_unit == MIXED:
         raise DataError(f"{joints.sheet.path}: joint columns mix units of angle; use one of them")
     q = np.stack([joints.numbers(column, empty=False) for column in joints.joints], axis=1)
     mixed = y_unit == MIXED
-    y, names = raw_points(points, places, len(q), told if mixed else None)
+    y, names = raw_points(points, places, len(q), given if mixed else None)
     where = (joints.sheet.path, points[0].sheet.path)
     scales = Scales(*decide(q, y, q_unit, "m" if mixed else y_unit, sliding, where))
     scale = [LENGTHS.get(unit, ANGLES[scales.q]) for unit in q_units]
@@ -201,7 +206,7 @@ def without_points(joints: Reading) -> Reading:
 
 
 def gathered(
-    parts: Sequence[Part], told: Told, scales: Scales, poses: int
+    parts: Sequence[Part], given: Given, scales: Scales, poses: int
 ) -> tuple[dict[str, Array], dict[str, Array], tuple[tuple[Meaning, ...], ...]]:
     """Columns that something uses, columns that are only kept, and the meanings in each file."""
     columns: dict[str, Array] = {}
@@ -211,7 +216,7 @@ def gathered(
         mine = []
         for column in part.reading.columns:
             name, target = column.meaning, part.targets.get(column.meaning.partition("_")[0], "")
-            found = understood(part.reading, column, told, scales, target)
+            found = understood(part.reading, column, given, scales, target)
             mine.append(found.meaning)
             if len(found.values) and found.kept:
                 unknown[column.name] = spread(found.values, part.pose, poses, "first")
@@ -246,11 +251,11 @@ def callings(points: Sequence[Reading], places: Sequence[Places]) -> list[dict[s
 
 
 def raw_points(
-    points: Sequence[Reading], places: Sequence[Places], poses: int, told: Told | None
+    points: Sequence[Reading], places: Sequence[Places], poses: int, given: Given | None
 ) -> tuple[Array, tuple[str, ...]]:
     """(poses, k, 3) points as in the files, and the targets' names.
 
-    told: where the columns' units differ; the points are then in metres.  Raises DataError.
+    given: where the columns' units differ; the points are then in metres.  Raises DataError.
     """
     blocks: list[Array] = []
     names: list[str] = []
@@ -259,7 +264,7 @@ def raw_points(
             block = np.full((poses, len(spot.names), 3), np.nan)
             for axis, letter in enumerate("xyz"):
                 column = reading.column(f"smr{number}_{letter}")
-                factor = LENGTHS[unit_of(column, told)[0]] if told else 1.0
+                factor = LENGTHS[unit_of(column, given)[0]] if given else 1.0
                 block[spot.pose, spot.slot, axis] = reading.numbers(column) * factor
             partly = np.isnan(block).any(-1) & ~np.isnan(block).all(-1)
             if partly.any():
@@ -287,10 +292,10 @@ NOTHING = np.empty(0)
 
 
 def understood(
-    reading: Reading, column: Column, told: Told, scales: Scales, who: str
+    reading: Reading, column: Column, given: Given, scales: Scales, who: str
 ) -> Understood:
     """What a column means, with its values in SI.  who: the target of a point."""
-    unit, known = unit_of(column, told)
+    unit, known = unit_of(column, given)
     first = next((cell for cell in column.cells if cell), "")
     family = column.family
     if not column.meaning:
@@ -308,12 +313,12 @@ def understood(
     if family == "target":
         return Understood(Meaning(column, "name of the target", "", known, first), NOTHING)
     if family == "time":
-        values, known = seconds(reading, column, told.units.get("time", ""))
+        values, known = seconds(reading, column, given.units.get("time", ""))
         if not len(values):
             return Understood(Meaning(column, "left out", "", known, ""), values)
         return Understood(Meaning(column, "time", "s", known, first), values)
     if family == "temperature":
-        values, unit, known = celsius(reading, column, told.units.get("temperature", ""))
+        values, unit, known = celsius(reading, column, given.units.get("temperature", ""))
         si = f"{values[0]:.6g} C" if len(values) else ""
         what = "temperature" if len(values) else "left out"
         return Understood(Meaning(column, what, unit, known, si), values)
@@ -324,7 +329,7 @@ def understood(
 
 def left_over(column: Column, unit: str, first: str) -> Understood:
     """A column that means nothing: kept as text, or left out."""
-    if column.remark == contract.KEPT:
+    if column.remark == KEPT:
         return Understood(Meaning(column, "kept", unit, "", first), np.array(column.cells), True)
     return Understood(Meaning(column, "left out", unit, column.remark, ""), NOTHING)
 

@@ -5,15 +5,9 @@ from __future__ import annotations
 import re
 
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.measuring.importers.reading import (
-    Column,
-    Reading,
-    Told,
-    checked,
-    plain,
-    split_unit,
-)
+from minimax_cal.measuring.importers.reading import Column, Given, Reading, checked
 from minimax_cal.measuring.importers.sheet import Sheet
+from minimax_cal.measuring.importers.words import plain, split_unit
 
 TITLE = "columns as mapped"
 SKIP = re.compile(r"(?:-|skip)(?:\*(\d+))?")
@@ -24,21 +18,16 @@ EXACT = re.compile(
 )
 
 
-def fits(sheet: Sheet, joints: bool) -> bool:
-    """Never by itself: only where its columns are told."""
-    return False
-
-
-def read(sheet: Sheet, told: Told) -> Reading:
+def read(sheet: Sheet, given: Given, joints: bool) -> Reading:
     """The file under the mapping.  Raises OptionError."""
-    tokens = [token.strip() for token in told.columns.split(",") if token.strip()]
+    tokens = [token.strip() for token in given.columns.split(",") if token.strip()]
     placed = any("=" in token for token in tokens)
     found = by_place(sheet, tokens) if placed else in_order(sheet, tokens)
     columns = []
     for i in range(sheet.width):
         name = sheet.header[i] if sheet.header else f"column {i + 1}"
         what, unit = found.get(i, ("", ""))
-        known = "told" if unit else ""
+        known = "given" if unit else ""
         if what and not unit and sheet.header and (unit := split_unit(name)[1]):
             known = "header"
         columns.append(Column(name, what, unit, tuple(row[i] for row in sheet.cells), known))

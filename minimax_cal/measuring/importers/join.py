@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.importers.names import Match, match_names, natural, parts_of
 from minimax_cal.measuring.importers.reading import Column, Reading
 
+LABELS = ("", "group", "tool")  # meanings of columns that may name targets
 LEAST_PARTS = 2  # of a name that holds a pose and a target: at least
 MOST_NAMED = 12  # points or poses that a notice names
 RIGID, LOOSE = 0.02, 0.1  # spread of the distances between targets, relative: one body, or not
@@ -35,8 +37,14 @@ class Places:
 def place(points: Reading, joints: Reading, layout: str) -> tuple[Reading, Places]:
     """Rows of points that have a pose, and where they go.  Raises DataError naming file and line.
 
-    By names where both files have some, else by order.
+    By names where both files have some, else by order.  What is missing is listed.
     """
+    points, spot = placed(points, joints, layout)
+    return points.saying(*gaps(points, joints, spot)), spot
+
+
+def placed(points: Reading, joints: Reading, layout: str) -> tuple[Reading, Places]:
+    """Rows of points and where they go."""
     if points is joints:
         return points, with_targets(points, np.arange(len(points.line)), "same row")
     key, other = points.find("pose"), joints.find("pose")
@@ -53,6 +61,38 @@ def place(points: Reading, joints: Reading, layout: str) -> tuple[Reading, Place
     return by_name(points, joints, match)
 
 
+def with_keys(points: Reading, joints: Reading) -> Reading:
+    """The points with the column that names their poses, whatever it is called.
+
+    Trackers call it target.  Where points share a name, the column that tells them apart names the
+    targets.
+    """
+    other = joints.find("pose")
+    if points is joints or other is None:
+        return points
+    for key in (points.find("pose"), points.find("target")):
+        if key and (match := match_names(key.cells, other.cells)):
+            beside = points.find("pose")
+            given = {beside.name: ""} if beside and beside is not key else {}
+            points = points.meaning({**given, key.name: "pose"})
+            return points if points.find("target") else with_target(points, match)
+    return points
+
+
+def with_target(points: Reading, match: Match) -> Reading:
+    """Points that share a name with the column that tells them apart as that of their targets."""
+    gone = set(points.deleted)
+    rows = [i for i, pose in enumerate(match.pose) if pose >= 0 and i not in gone]
+    names = [(match.pose[i], match.label[i]) for i in rows]
+    most = max(Counter(names).values(), default=1)
+    for column in points.columns if most > 1 else ():
+        cells = [column.cells[i] for i in rows]
+        apart = len(set(zip(names, cells, strict=True))) == len(rows)
+        if column.meaning in LABELS and apart and len(set(cells)) == most:
+            return points.meaning({column.name: "target"})
+    return points
+
+
 def check_unique(joints: Reading, key: Column) -> None:
     """Raise DataError where two poses have one name."""
     first: dict[str, int] = {}
@@ -66,7 +106,7 @@ def check_unique(joints: Reading, key: Column) -> None:
 
 
 def by_name(points: Reading, joints: Reading, match: Match) -> tuple[Reading, Places]:
-    """Points where their names say; those without a pose left out, and what is missing told."""
+    """Points where their names say; those without a pose left out."""
     rows = np.array(match.pose)
     kept = np.flatnonzero(rows >= 0)
     if len(lost := np.flatnonzero(rows < 0)):
@@ -81,23 +121,45 @@ def by_name(points: Reading, joints: Reading, match: Match) -> tuple[Reading, Pl
     if own == ("",) and len(set(labels)) > 1:
         own = tuple(sorted(set(labels), key=natural))
         slot = np.array([own.index(label) for label in labels])
+    first = without_repeats(points, rows[kept], slot)
+    if len(first) < len(kept):
+        again = sorted({*range(len(kept))} - {*first})
+        points = points.saying(f"points that are there twice, left out once: {points.lines(again)}")
+        points, kept, slot = points.take(first), kept[first], slot[first]
     check_once(points, rows[kept], slot)
-    spot = Places(rows[kept], slot, own, match.how)
-    return points.saying(*gaps(joints, spot)), spot
+    return points, Places(rows[kept], slot, own, match.how)
 
 
-def gaps(joints: Reading, spot: Places) -> list[str]:
-    """Poses that lack a point, by their names."""
-    seen = np.zeros((len(joints.line), len(spot.names)), dtype=bool)
-    seen[spot.pose, spot.slot] = True
-    names = joints.column("pose").cells
-    out = []
-    for pose in np.flatnonzero(~seen.all(axis=1)):
-        lacking = [spot.names[slot] for slot in np.flatnonzero(~seen[pose])]
-        whole = len(spot.names) == 1 or len(lacking) == len(spot.names)
-        out.append(names[pose] + ("" if whole else f" (target {', '.join(lacking)})"))
-    if not out:
+def without_repeats(points: Reading, pose: Array, slot: Array) -> list[int]:
+    """The rows of points without those that repeat an earlier one, digit by digit."""
+    coordinates = [column.cells for column in points.columns if column.family == "smr"]
+    rows = zip(pose.tolist(), slot.tolist(), *coordinates, strict=True)
+    first = {row: i for i, row in reversed(list(enumerate(rows)))}
+    return sorted(first.values())
+
+
+def gaps(points: Reading, joints: Reading, spot: Places) -> list[str]:
+    """Poses that lack a point, by their names or lines; none where most do."""
+    slots, several = len(spot.names), len(points.smrs) > 1
+    seen = np.zeros((len(joints.line), len(points.smrs) * slots), dtype=bool)
+    for i, number in enumerate(points.smrs):
+        given = np.array([bool(cell) for cell in points.column(f"smr{number}_x").cells])
+        seen[spot.pose[given], i * slots + spot.slot[given]] = True
+    labels = [
+        f"smr{number} {name}".strip() if several else name
+        for number in points.smrs
+        for name in spot.names
+    ]
+    key = joints.find("pose")
+    names = key.cells if key else [f"line {line}" for line in joints.line]
+    poses = np.flatnonzero(~seen.all(axis=1))
+    if not len(poses) or 2 * len(poses) > len(seen):
         return []
+    out = []
+    for pose in poses:
+        lacking = [label for label, there in zip(labels, seen[pose], strict=True) if not there]
+        whole = len(labels) == 1 or not seen[pose].any()
+        out.append(names[pose] + ("" if whole else f" (target {', '.join(lacking)})"))
     return [f"no point, left empty: {name_first(out, MOST_NAMED)}"]
 
 
@@ -110,7 +172,7 @@ def settled(points: Reading, joints: Reading, layout: str) -> Reading:
     """
     if not points.deleted:
         return points
-    beside, rest = points.kept_beside(), points.measured_again()
+    beside, rest = points.with_deleted(), points.without_deleted()
     if points is joints:
         return beside
     keyed = points.find("pose") and joints.find("pose")
@@ -121,7 +183,8 @@ def settled(points: Reading, joints: Reading, layout: str) -> Reading:
         try:
             place(second, joints, layout)
         except DataError:
-            raise DataError(f"{error} (left out as marked deleted: {points.where})") from None
+            where = points.lines(points.deleted)
+            raise DataError(f"{error} (left out as marked deleted: {where})") from None
         return second
     return first
 

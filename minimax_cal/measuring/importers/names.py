@@ -7,18 +7,20 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 PART = re.compile(r"\d+|[^\W\d_]+")
 MOST_BESIDE = 3  # parts of a name that may be the target's
+COMMON = 0.5  # of the count of the commonest word
 ENOUGH = 0.5  # of the points that a pattern must find poses for
 Parts = tuple[str | int, ...]
 
 
 @dataclass(frozen=True)
 class Match:
-    """pose: for each point the row of its pose, -1 for none.  label: its target, '' untold.
+    """pose: for each point the row of its pose, -1 for none.  label: its target, '' not given.
 
     how: the pattern, for people.
     """
@@ -63,8 +65,7 @@ def patterns(points: Sequence[str], poses: Sequence[str]) -> Iterator[Match]:
             yield matched(points, poses, [beside(parts, rows) for parts in names], f"name: {way}")
     numbers = {n: i for i, name in enumerate(poses) if (n := number_of(parts_of(name))) >= 0}
     if len(numbers) == len(poses):
-        only = [(numbers.get(number_of(parts), -1), "") for parts in names]
-        yield matched(points, poses, only, "number in the name")
+        yield matched(points, poses, by_number(names, numbers), "number in the name")
 
 
 def last_of(parts: Parts, rows: Mapping[Parts, int]) -> tuple[int, str]:
@@ -81,6 +82,22 @@ def first_of(parts: Parts, rows: Mapping[Parts, int]) -> tuple[int, str]:
         if (row := rows.get(parts[size:], -1)) >= 0:
             return row, "".join(map(str, parts[:size]))
     return -1, ""
+
+
+def by_number(names: Sequence[Parts], numbers: Mapping[int, int]) -> list[tuple[int, str]]:
+    """The pose's row where the number alone tells, and the word beside it where several are common.
+
+    Rare words name other things: R1 to R3 among P1 to P48 are references.
+    """
+    words = [" ".join(part for part in parts if isinstance(part, str)) for parts in names]
+    count = Counter(words)
+    common = {word for word in count if count[word] >= COMMON * max(count.values())}
+    return [
+        (numbers.get(number_of(parts), -1), word if len(common) > 1 else "")
+        if word in common
+        else (-1, "")
+        for parts, word in zip(names, words, strict=True)
+    ]
 
 
 def number_of(parts: Parts) -> int:

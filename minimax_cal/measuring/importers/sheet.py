@@ -6,6 +6,7 @@ import codecs
 import csv
 import re
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import check_table, read_raw
+from minimax_cal.measuring.importers.words import is_understood, unit_name
 from minimax_cal.measuring.spreadsheet import is_workbook, text_of_workbook
 
 DELIMITERS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "spaces"}
@@ -21,11 +23,10 @@ DECIMALS = {".": "point", ",": "comma"}
 POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 COMMA = re.compile(r"[-+]?(\d*),(\d+)([eE][-+]?\d+)?")
 COMMENTS = ("#", "%", "//", "!")
-UNIT = re.compile(
-    "mm|m|um|\u00b5m|\u03bcm|cm|in|deg|\u00b0|grad|Grad|rad|mrad|s|ms|\u00b0C|C|K|F|kg|Nm"
-)
 WORKBOOK = "workbook"
+COORDINATES = 3  # of a point
 LOOKED_AT = 200  # rows that decide the delimiter
+NumberedRow = tuple[int, list[str]]  # the line of the file, and its cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +34,8 @@ class Sheet:
     """A file of rows and columns.
 
     header: names, or empty.  line: (m,) line of the file of each row.  cells: m rows of text.
-    delimiter, decimal: empty where the text has no columns.  preamble: lines above the table.
-    torn: lines that have fewer or more cells, where they were left out.
+    delimiter, decimal: empty where the text has no columns.  above, below: lines that are not of
+    the table.  torn: lines that have fewer or more cells, where they were left out.
     """
 
     path: Path
@@ -46,7 +47,8 @@ class Sheet:
     line: Array
     cells: tuple[tuple[str, ...], ...]
     torn: tuple[int, ...] = ()
-    preamble: tuple[int, ...] = ()
+    above: tuple[int, ...] = ()
+    below: tuple[int, ...] = ()
 
     @property
     def width(self) -> int:
@@ -66,31 +68,27 @@ def open_text(path: Path | str) -> Sheet:
 def cut(sheet: Sheet, decimal: str = "", *, most_torn: float = 0.0) -> Sheet:
     """The rows and columns of a text, by the delimiter and decimal sign found.  Raises DataError.
 
-    decimal: the sign, where the user told it.  most_torn: share of rows that may be left out
+    decimal: the sign, where the user gives it.  most_torn: share of rows that may be left out
     because they have fewer or more cells than the others.
     """
     path, text = sheet.path, sheet.text
-    numbered = [
-        (number, line)
-        for number, line in enumerate(text.splitlines(), 1)
-        if line.strip(" \t,;") and not line.lstrip().startswith(COMMENTS)
-    ]
+    numbered = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip(" \t,;")]
+    notes = [(n, line) for n, line in numbered if line.lstrip().startswith(COMMENTS)]
+    numbered = [row for row in numbered if row not in notes] if notes else numbered
     delimiter = "\t" if sheet.encoding == WORKBOOK else ""
     delimiter = delimiter or delimiter_of([line for _, line in numbered[:LOOKED_AT]])
     if not delimiter:
         raise DataError(f"{path}: has no columns that commas, semicolons, tabs or spaces separate")
     rows = [(number, cells_of(path, number, line, delimiter)) for number, line in numbered]
-    above = 0 if most_torn else preamble_of([row for _, row in rows])
-    preamble, rows = tuple(number for number, _ in rows[:above]), rows[above:]
-    header: tuple[str, ...] = ()
-    if is_header(rows[0][1]):
-        _, first = rows.pop(0)
-        header = tuple(trimmed(first))
-        if rows and (units := units_in(rows[0][1], len(header))):
-            header = tuple(f"{n} [{u}]" if u else n for n, u in zip(header, units, strict=True))
-            rows.pop(0)
-        if not rows:
-            raise DataError(f"{path}: holds a header but no rows")
+    above = [] if most_torn else above_table([row for _, row in rows])
+    below = [] if most_torn else below_table([row for _, row in rows], sheet.encoding == WORKBOOK)
+    above, below = [[rows[i][0] for i in some] for some in (above, below)]
+    rows = rows[len(above) : len(rows) - len(below)]
+    header, rows = split_header(rows)
+    if not header and not most_torn:
+        header = noted_header([line for n, line in notes if n < rows[0][0]], delimiter, rows)
+    if not rows:
+        raise DataError(f"{path}: holds a header but no rows")
     width = len(header) or Counter(len(trimmed(row)) for _, row in rows).most_common(1)[0][0]
     torn = [(number, row) for number, row in rows if len(row) < width or any(row[width:])]
     if len(torn) > (max(1.0, most_torn * len(rows)) if most_torn else 0.0):
@@ -107,23 +105,79 @@ def cut(sheet: Sheet, decimal: str = "", *, most_torn: float = 0.0) -> Sheet:
     names = header or tuple(f"column {i + 1}" for i in range(width))
     sign = decimal or decimal_of(path, names, line, cells)
     found = replace(sheet, delimiter=delimiter, decimal=sign, header=header, line=line, cells=cells)
-    return replace(found, torn=lost, preamble=preamble)
+    return replace(found, torn=lost, above=tuple(above), below=tuple(below))
 
 
-def preamble_of(rows: list[list[str]]) -> int:
-    """How many rows above the table say something else: they are half as long, or shorter."""
+def above_table(rows: list[list[str]]) -> range:
+    """Rows above the table that say something else: they are half as long, or shorter."""
     lengths = [len(trimmed(row)) for row in rows]
     width = Counter(lengths).most_common(1)[0][0]
     first = next((i for i, length in enumerate(lengths) if 2 * length > width), 0)
-    return first if first < len(rows) - 1 else 0
+    return range(first if first < len(rows) - 1 else 0)
+
+
+def below_table(rows: list[list[str]], padded: bool) -> range:
+    """Rows below the table: half as long, or shorter, with words, too few numbers for a point.
+
+    padded: whether all rows have cells up to the last column.
+    """
+    lengths = [len(trimmed(row) if padded else row) for row in rows]
+    width = Counter(lengths).most_common(1)[0][0]
+    last = len(rows)
+    while last > 1 and 2 * lengths[last - 1] <= width and is_remark(rows[last - 1]):
+        last -= 1
+    return range(last, len(rows))
+
+
+def is_remark(row: list[str]) -> bool:
+    """Whether a row holds words, and too few numbers for a point."""
+    filled = sum(map(bool, row))
+    return numbers_in(row) < min(filled, COORDINATES)
+
+
+def split_header(rows: list[NumberedRow]) -> tuple[tuple[str, ...], list[NumberedRow]]:
+    """Names of the columns with their units, and the rows below.
+
+    A row of names that are the same, or not there, has names of groups above it or below it: SMR 1
+    over X, Y, Z.
+    """
+    if not is_header(rows[0][1]):
+        return (), rows
+    names, rows = trimmed(rows[0][1]), rows[1:]
+    if "" in names and len(rows) > 1 and not any(map(is_number, rows[0][1])):
+        names, rows = grouped(names, rows[0][1]), rows[1:]
+    if rows and (units := units_in(rows[0][1], len(names))):
+        names = [f"{n} [{u}]" if u else n for n, u in zip(names, units, strict=True)]
+        rows = rows[1:]
+    return tuple(names), rows
+
+
+def grouped(groups: list[str], names: list[str]) -> list[str]:
+    """The names below groups, each with that of its group where others are called alike."""
+    names = [*trimmed(names), *[""] * len(groups)][: max(len(groups), len(trimmed(names)))]
+    over: list[str] = []
+    for group in [*groups, *[""] * len(names)][: len(names)]:
+        over.append(group or (over[-1] if over else ""))
+    return [
+        f"{group} {name}".strip() if not name or names.count(name) > 1 else name
+        for group, name in zip(over, names, strict=True)
+    ]
+
+
+def noted_header(notes: list[str], delimiter: str, rows: list[NumberedRow]) -> tuple[str, ...]:
+    """The names of a last comment above the rows that has one for each column, else nothing."""
+    marks = "".join(COMMENTS)
+    names = split_line(notes[-1].strip().lstrip(marks), delimiter) if notes else []
+    right = len(names) == len(trimmed(rows[0][1])) and is_header(names)
+    return tuple(names) if right and is_understood(names) else ()
 
 
 def units_in(row: list[str], width: int) -> list[str]:
     """The units of a row that holds nothing else, below the header; else nothing."""
     cells = [cell.strip("[]() ") for cell in (*row, *[""] * width)][:width]
     filled = [cell for cell in cells if cell and cell != "-"]
-    known = bool(filled) and all(UNIT.fullmatch(cell) for cell in filled)
-    return [cell if UNIT.fullmatch(cell) else "" for cell in cells] if known else []
+    known = bool(filled) and all(map(unit_name, filled))
+    return [cell if unit_name(cell) else "" for cell in cells] if known else []
 
 
 def decoded(path: Path) -> tuple[str, str]:
@@ -135,10 +189,10 @@ def decoded(path: Path) -> tuple[str, str]:
             return raw.decode(name, errors="replace"), name
     if b"\0" in raw:
         raise DataError(f"{path}: is not a text file; expected rows of numbers")
-    try:
-        return raw.decode("utf-8-sig"), "utf-8"
-    except UnicodeDecodeError:
-        return raw.decode("latin-1"), "latin-1"
+    for name, codec in (("utf-8", "utf-8-sig"), ("gb2312", "gb2312")):
+        with suppress(UnicodeDecodeError):
+            return raw.decode(codec), name
+    return raw.decode("latin-1"), "latin-1"
 
 
 def split_line(line: str, delimiter: str) -> list[str]:
@@ -147,15 +201,17 @@ def split_line(line: str, delimiter: str) -> list[str]:
         return line.split()
     if '"' not in line:
         return [cell.strip() for cell in line.split(delimiter)]
-    row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+    row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True, strict=True))
     return [cell.strip() for cell in row]
 
 
 def cells_of(path: Path, number: int, line: str, delimiter: str) -> list[str]:
     """The cells of a line of a file.  Raises DataError."""
-    if delimiter != " " and line.count('"') % 2:
-        raise DataError(f"{path}:{number}: has a quotation mark without its pair; delete it")
-    return split_line(line, delimiter)
+    try:
+        return split_line(line, delimiter)
+    except csv.Error:
+        what = "has a quotation mark without its pair; delete it"
+        raise DataError(f"{path}:{number}: {what}") from None
 
 
 def trimmed(row: list[str]) -> list[str]:
@@ -169,9 +225,14 @@ def is_number(cell: str) -> bool:
     return bool(POINT.fullmatch(cell) or COMMA.fullmatch(cell))
 
 
+def numbers_in(row: list[str]) -> int:
+    """How many cells of a row are numbers."""
+    return sum(map(is_number, row))
+
+
 def is_header(row: list[str]) -> bool:
     """Whether most cells of a row are words."""
-    filled = trimmed(row)
+    filled = [cell for cell in row if cell]
     return 2 * sum(not is_number(cell) for cell in filled) > len(filled)
 
 
@@ -179,7 +240,10 @@ def delimiter_of(lines: list[str]) -> str:
     """The delimiter that cuts most lines into the same count of mostly numbers, or ''."""
     best, most = "", 0.0
     for delimiter in DELIMITERS:
-        rows = [split_line(line, delimiter) for line in lines if line.count('"') % 2 == 0]
+        rows: list[list[str]] = []
+        for line in lines:
+            with suppress(csv.Error):
+                rows.append(split_line(line, delimiter))
         if not rows:
             continue
         count, times = Counter(map(len, rows)).most_common(1)[0]

@@ -8,7 +8,8 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.importers.reading import TIMES, Column, Reading
+from minimax_cal.measuring.importers.reading import Column, Reading
+from minimax_cal.measuring.importers.words import TIMES
 
 STAMPED = "time stamps"
 CLOCKS = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M", "%I:%M:%S.%f %p", "%I:%M:%S %p", "%I:%M %p")
@@ -25,25 +26,25 @@ CELSIUS = {"C": (1.0, 0.0), "K": (1.0, -273.15), "F": (5.0 / 9.0, -160.0 / 9.0)}
 ROOM = {"C": (5.0, 45.0), "F": (50.0, 113.0), "K": (278.0, 318.0)}  # where people measure
 
 
-def seconds(reading: Reading, column: Column, told: str) -> tuple[Array, str]:
+def seconds(reading: Reading, column: Column, given: str) -> tuple[Array, str]:
     """(m,) seconds, NaN where empty, and how they are known; of stamps, since 1900.
 
-    An empty array and a remark, where the column tells no time.  told: a unit (s, ms), or the
+    An empty array and a remark, where the column tells no time.  given: a unit (s, ms), or the
     order of a date (dmy, mdy, ymd).  Raises DataError.
     """
     cells = [cell.strip().lstrip("'").replace(",", ".") for cell in column.cells]
     filled = [cell for cell in cells if cell]
     if len(set(filled)) < 2:
         return np.empty(0), "the same in all rows"
-    if unit := told if told in TIMES else column.unit:
+    if unit := given if given in TIMES else column.unit:
         if unit not in TIMES:
             raise DataError(
                 f"{reading.sheet.path}: column {column.name}: {unit} is no unit of time"
             )
-        return reading.numbers(column) * TIMES[unit], "told" if told else column.known
+        return reading.numbers(column) * TIMES[unit], "given" if given else column.known
     found: dict[tuple[float, ...], tuple[Array, str]] = {}
     for order, days in DAYS.items():
-        if told and told != order:
+        if given and given != order:
             continue
         for form in (*(day + clock for day in days for clock in CLOCKS), COMPACT):
             if (stamps := parsed(cells, form)) is not None:
@@ -59,9 +60,9 @@ def seconds(reading: Reading, column: Column, told: str) -> tuple[Array, str]:
             f"{reading.sheet.path}: column {column.name}: {filled[0]} may be day or month first; "
             "add units='time=dmy' or units='time=mdy'"
         )
-    if told:
+    if given:
         raise DataError(
-            f"{reading.sheet.path}: column {column.name}: {filled[0]!r} is not a time as {told}"
+            f"{reading.sheet.path}: column {column.name}: {filled[0]!r} is not a time as {given}"
         )
     return np.empty(0), "no time stamps that are understood; if seconds, add units='time=s'"
 
@@ -110,12 +111,12 @@ def parsed(cells: list[str], form: str) -> Array | None:
     return out
 
 
-def celsius(reading: Reading, column: Column, told: str) -> tuple[Array, str, str]:
+def celsius(reading: Reading, column: Column, given: str) -> tuple[Array, str, str]:
     """(m,) temperatures in degrees Celsius, the unit found, and how.  Raises DataError."""
     values = reading.numbers(column)
     if not np.isfinite(values).any():
         return np.empty(0), "", "empty"
-    unit, known = told or column.unit, "told" if told else column.known
+    unit, known = given or column.unit, "given" if given else column.known
     if not unit:
         low, high = np.nanmin(values), np.nanmax(values)
         fit = [name for name, (least, most) in ROOM.items() if least <= low and high <= most]

@@ -1,4 +1,4 @@
-"""Which units numbers are in: told, by the header, or proven by what an arm can be; never a guess.
+"""Which units numbers are in: given, by the header, or proven by what an arm can be; never a guess.
 
 The lever is the largest ratio of how far a target moved to how far the joints turned: no longer
 than the arm with its tool, and not much shorter either.  Wrong units miss it by 57 or 1000 times.
@@ -13,7 +13,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.importers.reading import ANGLES, LENGTHS
+from minimax_cal.measuring.importers.words import ANGLES, LENGTHS
 
 MOST_TURN = 4.0 * np.pi  # a joint that turned farther was not written in radians
 FARTHEST_POINT = 200.0  # farther than any tracker measures [m]
@@ -27,7 +27,7 @@ BOTH = (("rad", "deg"), ("mm", "m"))
 def decide(
     q: Array, y: Array, q_unit: str, y_unit: str, sliding: Array, where: tuple[Path, Path]
 ) -> tuple[str, str, str, str]:
-    """Units of the joints and points, and how each is known beyond what was told.
+    """Units of the joints and points, and how each is known beyond what was given.
 
     q: (m, n), y: (m, k, 3) as in the files; q_unit, y_unit: '' where unknown.  where: the files of
     the joints and of the points.  Raises DataError naming the option to add.
