@@ -303,7 +303,7 @@ def test_pose_after_a_search_over_base_rotations(robot: mc.Robot, noisy: Simulat
 
 
 def test_a_holdout_that_leaves_nothing_is_refused(robot: mc.Robot, noisy: Simulation) -> None:
-    with pytest.raises(mc.OptionError, match="leaves none of 60 poses"):
+    with pytest.raises(mc.OptionError, match=r"\b60\b"):
         mc.calibrate(robot, noisy.data, holdout=0.995)
 
 
@@ -324,7 +324,7 @@ def test_only_offsets_leave_the_rest_as_drawn(noisy: Simulation, robot: mc.Robot
     fixed = [f"{kind}{j}" for kind in ("a", "d", "alpha", "beta") for j in range(1, 7)]
     same = mc.calibrate(robot, noisy.data, "sum", fix=fixed)
     assert (same.robot.mdh == fit.robot.mdh).all()
-    with pytest.raises(mc.OptionError, match="the only choice is offsets"):
+    with pytest.raises(mc.OptionError, match=r"lengths.*offsets"):
         mc.calibrate(robot, noisy.data, only="lengths")
 
 
@@ -332,5 +332,5 @@ def test_only_offsets_leave_the_rest_as_drawn(noisy: Simulation, robot: mc.Robot
 def test_a_prior_that_says_nothing_is_refused(
     robot: mc.Robot, noisy: Simulation, sigma: str
 ) -> None:
-    with pytest.raises(mc.OptionError, match=r"prior a2: sigma .* says nothing of an arm"):
+    with pytest.raises(mc.OptionError, match=r"\ba2\b.*sigma"):
         mc.calibrate(robot, noisy.data, priors={"a2": sigma})
