@@ -377,3 +377,23 @@ def test_an_export_is_read_as_it_is(make: Maker, tmp_path: Path, rng: np.random.
     said = " ".join(found.notices)
     for words in export.says:
         assert words in said
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "line", "words"),
+    [
+        (pcdmis_fanuc, "report.txt", "Y ", "a second y of point"),
+        (pcdmis_fanuc, "CALIB.LS", "\tJ1=", "J1:"),
+        (leica_kuka, "kalib.dat", "DECL E6AXIS", "set twice"),
+    ],
+)
+def test_a_line_that_is_there_twice_is_named(
+    make: Maker, name: str, line: str, words: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    truth = mc.simulate("irb2600", POSES, TARGETS, 5).data
+    export = make(tmp_path, np.degrees(truth.q), 1e3 * truth.y, rng)
+    lines = (tmp_path / name).read_text().splitlines()
+    place = next(i for i, text in enumerate(lines) if text.startswith(line))
+    (tmp_path / name).write_text("\n".join([*lines[:place], lines[place], *lines[place:]]))
+    with pytest.raises(mc.DataError, match=words):
+        import_files([tmp_path / each for each in export.files], tmp_path / (export.joints or ""))

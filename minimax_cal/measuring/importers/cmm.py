@@ -6,9 +6,11 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.importers.headed import read as read_headed
 from minimax_cal.measuring.importers.names import folded
 from minimax_cal.measuring.importers.reading import Given, Reading
@@ -37,8 +39,8 @@ class Coordinate:
     unit: str
 
 
-def text_rows(text: str) -> list[Coordinate]:
-    """The coordinates of a report in blocks, as PC-DMIS writes it."""
+def text_rows(path: Path, text: str) -> list[Coordinate]:
+    """The coordinates of a report in blocks, as PC-DMIS writes it.  Raises DataError."""
     out = []
     blocks = list(BLOCK.finditer(text))
     ends = [*(block.start() for block in blocks), len(text)][1:]
@@ -46,12 +48,15 @@ def text_rows(text: str) -> list[Coordinate]:
         head = COLUMNS.search(text, here.end(), end)
         names = [folded(name) for name in head[1].split()] if head else []
         at = next((i for i, name in enumerate(names) if MEASURED.fullmatch(name)), -1)
-        for row in ROW.finditer(text, here.end(), end):
-            cells = row[2].split()
-            if 0 <= at < len(cells):
-                line = text.count("\n", 0, row.start(1)) + 1
-                unit = unit_name(here[2].lower())
-                out.append(Coordinate(line, here[1], row[1].lower(), cells[at], unit))
+        for row in ROW.finditer(text, here.end(), end) if at >= 0 else ():
+            cells, line = row[2].split(), text.count("\n", 0, row.start(1)) + 1
+            if len(cells) < len(names):
+                raise DataError(
+                    f"{path}:{line}: point {here[1]}: {len(cells)} values, but {len(names)} "
+                    "columns; complete the row or delete the point"
+                )
+            unit = unit_name(here[2].lower())
+            out.append(Coordinate(line, here[1], row[1].lower(), cells[at], unit))
     return out
 
 
@@ -111,7 +116,7 @@ def whole(pairs: Sequence[tuple[str, str]]) -> bool:
 
 def coordinates_of(sheet: Sheet) -> list[Coordinate]:
     """The coordinates of a text, or of a table."""
-    return table_rows(sheet) if sheet.delimiter else text_rows(sheet.text)
+    return table_rows(sheet) if sheet.delimiter else text_rows(sheet.path, sheet.text)
 
 
 def fits(sheet: Sheet, joints: bool) -> bool:
@@ -120,11 +125,16 @@ def fits(sheet: Sheet, joints: bool) -> bool:
 
 
 def read(sheet: Sheet, given: Given, joints: bool) -> Reading:
-    """A row a point."""
+    """A row a point.  Raises DataError for a coordinate that is there twice."""
     found = coordinates_of(sheet)
     points: dict[str, dict[str, Coordinate]] = {}
     for one in found:
-        points.setdefault(one.point, {}).setdefault(one.axis, one)
+        first = points.setdefault(one.point, {}).setdefault(one.axis, one)
+        if first is not one:
+            raise DataError(
+                f"{sheet.path}:{one.line}: a second {one.axis} of point {one.point}, as in line "
+                f"{first.line}; delete one, or name the point otherwise"
+            )
     units = {one.unit for one in found}
     unit = f" [{units.pop()}]" if len(units) == 1 and units != {""} else ""
     header = ("point", *(f"{axis}{unit}" for axis in "XYZ"))

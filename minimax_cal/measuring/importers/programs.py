@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +29,15 @@ class Target:
     axes: Mapping[str, str]
 
 
+def by_axis(pairs: Sequence[tuple[str, str]]) -> dict[str, str]:
+    """Values by axis; of an axis that is there twice both, which is no number."""
+    out: dict[str, str] = {}
+    for axis, value in pairs:
+        name = axis.upper()
+        out[name] = f"{out[name]} and {value}" if name in out else value
+    return out
+
+
 # ---- KUKA --------------------------------------------------------------------------------------
 
 KRL_TARGET = re.compile(
@@ -41,7 +50,7 @@ OF_EDITOR = re.compile(r"[Xx]([A-Za-z_]\w*)")  # the editor calls the values of 
 def krl_targets(text: str) -> Iterator[Target]:
     """`{A1 ..., A2 ...}`, declared or in a motion."""
     for found in KRL_TARGET.finditer(text):
-        axes = {axis.upper(): value for axis, value in KRL_AXIS.findall(found[2])}
+        axes = by_axis(KRL_AXIS.findall(found[2]))
         own = OF_EDITOR.fullmatch(found[1] or "")
         yield Target(own[1] if own else found[1] or "", found.start(2), axes)
 
@@ -90,7 +99,7 @@ LS_AXIS = re.compile(r"\b([JE]\d)\s*=\s*([^\s,]+)[ \t]*(?:deg|mm)", re.IGNORECAS
 def ls_targets(text: str) -> Iterator[Target]:
     """`P[1]{ ... J1= ... deg, ...}`; points in Cartesian coordinates are none."""
     for found in LS_TARGET.finditer(text):
-        if axes := {axis.upper(): value for axis, value in LS_AXIS.findall(found[2])}:
+        if axes := by_axis(LS_AXIS.findall(found[2])):
             yield Target(f"P[{found[1]}]", found.start(2), axes)
 
 
