@@ -108,11 +108,19 @@ def cases(data: Path) -> Iterator[tuple[str, list[str]]]:
     yield "tradeoff", ["tradeoff", arm, poses, "--steps", "3", "--json"]
     yield "effects", ["effects", arm, poses, "--json"]
     yield "robots", ["robots", "--json"]
-    for kind in ("wires", "poses", "closures"):
+    for kind in ("wires", "poses", "closures", "contacts"):
         yield f"relative {kind}", ["relative", arm, str(data / f"{kind}.csv"), "--json"]
     both = [str(data / f"{kind}.csv") for kind in ("wires", "closures")]
     yield "relative several", ["relative", arm, *both, "--json"]
     yield "relative effects", ["relative", arm, *both, "--effects", "joint_compliance", "--json"]
+    folder = data / "cell"
+    seen = [
+        "--pixels", str(folder / "detections.csv"), "--joints", str(folder / "joints.csv"),
+        "--camera", f"cam0={folder / 'cam0.yaml'}", "--board", str(folder / "board.csv"), "--json",
+    ]  # fmt: skip
+    yield "calibrate pixels", ["calibrate", "ur5", *seen]
+    yield "calibrate pixels minimax", ["calibrate", "ur5", *seen, "--objective", "minimax"]
+    yield "relative pixels", ["relative", "ur5", str(folder / "poses.csv"), *seen]
     yield (
         "simulate",
         ["simulate", "ur10", "--poses", "9", "--compliance", "2", "-o", "simulated.csv"],
@@ -127,8 +135,10 @@ def prepare(data: Path) -> None:
     """Files that both revisions read: simulated arms with their faults, inputs of commands."""
     import numpy as np
 
-    from experiments import blind_gap, gap_cases, relative
-    from minimax_cal.fitting.instruments import write_relative
+    from experiments import blind_gap, gap_cases, pixel_cells, relative
+    from minimax_cal.fitting.instruments import flange_poses, write_relative
+    from minimax_cal.robots.sampling import random_poses
+    from tests.fitting.test_contacts import planes
 
     if (data / "done").exists():
         return
@@ -150,6 +160,13 @@ def prepare(data: Path) -> None:
     for kind, name in {"wires": "wires_3", "poses": "poses", "closures": "closures"}.items():
         measured = relative.SIMULATORS[name](arm, np.random.default_rng(SEED), 60, relative.NOISE)
         write_relative(data / f"{kind}.csv", measured.data)
+    write_relative(data / "contacts.csv", planes(arm, SEED, relative.NOISE))
+    points = pixel_cells.board_points((6, 5), 0.04)
+    cell = pixel_cells.make_cell(np.random.default_rng(1), points=points, poses=20, on_flange=True)
+    (data / "cell").mkdir()
+    pixel_cells.write_cell(cell, data / "cell")
+    q = random_poses(cell.true, 24, np.random.default_rng(SEED))
+    write_relative(data / "cell" / "poses.csv", flange_poses(q, cell.true.pose(q)))
     (data / "done").write_text("")
 
 
@@ -309,7 +326,7 @@ def main() -> int:
     commit = git("rev-parse", chosen.revision)
     asked = inspect.getsource(cases) + inspect.getsource(prepare)
     mark = hashlib.sha256(asked.encode()).hexdigest()[:8]
-    data, before, now = STORE / "data", STORE / f"{commit[:12]}-{mark}", STORE / "now"
+    data, before, now = STORE / f"data-{mark}", STORE / f"{commit[:12]}-{mark}", STORE / "now"
     data.mkdir(parents=True, exist_ok=True)
     prepare(data)
     shutil.rmtree(now, ignore_errors=True)
@@ -331,6 +348,8 @@ def main() -> int:
         if process.wait():
             raise SystemExit("a revision could not be run; see what it printed")
     (before / "done").write_text("")
+    if not list(now.glob("*.answer.json")):
+        raise SystemExit(f"no command's name holds {chosen.only!r}: nothing is compared")
     found = compare(before, now, chosen.rel, chosen.only)
     print("\n".join(found[:200]))
     print(f"{len(found)} differences from {commit[:12]} at {chosen.rel:g} relative")
