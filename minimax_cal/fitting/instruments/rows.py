@@ -30,8 +30,8 @@ class Block(Protocol):
 
     A state of a block has the links and, as effects, the e parameters of the block's own and those
     of the laws by which its arm gives way; its p parameters are in the order of `Names`: links, the
-    base (which is the frame), its own, the laws'.  Of a model with a target `names.geometric` counts
-    links, base and that target.
+    base (which is the frame), its own, the laws'.  Its model's `names.geometric`
+    counts links, base and target.
     """
 
     @property
