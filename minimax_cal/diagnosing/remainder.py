@@ -262,9 +262,9 @@ def far_apart(q: Array, count: int) -> Array:
 class Beside:
     """A fit of some columns, and what it predicts of each part of the poses without that part.
 
-    parts: (f, m) masks of the poses left out.  y: (m, r) what is fitted.  columns: (m, r, p), with
-    weights `ridge` (p,) of a prior of mean 0.  error: (m, r) what is left of each pose without its
-    part.  picked: which prior of the last block.
+    parts: (f, m) masks of the poses left out, each pose in one at most.  y: (m, r) what is fitted.
+    columns: (m, r, p), with weights `ridge` (p,) of a prior of mean 0.  error: (m, r) what is left
+    of each pose without its part.  picked: which prior of the last block.
     """
 
     parts: Array
@@ -315,7 +315,8 @@ class Beside:
     def without(self, one: Array, other: Array) -> Array:
         """(f, c, d) products of columns (m, r, c) and (m, r, d) at all poses but a part's."""
         own = np.array([product_of(one[part], other[part]) for part in self.parts])
-        return np.asarray(product_of(one, other) - own)
+        never = ~self.parts.any(axis=0)
+        return np.asarray(own.sum(axis=0) + product_of(one[never], other[never]) - own)
 
     def told(self, columns: Array) -> tuple[Array, Array]:
         """Values (f, p, c) of this fit's columns for others (m, r, c), without each part.

@@ -233,11 +233,12 @@ class Beside:
     def part(self, some: Some) -> Array:
         """(g, r, d) coordinates of columns in the geometry's span, each formed once."""
         width = self.width
-        self.held = grown(self.held, width, axis=2)
-        self.known = np.pad(self.known, (0, width - len(self.known)))
-        index = np.arange(width)[some]
-        new = np.unique(index[~self.known[index]])
-        if len(new):
+        if width > len(self.known):
+            self.held = grown(self.held, width, axis=2)
+            self.known = np.pad(self.known, (0, width - len(self.known)))
+        if not self.known[some].all():
+            index = np.arange(width)[some]
+            new = np.unique(index[~self.known[index]])
             run = slice(int(new[0]), int(new[-1]) + 1)  # which needs no copy of the columns
             missing = run if 2 * len(new) > run.stop - run.start else new
             raw = self.sums.products(np.arange(self.fixed), self.shifted(missing))
