@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.evidence.limits import LEAST_DOF, UNLIKE
+from minimax_cal.evidence.limits import CERTAIN, LEAST_DOF
 from minimax_cal.evidence.noise import orthonormal, restricted
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.rows import linearised
@@ -44,7 +44,7 @@ def weighed_anew(study: Study, known: Array, *, each: bool = True) -> Study:
     least, _ = rest.fit_variances([alike, along + across], np.array(size))
     parts = [*(turned if each else alike[None]), along, across]
     most, found = rest.fit_variances(parts, np.repeat(size, (len(parts) - 2, 2)))
-    if scipy.stats.chi2.sf(least - most, len(parts) - 2) > UNLIKE:
+    if scipy.stats.chi2.sf(least - most, len(parts) - 2) > CERTAIN:
         return study
     scatter = np.broadcast_to(np.sqrt(found[:-2]), len(turned))
     return weighed(study, scatter, sight, found[-2:])

@@ -24,7 +24,6 @@ APART = 0.1  # of a line's gain, by which they may differ however sure they are:
 # by less than 0.09 on the Meca500 and the IRB 120, a curve's by 0.1 to 1.1 on the UR10
 NEARLY = 0.5  # the same of waves near a gear's ratio, which groups left out must call for besides:
 # at 241 a turn of the IRB 120's second joint they differ by 0.05 to 0.30
-UNLIKE = 1e-6  # chance that noises alike look so unlike that rows are weighed once more
 
 # ---- what else it could be -----------------------------------------------------------------------
 
@@ -72,7 +71,8 @@ SCATTERS = 0.05  # chance by flipped signs above which a motion scatters, and fo
 MAX_JOINT_JITTER = 1.5e-5  # of a sound joint, where no data sheet says [rad]: 5 to 15 urad
 CREDIBLE = 3.0  # sigmas by which masses may be off to explain what a name leaves: with the true law
 # they are by up to 2, without it by 3.3 to 9 (twelve and eighteen simulated UR10s)
-CERTAIN = 1e-6  # chance below which something is there, though no name of it holds
+CERTAIN = 1e-6  # chance below which something is there: a cause, though no name of it holds, or
+# noises so unlike each other that rows are weighed once more
 HALF = 0.5  # of what is there, by its size: more under no name that holds, and nothing is named
 MAX_OVER_NOISE = 1.1  # error, or scatter of visits, over the noise that may be: less is no matter
 TARGETS_SCATTER = 0.01  # chance of their distances below which targets move by themselves

@@ -146,7 +146,7 @@ def test_poses_that_lack_a_point_do_not_count(plain: Study) -> None:
 def test_of_few_poses_or_of_computed_points_nothing_is_said(
     plain: Study, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scatter, "UNLIKE", 1.0)  # noises alike are weighed anew too
+    monkeypatch.setattr(scatter, "CERTAIN", 1.0)  # noises alike are weighed anew too
     made = drawn(plain, np.full(6, QUIET), POINT, POINT, 1)
     rows = 3 * made.scene.targets
     few = -(-(made.rows.basis.shape[1] + int(LEAST_DOF)) // rows)  # poses that are just enough

@@ -3,7 +3,7 @@
 from minimax_cal.evidence import limits
 from tests.thresholds import LIMITS, thresholds
 
-MOST = 46
+MOST = 45
 
 
 def test_numbers_that_decide_are_few_and_in_one_module() -> None:
