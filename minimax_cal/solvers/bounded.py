@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 import scipy
 
@@ -37,8 +39,8 @@ def nearest(matrix: Array, target: Array, low: Array, high: Array) -> Array:
     """
     if np.isfinite(low).all() and np.isinf(high).all():
         rounds = 100 * len(low)
-        return np.asarray(
-            low + scipy.optimize.nnls(matrix, target - matrix @ low, maxiter=rounds)[0]
-        )
+        with suppress(RuntimeError):  # columns almost the same may make it go in circles
+            found = scipy.optimize.nnls(matrix, target - matrix @ low, maxiter=rounds)[0]
+            return np.asarray(low + found)
     ends = low, high
     return np.asarray(scipy.optimize.lsq_linear(matrix, target, ends, method="bvls", tol=1e-12).x)

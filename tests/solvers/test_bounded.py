@@ -2,9 +2,11 @@
 
 import cvxpy as cp
 import numpy as np
+import pytest
+import scipy
 from numpy.testing import assert_allclose
 
-from minimax_cal.solvers.bounded import bounded
+from minimax_cal.solvers.bounded import bounded, nearest
 
 
 def test_a_bounded_step_is_the_optimum(rng: np.random.Generator) -> None:
@@ -31,3 +33,17 @@ def test_columns_that_are_the_same_share_their_part(rng: np.random.Generator) ->
     best.solve(solver=cp.CLARABEL)
     assert (x >= low - 1e-12).all()
     assert_allclose(np.sum((matrix @ x - right) ** 2), best.value, rtol=1e-5)
+
+
+def test_a_compiled_solver_that_gives_up_is_replaced(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matrix, target = rng.normal(size=(5, 5)), rng.normal(size=5)
+    low, high = np.full(5, -0.1), np.full(5, np.inf)
+    fast = nearest(matrix, target, low, high)
+
+    def stopped(*given: object, **more: object) -> None:
+        raise RuntimeError("Maximum number of iterations reached.")
+
+    monkeypatch.setattr(scipy.optimize, "nnls", stopped)
+    assert_allclose(nearest(matrix, target, low, high), fast, rtol=0, atol=1e-9)
