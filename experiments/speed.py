@@ -44,7 +44,9 @@ from minimax_cal.fitting.minimax_problem import (
 from minimax_cal.fitting.options import solver_of
 from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.tables import Table
+from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.effects.table import Fitted, Term
 from minimax_cal.modelling.model import Model, SumOfSquares, model_of
 from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import State
@@ -57,6 +59,14 @@ from minimax_cal.solvers import least_squares, minimax
 PARTS = ("races", "points", "bootstrap", "command", "growth", "diagnosis")
 SAME = 1e-6  # relative difference of two optima that are called the same
 NOISE = 2e-5  # of a coordinate, where very many poses are made [m]
+LAWS = (  # of an arm like a real one, beside the compliance that each has, with values in SI
+    (Term("gear_error", "J1", {"turns": 1.0}), (1e-4, 5e-5)),
+    (Term("gear_ripple", "J2", {"turns": 120.0}), (3e-5, 2e-5)),
+    (Term("gear_ripple", "J3", {"turns": 100.0}), (4e-5, 1e-5)),
+    (Term("backlash", "J4"), (1e-4,)),
+    (Term("axis_wobble", "J5", {"turns": 1.0}), (5e-5, 5e-5)),
+    (Term("target_offset", "smr1"), (5e-5,)),
+)
 Run = Callable[[], object]
 
 
@@ -312,11 +322,27 @@ def bootstraps(seed: int) -> dict[str, float]:
 def diagnoses(seed: int, sizes: tuple[tuple[int, int], ...]) -> dict[str, float]:
     """Seconds of a diagnosis by the number of poses and targets."""
     robot, out = load_robot("irb2600"), {}
+    mc.diagnose(robot, simulated(60, seed), quick=True)  # loads what is imported when it is used
     for poses, targets in sizes:
         more = simulate(robot, poses, targets, seed).data
         began = time.process_time()
         mc.diagnose(robot, more)
         out[f"diagnose_{poses}x{targets}"] = time.process_time() - began
+    return out
+
+
+def diagnosis_like_real(seed: int) -> dict[str, float]:
+    """Seconds of a diagnosis of 600 poses of an arm with many laws, whole and quick."""
+    robot, out = load_robot("irb2600"), {}
+    bare = simulate(robot, 600, 3, seed)
+    laws = Fitted.of((term, np.array(values)) for term, values in LAWS)
+    history = with_history(bare.data)
+    moved = replace(bare.cell, effects=laws).follow(history) - bare.cell.follow(history)
+    data = bare.data.with_y(bare.data.y + moved)
+    for name, quick in (("like_real", False), ("like_real_quick", True)):
+        began = time.process_time()
+        mc.diagnose(robot, data, quick=quick)
+        out[f"diagnose_{name}"] = time.process_time() - began
     return out
 
 
@@ -362,6 +388,7 @@ def timed(
         seconds |= grown
     if "diagnosis" in parts:
         seconds |= diagnoses(seed, cases)
+        seconds |= {} if quick else diagnosis_like_real(seed)
     return seconds, memory
 
 
