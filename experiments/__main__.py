@@ -99,6 +99,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.relative",
         "What lengths, closures and poses tell beside a tracker, and how true their positions are",
     ),
+    "relative_gap": (
+        "experiments.relative_gap",
+        "Does a diagnosis of several instruments name the true cause: sockets, wires, whole poses",
+    ),
     "pixels": (
         "experiments.pixels",
         "What cameras tell of an arm: lenses that are wrong, bad starts, pixels that are too weak",

@@ -162,7 +162,7 @@ def sockets(
         found, gap = reach(arm.real, SPOT, goal, start, iterations=30)
         told = found
         for _ in range(5):  # what the controller is told, so that the bent arm is there
-            told = found - arm.compliance * gravity(arm.real, told)
+            told = found - (arm.bent(told) - told)
         kept = np.flatnonzero((gap < CLOSED) & inside(arm.robot, told))[:visits]
         if len(kept) == visits:
             q, label = np.concatenate([q, told[kept]]), np.append(label, [len(centres)] * visits)

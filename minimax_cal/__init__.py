@@ -11,6 +11,8 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.correcting.deliverable import Delivered, deliver
     from minimax_cal.correcting.export import export
     from minimax_cal.diagnosing.diagnose import diagnose
+    from minimax_cal.diagnosing.instruments import diagnose_relative
+    from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
     from minimax_cal.diagnosing.many import diagnose_many
     from minimax_cal.diagnosing.result import Diagnosis
     from minimax_cal.dynamics.diagnose import diagnose_motion
@@ -80,6 +82,7 @@ __all__ = [
     "MotionGap",
     "OptionError",
     "Options",
+    "RelativeDiagnosis",
     "Robot",
     "RobotError",
     "Run",
@@ -99,6 +102,7 @@ __all__ = [
     "diagnose",
     "diagnose_many",
     "diagnose_motion",
+    "diagnose_relative",
     "evaluate",
     "evaluate_motion",
     "export",
@@ -169,6 +173,8 @@ MODULES = {  # name: where it is defined
     "Diagnosis": "diagnosing.result",
     "diagnose": "diagnosing.diagnose",
     "diagnose_many": "diagnosing.many",
+    "RelativeDiagnosis": "diagnosing.instruments_result",
+    "diagnose_relative": "diagnosing.instruments",
     "Run": "dynamics.run",
     "read_runs": "dynamics.logs",
     "MotionDiagnosis": "dynamics.result",

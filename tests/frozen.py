@@ -112,6 +112,7 @@ def cases(data: Path) -> Iterator[tuple[str, list[str]]]:
         yield f"relative {kind}", ["relative", arm, str(data / f"{kind}.csv"), "--json"]
     both = [str(data / f"{kind}.csv") for kind in ("wires", "closures")]
     yield "relative several", ["relative", arm, *both, "--json"]
+    yield "relative diagnose", ["relative", arm, *both, "--diagnose", "--json"]
     yield "relative effects", ["relative", arm, *both, "--effects", "joint_compliance", "--json"]
     folder = data / "cell"
     seen = [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,12 +16,20 @@ from minimax_cal.cli.options import (
     InGroups,
     Output,
     options_from,
+    plain_option,
     result_options,
 )
 from minimax_cal.cli.pixel_files import PIXEL_FILES, PixelFiles
 from minimax_cal.fitting.instruments import RelativeOptions, relative
 from minimax_cal.fitting.instruments.kinds import Given
+from minimax_cal.fitting.instruments.result import RelativeCalibration
 from minimax_cal.fitting.options import Options
+from minimax_cal.ground.errors import OptionError
+
+if TYPE_CHECKING:
+    from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
+
+SOUGHT = "What is sought"
 
 
 @click.command(name="relative", cls=InGroups)
@@ -31,6 +39,20 @@ from minimax_cal.fitting.options import Options
 @options_from(RelativeOptions)
 @PIXEL_FILES
 @options_from(Options, "method")
+@plain_option(
+    SOUGHT,
+    "--diagnose",
+    is_flag=True,
+    help="Look for effects of the arm that explain what geometry leaves.",
+)
+@plain_option(
+    SOUGHT,
+    "--without",
+    "exclude",
+    multiple=True,
+    metavar="EFFECT",
+    help="With --diagnose: do not consider this effect; `minimax-cal effects` lists them.",
+)
 @DETAILS
 @result_options("the result (JSON)")
 def relative_command(
@@ -38,6 +60,8 @@ def relative_command(
     data: tuple[Path, ...],
     details: bool,
     to: Output,
+    diagnose: bool,
+    exclude: tuple[str, ...],
     pixels: Path | None,
     joints: Path | None,
     camera: Sequence[str],
@@ -54,16 +78,26 @@ def relative_command(
 
     Several files, of any kinds, are one fit: all share the arm, each counts by its own noise.  A
     tracker's measurements (smr1_x_mm ...) may be among them, and what cameras saw (--pixels).
+
+    With --diagnose the file holds the diagnosis as well, and the arm with the effects found.
     """
     files, every = PixelFiles(pixels, joints, tuple(camera), board), list[Given](data)
     if files.given:
         from minimax_cal.fitting.instruments.cameras import detected
 
         every.append(detected(*files.paths()))
+    if exclude and not diagnose:
+        raise OptionError("--without is of --diagnose; give both, or neither")
     with to.stages() as progress:
-        fit = relative(robot, every, progress, **chosen)
-    to.notice(*fit.notices)
-    if to.deliver(fit.json, fit.status):
+        found: RelativeCalibration | RelativeDiagnosis
+        if diagnose:
+            from minimax_cal.diagnosing.instruments import diagnose_relative
+
+            found = diagnose_relative(robot, every, exclude=exclude, progress=progress, **chosen)
+        else:
+            found = relative(robot, every, progress, **chosen)
+    to.notice(*found.notices)
+    if to.deliver(found.json, found.status):
         advice = options.keep(to.path, "relative.json")
-        options.present(details, [fit.headline()], fit.first_tables(), fit.tables, advice)
-    return options.exit_code(fit.status)
+        options.present(details, [found.headline()], found.first_tables(), found.tables, advice)
+    return options.exit_code(found.status)

@@ -23,6 +23,7 @@ from minimax_cal.evidence.remains import Remains, rest_of
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
+from minimax_cal.measuring.grouping import clusters
 from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.scene import Scene, joint_of, unmasked
 from minimax_cal.modelling.effects.table import EFFECTS, Term
@@ -91,9 +92,11 @@ def causes_of(
 def found_again(study: Study, causes: Causes) -> Causes:
     """The causes with their effects as findings: rivals, and how often each is found again."""
     choice = causes.choice
-    found = merged(findings(study, choice))
+    site = Site(study.scene, study.model, study.fit.state, choice.noise)
+    found = merged(findings(study.scene, choice, site))
     found = [with_untested(one, study.scene, causes.exclude) for one in found]
-    effects = judged_again(found, choice, study, causes.jobs, causes.cluster)
+    group = np.repeat(clusters(study.data), study.rows.width)
+    effects = judged_again(found, choice, group, causes.jobs, causes.cluster)
     change = asked(effects) and mostly_loose(effects, [f for f in effects if f.established])
     guessed = change or loudest(causes.left) is not None
     return replace(causes, choice=choice.portable(), effects=effects, guessed=guessed)
@@ -196,30 +199,32 @@ def entire(terms: Sequence[Term], every: Sequence[Term]) -> tuple[Term, ...]:
     return tuple(terms) if law is found else tuple(replace(first, choice=one) for one in law)
 
 
-def findings(study: Study, choice: Choice) -> list[Finding]:
-    """Each effect with its rivals, in the order of `by_weight`."""
+def findings(scene: Scene, choice: Choice, site: Site | None = None) -> list[Finding]:
+    """Each effect with its rivals, in the order of `by_weight`.
+
+    site: for what would tell them apart; nothing is proposed without one.
+    """
     beside = [choice.beside_others(number) for number in range(len(choice.found))]
     fits = [one for _, one in beside]
-    return [finding(study, choice, *beside[number], fits) for number in by_weight(choice)]
+    return [finding(scene, *beside[number], fits, site) for number in by_weight(choice)]
 
 
 def finding(
-    study: Study, choice: Choice, table: Bench, one: Added, fits: Sequence[Added]
+    scene: Scene, table: Bench, one: Added, fits: Sequence[Added], site: Site | None
 ) -> Finding:
     """An effect with its rivals, and what would tell the nearest of them apart.
 
     table, one: it beside the others.  fits: of every effect.
     """
     found = alternatives(table, one)
-    advice = [""] * len(found)
     unclear = [i for i, (_, _, power) in enumerate(found) if power < ENOUGH][:ADVISED]
-    if unclear:
-        site = Site(study.scene, study.model, study.fit.state, choice.noise)
+    advice = [""] * len(found)
+    if site:
         others = [(f.candidate.term, f.value) for f in fits if f is not one]
         for i in unclear:
             rival = found[i][0].candidate.term
             advice[i] = separate_with(site, Pair(one.candidate.term, one.value, rival, others))
-    columns = one.candidate.term.columns(study.scene)
+    columns = one.candidate.term.columns(scene)
     size, _ = table.likeness(one, one.candidate)
     return Finding(
         terms=(one.candidate.term,),

@@ -8,24 +8,23 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.diagnosing.result import Alternative, Finding
-from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.dictionary import Key
 from minimax_cal.evidence.limits import CERTAIN, FREQUENT, HALF
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.evidence.stability import Repeats, repeated
-from minimax_cal.measuring.grouping import clusters
+from minimax_cal.ground.arrays import Array
 
 
 def judged_again(
-    findings: Sequence[Finding], whole: Choice, study: Study, jobs: int = 1, cluster: str = ""
+    findings: Sequence[Finding], whole: Choice, group: Array, jobs: int = 1, cluster: str = ""
 ) -> tuple[Finding, ...]:
     """The findings, sought again in subsamples of the poses.
 
-    whole: what was chosen on all poses.  jobs, cluster: as `repeated` has them.
+    whole: what was chosen on all poses.  group: (N,) of rows that stay together.  jobs, cluster: as
+    `repeated` has them.
     """
     if not findings:
         return ()
-    group = np.repeat(clusters(study.data), study.rows.width)
     found = repeated(whole, group, jobs=jobs, cluster=cluster)
     return tuple(judged(one, whole, found) for one in findings)
 

@@ -25,7 +25,7 @@ from minimax_cal.ground.units import in_files
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.faults.nests import RESEAT
-from minimax_cal.measuring.floor import Floor
+from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.pose_rows import pose_rows
@@ -267,8 +267,87 @@ class Step:
     trusted: Accuracy
 
 
+class Explained:
+    """What was explained, of whatever instruments: a verdict and its effects.
+
+    status: of the fit of geometry.  verdict: one of VERDICTS.  effects: the largest first.
+    structure: probability that what remains is unrelated to what structure_in names.
+    not_testable: effects, and what the data lack for them.
+    """
+
+    status: Status
+    verdict: str
+    effects: tuple[Finding, ...]
+    structure: float
+    structure_in: str
+    not_testable: tuple[tuple[str, str], ...]
+
+    @property
+    def excess(self) -> str:
+        """How far the remaining error is above the known noise, in words."""
+        raise NotImplementedError
+
+    @property
+    def main(self) -> list[Finding]:
+        """The confirmed causes but for the minor ones, the largest first; at least one if any."""
+        sure = [f for f in self.effects if f.established]
+        return [f for f in sure if not f.minor] or sure[:1]
+
+    @property
+    def minor(self) -> list[Finding]:
+        """The other confirmed causes."""
+        main = self.main
+        return [f for f in self.effects if f.established and f not in main]
+
+    @property
+    def minor_sizes(self) -> tuple[float, float]:
+        """RMS that the minor causes explain, and what they take off the held-out RMS [mm]."""
+        both = [(f.before, f.after) for f in self.minor if math.isfinite(f.before - f.after)]
+        explained = sum(before**2 - after**2 for before, after in both)
+        return math.sqrt(max(explained, 0.0)), sum(before - after for before, after in both)
+
+    @property
+    def by_rung(self) -> list[Finding]:
+        """The effects in the order of the error budget."""
+        return list(self.effects)
+
+    def parameter_table(self) -> Table:
+        """The parameters of every effect found: millimetres and milliradians."""
+        rows = tuple(
+            (f.name, p["name"], scale * p["value"],
+             scale * number(p["sigma"]), unit)
+            for f in self.by_rung
+            for p in f.parameters()
+            for scale, unit in (PEOPLES.get(p["unit"], (1.0, p["unit"])),)
+        )  # fmt: skip
+        header = ("effect", "parameter", "value", "sigma", "unit")
+        return Table("parameters of the effects", header, rows, ("", "", ".4g", ".2g", ""))
+
+    def rival_table(self) -> Table:
+        """What these data cannot tell from the effects found, and what would tell them apart."""
+        rows = tuple(
+            (f.name, a.name, a.rho2, a.power, a.loss,
+             a.separate_with or "no measurement considered would")
+            for f in self.by_rung
+            for a in f.alternatives
+        )  # fmt: skip
+        header = ("effect", "alternative", "similarity", "power", "fits worse by",
+                  "what to measure next")  # fmt: skip
+        title = (
+            f"alternatives that these data do not exclude: they fit worse by less than {BAND:.0f}, "
+            f"or the power is below {ENOUGH:.0f}; at similarity 1 both move the arm alike"
+        )
+        return Table(title, header, rows,
+                     ("", "", ".3f", ".3g", ".3g", ""))  # fmt: skip
+
+    def untestable_table(self) -> Table:
+        """Effects that are neither found nor excluded."""
+        rows = tuple((name_effect(effect), needs) for effect, needs in self.not_testable)
+        return Table("not testable with these data", ("effect", "needs"), rows)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Diagnosis(Result):
+class Diagnosis(Explained, Result):
     """What is still wrong with a calibrated robot.
 
     status: of the geometric fit.  verdict: one of VERDICTS.  effects: by share of the gap.
@@ -332,31 +411,21 @@ class Diagnosis(Result):
         return proposal(self) or None
 
     @property
+    def excess(self) -> str:
+        """What the last step leaves, against the noise beneath it."""
+        joints = "" if self.floor.source == REPEATS else ", with what sound joints add"
+        return (
+            f"{self.ladder[-1].trusted.rms_mm:.3f} mm against at most {self.floor.high:.3f} mm "
+            f"({self.floor.source}{joints})"
+        )
+
+    @property
     def by_rung(self) -> list[Finding]:
         """The effects in the order of the ladder, faults of the data first."""
         rungs = [step.name for step in self.ladder]
         names = [f.term.step for f in self.effects]
         at = [rungs.index(name) if name in rungs else 0 for name in names]
         return [self.effects[i] for i in sorted(range(len(at)), key=at.__getitem__)]
-
-    @property
-    def main(self) -> list[Finding]:
-        """The confirmed causes but for the minor ones, the largest first; at least one if any."""
-        sure = [f for f in self.effects if f.established]
-        return [f for f in sure if not f.minor] or sure[:1]
-
-    @property
-    def minor(self) -> list[Finding]:
-        """The other confirmed causes."""
-        main = self.main
-        return [f for f in self.effects if f.established and f not in main]
-
-    @property
-    def minor_sizes(self) -> tuple[float, float]:
-        """RMS that the minor causes explain, and what they take off the held-out RMS [mm]."""
-        both = [(f.before, f.after) for f in self.minor if math.isfinite(f.before - f.after)]
-        explained = sum(before**2 - after**2 for before, after in both)
-        return math.sqrt(max(explained, 0.0)), sum(before - after for before, after in both)
 
     def leftover(self) -> Leftover:
         """What geometry leaves and what the effects leave, pose by pose."""
@@ -513,40 +582,6 @@ class Diagnosis(Result):
             f.established for f in found
         )  # without the column that says one thing
         return Table(title, header[:shown], tuple(row[:shown] for row in rows), formats[:shown])
-
-    def parameter_table(self) -> Table:
-        """The parameters of every effect found: millimetres and milliradians."""
-        rows = tuple(
-            (f.name, p["name"], scale * p["value"],
-             scale * number(p["sigma"]), unit)
-            for f in self.by_rung
-            for p in f.parameters()
-            for scale, unit in (PEOPLES.get(p["unit"], (1.0, p["unit"])),)
-        )  # fmt: skip
-        header = ("effect", "parameter", "value", "sigma", "unit")
-        return Table("parameters of the effects", header, rows, ("", "", ".4g", ".2g", ""))
-
-    def rival_table(self) -> Table:
-        """What these data cannot tell from the effects found, and what would tell them apart."""
-        rows = tuple(
-            (f.name, a.name, a.rho2, a.power, a.loss,
-             a.separate_with or "no measurement considered would")
-            for f in self.by_rung
-            for a in f.alternatives
-        )  # fmt: skip
-        header = ("effect", "alternative", "similarity", "power", "fits worse by",
-                  "what to measure next")  # fmt: skip
-        title = (
-            f"alternatives that these data do not exclude: they fit worse by less than {BAND:.0f}, "
-            f"or the power is below {ENOUGH:.0f}; at similarity 1 both move the arm alike"
-        )
-        return Table(title, header, rows,
-                     ("", "", ".3f", ".3g", ".3g", ""))  # fmt: skip
-
-    def untestable_table(self) -> Table:
-        """Effects that are neither found nor excluded."""
-        rows = tuple((name_effect(effect), needs) for effect, needs in self.not_testable)
-        return Table("not testable with these data", ("effect", "needs"), rows)
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result, but for those of where the errors lie."""

@@ -6,10 +6,9 @@ import math
 from collections.abc import Sequence
 
 from minimax_cal.diagnosing.last_question import ABOVE_NOISE, ONLY_MINOR
-from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding
+from minimax_cal.diagnosing.result import Alternative, Diagnosis, Explained, Finding
 from minimax_cal.evidence.limits import HALF, STRUCTURE
 from minimax_cal.ground.words import capitalise
-from minimax_cal.measuring.floor import REPEATS
 from minimax_cal.modelling.effects.words import name_place, name_structure
 from minimax_cal.solvers.status import Status
 
@@ -39,12 +38,10 @@ def reasons(found: Diagnosis) -> tuple[str, ...]:
     """
     if found.status is Status.FAILED:
         return (CONTRADICTED,)
-    causes = (listed(title_of(found), found.main), subsampled(found.main))
-    first = (opening(found), *causes) if is_partial(found) else (*causes, opening(found))
     return tuple(
         sentence
         for sentence in (
-            *first,
+            *causes_first(found),
             minor(found),
             shrunk(found),
             remaining(found),
@@ -56,10 +53,24 @@ def reasons(found: Diagnosis) -> tuple[str, ...]:
     )
 
 
+def explained(found: Explained) -> tuple[str, ...]:
+    """Main causes with their share, and minor and possible ones, of whatever instruments."""
+    if found.status is Status.FAILED:
+        return (CONTRADICTED,)
+    loose = possible([f for f in found.by_rung if not f.established])
+    return tuple(filter(None, [*causes_first(found), minor(found), loose]))
+
+
+def causes_first(found: Explained) -> tuple[str, ...]:
+    """What comes first: the causes, or that the most is unexplained."""
+    causes = (listed(title_of(found), found.main), subsampled(found.main))
+    return (opening(found), *causes) if is_partial(found) else (*causes, opening(found))
+
+
 # ---- the sentences -----------------------------------------------------------------------------
 
 
-def opening(found: Diagnosis) -> str:
+def opening(found: Explained) -> str:
     """What comes before the causes; empty where these say it all."""
     if found.verdict in ("named", "one_of") and found.main:
         return ""
@@ -67,7 +78,7 @@ def opening(found: Diagnosis) -> str:
     return f"{text}: {unexplained(found)}" if found.verdict == "unknown" else text
 
 
-def title_of(found: Diagnosis) -> str:
+def title_of(found: Explained) -> str:
     """Main cause, ambiguous cause, or a partial one where most is unexplained."""
     many = "s" if len(found.main) > 1 else ""
     if found.verdict == "unknown" and is_partial(found):
@@ -76,20 +87,16 @@ def title_of(found: Diagnosis) -> str:
     return f"{OPENINGS['one_of' if ambiguous else 'named']}{many}"
 
 
-def is_partial(found: Diagnosis) -> bool:
+def is_partial(found: Explained) -> bool:
     """Whether the confirmed causes leave most of the error unexplained."""
     return sum(f.share for f in found.main if f.share > 0.0) < HALF
 
 
-def unexplained(found: Diagnosis) -> str:
+def unexplained(found: Explained) -> str:
     """What is not explained, and how that is known."""
     left = name_structure(found.structure_in)
     if left in (ABOVE_NOISE, ONLY_MINOR):
-        joints = "" if found.floor.source == REPEATS else ", with what sound joints add"
-        return (
-            f"{left}, {found.ladder[-1].trusted.rms_mm:.3f} mm against at most "
-            f"{found.floor.high:.3f} mm ({found.floor.source}{joints})."
-        )
+        return f"{left}, {found.excess}."
     sure = any(f.established for f in found.effects)
     if not found.structure < STRUCTURE:  # it is the causes that are not certain
         return f"{left}: {'these causes are uncertain' if sure else 'the cause is unknown'}."
@@ -157,7 +164,7 @@ def named_together(same: Sequence[Named]) -> str:
     return f"{first.name.removesuffix(first.at)}{together([f.at for f in same])}"
 
 
-def minor(found: Diagnosis) -> str:
+def minor(found: Explained) -> str:
     """The minor effects in one line, and what they take off the error."""
     small = found.minor
     if not small:

@@ -15,7 +15,7 @@ from minimax_cal.evidence.selection import Choice
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.remaining import components
-from minimax_cal.modelling.rows import Rows
+from minimax_cal.modelling.rows import Posed
 
 FEW = 2  # parameters of an effect whose motions are asked each by itself
 NOTHING = Remains("nothing", "anything", 0.0, 1.0, 0.0)
@@ -33,7 +33,7 @@ def left_by(study: Study, choice: Choice, more: Array | None = None) -> tuple[Re
 
 
 def left_over(
-    scene: Scene, rows: Rows, known: Array, named: Sequence[tuple[str, Array]] = ()
+    scene: Scene, rows: Posed, known: Array, named: Sequence[tuple[str, Array]] = ()
 ) -> tuple[Remains, ...]:
     """What geometry and known columns (N, q) leave.  named: motions as `components` has them."""
     noise = anchored(restricted(rows, known), rows)

@@ -239,7 +239,12 @@ def of_relative(content: Mapping[str, Any], source: str) -> Opened:
     rungs = (Rung(NOMINAL, bare("nominal_robot")), Rung(CALIBRATED, whole))
     kept = content.get("status") == Status.NO_BETTER  # the drawn arm is the robot of such a file
     status = Status.NO_BETTER if kept else None
-    return Opened(source, rungs, 1, placed=False, status=status, geometric=alone)
+    known = whole.effects.causes
+    firm = {term.text for term in established(content, source)} if "diagnosis" in content else None
+    possible = frozenset(term.text for term in known) - firm if firm is not None else frozenset()
+    return Opened(
+        source, rungs, 1, placed=False, status=status, geometric=alone, possible=possible
+    )  # fmt: skip
 
 
 def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
@@ -305,6 +310,11 @@ def established(content: Mapping[str, Any], source: str) -> list[Term]:
 
     Raises CalibrationError.
     """
+    if content.get("kind") == RELATIVE and "diagnosis" in content:
+        with reading(source):
+            cell = content.get("cell")
+            terms = cell_from_dict(cell, f"{source}: cell").effects.causes if cell else ()
+            return confirmed(content["diagnosis"], terms)
     if content.get("kind") != "diagnosis":
         raise OptionError(f"{source}: is no diagnosis, so that it names no effects")
     with reading(source):

@@ -205,3 +205,25 @@ def test_numbers_that_do_not_work_out_are_exit_code_1(
     assert "the nominal robot misses by" in err
     assert err.splitlines()[-1].startswith("error: failed: ")
     assert not (tmp_path / "fit.json").exists()
+
+
+def test_a_diagnosis_of_two_files_is_reported(
+    files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result, page = tmp_path / "relative.json", tmp_path / "relative.html"
+    given = ("relative", "irb2600", files["wires_3"], files["tracker"], "--diagnose")
+    assert run(*given, "-o", result, "--quiet") == 0
+    said = capsys.readouterr().out
+    assert "No cause beyond geometry was found." in said
+    assert "wires_3 RMS mm" in said
+    assert json.loads(result.read_text())["diagnosis"]["verdict"] == "none"
+    assert run("report", result, "-o", page, "--quiet") == 0
+    text = page.read_text()
+    assert 'id="diagnosis"' in text
+    assert "No cause beyond geometry was found." in text
+    assert run("export", result, "--to", "dh-csv", "-o", tmp_path / "arm.csv", "--quiet") == 0
+
+
+def test_without_needs_diagnose(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("relative", "irb2600", files["wires_3"], "--without", "backlash") == 2
+    assert "--without is of --diagnose" in capsys.readouterr().err

@@ -78,6 +78,8 @@ TEMPLATES = (
     "relative irb120 wires.csv --prior a*=0.5mm --json",
     "relative irb120 wires.csv data.csv --json",
     "relative irb120 contacts.csv data.csv --json",
+    "relative irb120 wires.csv data.csv --diagnose -o out.json",
+    "relative irb120 wires.csv --diagnose --without backlash --json",
     "relative irb120 wires.csv data.csv --effects joint_compliance:all -o out.json",
     "identify sweeps.csv --joints revolute,revolute,revolute,revolute,revolute,revolute --json",
     "import run1.csv run2.csv -o out.csv",

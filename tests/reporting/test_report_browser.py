@@ -13,6 +13,8 @@ import pytest
 from conftest import run
 from test_report import NASTY, WORDING, hostile, write
 
+from experiments.relative_gap import Job, arm_of, seen
+from minimax_cal.diagnosing.instruments import diagnose_relative
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import visible
 from minimax_cal.judging.tolerance import limits_of
@@ -328,3 +330,18 @@ def test_pdf_holds_the_whole_report(results: Path, tmp_path: Path) -> None:
     assert raw.rstrip().endswith(b"%%EOF")
     assert len(re.findall(rb"/Type /Page\b", raw)) >= 5
     assert len(raw) > 200_000  # the charts' lines and the letters
+
+
+@pytest.mark.dev
+def test_a_diagnosis_of_several_instruments_is_shown(driver: Any, tmp_path: Path) -> None:
+    job = Job("irb2600", ("wires_3", "tracker"), "compliance", 1, 80)
+    arm, rng = arm_of(job), np.random.default_rng(4)
+    found = diagnose_relative(arm.robot, [seen(arm, k, 80, rng) for k in job.instruments])
+    path = tmp_path / "relative.html"
+    path.write_text(render(compose(read_sources([found]), WORDING)))
+    open_page(driver, path)
+    assert [e for e in driver.get_log("browser") if e["level"] == "SEVERE"] == []
+    text = driver.execute_script("return document.querySelector('#diagnosis').innerText")
+    for word in (found.reasons[0], "error budget", "joint compliance", "confirmed"):
+        assert word.lower() in text.lower(), word
+    assert driver.find_element("css selector", "#diagnosis table").is_displayed()

@@ -286,16 +286,21 @@ def variances(problem: Squares, x: State) -> Array:
     Each pays for its share of the parameters, tr(H^-1 G_b) of the whole Gram matrix H [Forstner's
     variance components]; a prior pays for parameters of its own.
     """
+    cost, spare = remaining(problem, x)
+    weighing = len(problem.stack.blocks) > 1 or len(problem.weight)
+    left = np.maximum(cost / spare, LEAST_NOISE**2 if weighing else 0.0)
+    return np.where(np.isnan(problem.stack.given), left, problem.stack.given)
+
+
+def remaining(problem: Squares, x: State) -> tuple[Array, Array]:
+    """(b,) squared error of each block's rows [m^2], and its numbers beyond its parameters."""
     stack = problem.stack
     errors, slopes = zip(*stack.rows_by_block(x, problem.active), strict=True)
     grams = [w * slope @ slope.T for w, slope in zip(stack.precision, slopes, strict=True)]
     inverse = solve_normal(sum(grams) + problem.prior, np.eye(len(grams[0])))
     paid = np.array([float(np.trace(inverse @ gram)) for gram in grams])
     spare = np.maximum([block.numbers for block in stack.blocks] - paid, 1.0)
-    weighing = len(stack.blocks) > 1 or len(problem.weight)
-    cost = np.array([float(error @ error) for error in errors])
-    left = np.maximum(cost / spare, LEAST_NOISE**2 if weighing else 0.0)
-    return np.where(np.isnan(stack.given), left, stack.given)
+    return np.array([float(error @ error) for error in errors]), spare
 
 
 def covariance_of(problem: Squares, x: State, variance: Array) -> Array:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -126,30 +128,90 @@ def relative(
     --------
     >>> print(mc.relative("irb2600", "wires.csv", holdout=0.1).headline())
     """
-    chosen = RelativeOptions(
+    chosen = chosen_of(
         holdout=holdout,
         seed=seed,
-        fix=listed(fix),
-        free=listed(free),
+        fix=fix,
+        free=free,
         offset=offset,
-        known_distances=tuple(known_distances),
+        known_distances=known_distances,
         lever=lever,
-        noises=read_noises(noises or {}),
-        priors=sigmas_of(priors or {}),
-        effects=listed_effects(effects),
+        noises=noises,
+        priors=priors,
+        effects=effects,
         camera_on=camera_on,
         fix_camera=fix_camera,
         camera_prior=camera_prior,
         method=method,
         resolution=resolution,
     )
+    return asked_of(robot, data, chosen).calibrated(progress)
+
+
+READ: Mapping[str, Callable[[Any], Any]] = {  # what people write of an option, as `RelativeOptions`
+    "fix": listed,
+    "free": listed,
+    "known_distances": tuple,
+    "noises": lambda given: read_noises(given or {}),
+    "priors": lambda given: sigmas_of(given or {}),
+    "effects": listed_effects,
+}
+
+
+def chosen_of(**given: Any) -> RelativeOptions:
+    """The options of `relative` by name.  Raises CalibrationError."""
+    read = {name: READ[name](value) if name in READ else value for name, value in given.items()}
+    return RelativeOptions(**read)
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What is to be calibrated, checked.
+
+    every: the measurements of each instrument.  splits: of each, (m,) True where held out, and what
+    the reader should know of that.
+    """
+
+    robot: Robot
+    every: Sequence[RelativeData]
+    options: RelativeOptions
+    splits: Sequence[tuple[Array, tuple[str, ...]]]
+
+    @cached_property
+    def trains(self) -> list[Train]:
+        """What fits may see."""
+        named = zip(labels_of(self.every), self.every, self.splits, strict=True)
+        return [Train(label, data.take(~held)) for label, data, (held, _) in named]
+
+    def fit(self, progress: Progress) -> InstrumentFit:
+        """The fit of the training measurements."""
+        return fit.fit_instruments(self.robot, self.trains, self.options, progress)
+
+    def calibrated(self, progress: Progress) -> RelativeCalibration:
+        """The calibration."""
+        began = time.perf_counter()
+        return result_of(self, self.fit(progress), began)
+
+    def beside(self, effects: Sequence[Term]) -> Asked:
+        """The same with effects."""
+        return replace(self, options=replace(self.options, effects=tuple(effects)))
+
+
+def asked_of(
+    robot: Robot | str | Path, data: Given | Sequence[Given], options: RelativeOptions
+) -> Asked:
+    """Data loaded and checked, and split.  Raises CalibrationError."""
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     given = [data] if isinstance(data, Given) else list(data)
     every = sorted(map(loaded, given), key=lambda data: not instrument_of(data).on_arm)
     check_given(every)
-    check_options(every, chosen)
+    check_options(every, options)
     every = [replace(each, at=with_history(check_joints(robot, each.at))) for each in every]
-    return calibrate_instruments(robot, every, chosen, progress)
+    check_noises(labels_of(every), every, options)
+    for each in every:
+        instrument_of(each).check_slips(robot, each, options)
+    splits = [instrument_of(each).held_back(each, options) for each in every]
+    return Asked(robot, every, options, splits)
 
 
 def loaded(data: Given) -> RelativeData:
@@ -171,19 +233,9 @@ def labels_of(every: Sequence[RelativeData]) -> list[str]:
     return out
 
 
-def calibrate_instruments(
-    robot: Robot, every: Sequence[RelativeData], options: RelativeOptions, progress: Progress
-) -> RelativeCalibration:
-    """Calibrate from all data together.  Raises CalibrationError."""
-    began = time.perf_counter()
-    labels = labels_of(every)
-    check_noises(labels, every, options)
-    for data in every:
-        instrument_of(data).check_slips(robot, data, options)
-    splits = [instrument_of(data).held_back(data, options) for data in every]
-    named = zip(labels, every, splits, strict=True)
-    trains = [Train(label, data.take(~held)) for label, data, (held, _) in named]
-    found = fit.fit_instruments(robot, trains, options, progress)
+def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalibration:
+    """What a fit says of all poses.  began: when the work did [s]."""
+    robot, every, splits, options = asked.robot, asked.every, asked.splits, asked.options
     measured = [
         measured_by(robot, found, i, data, held)
         for i, (data, (held, _)) in enumerate(zip(every, splits, strict=True))

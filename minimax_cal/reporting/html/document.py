@@ -54,6 +54,7 @@ SECTIONS = (  # name, title, what it holds
 )
 WITHOUT_COORDINATES = (
     ("accuracy", "Accuracy", fit_sections.parts_accuracy),
+    ("diagnosis", "Diagnosis", fit_sections.parts_causes),
     ("parameters", "Parameters", fit_sections.parts_parameters),
 )
 

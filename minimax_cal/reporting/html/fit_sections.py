@@ -82,6 +82,12 @@ def parts_parameters(sources: Sources) -> Blocks:
     return [sources.relative.tables()[-1]] if sources.relative else []
 
 
+def parts_causes(sources: Sources) -> Blocks:
+    """What the diagnosis of several instruments says; nothing without one."""
+    causes = sources.causes
+    return [text(causes.headline()), *causes.own_tables()] if causes else ()
+
+
 def errors_in_space(sources: Sources) -> Blocks:
     """Where in space the errors are."""
     if sources.poses and sources.cell:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.dynamics.result import MotionDiagnosis
 from minimax_cal.fitting.fit import Fit, Provenance
@@ -30,7 +31,15 @@ from minimax_cal.simulators.result import KIND, SimulatorGap
 AGAIN = "write it again with minimax-cal"
 
 Result = (
-    Fit | Diagnosis | RelativeCalibration | SimulatorGap | MotionDiagnosis | MotionGap | Path | str
+    Fit
+    | Diagnosis
+    | RelativeCalibration
+    | RelativeDiagnosis
+    | SimulatorGap
+    | MotionDiagnosis
+    | MotionGap
+    | Path
+    | str
 )
 
 
@@ -73,6 +82,7 @@ class File:
 class Sources:
     """A calibration, a diagnosis, or both, and the arm in a simulator; or a relative calibration.
 
+    causes: the diagnosis of a relative calibration, where its file holds one.
     notices: what the reader should know of both.
     """
 
@@ -82,6 +92,7 @@ class Sources:
     notices: tuple[str, ...] = ()
     simulator: SimulatorGap | None = None
     relative: RelativeCalibration | None = None
+    causes: RelativeDiagnosis | None = None
     motion: MotionGap | None = None
 
     @property
@@ -140,9 +151,7 @@ def read_sources(results: Sequence[Result]) -> Sources:
         if kind == RELATIVE:
             if len(results) > 1:
                 raise CalibrationError(f"{path}: is a {RELATIVE}; report it alone")
-            read = PixelCalibration if content.get("measured") == PIXELS else RelativeCalibration
-            told = read.from_dict(content, path)
-            return Sources(None, None, (File(kind, path, digest),), relative=told)
+            return without_coordinates(content, File(kind, path, digest))
         if kind == "calibration" and "parameters" in content:
             fits.append(Fit.from_dict(content, path))
         elif kind == "diagnosis":
@@ -173,6 +182,15 @@ def read_sources(results: Sequence[Result]) -> Sources:
     notices = [*together(fit, gap, files), *simulated(arm, fit, gap)]
     motion = moving[0] if moving else None
     return Sources(fit, gap, tuple(files), tuple(notices), arm, motion=motion)
+
+
+def without_coordinates(content: dict[str, Any], file: File) -> Sources:
+    """A relative calibration, and its diagnosis where the file holds one."""
+    if "diagnosis" in content:
+        causes = RelativeDiagnosis.from_dict(content, file.path)
+        return Sources(None, None, (file,), relative=causes.calibration, causes=causes)
+    read = PixelCalibration if content.get("measured") == PIXELS else RelativeCalibration
+    return Sources(None, None, (file,), relative=read.from_dict(content, file.path))
 
 
 def simulated(arm: SimulatorGap | None, fit: Fit | None, gap: Diagnosis | None) -> tuple[str, ...]:

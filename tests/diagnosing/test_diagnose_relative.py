@@ -1,0 +1,148 @@
+"""The diagnosis of several instruments: known causes, the noise that is given, the file."""
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from experiments.relative import NOISE
+from experiments.relative_gap import CAUSES, SETS, Imperfect, Job, arm_of, seen
+from minimax_cal.diagnosing.instruments import diagnose_relative
+from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
+from minimax_cal.fitting.instruments import relative
+from minimax_cal.fitting.opened import open_result
+from minimax_cal.ground.arrays import Array
+
+
+def measured(job: Job, arm: Imperfect | None = None) -> tuple[Imperfect, list]:
+    arm, rng = arm or arm_of(job), np.random.default_rng([job.seed, 2])
+    return arm, [seen(arm, kind, job.poses, rng) for kind in job.instruments]
+
+
+@cache
+def diagnosed(title: str, cause: str) -> RelativeDiagnosis:
+    arm, data = measured(Job("irb2600", SETS[title], cause, 1, 100))
+    return diagnose_relative(arm.robot, data)
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+@pytest.mark.parametrize("title", SETS)
+def test_the_cause_is_named_and_no_other(title: str, cause: str) -> None:
+    found = diagnosed(title, cause)
+    names = {f.term.effect for f in found.effects if f.established}
+    if cause in ("sound", "outside"):
+        assert found.verdict == {"sound": "none", "outside": "unknown"}[cause]
+        assert not names
+        return
+    assert found.verdict in ("named", "one_of")
+    assert names == {"joint_compliance" if cause == "compliance" else "gear_ripple"}
+    assert found.steps[-1].holdout.rms_mm < 0.7 * found.steps[1].holdout.rms_mm
+    assert found.steps[-1].holdout.rms_mm < 2.5e3 * NOISE
+
+
+@pytest.mark.parametrize("title", SETS)
+def test_the_last_step_is_the_calibration_with_the_effects(title: str) -> None:
+    """And the one before is that of geometry: by file and of all, as `relative` has them."""
+    found = diagnosed(title, "compliance")
+    arm, data = measured(Job("irb2600", SETS[title], "compliance", 1, 100))
+    terms = [term for one in found.effects for term in one.terms]
+    for step, effects in ((found.steps[1], ()), (found.steps[-1], terms)):
+        fit = relative(arm.robot, data, effects=effects)
+        assert_allclose(step.holdout.rms_mm, fit.accuracy["holdout"].rms_mm, rtol=1e-12)
+        for one in fit.instruments:
+            assert_allclose(step.files[one.name].rms_mm, one.accuracy["holdout"].rms_mm, rtol=1e-12)
+    values = [p.value for p in fit.parameters if p.of_effect]
+    assert_allclose([v for f in found.effects for v in f.values], values, rtol=1e-12)
+    assert found.calibration.cell is not None
+    assert fit.cell is not None
+    assert_allclose(found.calibration.cell.robot.mdh, fit.cell.robot.mdh, rtol=0, atol=1e-14)
+
+
+class Tossed(Imperfect):
+    """A joint that three others turn: to any law of one or two angles, chance."""
+
+    def bent(self, q: Array) -> Array:
+        out = q + 0.0
+        out[..., 1] += 1e-4 * np.sin(3.0 * q[..., 0] + 5.0 * q[..., 2] + 4.0 * q[..., 3])
+        return out
+
+
+@pytest.mark.parametrize("title", SETS)
+def test_what_no_law_finds_is_above_the_noise_that_is_given(title: str) -> None:
+    job = Job("irb2600", SETS[title], "sound", 3, 100)
+    sound = arm_of(job)
+    tossed = Tossed(sound.robot, sound.real, 0.0)
+    for arm, verdict, meets in ((sound, "none", True), (tossed, "unknown", False)):
+        _, data = measured(job, arm)
+        plain = diagnose_relative(arm.robot, data)
+        assert plain.meets_floor is None
+        names = [one.name for one in plain.calibration.instruments] or [plain.calibration.kind]
+        found = diagnose_relative(arm.robot, data, noises=dict.fromkeys(names, NOISE))
+        assert (found.verdict, found.meets_floor) == (verdict, meets)
+        assert not [f for f in found.effects if f.established]
+        remaining, highest = found.floor_mm
+        assert (remaining < 1.1 * highest) == meets
+        assert highest >= 1e3 * NOISE
+    assert found.headline().startswith("Unexplained")
+
+
+def test_what_is_left_out_is_not_found() -> None:
+    arm, data = measured(Job("irb2600", SETS["whole poses"], "compliance", 1, 100))
+    found = diagnose_relative(arm.robot, data, exclude=["joint_compliance"])
+    every = [(f.term.effect, *(a.effect for a in f.alternatives)) for f in found.effects]
+    assert "joint_compliance" not in [name for names in every for name in names]
+
+
+def test_effects_of_one_instrument_are_not_testable() -> None:
+    found = diagnosed("tracker + sockets", "sound")
+    needs = dict(found.not_testable)
+    assert "one instrument alone" in needs["target_offset"]
+    assert "approach1" in needs["backlash"]
+
+
+def test_a_file_comes_back_and_its_effects_can_be_fitted(tmp_path: Path) -> None:
+    found = diagnosed("tracker + sockets", "compliance")
+    path = tmp_path / "relative.json"
+    found.save(path)
+    content = json.loads(path.read_text())
+    again = RelativeDiagnosis.from_dict(content)
+    back = json.loads(again.json())["diagnosis"]
+    jitters = [one.pop("noise")["joint_jitter_mrad"] for one in (back, content["diagnosis"])]
+    assert jitters[0] == pytest.approx(jitters[1], rel=1e-12)
+    assert back == content["diagnosis"]
+    assert again.headline() == found.headline()
+    assert [t.text(99) for t in again.own_tables()] == [t.text(99) for t in found.own_tables()]
+    opened = open_result(path)
+    assert not opened.possible
+    assert found.calibration.cell is not None
+    assert opened.cell.effects.terms == found.calibration.cell.effects.terms
+    arm, data = measured(Job("irb2600", SETS["tracker + sockets"], "compliance", 1, 100))
+    fit = relative(arm.robot, data, effects=path)
+    assert_allclose(fit.accuracy["holdout"].rms_mm, found.steps[-1].holdout.rms_mm, rtol=1e-9)
+
+
+def test_a_possible_effect_is_not_taken_from_a_file() -> None:
+    found = diagnosed("tracker + sockets", "compliance")
+    loose = replace(found, effects=tuple(replace(f, again=0.7) for f in found.effects))
+    assert open_result(loose).possible == {t.text for f in found.effects for t in f.terms}
+    arm, data = measured(Job("irb2600", SETS["tracker + sockets"], "compliance", 1, 100))
+    assert relative(arm.robot, data, effects=loose).cell is None
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"effects": "backlash"}, "a diagnosis looks for them"),
+        ({"exclude": ["nonsense"]}, "no effect 'nonsense' to leave out"),
+        ({"holdout": 0.0}, "needs held-out rows in every file"),
+    ],
+)
+def test_mistakes_are_one_line(options: dict, words: str) -> None:
+    arm, data = measured(Job("irb2600", ("wires_3",), "sound", 1, 60))
+    with pytest.raises(mc.CalibrationError, match=words):
+        mc.diagnose_relative(arm.robot, data, **options)
