@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.fitting.identify import (
     RANK_TOLERANCE,
     RESOLUTION,
@@ -36,6 +37,7 @@ from minimax_cal.robots.robot import Robot
 
 STILL = 1e-7  # relative motion of a column that moves nothing
 SHARED = 0.05  # of a direction that others leave open: a parameter with less is known without it
+OPEN = 1e-4  # of the largest column: positions that a parameter moves by less depend on it no more
 LENGTHS = "all lengths together: "
 ALL_OWN = "all frames, anchors and targets of the files moved together"
 
@@ -182,20 +184,48 @@ def position_sigma(
     base is fitted wherever an arm is put to work.  covariance: (p, p) of the model's parameters,
     behind them those of laws by which the arm gives way, NaN where not identified.
     """
-    names = model.names
-    told = np.isfinite(np.diag(covariance))
-    told[5 * names.joints : 5 * names.joints + 6] = False  # the base, which is fitted again
-    some = plenty_of_poses(robot, replace(model, names=replace(names, effects=())))
-    here = still(robot.commanded(some.q), names.target_names, robot)
+    known = np.isfinite(np.diag(covariance))
+    known[5 * model.names.joints : 5 * model.names.joints + 6] = False  # the base, fitted again
+    jacobian = positions_by(robot, model, x, laws)
+    # by its square root: where much is known badly, rounding would make the sum itself negative
+    spread, axes = np.linalg.eigh(covariance[np.ix_(known, known)])
+    root = jacobian[:, known] @ (axes * np.sqrt(np.maximum(spread, 0.0)))
+    return float(np.sqrt(3.0 * (root**2).sum() / len(jacobian)))
+
+
+def left_open(jacobian: Array, active: Array, asked: Array) -> Array:
+    """(p,) the fewest of the parameters asked for with which all of them would be determined.
+
+    Those that move positions as no others together do.  jacobian: (r, p) as `positions_by`.
+    active: (p,) the identified parameters.
+    """
+    size = np.linalg.norm(jacobian, axis=0)
+    waiting = asked & ~active & (size > OPEN * size.max())
+    known, out = active.copy(), np.zeros_like(active)
+    while waiting.any():
+        basis = orthonormal(jacobian[:, known])
+        rest = np.linalg.norm(jacobian - basis @ (basis.T @ jacobian), axis=0)
+        waiting &= ~known & (rest > OPEN * size.max())
+        share = np.where(waiting, rest / np.maximum(size, 1e-300), 0.0)
+        if waiting.any():
+            most = int(np.argmax(share))
+            known[most] = out[most] = True
+    return out
+
+
+def positions_by(robot: Robot, model: Model, x: State, laws: Laws = NO_LAWS) -> Array:
+    """(3 m, p) motion of the targets' centroid at random poses per unit of each parameter.
+
+    But for the best rigid motion of all positions; behind the model's parameters those of laws.
+    """
+    some = plenty_of_poses(robot, replace(model, names=replace(model.names, effects=())))
+    here = still(robot.commanded(some.q), model.names.target_names, robot)
     some = laws.on(some, robot, here, x)
-    jacobian = some.jacobian(x).mean(axis=0)[..., told].reshape(3 * len(some.q), -1)
+    jacobian = some.jacobian(x).mean(axis=0)
+    jacobian = jacobian.reshape(-1, jacobian.shape[-1])
     links = kinematics.chain(x.mdh, some.q, some.prismatic)
     point = kinematics.points(links, x.target_positions).mean(axis=0).T
     point = point - point.mean(axis=0)
     rigid = np.concatenate([np.tile(np.eye(3), (len(point), 1, 1)), -hat(point)], axis=2)
     basis, _ = np.linalg.qr(rigid.reshape(-1, 6))
-    jacobian = jacobian - basis @ (basis.T @ jacobian)
-    # by its square root: where much is known badly, rounding would make the sum itself negative
-    spread, axes = np.linalg.eigh(covariance[np.ix_(told, told)])
-    root = jacobian @ (axes * np.sqrt(np.maximum(spread, 0.0)))
-    return float(np.sqrt((root**2).sum() / len(point)))
+    return np.asarray(jacobian - basis @ (basis.T @ jacobian))

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.fitting.identify import RESOLUTION
+from minimax_cal.fitting.identify import RESOLUTION, Because
 from minimax_cal.fitting.instruments import fit, plausible, remarks
 from minimax_cal.fitting.instruments.checks import check_given, check_noises, check_options
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.file import read_relative
 from minimax_cal.fitting.instruments.fit import InstrumentFit, Train
-from minimax_cal.fitting.instruments.identify import position_sigma
+from minimax_cal.fitting.instruments.identify import left_open, position_sigma, positions_by
 from minimax_cal.fitting.instruments.options import (
     Known,
     Progress,
@@ -263,6 +263,7 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
         parameters=fit.parameters_of(robot, found),
         identification=found.identification,
         position_sigma=sigma_of_positions(robot, found),
+        positions_open=open_positions(robot, found),
         beyond=instrument_of(every[0]).beyond(robot, found, options) if single else (),
         notices=tuple(dict.fromkeys(notices)),
         provenance=Provenance.of(robot, source, settings),
@@ -392,10 +393,31 @@ def instruments_of(
 
 def sigma_of_positions(robot: Robot, found: InstrumentFit) -> float:
     """`identify.position_sigma`, of the target of the first file."""
-    stack, block = found.stack, found.stack.blocks[0]
-    every = np.arange(stack.names.count)
-    parts = every[: stack.names.geometric], stack.own(0)[block.spots], every[stack.lawless :]
-    place = np.concatenate(parts)
+    stack, block, place = found.stack, found.stack.blocks[0], place_of(found)
     x = block.arm_state(stack.part(found.state, 0))
     covariance = found.covariance[np.ix_(place, place)]
     return position_sigma(robot, block.model, x, covariance, stack.laws)
+
+
+def place_of(found: InstrumentFit) -> Array:
+    """Where the parameters that move the target of the first file stand among all."""
+    stack = found.stack
+    every = np.arange(stack.names.count)
+    own = stack.own(0)[stack.blocks[0].spots]
+    return np.concatenate([every[: stack.names.geometric], own, every[stack.lawless :]])
+
+
+def open_positions(robot: Robot, found: InstrumentFit) -> tuple[str, ...]:
+    """Parameters that positions over the joints' range depend on and the measurements do not tell.
+
+    Asked of the arm as drawn, where what is redundant is so exactly.  Not those that were fixed.
+    """
+    fit = found.stiff or found
+    stack, block, place = fit.stack, fit.stack.blocks[0], place_of(fit)
+    reasons = fit.identification.reasons
+    names = [stack.names.all[i] for i in place]
+    fixed = [name in reasons and reasons[name].kind is Because.FIXED for name in names]
+    asked = ~np.array(fixed) & stack.movable[place]
+    jacobian = positions_by(robot, block.model, block.arm_state(stack.part(fit.nominal, 0)))
+    left = left_open(jacobian, fit.identification.active[place], asked)
+    return tuple(name for name, is_open in zip(names, left, strict=True) if is_open)

@@ -30,6 +30,7 @@ from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.ground.records import Number, Part, checked, reading
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
 from minimax_cal.modelling.cell import Cell, cell_from_dict, pose_from_dict
 from minimax_cal.modelling.frames import paired, tables_of
@@ -107,6 +108,7 @@ class RelativePart(MeasuredPart):
     beyond_one_reflector: tuple[str, ...] = ()
     condition: Number = math.nan
     position_sigma_mm: Number = math.nan
+    positions_open: tuple[str, ...] = ()
     notices: tuple[str, ...] = ()
     provenance: Provenance
 
@@ -263,9 +265,11 @@ class RelativeCalibration(Measured):
     """A robot calibrated from lengths, closures or poses, or from several files together.
 
     robot: calibrated; nominal: as drawn.  position_sigma: expected error of a position over the
-    joints' range, by the parameters' sigmas alone, the base fitted [m].  beyond: parameters that
-    whole poses tell and one reflector does not.  instruments: each of several files.  cell: the arm
-    with its effects, fitted together; None without any.  robot is then of a fit without them.
+    joints' range, by the parameters' sigmas alone, the base fitted [m].  positions_open: parameters
+    that positions depend on and that the measurements do not determine; no sigma holds these.
+    beyond: parameters that whole poses tell and one reflector does not.  instruments: each of
+    several files.  cell: the arm with its effects, fitted together; None without any.  robot is
+    then of a fit without them.
     """
 
     robot: Robot
@@ -280,6 +284,7 @@ class RelativeCalibration(Measured):
     notices: tuple[str, ...]
     provenance: Provenance
     instruments: tuple[InstrumentResult, ...] = ()
+    positions_open: tuple[str, ...] = ()
     cell: Cell | None = None
 
     @property
@@ -337,13 +342,24 @@ class RelativeCalibration(Measured):
         """The parameters of effects beyond geometry; none without any."""
         return (table_of_effects(self.parameters),) if self.cell else ()
 
+    @property
+    def given_open(self) -> str:
+        """On what a position's sigma rests, as the begin of a sentence."""
+        if not self.positions_open:
+            return "By the parameters' sigmas alone"
+        many = "is" if len(self.positions_open) == 1 else "are"
+        return (
+            f"These data do not determine {name_first(self.positions_open)}, on which positions "
+            f"depend: if {'it' if many == 'is' else 'they'} {many} as drawn, by the sigmas alone"
+        )
+
     def headline(self) -> str:
         """The result in some sentences, with what it does not say."""
         before, after, where = self.before_and_after()
         text = (
             f"{self.words.quantity.capitalize()}: RMS error {before.rms_mm:.3f} mm -> "
             f"{after.rms_mm:.3f} mm, largest {before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, "
-            f"at {where}. {self.words.caution}By the parameters' sigmas alone a position over the "
+            f"at {where}. {self.words.caution}{self.given_open} a position over the "
             f"joints' range is good to {1e3 * self.position_sigma:.3f} mm RMS once a base is "
             f"fitted. {self.identified} of {len(self.parameters)} parameters identified (condition "
             f"{self.identification.condition:.3g}); {self.status} after {self.iterations} "
@@ -372,6 +388,7 @@ class RelativeCalibration(Measured):
             "beyond_one_reflector": list(self.beyond),
             "condition": self.identification.condition,
             "position_sigma_mm": 1e3 * self.position_sigma,
+            "positions_open": list(self.positions_open),
             "notices": list(self.notices),
             "provenance": vars(self.provenance),
         }
@@ -396,6 +413,7 @@ class RelativeCalibration(Measured):
             parameters=tuple(in_si(p) for p in part.parameters),
             identification=Stated(known, {}, np.zeros(0), np.zeros(0), part.condition),
             position_sigma=1e-3 * part.position_sigma_mm,
+            positions_open=part.positions_open,
             beyond=part.beyond_one_reflector,
             notices=part.notices,
             provenance=part.provenance,
