@@ -22,7 +22,7 @@ from minimax_cal.cli.options import (
     result_options,
 )
 from minimax_cal.cli.stderr import AS_JSON, tell
-from minimax_cal.correcting.compensate import compensate
+from minimax_cal.correcting.compensate import Compensation, compensate
 from minimax_cal.correcting.programs.program import LANGUAGES, is_program, read_program
 from minimax_cal.correcting.target_file import read_targets
 from minimax_cal.fitting.opened import open_result
@@ -116,23 +116,26 @@ def compensate_command(
         found = compensate(fit, given.data, robot, **chosen)
         text = to.cells(given.corrected(found), safe_cells)
     to.notice(*found.notices)
-    to.write_rows(lambda: text, lambda: json_text(found.to_dict()))
-    if to.as_json:
-        click.echo(json_text(found.to_dict()), nl=False)
-    elif to.path:
-        click.echo(found.summary(WIDTH))
-    else:
-        if sys.stdout.isatty():
-            text = on_terminal(text if isinstance(text, str) else text.decode("latin-1"))
-        click.echo(text, nl=False)
-        if AS_JSON.get() and not to.quiet:
-            tell("summary", found.headline())
-        elif not to.quiet:
-            click.echo(found.summary(WIDTH), err=True)
+    if to.deliver(lambda: json_text(found.to_dict()), rows=lambda: text):
+        show_corrected(found, text, to)
     if found.failed.any():
         tell("error", found.complaint(), exit_code=FAILED)
         return FAILED
     return 0
+
+
+def show_corrected(found: Compensation, text: str | bytes, to: Output) -> None:
+    """The summary where the targets went to a file; else the targets, and the summary beside."""
+    if to.path:
+        click.echo(found.summary(WIDTH))
+        return
+    if sys.stdout.isatty():
+        text = on_terminal(text if isinstance(text, str) else text.decode("latin-1"))
+    click.echo(text, nl=False)
+    if AS_JSON.get() and not to.quiet:
+        tell("summary", found.headline())
+    elif not to.quiet:
+        click.echo(found.summary(WIDTH), err=True)
 
 
 def check_alike(targets: Path, out: Path | None) -> None:

@@ -117,28 +117,25 @@ def import_command(
     check_finite(found.data)  # what is left of it
     off = [fault.text for fault in distance_faults(found.data)]
     found = replace(found, data=replace(found.data, notices=(*found.data.notices, *off)))
-    to.write_rows(
-        lambda: readable(to.cells(csv_of(found), safe_cells), to.path),
+    wanted = to.deliver(
         lambda: json_text(content(found, to.path)),
+        rows=lambda: readable(to.cells(csv_of(found), safe_cells), to.path),
     )
     to.notice(*found.data.notices)
-    if to.as_json:
-        click.echo(json_text(content(found, to.path)), nl=False)
-        return 0
-    show(found.files(), *found.columns(), *([found.preview()] if preview else []))
-    click.echo(found.headline() + ("" if to.path else "\nnothing written; add -o FILE"))
+    if wanted:
+        show(found.files(), *found.columns(), *([found.preview()] if preview else []))
+        click.echo(found.headline() + ("" if to.path else "\nnothing written; add -o FILE"))
     return 0
 
 
 def show_logs(found: LogFiles, to: Output, safe_cells: bool) -> int:
     """Show what was understood of logs, and write them."""
-    to.write_rows(
-        lambda: to.cells(runs_text(found.runs, found.sliding), safe_cells),
+    wanted = to.deliver(
         lambda: json_text(log_content(found, to.path)),
+        rows=lambda: to.cells(runs_text(found.runs, found.sliding), safe_cells),
     )
     to.notice(*found.notices)
-    if to.as_json:
-        click.echo(json_text(log_content(found, to.path)), nl=False)
+    if not wanted:
         return 0
     rows = tuple(
         (run.name, title, len(run.time), run.duration, 1.0 / step_of(run), columns[0], run.unit)

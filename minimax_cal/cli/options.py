@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
-from functools import reduce, wraps
+from functools import cache, reduce, wraps
 from importlib.util import find_spec
 from inspect import signature
 from math import inf, isnan
@@ -260,29 +260,31 @@ class Output:
             if path and not self.quiet:
                 say_written(path)
 
-    def write_rows(self, csv: Callable[[], str | bytes], json: Callable[[], str]) -> None:
-        """Write a result that is rows: CSV, or JSON where the file's ending asks for it."""
-        if self.path:
-            write_whole(self.path, json() if self.path.suffix.lower() == ".json" else csv())
-            self.wrote(self.path)
-
     def draw(self, save: Callable[[Any, Path], object], result: Any) -> None:
         """Save the picture of a result where it was asked for."""
         if self.figure:
             save(result, self.figure)
             self.wrote(self.figure)
 
-    def deliver(self, text: Callable[[], str], status: Status = Status.CONVERGED) -> bool:
-        """Write the JSON of a result where it was asked for; whether people want to read it too.
+    def deliver(
+        self,
+        json: Callable[[], str],
+        status: Status = Status.CONVERGED,
+        *,
+        rows: Callable[[], str | bytes] | None = None,
+    ) -> bool:
+        """Write a result where it was asked for; whether people want to read it too.
 
-        A result that failed is not written to a file.
+        rows: its CSV, which a file gets unless its ending asks for JSON.  A result that failed is
+        not written to a file.
         """
-        made = text() if self.path or self.as_json else ""
+        once = cache(json)
         if self.path and status is not Status.FAILED:
-            write_whole(self.path, made)
+            made = rows if rows and self.path.suffix.lower() != ".json" else once
+            write_whole(self.path, made())
             self.wrote(self.path)
         if self.as_json:
-            click.echo(made, nl=False)
+            click.echo(once(), nl=False)
         return not self.as_json
 
 

@@ -134,16 +134,13 @@ def plan_command(
     with to.stages() as progress:
         found = poses_of(arm, poses, kind, chosen, progress)
     to.notice(*found.notices)
-    to.write_rows(lambda: found.csv(unit), found.json)
+    if to.deliver(found.json, rows=lambda: found.csv(unit)):
+        options.present(
+            details, [found.headline()], [found.criterion_table().brief()],
+            lambda: (*found.tables(), *(() if to.path else (found.pose_table(unit),))),
+            keep(to.path, "poses.csv"),
+        )  # fmt: skip
     to.draw(save_plan, found)
-    if to.as_json:
-        click.echo(found.json(), nl=False)
-        return 0
-    options.present(
-        details, [found.headline()], [found.criterion_table().brief()],
-        lambda: (*found.tables(), *(() if to.path else (found.pose_table(unit),))),
-        keep(to.path, "poses.csv"),
-    )  # fmt: skip
     return 0
 
 
@@ -184,15 +181,12 @@ def show_motion(
     with to.stages() as progress:
         found = plan_motion(arm, progress=progress, **wanted)
     to.notice(*found.notices)
-    to.write_rows(lambda: found.csv(unit), found.json)
+    if to.deliver(found.json, rows=lambda: found.csv(unit)):
+        options.present(
+            details, [found.headline()], [found.told_table().brief()],
+            found.tables, keep(to.path, "motion.csv"),
+        )  # fmt: skip
     if waypoints:
         write_whole(waypoints, found.waypoints(unit))
         to.wrote(waypoints)
-    if to.as_json:
-        click.echo(found.json(), nl=False)
-        return 0
-    options.present(
-        details, [found.headline()], [found.told_table().brief()],
-        found.tables, keep(to.path, "motion.csv"),
-    )  # fmt: skip
     return 0
