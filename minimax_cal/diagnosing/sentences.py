@@ -21,6 +21,7 @@ CONTRADICTED = (
     "Unexplained: the best fit contradicts the measurements. It is no calibration of this arm, and "
     "says nothing about causes."
 )
+ONLY_SMALL = "No cause beyond geometry was found that matters."
 OPENINGS = {  # by the JSON's verdict
     "none": "No cause beyond geometry was found.",
     "named": "Main cause",
@@ -74,13 +75,17 @@ def opening(found: Explained) -> str:
     """What comes before the causes; empty where these say it all."""
     if found.verdict in ("named", "one_of") and found.main:
         return ""
+    if found.verdict == "none" and found.main:
+        return ONLY_SMALL
     text = OPENINGS[found.verdict]
     return f"{text}: {unexplained(found)}" if found.verdict == "unknown" else text
 
 
 def title_of(found: Explained) -> str:
-    """Main cause, ambiguous cause, or a partial one where most is unexplained."""
+    """Main cause, ambiguous cause, a minor one, or a partial one where most is unexplained."""
     many = "s" if len(found.main) > 1 else ""
+    if found.verdict == "none":
+        return f"Minor cause{many}"
     if found.verdict == "unknown" and is_partial(found):
         return f"Partial cause{many}"
     ambiguous = found.verdict == "one_of" and bool(found.main and found.main[0].alternatives)
