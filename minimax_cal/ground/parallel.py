@@ -212,27 +212,42 @@ def on_cluster(work: Work, cluster: str, modules: set[str]) -> Numbered:
         need_modules(client, cluster, modules)
         futures = client.map(numbered, *zip(*work, strict=True), pure=False)
         try:
-            for future in finished(client, futures):
-                yield future.result()
+            yield from results_of(client, futures)
         except (distributed.KilledWorker, CancelledError, OSError) as error:
             raise WorkersLost(f"{cluster}: {' '.join(str(error).split())}") from error
 
 
-def finished(client: Any, futures: Sequence[Any]) -> Iterator[Any]:
-    """Futures as they finish.  Raises OSError when nobody has been at work on them for long."""
+def results_of(client: Any, futures: Sequence[Any]) -> Numbered:
+    """Results as they arrive.  Raises OSError when nobody has been at work on them for long."""
     distributed = optional("distributed", "a Dask cluster", DISTRIBUTED)
     waiting, seen = set(futures), time.monotonic()
     while waiting:
+        done: set[Any] = set()
         with suppress(distributed.TimeoutError), client.as_current():
             done = distributed.wait(waiting, timeout=WATCH, return_when="FIRST_COMPLETED").done
-            waiting -= done
-            yield from done
+        for future in done:
+            for result in fetched(future, distributed.TimeoutError):
+                waiting.discard(future)
+                yield result
         if client.status == "running" and client.scheduler_info()["workers"]:
             seen = time.monotonic()
         elif time.monotonic() - seen > DESERTED:
             raise OSError(
                 f"no scheduler or no workers for {DESERTED:g} s; start them again, and then this"
             )
+
+
+def fetched(future: Any, late: type[Exception]) -> list[tuple[int, Any]]:
+    """The result of a call that is done, or nothing where its worker left before it was fetched.
+
+    Dask makes such a call again elsewhere, but a client that asked already waits for ever.  Raises
+    what the call raised.
+    """
+    if future.status == "error":
+        return [future.result()]
+    with suppress(late):
+        return [future.result(timeout=DESERTED)]
+    return []
 
 
 def need_modules(client: Any, cluster: str, modules: set[str]) -> None:

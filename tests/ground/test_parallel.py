@@ -6,7 +6,15 @@ import time
 import pytest
 
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.parallel import START, WorkersLost, chunked, deque, in_parallel, share
+from minimax_cal.ground.parallel import (
+    START,
+    WorkersLost,
+    chunked,
+    deque,
+    fetched,
+    in_parallel,
+    share,
+)
 
 pytest.importorskip("joblib", reason="several processes need pip install minimax-cal[experiments]")
 LONG = 0.1  # seconds of a call
@@ -68,3 +76,22 @@ def test_a_process_that_dies_is_said() -> None:
 def test_no_processes_are_refused() -> None:
     with pytest.raises(OptionError, match="0 processes"):
         list(share(squared, [(1,)], processes=0))
+
+
+class Future:
+    """A call that is done: its result, or what it raised, or nothing where its worker left."""
+
+    def __init__(self, status: str, result: object) -> None:
+        self.status, self.given = status, result
+
+    def result(self, timeout: float = 0.0) -> object:
+        if isinstance(self.given, Exception):
+            raise self.given
+        return self.given
+
+
+def test_a_result_that_is_lost_is_waited_for_again() -> None:
+    assert fetched(Future("finished", (3, "x")), TimeoutError) == [(3, "x")]
+    assert fetched(Future("finished", TimeoutError()), TimeoutError) == []
+    with pytest.raises(TimeoutError):  # the call's own
+        fetched(Future("error", TimeoutError()), TimeoutError)
