@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import pickle
 import time
 import warnings
 from collections import deque
@@ -162,6 +163,8 @@ def beside(waiting: Queue, clock: Clock, count: int) -> Numbered:
     """Calls in count - 1 other processes and in this one, until all are done or at work."""
     loky = import_module("joblib.externals.loky")
     broken = import_module("joblib.externals.loky.process_executor").BrokenProcessPool
+    # packed here: in the pool's thread a call could change meanwhile, by what one made here stores
+    pack = import_module("joblib.externals.loky.backend.reduction").dumps
     pool = loky.get_reusable_executor(max_workers=count - 1, env=ONE_THREAD)
     PLAIN[:] = [pool]
     flying: set[Future[list[tuple[int, Any]]]] = set()
@@ -169,7 +172,7 @@ def beside(waiting: Queue, clock: Clock, count: int) -> Numbered:
         while waiting or flying:
             while waiting and len(flying) < AHEAD * (count - 1):
                 chunk = next(chunked(waiting, clock.seconds, PARTS * count))
-                flying.add(pool.submit(several, chunk))
+                flying.add(pool.submit(unpacked, bytes(pack(chunk))))
             if waiting:
                 yield clock.time(waiting.popleft())
             else:
@@ -198,6 +201,11 @@ def chunked(waiting: Queue, seconds: float, shares: int) -> Iterator[list[Any]]:
 def several(work: Work) -> list[tuple[int, Any]]:
     """Some calls where they run."""
     return [numbered(*each) for each in work]
+
+
+def unpacked(chunk: bytes) -> list[tuple[int, Any]]:
+    """Calls from the process that shares them."""
+    return several(pickle.loads(chunk))
 
 
 def on_cluster(work: Work, cluster: str, modules: set[str]) -> Numbered:

@@ -1,7 +1,9 @@
 """Calls shared between processes: same results, each once; few are not worth a process."""
 
 import os
+import threading
 import time
+from typing import ClassVar
 
 import pytest
 
@@ -24,6 +26,19 @@ def squared(number: int, seconds: float = 0.0) -> tuple[int, int]:
     """The square, and the process that made it."""
     time.sleep(seconds)
     return number**2, os.getpid()
+
+
+class Noted:
+    """A number that notes which thread packs it."""
+
+    threads: ClassVar[set[int]] = set()
+
+    def __reduce__(self) -> tuple[type, tuple[int]]:
+        self.threads.add(threading.get_ident())
+        return int, (3,)
+
+    def __pow__(self, power: int) -> int:
+        return 3**power
 
 
 def died(parent: int) -> None:
@@ -95,3 +110,11 @@ def test_a_result_that_is_lost_is_waited_for_again() -> None:
     assert fetched(Future("finished", TimeoutError()), TimeoutError) == []
     with pytest.raises(TimeoutError):  # the call's own
         fetched(Future("error", TimeoutError()), TimeoutError)
+
+
+def test_calls_are_packed_where_others_are_made() -> None:
+    """In another thread they might change meanwhile, by what a call made here keeps for later."""
+    calls = [(Noted(), LONG)] * int(4 * START / LONG)
+    found = {number: result for number, (result, _) in share(squared, calls, processes=2)}
+    assert set(found.values()) == {9}
+    assert Noted.threads == {threading.get_ident()}
