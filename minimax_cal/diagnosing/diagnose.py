@@ -59,7 +59,8 @@ from minimax_cal.fitting.second_visits import contradictions
 from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.options import check_left_out
 from minimax_cal.ground.stages import name_rung, number_step
 from minimax_cal.ground.words import name_first
 from minimax_cal.measuring import checks
@@ -156,9 +157,7 @@ def diagnose(
     began = time.perf_counter()
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     given = measured(data)
-    for name in exclude:
-        if name not in EFFECTS:
-            raise OptionError(f"no effect {name!r} to leave out; choose {', '.join(EFFECTS)}")
+    check_left_out(exclude, EFFECTS)
     given = checks.check_joints(robot, given)
     checks.check_spread(robot, given)
     options = DiagnosisOptions(seed, holdout, holdout_by, instrument, tuple(exclude), quick)

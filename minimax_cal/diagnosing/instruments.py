@@ -37,6 +37,7 @@ from minimax_cal.fitting.instruments.options import Progress, silent
 from minimax_cal.fitting.instruments.result import RelativeCalibration
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.options import check_left_out
 from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
@@ -87,9 +88,7 @@ def diagnose_relative(
     >>> print(mc.diagnose_relative("irb2600", ["tracker.csv", "sockets.csv"]).headline())
     """
     began = time.perf_counter()
-    for name in exclude:
-        if name not in EFFECTS:
-            raise OptionError(f"no effect {name!r} to leave out; choose {', '.join(EFFECTS)}")
+    check_left_out(exclude, EFFECTS)
     chosen = chosen_of(**options)
     if chosen.effects:
         raise OptionError("effects: a diagnosis looks for them; leave them out")
@@ -213,15 +212,17 @@ def budget_of(asked: Asked, fit: InstrumentFit, effects: Sequence[Finding]) -> B
     chosen = [term for found in effects for term in found.terms]
     scene = scene_of_all(asked.robot, fit)
     waiting = [whole(found, chosen, scene) for found in effects]
-    every = asked.beside([term for found in waiting for term in found.terms])
-    noise = (every.fit(silent) if waiting else fit).noise
+    every = [term for found in waiting for term in found.terms]
+    began = time.perf_counter()
+    full = asked.beside(every).fit(silent) if waiting else fit
+    spent, noise = time.perf_counter() - began, full.noise
     first = result_of(asked, fit, time.perf_counter())
     out = Budget([fit], [first], [], [missed(first, fit, noise)])
     for found in waiting:
         terms = [term for one in (*out.findings, found) for term in one.terms]
         wider = asked.beside(terms)
-        began = time.perf_counter()
-        bent = wider.fit(silent)
+        began = time.perf_counter() - (spent if terms == every else 0.0)
+        bent = full if terms == every else wider.fit(silent)
         result = result_of(wider, bent, began)
         error = missed(result, bent, noise)
         if error**2 < (1.0 - HELPS) * out.missed[-1] ** 2:

@@ -48,6 +48,7 @@ from minimax_cal.evidence.limits import LEVEL
 from minimax_cal.evidence.selection import Choice, select
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.options import check_left_out
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.robots.robot import Robot, load_robot
 
@@ -130,9 +131,7 @@ def diagnose_motion(
     """
     began = time.perf_counter()
     arm_of = robot if isinstance(robot, Robot) else load_robot(robot)
-    for name in exclude:
-        if name not in LAWS:
-            raise OptionError(f"no effect {name!r} to leave out; choose {', '.join(LAWS)}")
+    check_left_out(exclude, LAWS)
     progress("reading logs")
     runs = runs_of(robot, arm_of, logs)
     prepared = prepare(with_payload(runs, payload))

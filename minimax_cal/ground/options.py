@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -55,6 +55,13 @@ def option(default: Any, help: str = "", unit: str = "", **more: Any) -> Any:
 def names_of(texts: Iterable[str]) -> tuple[str, ...]:
     """Names separated by commas, from an option that may be given several times."""
     return tuple(name.strip() for text in texts for name in text.split(",") if name.strip())
+
+
+def check_left_out(names: Iterable[str], known: Collection[str]) -> None:
+    """Raise OptionError for an effect to leave out that nobody knows."""
+    for name in names:
+        if name not in known:
+            raise OptionError(f"no effect {name!r} to leave out; choose {', '.join(known)}")
 
 
 def number(text: str) -> float:

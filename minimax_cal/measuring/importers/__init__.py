@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,8 +25,9 @@ from minimax_cal.measuring.set_aside import whole
 __all__ = ["Imported", "csv_of", "import_files", "read_any", "save", "units_of"]
 
 # The first that fits a file is taken: of the text alone, then of its rows and columns.
-OF_TEXT = (programs, cmm)
-OF_ROWS = (cmm, headed)
+Read = Callable[[Sheet, Given, bool], Reading | None]  # None where a file is of another format
+OF_TEXT: tuple[Read, ...] = (programs.read, cmm.read)
+OF_ROWS: tuple[Read, ...] = (cmm.read, headed.read)
 MEASURED = re.compile(r"q\d*|(?:smr|base)\d*(?:_[xyz])?|qread\d*|u95|temperature|time")
 OF_JOINTS = re.compile(r"(?:^|[,=])\s*q\d*(?:_|\s*(?:,|$))")
 LAYOUTS = ("", "pose", "target")
@@ -127,15 +128,14 @@ def read_any(path: Path | str, given: Given, *, joints: bool = False) -> Reading
     sheet = open_text(path)
     given = replace(given, columns=given.joint_columns if joints else given.columns)
     if not given.columns:
-        for module in OF_TEXT:
-            if module.fits(sheet, joints):
-                found: Reading = module.read(sheet, given, joints)
+        for read in OF_TEXT:
+            if found := read(sheet, given, joints):
                 return found
     sheet = cut(sheet, given.decimal)
-    fitting = [mapped] if given.columns else [m for m in OF_ROWS if m.fits(sheet, joints)]
-    if not fitting:
+    ways = (mapped.read,) if given.columns else OF_ROWS
+    reading = next(filter(None, (read(sheet, given, joints) for read in ways)), None)
+    if reading is None:
         raise DataError(unknown(sheet))
-    reading: Reading = fitting[0].read(sheet, given, joints)
     for where, lines in (("above", sheet.above), ("below", sheet.below)):
         if lines:
             left_out = ", ".join(map(str, lines))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.importers.headed import read as read_headed
+from minimax_cal.measuring.importers.headed import POINTS, understood
 from minimax_cal.measuring.importers.names import folded
 from minimax_cal.measuring.importers.reading import Given, Reading
 from minimax_cal.measuring.importers.sheet import Sheet, decimal_of
@@ -119,14 +119,14 @@ def coordinates_of(sheet: Sheet) -> list[Coordinate]:
     return table_rows(sheet) if sheet.delimiter else text_rows(sheet.path, sheet.text)
 
 
-def fits(sheet: Sheet, joints: bool) -> bool:
-    """Whether there is a row for each coordinate."""
-    return not joints and bool(coordinates_of(sheet))
+def read(sheet: Sheet, given: Given, joints: bool) -> Reading | None:
+    """A row a point; None unless there is a row for each coordinate.
 
-
-def read(sheet: Sheet, given: Given, joints: bool) -> Reading:
-    """A row a point.  Raises DataError for a coordinate that is there twice."""
-    found = coordinates_of(sheet)
+    Raises DataError for a coordinate that is there twice.
+    """
+    found = [] if joints else coordinates_of(sheet)
+    if not found:
+        return None
     points: dict[str, dict[str, Coordinate]] = {}
     for one in found:
         first = points.setdefault(one.point, {}).setdefault(one.axis, one)
@@ -146,6 +146,6 @@ def read(sheet: Sheet, given: Given, joints: bool) -> Reading:
     sign = given.decimal or sheet.decimal or decimal_of(sheet.path, header, line, cells)
     others = sorted({*sheet.line.tolist()} - {one.line for one in found})
     table = replace(sheet, header=header, line=line, cells=cells, decimal=sign)
-    reading = replace(read_headed(table, given, False), format="a row for each coordinate")
+    reading = replace(understood(table, POINTS), format="a row for each coordinate")
     lines = ", ".join(map(str, others))
     return reading.saying(f"no coordinates, and left out: line {lines}") if others else reading

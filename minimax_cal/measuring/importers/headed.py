@@ -115,6 +115,7 @@ ROBODK = Format(
     notice="x, y, z are taken as measured points; if they are the controller's own pose there is "
     "nothing to calibrate from",
 )
+POINTS = Format("points", lambda stems, joints: not joints and bool(points_of(stems)), in_words)
 FORMATS = (  # the first that fits is taken
     ROBODK,
     TRACKER6D,
@@ -132,23 +133,26 @@ FORMATS = (  # the first that fits is taken
     ),
     Format("table of joints and points", has_both, in_words),
     Format("joint values", has_joints, in_words),
-    Format("points", lambda stems, joints: not joints and bool(points_of(stems)), in_words),
+    POINTS,
 )
 
 
-def fits(sheet: Sheet, joints: bool) -> bool:
-    """Whether a format has such a header; without one, whether it can be joints or points."""
-    if not sheet.header:
-        return sheet.width > 1 if joints else sheet.width == len(XYZ)
-    return any(form.fits(stems_of(sheet.header), joints) for form in FORMATS)
+def read(sheet: Sheet, given: Given, joints: bool) -> Reading | None:
+    """The columns, as the first format that fits has them; None where none does.
 
-
-def read(sheet: Sheet, given: Given, joints: bool) -> Reading:
-    """The columns, as the format has them.  Raises DataError."""
+    Raises DataError.
+    """
     if not sheet.header:
-        return headless(sheet, joints)
+        fits = sheet.width > 1 if joints else sheet.width == len(XYZ)
+        return headless(sheet, joints) if fits else None
     stems = stems_of(sheet.header)
-    form = next(form for form in FORMATS if form.fits(stems, joints))
+    form = next((form for form in FORMATS if form.fits(stems, joints)), None)
+    return understood(sheet, form) if form else None
+
+
+def understood(sheet: Sheet, form: Format) -> Reading:
+    """The columns, as a format has them.  Raises DataError."""
+    stems = stems_of(sheet.header)
     meanings = form.meanings(stems)
     columns = []
     for i, (name, stem) in enumerate(zip(sheet.header, stems, strict=True)):

@@ -163,14 +163,15 @@ def language_of(text: str) -> tuple[Language, list[Target], str] | None:
     return None
 
 
-def fits(sheet: Sheet, joints: bool) -> bool:
-    """Whether the text holds joint targets."""
-    return language_of(sheet.text) is not None
+def read(sheet: Sheet, given: Given, joints: bool) -> Reading | None:
+    """One row a target, their names the key where all have one; None without joint targets.
 
-
-def read(sheet: Sheet, given: Given, joints: bool) -> Reading:
-    """One row a target, their names the key where all have one.  Raises DataError."""
-    language, targets, bare = language_of(sheet.text) or (LANGUAGES[0], [], "")
+    Raises DataError.
+    """
+    program = language_of(sheet.text)
+    if program is None:
+        return None
+    language, targets, bare = program
     lines = [bare.count("\n", 0, target.at) + 1 for target in targets]
     check_targets(sheet, language.word, targets, lines)
     names = tuple(target.name for target in targets)

@@ -21,14 +21,13 @@ from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import json_of, read_raw
+from minimax_cal.ground.records import AGAIN
 from minimax_cal.ground.words import visible
 from minimax_cal.measuring.history import numbered, visits
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.simulators.motion.result import MotionGap
 from minimax_cal.simulators.result import KIND, SimulatorGap
-
-AGAIN = "write it again with minimax-cal"
 
 Result = (
     Fit
