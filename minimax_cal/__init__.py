@@ -36,7 +36,6 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.judging.bootstrap import bootstrap
     from minimax_cal.judging.saved import evaluate
     from minimax_cal.judging.standard import iso9283
-    from minimax_cal.judging.tradeoff import tradeoff
     from minimax_cal.judging.watching.comparison import compare
     from minimax_cal.judging.watching.health import check
     from minimax_cal.measuring import datasets
@@ -129,7 +128,6 @@ __all__ = [
     "report",
     "simulate",
     "simulator_gap",
-    "tradeoff",
     "write_measurements",
 ]
 
@@ -169,7 +167,6 @@ MODULES = {  # name: where it is defined
     "check": "judging.watching.health",
     "compare": "judging.watching.comparison",
     "iso9283": "judging.standard",
-    "tradeoff": "judging.tradeoff",
     "Diagnosis": "diagnosing.result",
     "diagnose": "diagnosing.diagnose",
     "diagnose_many": "diagnosing.many",

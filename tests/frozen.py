@@ -105,7 +105,6 @@ def cases(data: Path) -> Iterator[tuple[str, list[str]]]:
     ]  # fmt: skip
     yield "check", ["check", "plain.json", poses, "--tolerance", "rms 0.5", "--json"]
     yield "compare", ["compare", "plain.json", "base.json", "--json"]
-    yield "tradeoff", ["tradeoff", arm, poses, "--steps", "3", "--json"]
     yield "effects", ["effects", arm, poses, "--json"]
     yield "robots", ["robots", "--json"]
     for kind in ("wires", "poses", "closures", "contacts"):

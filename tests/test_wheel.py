@@ -107,7 +107,6 @@ def test_every_command_runs_or_names_its_extra(installed: Callable[..., Ran]) ->
     run("compensate", "fit.json", "targets.csv")
     run("iso9283", "fit.json")
     run("map", "fit.json", "--samples", 1000, "--json")
-    run("tradeoff", "irb120", "poses.csv", "--steps", 1)
     run("plan", "irb120", "--poses", 8, "--candidates", 60, "-o", "next.csv")
     run("export", "fit.json", "--to", "urdf", "-o", "arm.urdf")
     run("export", "fit.json", "--to", "mjcf", "-o", "arm.xml")

@@ -53,22 +53,6 @@ COMMANDS: dict[str, dict[str, Entry]] = {
             "compare",
             "What differs between two calibrations A and B: before and after a repair, say.",
         ),
-        "fleet": (
-            "fleet",
-            "Calibrate or check every cell of CELLS (TOML) in one go, with one overview of all.",
-        ),
-        "iso9283": (
-            "iso9283",
-            "Pose and distance accuracy of FIT by the formulas of ISO 9283, before and after.",
-        ),
-        "map": (
-            "map",
-            "Where FIT is sure of a position, and where the arm missed, over the workspace.",
-        ),
-        "tradeoff": (
-            "tradeoff",
-            "Small RMS or small largest error: what ROBOT could have, by the measurements in DATA.",
-        ),
     },
     "Diagnose": {
         "diagnose": (
@@ -133,11 +117,25 @@ COMMANDS: dict[str, dict[str, Entry]] = {
         ),
         "backends": ("backends", "The QP backends that are installed, with their versions."),
     },
+    "More": {
+        "fleet": (
+            "fleet",
+            "Calibrate or check every cell of CELLS (TOML) in one go, with one overview of all.",
+        ),
+        "iso9283": (
+            "iso9283",
+            "Pose and distance accuracy of FIT by the formulas of ISO 9283, before and after.",
+        ),
+        "map": (
+            "map",
+            "Where FIT is sure of a position, and where the arm missed, over the workspace.",
+        ),
+    },
 }
 # parameters that name outputs
 WRITTEN = ("output", "figure", "path", "pdf", "truth", "write", "out")
 SPARED = ("numpy.f2py", "numpy.testing")  # which SciPy would load and no command uses
-LONG = ("relative", "tradeoff", "diagnose", "plan", "gap")  # worth compiled kernels
+LONG = ("relative", "diagnose", "plan", "gap")  # worth compiled kernels
 ENTRIES = {name: entry for part in COMMANDS.values() for name, entry in part.items()}
 
 

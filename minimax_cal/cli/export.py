@@ -20,7 +20,7 @@ from minimax_cal.cli.options import (
     with_output,
 )
 from minimax_cal.correcting.export import exported, written
-from minimax_cal.correcting.exporters.table import EXPORTERS
+from minimax_cal.correcting.exporters.table import FORMATS
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
 
@@ -35,7 +35,7 @@ FORMAT = "The format"
     "kind",
     required=True,
     metavar="FORMAT",
-    help="The format: " + ", ".join(EXPORTERS) + ".",
+    help=f"The format: {', '.join(FORMATS)}.",
 )
 @plain_option(
     FORMAT,
@@ -54,12 +54,16 @@ FORMAT = "The format"
 @options_of(
     exported,
     tip=Option("The last link of the chain in that file.", metavar="LINK", group=FORMAT),
-    experimental=Option(
-        "Agree to a format whose frames its maker does not document (moc).", group=FORMAT
-    ),
     keep_anyway=Option(
         "Also where the calibrated arm is no better than the drawn one.", group=FORMAT
     ),
+)
+@plain_option(
+    FORMAT,
+    "--experimental",
+    is_flag=True,
+    hidden=True,
+    help="Agree to moc.",
 )
 @RUNG
 @JSON

@@ -63,7 +63,7 @@ def export(
         A calibration, its cell, a diagnosis, a relative calibration or a robot, or the file
         or name of one; an MJCF is converted to sdf as it is.
     to
-        urdf, ur-yaml, ros-yaml, ros2-control, dh-csv, json, moc, mjcf or sdf.
+        urdf, ur-yaml, ros-yaml, ros2-control, dh-csv, json, mjcf or sdf.
     path
         Written to as well, where given.
     urdf

@@ -1,1 +1,1 @@
-"""How good a calibration is: bootstrap, trade-off, maps, ISO 9283."""
+"""How good a calibration is: bootstrap, maps, ISO 9283."""

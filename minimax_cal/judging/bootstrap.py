@@ -15,11 +15,7 @@ import numpy as np
 
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.intervals import Interval
-from minimax_cal.fitting.minimax_problem import (
-    LEAST_TOLERANCE,
-    measured_distances,
-    minimax_problem,
-)
+from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
 from minimax_cal.fitting.options import Progress, silent, solver_of
 from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
@@ -28,7 +24,6 @@ from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.stages import count_stage
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.ground.units import for_people, in_files
-from minimax_cal.judging.redrawn import Draw, solved_at_once
 from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import Model, SumOfSquares, with_poses
 from minimax_cal.modelling.parameters import State, links_of
@@ -42,7 +37,6 @@ BUNDLES = 2000  # more poses than these are drawn in bundles
 MIN_DRAWN_SHARE = 1e-3  # of what all poses tell of some direction, those drawn must tell as much
 MAX_REPLICATES = 100_000  # replicates: of 2000 poses their draws fill 1.6 GB
 MOST_LOST = 0.5  # of the replicates
-TOGETHER = 250  # replicates of a minimax that are solved at once
 BATCH = 64  # replicates whose Gram matrices are kept at a time
 PACE = 25  # replicates between two words on progress
 
@@ -260,20 +254,10 @@ def solved_again(fit: Fit, draws: Draws, progress: Progress) -> tuple[Array, Arr
     qp, _ = solver_of(options.qp, QP_TOLERANCE)
     settings, active = Sqp(hessian=options.hessian), estimator.model.active
     mu = fit.minimax.multiplier if fit.minimax else minimax.EVEN
-    alike = not (estimator.model.prior.weight.any() or options.distance == "squared")
     part, _ = normal_parts(estimator.model, state, draws)
     good = determined(draws, part, estimator.model.prior.weight[active])
     change = np.zeros((len(good), int(active.sum())))
-    rest = good.copy()
-    for first in range(0, int(good.sum()) if alike else 0, TOGETHER):
-        some = np.flatnonzero(good)[first : first + TOGETHER]
-        progress(count_stage("replicate", int(some[0]) + 1, len(good)))
-        told, draw = drawn_distances(fit, np.stack([draws.rows(i) for i in some.tolist()]))
-        ends, met = solved_at_once(estimator.model, state, draw, mu, settings)
-        for i in np.flatnonzero(told & met):
-            change[some[i]] = between(state, ends.take(np.array(i)))[active]
-        rest[some[told & met]] = False
-    for done, number in enumerate(np.flatnonzero(rest).tolist()):
+    for done, number in enumerate(np.flatnonzero(good).tolist()):
         if done % PACE == 0:
             progress(count_stage("replicate", number + 1, len(good)))
         rows = np.repeat(np.arange(len(draws.member)), draws.rows(number))
@@ -284,29 +268,6 @@ def solved_again(fit: Fit, draws: Draws, progress: Progress) -> tuple[Array, Arr
         good[number] = best.status is Status.CONVERGED
         change[number] = between(state, best.x)[active]
     return change, good
-
-
-def drawn_distances(fit: Fit, times: Array) -> tuple[Array, Draw]:
-    """The draws with the distances between targets as each has them (`measured_distances`).
-
-    times: (B, m).  Returns (B,) too, False for draws that lack a pair.
-    """
-    train, options = fit.train, fit.options
-    pairs = measured_distances(train).pairs[: None if options.distance == "two-sided" else 0]
-    apart = np.linalg.norm(train.y[:, pairs[:, 0]] - train.y[:, pairs[:, 1]], axis=-1)
-    known = np.isfinite(apart)
-    usual = np.where(known, apart, 0.0).sum(axis=0) / known.sum(axis=0)
-    off, count = np.where(known, apart - usual, 0.0), times @ known
-    least = np.maximum(count, 2)
-    mean = times @ off / least
-    scatter = np.sqrt(np.maximum(times @ off**2 - least * mean**2, 0.0) / (least - 1))
-    if "u95" in train.columns and np.isfinite(train.columns["u95"]).any():
-        u95 = [np.nanmedian(np.repeat(train.columns["u95"], drawn)) for drawn in times]
-        scatter = np.sqrt(2.0) * np.array(u95)[:, None] * np.ones_like(scatter)
-    if options.distance_tolerance is not None:
-        scatter = np.full_like(scatter, options.distance_tolerance)
-    draw = Draw(times, pairs, usual + mean, np.maximum(scatter, LEAST_TOLERANCE))
-    return (count > 2).all(axis=1), draw
 
 
 def normal_parts(model: Model, state: State, draws: Draws) -> tuple[Array, Array]:

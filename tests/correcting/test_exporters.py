@@ -18,8 +18,9 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.cli.export import export_command
 from minimax_cal.correcting.export import exported
-from minimax_cal.correcting.exporters import EXPORTERS, Job, export
+from minimax_cal.correcting.exporters import Job, export
 from minimax_cal.correcting.exporters.moc import Moc, parse_moc, read_moc, text_of
+from minimax_cal.correcting.exporters.table import FORMATS
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.modelling.simulate import Simulation, simulate
 from minimax_cal.robots.robot import robot_from_dict
@@ -462,7 +463,7 @@ def test_a_calibrated_ur10_by_command_in_an_independent_reader(
     assert_allclose(mc.load_robot(tmp_path / "out.urdf").pose(q).shape, poses.shape)
 
 
-@pytest.mark.parametrize("to", [name for name in EXPORTERS if name != "moc"])
+@pytest.mark.parametrize("to", FORMATS)
 def test_every_format_by_command(to: str, fit: tuple[Path, Simulation]) -> None:
     result = run(fit[0], "--to", to)
     assert result.exception is None

@@ -110,7 +110,6 @@ def test_a_fit_of_stations_is_as_good_a_source_as_any(
     said: list[object] = []
     mc.export(path, "dh-csv", notify=said.append)
     assert not any("session_jump" in str(text) for text in said)
-    assert mc.tradeoff(fit, steps=0).choices[0].train.rms_mm < fit.accuracy["train"].rms_mm + 1e-9
 
 
 def test_a_session_of_few_poses_is_placed_by_the_others() -> None:

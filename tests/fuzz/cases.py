@@ -62,7 +62,6 @@ TEMPLATES = (
     "report diagnosis.json -o out.html --date 2026-01-01",
     "relative ROBOT wires.csv --json",
     "relative irb120 wires.csv -o out.json",
-    "tradeoff irb120 data.csv --steps 2 --json",
     "diagnose irb120 data.csv --json",
     "plan ROBOT --poses 6 --candidates 40 -o out.csv",
     "plan irb120 --poses 4 --candidates 40 --fit fit.json --data data.csv --json",
@@ -97,7 +96,7 @@ PLAIN = -2  # as well: the command lines of TEMPLATES as they are
 KNOWN = ("calibrate", "evaluate", "check")  # commands whose answer to some changes is known
 ROBOTS = ("robot.json", "robot.yaml", "robot.toml", "robot.urdf", "irb120")
 # How often, beside the others: those that take seconds, and those that can hardly go wrong.
-RATES = {"calibrate": 0.15, "diagnose": 0.1, "tradeoff": 0.15, "plan": 0.08, "gap": 0.3}
+RATES = {"calibrate": 0.15, "diagnose": 0.1, "plan": 0.08, "gap": 0.3}
 RATES |= {"robots": 0.2, "backends": 0.2}
 NAMED = {"cells.toml": ("robot.json", "data.csv", "fit.json")}  # files that a file names
 PLACES = (

@@ -65,6 +65,7 @@ EXPORTERS: dict[str, Exporter] = {
 }
 
 
+FORMATS = tuple(name for name in EXPORTERS if name != "moc")  # its frames are not documented
 CONVERTERS = {"sdf": MODELS}  # formats that a simulator's own model is converted to
 convert = later(SDF, "convert")
 
@@ -72,7 +73,7 @@ convert = later(SDF, "convert")
 def exporter(to: str) -> Exporter:
     """The format of a name.  Raises OptionError."""
     if to not in EXPORTERS:
-        raise OptionError(f"{to}: no such format; choose one of {', '.join(EXPORTERS)}")
+        raise OptionError(f"{to}: no such format; choose one of {', '.join(FORMATS)}")
     return EXPORTERS[to]
 
 
