@@ -23,7 +23,6 @@ from minimax_cal.planning.task import Task
 
 GROWTH = (0.5, 0.75, 1.0, 1.5, 2.0)  # numbers of poses to compare, as parts of those asked for
 SETS = 20  # random sets of which observability indices are told
-LOOSE = 0.99  # of the size: a bound below that ought to have been a solver's
 
 
 def sigmas(menu: Menu, designs: Sequence[Array], squares: Array) -> Array:
@@ -99,7 +98,7 @@ def separated(asked: Question, contest: Contest, stops: Visits, seen: Array) -> 
     )
 
 
-def remarks(task: Task, found: Poses, best: Found) -> list[str]:
+def remarks(task: Task, found: Poses) -> list[str]:
     """What the reader should know about how the poses were found."""
     out = ["the arm's body is a crude one and the cell is not known: check every move yourself"]
     told = {name.rpartition(".")[0] for name in task.ahead.names}
@@ -114,12 +113,5 @@ def remarks(task: Task, found: Poses, best: Found) -> list[str]:
         out.append(
             f"{found.drawn} candidates, not {task.options.candidates}: poses that can be taken and "
             f"seen are rare ({found.tested} were drawn); {rarest(found.rejected)}"
-        )
-    if not best.relaxed.solver and best.bound < LOOSE * best.design.size:
-        out.append("no solver answered: the bound is that of the exchange's own polar, and loose")
-    elif 0 < best.relaxed.given < len(found.q):
-        out.append(
-            f"the relaxation looked at {best.relaxed.given} of {len(found.q)} candidates; its "
-            "bound holds for all of them"
         )
     return out

@@ -16,8 +16,7 @@ from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.planning.candidates import Poses, candidates, near, rarest
 from minimax_cal.planning.designs.criteria import Criterion, inverse
-from minimax_cal.planning.designs.exchange import Menu, exchange, polar
-from minimax_cal.planning.designs.relaxation import highest
+from minimax_cal.planning.designs.exchange import Menu, exchange, highest, polar
 from minimax_cal.planning.designs.search import ROUGH, Found, best_design, first_design, worth
 from minimax_cal.planning.options import PlanOptions, check_options, settings_of
 from minimax_cal.planning.outlook import grown, indices, remarks, separated
@@ -205,7 +204,7 @@ def chosen(
     aim = task.aim(found)
     best = best_design(*aim, first, progress)
     progress("comparison")
-    notices = (*task.ground.notices, *said, *remarks(task, found, best))
+    notices = (*task.ground.notices, *said, *remarks(task, found))
     return assembled(task, found, aim, best, notices, began)
 
 
@@ -290,7 +289,6 @@ def assembled(
             travel(found.q[best.design.chosen], robot.prismatic),
         ),
         at_hand=sum(one.poses for one in task.ground.measured),
-        solver=best.relaxed.solver,
         settings=settings_of(options, poses),
         notices=notices,
         seconds=time.perf_counter() - began,

@@ -47,7 +47,7 @@ class Plan(Result):
     indices: observability, planned and random.  growth: with the number of poses.
     candidates: what was chosen from.  instrument: noise that was assumed, place: (3,) where it
     stands in base axes [m].  travel: of the largest joint moves, as ordered and as chosen [rad].
-    at_hand: number of poses measured before, which count.  solver: of the relaxation.  cameras:
+    at_hand: number of poses measured before, which count.  cameras:
     that are planned for, and seen (N, c) by which the board is seen; none for a tracker.
     still: what stands at `place`: the tracker, else the board or the camera.
     """
@@ -72,7 +72,6 @@ class Plan(Result):
     place: Array
     travel: tuple[float, float]
     at_hand: int
-    solver: str
     settings: Mapping[str, object]
     notices: tuple[str, ...]
     seconds: float
@@ -233,7 +232,6 @@ class Plan(Result):
             "candidates": self.candidates.to_dict(),
             "instrument": {"place_in_base_mm": 1e3 * self.place, **self.instrument.to_dict()},
             "travel_rad": {"ordered": self.travel[0], "as_chosen": self.travel[1]},
-            "solver": self.solver,
             "settings": self.settings,
             "notices": self.notices,
             "seconds": self.seconds,

@@ -25,7 +25,6 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import gravity
 from minimax_cal.planning import plan as module
 from minimax_cal.planning import separating, task
-from minimax_cal.planning.designs.convex import capped
 from minimax_cal.planning.designs.criteria import (
     Criterion,
     Determinant,
@@ -36,8 +35,7 @@ from minimax_cal.planning.designs.criteria import (
     size_of,
     sizes_of,
 )
-from minimax_cal.planning.designs.exchange import Menu, exchange, floor, greedy, polar
-from minimax_cal.planning.designs.relaxation import relax
+from minimax_cal.planning.designs.exchange import Menu, exchange, floor, greedy, lower_bound, polar
 from minimax_cal.planning.designs.search import best_design, first_design, worth
 from minimax_cal.planning.observability import observability
 from minimax_cal.planning.outlook import sigmas
@@ -55,7 +53,7 @@ from minimax_cal.planning.route import lengths, shortest, travel, visits
 from minimax_cal.robots.sampling import random_poses
 
 ROUNDING = 1e-9  # relative: the same numbers by other algebra
-SOLVER = 4e-3  # relative: between a relaxation and its bound, which is asked to be 3e-3
+NEAR = {"D": 0.01, "A": 0.01, "I": 0.01, "G": 0.1, "E": 0.1}  # of the largest, a soft mean serves
 NOISE = Instrument(10e-6, 2.5e-6, 10e-6)
 
 
@@ -179,9 +177,6 @@ def test_small_menus_by_brute_force(name: str, seed: int, at_hand: bool) -> None
     found = best_design(menu, criterion, first_design(menu, criterion, 5, 0), silent)
     assert found.bound <= best * (1 + ROUNDING)
     assert_allclose(found.design.size, best, rtol=ROUNDING)
-    # the weights are at least as good as any whole design, and the bound is near them
-    assert found.relaxed.size <= best * (1 + SOLVER)
-    assert found.bound >= found.relaxed.size * (1 - SOLVER)
 
 
 def polynomial(points: Array, degree: int, copies: int) -> Menu:
@@ -205,7 +200,7 @@ def test_d_optimal_polynomials_are_the_known_ones(degree: int, support: list[flo
     known = np.vander(np.repeat(support, each), degree + 1, increasing=True)
     best = np.linalg.det(known.T @ known) ** (-1 / (degree + 1))
     assert_allclose(found.design.size, best, rtol=ROUNDING)
-    assert_allclose(found.bound, best, rtol=SOLVER)
+    assert_allclose(found.bound, best, rtol=ROUNDING)
     # Kiefer and Wolfowitz: at the optimum the largest variance of a prediction is f / n
     cov = inverse(menu.of(found.design.chosen))
     variance = np.einsum("cri,ij,crj->c", menu.rows, cov, menu.rows)
@@ -213,10 +208,9 @@ def test_d_optimal_polynomials_are_the_known_ones(degree: int, support: list[flo
     assert_allclose(floor(menu, polar(cov, criterion.mix(cov)), count), best, rtol=ROUNDING)
 
 
-@pytest.mark.parametrize("solver", ["SCS", "CLARABEL"])
 @pytest.mark.parametrize("name", NAMES)
-def test_the_relaxation_is_cvxpys_own(name: str, solver: str) -> None:
-    """The same convex problem written down plainly, all experiments at once."""
+def test_the_bound_is_near_the_best_weights(name: str) -> None:
+    """Below the convex problem's optimum, written down plainly for cvxpy, and near it."""
     cp = pytest.importorskip("cvxpy")
     menu, f, count = random_menu(2, 30, 2, 3), 3, 8
     criterion = criteria(f)[name]
@@ -225,54 +219,22 @@ def test_the_relaxation_is_cvxpys_own(name: str, solver: str) -> None:
     rules = [cp.sum(w) == count, w <= 1]
     if name == "D":
         goal = cp.exp(-cp.log_det(info) / f)
-        plain = cp.Problem(cp.Maximize(cp.log_det(info)), rules)
-        plain.solve(solver="CLARABEL")
+        cp.Problem(cp.Maximize(cp.log_det(info)), rules).solve(solver="CLARABEL")
         expected = float(goal.value)
     elif name == "E":
-        plain = cp.Problem(cp.Maximize(cp.lambda_min(info)), rules)
-        plain.solve(solver="CLARABEL")
-        expected = 1.0 / plain.value
+        expected = 1.0 / cp.Problem(cp.Maximize(cp.lambda_min(info)), rules).solve(
+            solver="CLARABEL"
+        )
     else:
         weights = (
             criterion.weights if isinstance(criterion, Largest) else [criterion.weight]  # type: ignore[attr-defined]
         )
         roots = [np.linalg.cholesky(part + 1e-12 * np.eye(f)) for part in weights]
         worst = cp.max(cp.hstack([cp.matrix_frac(root, info) for root in roots]))
-        plain = cp.Problem(cp.Minimize(worst), rules)
-        plain.solve(solver="CLARABEL")
-        expected = plain.value
-    start = first_design(menu, criterion, count, 0)
-    found = relax(menu, criterion, start, solvers=(solver,), gap=0.0)
-    assert found.solver == solver
-    assert_allclose(found.size, expected, rtol=SOLVER)
-    assert found.bound <= expected * (1 + 1e-6)
-    assert found.bound >= expected * (1 - SOLVER)
-    assert_allclose(found.weights.sum(), count, rtol=ROUNDING)
-    assert found.weights.min() >= 0.0
-    assert found.weights.max() <= 1.0
-
-
-def test_a_bound_from_a_part_holds_for_all() -> None:
-    """The solver sees few of the experiments; the bound is below the best of all."""
-    menu, criterion = random_menu(4, 400, 1, 3), Determinant()
-    start = first_design(menu, criterion, 4, 0)
-    found = relax(menu, criterion, start)
-    assert 0 < found.given < 400
-    best = min(
-        exchange(menu, criterion, np.random.default_rng(i).choice(400, 4, replace=False)).size
-        for i in range(10)
-    )
-    assert found.bound <= best * (1 + ROUNDING)
-    assert found.bound >= 0.97 * best  # four whole experiments are near the best weights
-    assert relax(menu, criterion, start, rounds=0).bound <= found.bound
-
-
-def test_weights_are_projected(rng: np.random.Generator) -> None:
-    weights = capped(rng.normal(size=50), 12)
-    assert_allclose(weights.sum(), 12.0, rtol=ROUNDING)
-    assert weights.min() >= 0.0
-    assert weights.max() <= 1.0
-    assert_allclose(capped(weights, 12), weights, atol=ROUNDING)
+        expected = cp.Problem(cp.Minimize(worst), rules).solve(solver="CLARABEL")
+    found = lower_bound(menu, criterion, first_design(menu, criterion, count, 0))
+    assert found <= expected * (1 + 1e-6)
+    assert found >= expected * (1 - NEAR[name])
 
 
 def test_greedy_takes_the_best_one_by_one() -> None:

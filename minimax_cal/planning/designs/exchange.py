@@ -16,8 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.planning.designs.criteria import Criterion, size_of, sizes_of
+from minimax_cal.planning.designs.criteria import Criterion, inverse, size_of, sizes_of
 
+BOUND_STEPS = 60  # of the weights whose polar gives the bound
 SHORT = 5  # of the experiments that promise most, so many are tried exactly
 BETTER = 1e-9  # relative gain below which a swap is rounding
 RIDGE = 1e-10  # of the mean information: keeps what one experiment less leaves invertible
@@ -77,11 +78,33 @@ def floor(menu: Menu, pull: Array, count: int) -> float:
     """A size that no design of so many different experiments is below.  pull: as `polar`.
 
     1 / (<G, base> + the `count` largest <G, A_j'A_j>).  It is tight where C and W are those of the
-    best weights.  With weights that may be any number and D, that is the theorem of Kiefer and
-    Wolfowitz [1960]: max_j tr(A_j C A_j') = f at the optimum.
+    best design, up to what whole experiments lose against parts of them.  With weights that may be
+    any number and D, that is the theorem of Kiefer and Wolfowitz [1960]: max_j tr(A_j C A_j') = f
+    at the optimum.
     """
     most = np.sort(menu.scores(pull))[-count:].sum() + np.einsum("ij,ij->", pull, menu.base)
     return 1.0 / float(most)
+
+
+def lower_bound(menu: Menu, criterion: Criterion, chosen: Array) -> float:
+    """The best floor of weights that begin at a design and move to what scores highest.
+
+    [Frank and Wolfe 1956].  Of each step's polar the floor holds, wherever the weights are.
+    """
+    weights, bound = np.bincount(chosen, minlength=menu.count).astype(float), 0.0
+    for step in range(BOUND_STEPS):
+        cov = inverse(menu.information(weights))
+        pull = polar(cov, criterion.mix(cov))
+        bound = max(bound, floor(menu, pull, len(chosen)))
+        ahead = np.zeros(menu.count)
+        ahead[highest(menu.scores(pull), len(chosen))] = 1.0
+        weights += (ahead - weights) * 2.0 / (step + 4.0)
+    return bound
+
+
+def highest(scores: Array, count: int) -> Array:
+    """Indices of the largest scores."""
+    return np.argsort(-scores, kind="stable")[:count]
 
 
 # ---- exchange ----------------------------------------------------------------------------------

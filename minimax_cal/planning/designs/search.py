@@ -1,4 +1,4 @@
-"""The best design that can be found of a menu: relaxation, exchange, and what random ones do."""
+"""The best design that can be found of a menu by exchange, a bound, and what random ones do."""
 
 from __future__ import annotations
 
@@ -10,8 +10,16 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.planning.designs.criteria import Criterion, Trace, inverse, size_of
-from minimax_cal.planning.designs.exchange import Design, Menu, draw, exchange, greedy
-from minimax_cal.planning.designs.relaxation import Relaxed, highest, relax
+from minimax_cal.planning.designs.exchange import (
+    Design,
+    Menu,
+    draw,
+    exchange,
+    greedy,
+    highest,
+    lower_bound,
+    polar,
+)
 
 PER_PLACE, BESIDE = 8, 160  # experiments looked at for each to choose, and beside
 ROUGH = 2  # sweeps where a design is only to begin with, or to compare
@@ -22,19 +30,14 @@ TRIES = 60  # experiments more than asked for, to say how many are needed
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The design, and the relaxation that says how good it is.
+    """The design, a bound, and the experiments that good designs of this menu hold.
 
-    likely: experiments that good designs of this menu hold.
+    bound: no design of so many experiments has a size below it.
     """
 
     design: Design
-    relaxed: Relaxed
+    bound: float
     likely: Array
-
-    @property
-    def bound(self) -> float:
-        """No design of so many is below it."""
-        return min(self.relaxed.bound, self.design.size)
 
 
 def first_design(menu: Menu, criterion: Criterion, count: int, seed: int) -> Array:
@@ -50,21 +53,29 @@ def first_design(menu: Menu, criterion: Criterion, count: int, seed: int) -> Arr
 def best_design(
     menu: Menu, criterion: Criterion, first: Array, progress: Callable[[str], None]
 ) -> Found:
-    """The best design found of as many different experiments as in a first one, and a bound."""
-    count = len(first)
-    progress("relaxation")
-    relaxed = relax(menu, criterion, first)
-    few = highest(relaxed.scores, PER_PLACE * count + BESIDE)
-    order = np.lexsort((-relaxed.scores, -np.round(relaxed.weights, 4)))
-    likely = np.union1d(np.union1d(few, order[:count]), first)
+    """The best design found of as many different experiments as in a first one, and a bound.
+
+    At first those come in that the first design scores highest, then the best one's, then any.
+    """
     progress("exchange")
-    starts = [order[:count], first, likely[greedy(menu.take(likely), criterion, count)]]
+    likely, mix = promising(menu, criterion, first)
+    starts = [first, likely[greedy(menu.take(likely), criterion, len(first))]]
     if not isinstance(criterion, Trace):
-        mean = Trace(criterion.mix(inverse(menu.information(relaxed.weights))))
-        starts.append(exchange(menu, mean, order[:count], likely, ROUGH).chosen)
+        starts.append(exchange(menu, Trace(mix), first, likely, ROUGH).chosen)
     designs = [exchange(menu, criterion, start, likely) for start in starts]
     best = min(designs, key=lambda design: design.size)
-    return Found(exchange(menu, criterion, best.chosen, sweeps=ROUGH), relaxed, likely)
+    likely = np.union1d(likely, promising(menu, criterion, best.chosen)[0])
+    best = exchange(menu, criterion, best.chosen, likely)
+    best = exchange(menu, criterion, best.chosen, sweeps=ROUGH)
+    return Found(best, min(lower_bound(menu, criterion, best.chosen), best.size), likely)
+
+
+def promising(menu: Menu, criterion: Criterion, chosen: Array) -> tuple[Array, Array]:
+    """A design with the experiments that it scores highest, and its weight of the covariance."""
+    cov = inverse(menu.of(chosen))
+    mix = criterion.mix(cov)
+    few = highest(menu.scores(polar(cov, mix)), PER_PLACE * len(chosen) + BESIDE)
+    return np.union1d(chosen, few), mix
 
 
 def begin(menu: Menu, criterion: Criterion, count: int) -> Array:
