@@ -1,12 +1,12 @@
-"""Small faults put into a module, one at a time: which do its tests notice?
+"""Small faults put into the code, one at a time: which do the tests notice?
 
-    python tests/mutants.py minimax_cal/robots/kinematics.py tests/robots/test_kinematics.py
-    python tests/mutants.py MODULE TEST... --count 20 --seed 1
-    python tests/mutants.py MODULE TEST... --line 88  # of the same sample, those of a line
+    pytest -n auto --cov=minimax_cal --cov=qp_backends --cov-context=test  # who runs a line
+    python tests/mutants.py                        # 200 faults over all rooms, always the same
+    python tests/mutants.py minimax_cal/judging --count 40 --seed 2
 
 A seeded sample of changes: another comparison, sign, operation, number, truth value or extreme.
-Each is run in a copy of the project; a test that fails, or runs six times as long, has killed
-it.  Processes fork from one that has the libraries loaded.
+Each is run in a copy of the project with the quickest of the tests that run its line; a test that
+fails, or takes far longer, has noticed it.  Processes fork from one that has the libraries loaded.
 """
 
 from __future__ import annotations
@@ -20,12 +20,17 @@ import random
 import shutil
 import sys
 import tempfile
-import time
+from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
+
+from coverage import CoverageData
 
 ROOT = Path(__file__).resolve().parent.parent
 PATIENCE = 6.0  # times what the tests take without a fault
+TRIED, MOST = 60, 20  # tests of a line that are timed, and that are asked
 SERVER = multiprocessing.get_context("forkserver")
 SERVER.set_forkserver_preload(
     ["pytest", "_pytest.assertion.rewrite", "numpy.testing", "scipy.optimize",
@@ -110,18 +115,82 @@ def code(tree: ast.AST) -> Iterator[ast.AST]:
         yield from code(shown)
 
 
-def mutants(source: str) -> list[tuple[int, str, str]]:
-    """Line, what was changed, and the whole source with that change."""
-    tree = ast.parse(source)
+def changes(source: str) -> list[tuple[int, str]]:
+    """Line and kind of every change of a module."""
     return [
-        (getattr(node, "lineno", 0), said, ast.unparse(tree))
-        for node in code(tree)
+        (getattr(node, "lineno", 0), said)
+        for node in code(ast.parse(source))
         for said in faults(node)
     ]
 
 
-def tested(tree: str, tests: list[str], keep: bool) -> None:
-    """Run tests of a tree in a process of their own.  keep: the compiled modules."""
+def mutated(source: str, number: int) -> str:
+    """The module with its n-th change."""
+    tree = ast.parse(source)
+    count = 0
+    for node in code(tree):
+        for _ in faults(node):
+            if count == number:
+                return ast.unparse(tree)
+            count += 1
+    raise IndexError(number)
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A change of a module, and the tests that run its line, the most special first."""
+
+    module: str
+    number: int
+    line: int
+    said: str
+    tests: tuple[str, ...]
+
+    @property
+    def room(self) -> str:
+        """The folder of a package, or the package."""
+        return "/".join(self.module.split("/")[:-1][:2])
+
+
+class Reached:
+    """Which tests run which lines, from `pytest --cov --cov-context=test`."""
+
+    def __init__(self, path: Path, root: Path) -> None:
+        self.data = CoverageData(basename=str(path))
+        self.data.read()
+        self.root = root
+        self.wide = Counter(  # modules that a test runs
+            context
+            for file in self.data.measured_files()
+            for context in {c for line in self.data.contexts_by_lineno(file).values() for c in line}
+        )
+
+    def tests(self, module: str, line: int) -> tuple[str, ...]:
+        """The tests of a line; of a line run at the import, those of the module."""
+        by_line = self.data.contexts_by_lineno(str(self.root / module))
+        found = set(by_line.get(line, []))
+        if "" in found:
+            found = {c for contexts in by_line.values() for c in contexts}
+        ids = sorted(found - {""}, key=lambda c: (self.wide[c], c))
+        return tuple(dict.fromkeys(c.rpartition("|")[0] for c in ids))[:TRIED]
+
+
+def sample(count: int, seed: int, reached: Reached, only: list[str]) -> list[Mutant]:
+    """Changes drawn from all modules, every room by the number of its possible ones."""
+    chooser, every = random.Random(seed), []
+    for package in ("minimax_cal", "qp_backends"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            module = str(path.relative_to(ROOT))
+            if module.endswith("kernels/fast.py") or (only and not module.startswith(tuple(only))):
+                continue
+            found = changes(path.read_text(encoding="utf-8"))
+            every += [(module, number, *each) for number, each in enumerate(found)]
+    chosen = chooser.sample(every, min(count, len(every)))
+    return [Mutant(*each, reached.tests(each[0], each[2])) for each in sorted(chosen)]
+
+
+def tested(tree: str, tests: list[str], keep: bool, report: str) -> None:
+    """Run tests of a tree in a process of their own.  report: where the times of each go."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
@@ -131,12 +200,15 @@ def tested(tree: str, tests: list[str], keep: bool) -> None:
     sys.dont_write_bytecode = not keep
     import pytest
 
-    sys.exit(int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests])))
+    more = [f"--junit-xml={report}"] if report else ["-x"]
+    sys.exit(int(pytest.main([*more, "-q", "-p", "no:cacheprovider", "-m", "", *tests])))
 
 
-def noticed(tree: Path, tests: list[str], limit: float, keep: bool = False) -> str:
+def noticed(
+    tree: Path, tests: list[str], limit: float, keep: bool = False, report: str = ""
+) -> str:
     """'' if the tests pass in a tree, else how they noticed."""
-    process = SERVER.Process(target=tested, args=(str(tree), tests, keep))
+    process = SERVER.Process(target=tested, args=(str(tree), tests, keep, report))
     process.start()
     process.join(limit)
     if process.exitcode is None:
@@ -145,40 +217,54 @@ def noticed(tree: Path, tests: list[str], limit: float, keep: bool = False) -> s
     return "failed" if process.exitcode else ""
 
 
+def seconds_of(tree: Path, tests: list[str], report: Path) -> dict[str, float]:
+    """What each test takes without a fault; those that do not pass are left out."""
+    noticed(tree, tests, 3600.0, keep=True, report=str(report))
+    out = {}
+    for case in ElementTree.parse(report).iter("testcase"):
+        if len(case) == 0:
+            *folders, module = case.get("classname", "").split(".")
+            name = f"{'/'.join([*folders, module])}.py::{case.get('name')}"
+            out[name] = float(case.get("time", 0.0))
+    return out
+
+
 def main() -> None:
-    """Print the survivors and the score."""
+    """Print the survivors and the score of each room."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("module")
-    parser.add_argument("tests", nargs="+")
-    parser.add_argument("--count", type=int, default=60)
+    parser.add_argument("modules", nargs="*", help="folders or files; all without")
+    parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--line", type=int, action="append", help="those of the sample alone")
+    parser.add_argument("--coverage", type=Path, default=ROOT / ".coverage")
     chosen = parser.parse_args()
-    source = (ROOT / chosen.module).read_text()
-    every = mutants(source)
-    sample = random.Random(chosen.seed).sample(every, min(chosen.count, len(every)))
-    sample = [each for each in sample if not chosen.line or each[0] in chosen.line]
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    found = sample(chosen.count, chosen.seed, Reached(chosen.coverage, ROOT), chosen.modules)
+    every, killed = Counter(one.room for one in found), Counter[str]()
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "tree"
         shutil.copytree(
             ROOT, tree, ignore=shutil.ignore_patterns(".git", ".venv*", "results", "__pycache__")
         )
-        began = time.perf_counter()
-        if said := noticed(tree, chosen.tests, 3600.0, keep=True):
-            raise SystemExit(f"the tests {said} without any fault")
-        limit = max(60.0, PATIENCE * (time.perf_counter() - began))
-        survivors = []
-        for line, what, mutated in sorted(sample):
-            (tree / chosen.module).write_text(mutated)
-            if not noticed(tree, chosen.tests, limit):
-                survivors.append(line)
-                print(f"{chosen.module}:{line}: {what}: {source.splitlines()[line - 1].strip()}",
-                      flush=True)  # fmt: skip
-    killed = len(sample) - len(survivors)
-    share = 100 * killed / len(sample)
-    print(f"{chosen.module}: {killed} of {len(sample)} killed ({share:.0f} %), "
-          f"of {len(every)} possible", flush=True)  # fmt: skip
+        shared = ROOT.parent / "shared"
+        if shared.exists():
+            (Path(folder) / "shared").symlink_to(shared)
+        known = sorted({test for one in found for test in one.tests})
+        seconds = seconds_of(tree, known, Path(folder) / "times.xml")
+        for one in found:
+            tests = sorted((t for t in one.tests if t in seconds), key=seconds.__getitem__)[:MOST]
+            path = tree / one.module
+            source = path.read_text(encoding="utf-8")
+            path.write_text(mutated(source, one.number), encoding="utf-8")
+            limit = 60.0 + PATIENCE * sum(seconds[test] for test in tests)
+            if tests and noticed(tree, tests, limit):
+                killed[one.room] += 1
+            else:
+                text = source.splitlines()[one.line - 1].strip()
+                print(f"{one.module}:{one.line}: {one.said}: {text}", flush=True)
+            path.write_text(source, encoding="utf-8")
+    for room, count in every.items():
+        print(f"{room}: {killed[room]} of {count}")
+    print(f"all: {killed.total()} of {every.total()} noticed", flush=True)
 
 
 if __name__ == "__main__":
