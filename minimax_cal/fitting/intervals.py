@@ -69,7 +69,8 @@ def rms_interval(
     mean = float(total.sum() / count.sum())
     if mean == 0.0:
         return Interval(0.0, 0.0)
-    logs = np.log(np.maximum(total / count, TINY * mean))
+    total = np.maximum(total, TINY * mean * count)
+    logs = np.log(total / count)
     width = min(float(logs.std(ddof=1)), 1.0) * m**-0.2
     drawn = rng.integers(0, m, (DRAWS, m))
     kernel = np.exp(width * rng.normal(size=drawn.shape) - 0.5 * width**2)
@@ -77,8 +78,9 @@ def rms_interval(
     own, own_spread = log_mean(total, count)
     student = (log - math.log(mean)) / np.maximum(spread, TINY)
     low, high = np.quantile(student, (0.5 - 0.5 * level, 0.5 + 0.5 * level))
-    ends = (float(np.exp(0.5 * (own - end * own_spread))) for end in (high, low))
-    return Interval(*ends)
+    with np.errstate(over="ignore"):  # open above where one pose is nearly all of the error
+        ends = np.exp(0.5 * (own - np.array([high, low]) * own_spread))
+    return Interval(*ends.tolist())
 
 
 def log_mean(total: Array, count: Array) -> tuple[Array, Array]:

@@ -69,6 +69,21 @@ def test_too_few_poses_tell_nothing() -> None:
     assert max_interval(np.zeros((1, 5, 3)), rng=rng_of()) == Interval(0.0, 0.0)
 
 
+@pytest.mark.parametrize(("m", "zero"), [(12, 6), (7, 6), (400, 399)])
+def test_exact_zeros_are_the_smallest_errors(m: int, zero: int) -> None:
+    """Bootstrap samples may hold nothing but zeros: no warning, and the ends of tiny errors."""
+    error = rng_of(5).normal(size=(1, m, 3))
+    error[:, :zero] = 0.0
+    found, tiny = (
+        rms_interval(errors, rng=rng_of())
+        for errors in (error, np.where(error == 0.0, 1e-12, error))
+    )
+    rms = np.sqrt((error**2).sum() / m)
+    assert 0.0 < found.low < rms < found.high
+    assert_allclose([found.low, found.high], [tiny.low, tiny.high], rtol=1e-9)
+    assert np.isnan(told(found, rms).high) == (m == zero + 1)  # one pose is all of the error
+
+
 def test_an_upper_end_of_the_law_alone_is_not_told() -> None:
     """Seven poses of which one is nearly all of the error: no sample without it tells anything."""
     error = np.zeros((1, 7, 3))
