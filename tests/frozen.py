@@ -1,11 +1,12 @@
 """What comes out of two versions of the project, compared as numbers.
 
-    python tests/frozen.py [REVISION] [--rel 1e-12] [--only WORD]
+    python tests/frozen.py [REVISION] [--rel 1e-9] [--only WORD]
 
 For changes of the code that must not change results: REVISION (default: HEAD) in a worktree of its
-own and the working tree run the same commands on the same files, and every number, word and exit
-code of theirs is compared; times, versions and the renames in RENAMED aside.  Answers of a
-revision are kept outside git (results/frozen), for they do not change.
+own and the working tree run the same commands on the same files (`tests/frozen_inputs`, and real
+arms of `../shared/data` where they are there).  Every number, word and exit code is compared, and
+every byte of an export; times and versions aside, and what stands in GONE, ADDED, CHANGED and
+RENAMED.  Answers of a revision are kept outside git (results/frozen), for they do not change.
 """
 
 from __future__ import annotations
@@ -13,179 +14,180 @@ from __future__ import annotations
 import argparse
 import contextlib
 import hashlib
-import inspect
 import io
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
+import time
 import traceback
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
-SHARED = ROOT.parent / "shared" / "data"
+INPUTS = ROOT / "tests" / "frozen_inputs"
 STORE = ROOT / "results" / "frozen"
-REAL = ("fanuc_r2000", "irb120", "meca500_r", "qkm_hl6", "ur10_b")
-OBJECTIVES = ("minimax", "sum", "point", "pose", "smr:2")
-FORMATS = ("urdf", "ur-yaml", "ros-yaml", "ros2-control", "dh-csv", "json", "moc", "mjcf")
+
+# What differs on purpose from the version before: patterns of the paths that are printed (* is
+# anything), and why.  GONE: only before.  ADDED: only now.  CHANGED: another value.
+GONE: dict[str, str] = {}
+ADDED: dict[str, str] = {}
+CHANGED: dict[str, str] = {}
+RENAMED: dict[str, str] = {}  # keys of before by what they are called now
 TIMES = {"seconds", "versions", "date", "cpu_seconds"}  # keys that no two runs share
-ADDED = {"arrays", "widening", "size"}  # keys that only the later revision has
-RENAMED: dict[str, str] = {}  # words of the earlier revision that were renamed on purpose
-POWER, SEED = 300.0, 41
-SEVERAL = 8  # pairs of effects, arms without a fault, arms of small effects
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
-CLOCKED = re.compile(r"\b\d+\.\d+ s\b|\b[0-9a-f]{64}\b")  # a duration, a hash of a file with one
+# What no two runs share: progress, durations, hashes of files that hold one.
+CLOCKED = re.compile(r"^progress: .*\n|\b\d+\.\d+ s\b|\b[0-9a-f]{64}\b", re.M)
+
+# name: command.  @ is a file of INPUTS; others were written by the commands above.
+COMMANDS = """
+calibrate plain: calibrate irb2600 @plain.csv --bootstrap 20 -o plain.json
+calibrate effects: calibrate irb2600 @plain.csv --effects joint_compliance:all,backlash:J5 -o effects.json
+calibrate huber: calibrate irb2600 @plain.csv --loss huber --objective sum --details -o huber.json
+calibrate trim: calibrate irb2600 @arms/outliers.irb2600.csv --trim 0.03 --objective point -o trim.json
+calibrate prior: calibrate irb2600 @plain.csv --prior a*=0.5mm --prior theta*=1mrad --objective sum --json
+calibrate one: calibrate irb2600 @plain.csv --objective smr:3 --effects joint_compliance:J2 --cv --json
+calibrate pose: calibrate irb2600 @plain.csv --objective pose --lever 300 --json
+calibrate bfgs: calibrate irb2600 @plain.csv --hessian bfgs --qp clarabel --distance squared --json
+calibrate fixed: calibrate irb2600 @plain.csv --fix d2,beta* --method nllm --json
+calibrate base: calibrate irb2600 @plain.csv --objective sum --holdout 0 -o base.json
+calibrate sessions: calibrate irb2600 @plain.csv @moved.csv --objective sum --json
+calibrate moved: calibrate irb2600 @moved.csv --objective sum -o moved.json
+calibrate pixels: calibrate ur5 {pixels} -o pixels.json
+calibrate pixels minimax: calibrate ur5 {pixels} --objective minimax --json
+evaluate plain: evaluate plain.json @moved.csv --new-frame --json
+evaluate effects: evaluate effects.json @plain.csv --json
+compensate plain: compensate plain.json @targets.csv -o corrected.csv
+compensate effects: compensate effects.json @targets.csv --json
+compensate rapid: compensate base.json @program.mod --tool tGrip --wobj wTable -o corrected.mod
+compensate krl: compensate plain.json @program.dat -o corrected.dat
+map effects: map effects.json --samples 2000 --json
+map base: map base.json @plain.csv --samples 2000 --frame base --json
+iso9283 effects: iso9283 effects.json --poses --json
+report plain: report plain.json --date 2026-01-01 --tolerance "rms 0.2, max 0.5" -o plain.html
+compare: compare base.json moved.json --json
+check: check base.json @plain.csv --tolerance "rms 0.5" --json
+check moved: check base.json @moved.csv --tolerance "rms 0.2" -o checked.json
+fleet: fleet @cells.toml --jobs 1 --out cells --page fleet.html --json
+import leica: import @makers/tracker.csv --joints @makers/kalib.dat -o leica.csv
+import sa: import @makers/points.csv --joints @makers/calib.script --json
+import wrong: import @plain.csv --mend reverse --leave-out 12:smr2=bumped -o mended.csv
+import log: import @makers/rtde.csv -o log.csv
+identify: identify @sweeps.csv --joints revolute,revolute,revolute,prismatic,revolute -o found.json
+calibrate identified: calibrate found.json @sweeps.csv --objective sum --json
+plan: plan ur10 --poses 12 --candidates 80 --json
+plan fit: plan irb2600 --poses 6 --fit effects.json --candidates 60 -o plan.csv
+plan separate: plan irb2600 --poses 4 --fit base.json --candidates 40 --separate joint_compliance:J2 link_bending:L2 --json
+plan camera: plan ur5 --poses 6 --candidates 40 --camera cam0=@cell/cam0.yaml --board @cell/board.csv --camera-at 40,-30,80,9.5,4.2,-13.2 --board-at 596.3,100,50,-10.6,9.6,2.6 --print-looks z --json
+plan motion: plan irb2600 --motion --duration 6 --payload 2 -o motion.csv --waypoints ways.csv
+effects: effects irb2600 @plain.csv --json
+robots: robots --json
+simulate: simulate ur10 --poses 9 --compliance 2 -o simulated.csv --truth truth.json
+relative wires: relative irb2600 @wires.csv --json
+relative poses: relative irb2600 @poses.csv -o relative.json
+relative closures: relative irb2600 @closures.csv --json
+relative contacts: relative irb2600 @contacts.csv --json
+relative effects: relative irb2600 @wires.csv @closures.csv --effects joint_compliance --json
+relative diagnose: relative irb2600 @wires.csv @poses.csv --diagnose --json
+relative pixels: relative ur5 @cell/poses.csv {pixels} --json
+report relative: report relative.json --date 2026-01-01 -o relative.html
+diagnose sessions: diagnose irb2600 @plain.csv @moved.csv --json
+report diagnosis: report compliance.gap.json --date 2026-01-01 -o diagnosis.html
+evaluate diagnosis: evaluate compliance.gap.json @arms/compliance.irb2600.csv --step 1 --json
+compensate diagnosis: compensate compliance.gap.json @targets.csv --json
+export drawn urdf: export irb2600 --to urdf -o drawn.urdf
+export drawn mjcf: export irb2600 --to mjcf -o drawn.xml
+export urdf again: export plain.json --to urdf --urdf drawn.urdf -o again.urdf
+export mjcf again: export effects.json --to mjcf --mjcf drawn.xml -o again.xml
+export diagnosis: export compliance.gap.json --to json -o diagnosed.json
+calibrate posed: calibrate ur10 @posed/poses.csv --objective sum --effects joint_compliance:all -o posed.json
+gap poses: gap @posed/arm.xml @posed/poses.csv --fit posed.json --write posed.xml -o posed.gap.json
+torques: torques @driven/arm.xml @driven/run0.csv @driven/run1.csv @driven/run2.csv --write still.xml -o torques.json
+evaluate torques: evaluate torques.json @driven/run2.csv --json
+report torques: report torques.json --date 2026-01-01 -o torques.html
+gap logs: gap @driven/arm.xml @driven/run0.csv @driven/run1.csv @driven/run2.csv --write driven.xml -o driven.gap.json
+"""  # noqa: E501
+PIXELS = (
+    "--pixels @cell/detections.csv --joints @cell/joints.csv --camera cam0=@cell/cam0.yaml "
+    "--board @cell/board.csv --camera-on flange"
+)
+DIAGNOSED = "diagnose {0}: diagnose @arms/{1}.json @arms/{0}.{1}.csv -o {0}.gap.json"
+EXPORTED = "export {0} {1}: export {0}.json --to {1} --experimental -o {0}.as.{1}"
+FORMATS = ("urdf", "ur-yaml", "ros-yaml", "ros2-control", "dh-csv", "json", "moc", "mjcf", "sdf")
+# Real arms, $ being their folder; each by another objective and in another format.
+REAL = {
+    "fanuc_r2000": ("sum", "ros-yaml"),
+    "irb120": ("point", "moc"),
+    "meca500_r": ("point", "dh-csv"),
+    "qkm_hl6": ("smr:2", "json"),
+    "ur10_b": ("sum", "ur-yaml"),
+}
+OF_REAL = """
+calibrate {0}: calibrate ${0}/robot.json ${0}/measurements.csv -o {0}.json
+calibrate {0} otherwise: calibrate ${0}/robot.json ${0}/measurements.csv --objective {1} --json
+diagnose {0}: diagnose ${0}/robot.json ${0}/measurements.csv -o {0}.gap.json
+report {0}: report {0}.json {0}.gap.json --date 2026-01-01 -o {0}.html
+export {0} {2}: export {0}.json --to {2} --experimental -o {0}.as.{2}
+"""
+MOTION = """
+torques ur10e: torques $ur10e_torque/ur10e.urdf {logs} --drive-gain 14.87,13.26,11.13,10.62,11.03,11.47 -o ur10e.json
+evaluate ur10e: evaluate ur10e.json $ur10e_torque/20_02_12-40sec_12harm.csv --json
+"""  # noqa: E501
+LOGS = ("05-20sec_8harm", "06-20sec_10harm", "06-20sec_5harm", "10-20sec_7harm")
 
 
-def cases(data: Path) -> Iterator[tuple[str, list[str]]]:
-    """Names and commands, in an order in which later ones may read what earlier ones wrote."""
-    calibrated = []
-    for name in REAL:
-        robot, measured = str(SHARED / name / "robot.json"), str(SHARED / name / "measurements.csv")
-        if not Path(robot).exists():
-            continue
-        for objective in OBJECTIVES:
-            fit = f"{name}_{objective.replace(':', '')}.json"
-            yield f"calibrate {name} {objective}", [
-                "calibrate", robot, measured, "--objective", objective, "-o", fit,
-            ]  # fmt: skip
-        calibrated += [f"{name}_minimax.json"]
-        yield f"diagnose {name}", ["diagnose", robot, measured, "-o", f"{name}_gap.json"]
-        yield f"report {name}", [
-            "report", f"{name}_minimax.json", f"{name}_gap.json", "--date", "2026-01-01",
-            "-o", f"{name}.html",
-        ]  # fmt: skip
-    arm, poses = "irb2600", str(data / "plain" / "data.csv")
-    for name, options in {
-        "plain": ["--bootstrap", "20"],
-        "effects": ["--effects", "joint_compliance:all,backlash:J5"],
-        "huber": ["--loss", "huber", "--objective", "sum"],
-        "trim": ["--trim", "0.03", "--objective", "point"],
-        "prior": ["--prior", "a*=0.5mm", "--prior", "theta*=1mrad", "--objective", "sum"],
-        "one": ["--objective", "smr:3", "--effects", "joint_compliance:J2"],
-        "pose": ["--objective", "pose", "--lever", "300"],
-        "bfgs": ["--hessian", "bfgs", "--qp", "clarabel", "--distance", "squared"],
-        "fixed": ["--fix", "d2,beta*", "--method", "nllm"],
-        "base": ["--objective", "sum", "--holdout", "0"],
-    }.items():
-        yield f"calibrate {name}", ["calibrate", arm, poses, *options, "-o", f"{name}.json"]
-        calibrated.append(f"{name}.json")
-    for fit in calibrated:
-        for form in FORMATS:
-            yield f"export {fit} {form}", [
-                "export", fit, "--to", form, "--experimental", "-o", f"{fit}.{form}",
-            ]  # fmt: skip
-        yield f"iso9283 {fit}", ["iso9283", fit, "--poses", "--json"]
-        yield f"report {fit}", ["report", fit, "--date", "2026-01-01", "-o", f"{fit}.html"]
-    for fit in ("plain.json", "effects.json", "base.json"):
-        yield f"evaluate {fit}", ["evaluate", fit, poses, "--json"]
-        yield (
-            f"compensate {fit}",
-            ["compensate", fit, str(data / "targets.csv"), "-o", f"{fit}.csv"],
-        )
-        yield f"compensate {fit} json", ["compensate", fit, str(data / "targets.csv"), "--json"]
-        yield f"map {fit}", ["map", fit, "--samples", "2000", "--json"]
-        yield (
-            f"map {fit} base",
-            ["map", fit, poses, "--samples", "2000", "--frame", "base", "--json"],
-        )
-        yield (
-            f"plan {fit}",
-            ["plan", arm, "--poses", "6", "--fit", fit, "--candidates", "60", "--json"],
-        )
-    yield "plan", ["plan", "ur10", "--poses", "12", "--candidates", "80", "--json"]
-    yield "plan separate", [
-        "plan", arm, "--poses", "4", "--fit", "plain.json", "--candidates", "40",
-        "--separate", "joint_compliance:J2", "link_bending:L2", "--json",
-    ]  # fmt: skip
-    yield "check", ["check", "plain.json", poses, "--tolerance", "rms 0.5", "--json"]
-    yield "compare", ["compare", "plain.json", "base.json", "--json"]
-    yield "effects", ["effects", arm, poses, "--json"]
-    yield "robots", ["robots", "--json"]
-    for kind in ("wires", "poses", "closures", "contacts"):
-        yield f"relative {kind}", ["relative", arm, str(data / f"{kind}.csv"), "--json"]
-    both = [str(data / f"{kind}.csv") for kind in ("wires", "closures")]
-    yield "relative several", ["relative", arm, *both, "--json"]
-    yield "relative diagnose", ["relative", arm, *both, "--diagnose", "--json"]
-    yield "relative effects", ["relative", arm, *both, "--effects", "joint_compliance", "--json"]
-    folder = data / "cell"
-    seen = [
-        "--pixels", str(folder / "detections.csv"), "--joints", str(folder / "joints.csv"),
-        "--camera", f"cam0={folder / 'cam0.yaml'}", "--board", str(folder / "board.csv"), "--json",
-    ]  # fmt: skip
-    yield "calibrate pixels", ["calibrate", "ur5", *seen]
-    yield "calibrate pixels minimax", ["calibrate", "ur5", *seen, "--objective", "minimax"]
-    yield "relative pixels", ["relative", "ur5", str(folder / "poses.csv"), *seen]
-    yield (
-        "simulate",
-        ["simulate", "ur10", "--poses", "9", "--compliance", "2", "-o", "simulated.csv"],
-    )
-    for folder in sorted(data.glob("case*")):
-        yield f"diagnose {folder.name}", [
-            "diagnose", str(folder / "robot.json"), str(folder / "data.csv"), "--json",
-        ]  # fmt: skip
+def cases(shared: Path) -> dict[str, list[str]]:
+    """Commands by name, in an order in which later ones may read what earlier ones wrote."""
+    arms = sorted(path.name.split(".")[:2] for path in (INPUTS / "arms").glob("*.csv"))
+    lines = [DIAGNOSED.format(*arm) for arm in arms]
+    lines += COMMANDS.strip().format(pixels=PIXELS).splitlines()
+    lines += [EXPORTED.format(fit, to) for fit in ("plain", "effects") for to in FORMATS]
+    if shared.is_dir():
+        for arm, chosen in REAL.items():
+            lines += OF_REAL.strip().format(arm, *chosen).splitlines()
+        logs = " ".join(f"$ur10e_torque/20_02_{name}.csv" for name in LOGS)
+        lines += MOTION.strip().format(logs=logs).splitlines()
+    pairs = (line.split(": ", 1) for line in lines)
+    files = {name: command.replace("@", f"{INPUTS}/") for name, command in pairs}
+    return {
+        name: shlex.split(command.replace("$", f"{shared}/")) for name, command in files.items()
+    }
 
 
-def prepare(data: Path) -> None:
-    """Files that both revisions read: simulated arms with their faults, inputs of commands."""
-    import numpy as np
+def chosen_cases(all_cases: dict[str, list[str]], only: str) -> dict[str, list[str]]:
+    """Those whose name holds a word, after those that write what they read."""
+    needed, out = set[str](), []
+    for name, command in reversed(all_cases.items()):
+        if only in name or needed & {word for word in command if word == output_of(command)}:
+            needed |= set(command)
+            out.append(name)
+    return {name: all_cases[name] for name in reversed(out)}
 
-    from experiments import blind_gap, gap_cases, pixel_cells, relative
-    from minimax_cal.fitting.instruments import flange_poses, write_relative
-    from minimax_cal.robots.sampling import random_poses
-    from tests.fitting.test_contacts import planes
 
-    if (data / "done").exists():
-        return
-    size = blind_gap.Size(
-        none=SEVERAL, none_rough=1, single=1, poses=0, rough=0, pair=SEVERAL, triple=3,
-        background=SEVERAL, outside=1, deleted=0, wrong_law=1, fault=2, powers=(POWER,),
-        clear=(POWER,), beyond=(POWER,), removed=(),
-    )  # fmt: skip
-    for number, case in enumerate(blind_gap.plan(SEED, size)):
-        gap_cases.write(gap_cases.make(case), data / f"case{number:02}")
-    rng = np.random.default_rng(SEED)
-    plain = gap_cases.make(gap_cases.Case("irb2600", "none", seed=SEED))
-    gap_cases.write(plain, data / "plain")
-    header = ",".join(f"q{joint}_rad" for joint in range(1, 7))
-    np.savetxt(
-        data / "targets.csv", rng.uniform(-1, 1, (12, 6)), "%.17g", ",", header=header, comments=""
-    )
-    arm = relative.Arm.of("irb2600", SEED, 0.0)
-    for kind, name in {"wires": "wires_3", "poses": "poses", "closures": "closures"}.items():
-        measured = relative.SIMULATORS[name](arm, np.random.default_rng(SEED), 60, relative.NOISE)
-        write_relative(data / f"{kind}.csv", measured.data)
-    write_relative(data / "contacts.csv", planes(arm, SEED, relative.NOISE))
-    points = pixel_cells.board_points((6, 5), 0.04)
-    cell = pixel_cells.make_cell(np.random.default_rng(1), points=points, poses=20, on_flange=True)
-    (data / "cell").mkdir()
-    pixel_cells.write_cell(cell, data / "cell")
-    q = random_poses(cell.true, 24, np.random.default_rng(SEED))
-    write_relative(data / "cell" / "poses.csv", flange_poses(q, cell.true.pose(q)))
-    (data / "done").write_text("")
+def output_of(command: list[str]) -> str:
+    """The file that -o names."""
+    return command[command.index("-o") + 1] if "-o" in command else ""
 
 
 # ---- one revision --------------------------------------------------------------------------------
 
 
-def run(tree: Path, out: Path, data: Path, only: str) -> None:
-    """Run every command with the code in a tree; leave what it said and wrote in a folder."""
+def run(tree: Path, out: Path, shared: Path, only: str) -> None:
+    """Run commands with the code in a tree; leave what each said and wrote in a folder."""
     sys.path[:0] = [str(tree)]
     os.chdir(out)
     from minimax_cal.cli import main
 
     assert Path(sys.modules["minimax_cal"].__file__ or "").is_relative_to(tree)
-    for name, command in cases(data):
-        target = out / (re.sub(r"[^\w.]+", "-", name) + ".answer.json")
-        if only and only not in name:
-            continue
-        before = {path: path.stat().st_mtime_ns for path in out.iterdir()}
-        said, told = io.StringIO(), io.StringIO()
+    for name, command in chosen_cases(cases(shared), only).items():
+        before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+        said, told, began = io.StringIO(), io.StringIO(), time.process_time()
         code: Any = 0
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(told):
             try:
@@ -194,31 +196,34 @@ def run(tree: Path, out: Path, data: Path, only: str) -> None:
                 code = end.code
             except Exception:
                 code = traceback.format_exc()
-        wrote = sorted(p for p in out.iterdir() if before.get(p) != p.stat().st_mtime_ns)
-        files = {path.name: path.read_text() for path in wrote}
-        answer = {
-            "code": code,
-            "stdout": said.getvalue(),
-            "stderr": told.getvalue(),
-            "files": files,
+        seconds = time.process_time() - began
+        files = {
+            str(path.relative_to(out)): path.read_bytes().decode("utf-8", "surrogateescape")
+            for path in sorted(out.rglob("*.*"))
+            if path.is_file()
+            and path.suffix not in (".answer", ".txt")
+            and before.get(path) != path.stat().st_mtime_ns
         }
-        target.write_text(json.dumps(answer))
-        print(f"{name}: {code}", flush=True)
+        answer = {"code": code, "stdout": said.getvalue(), "stderr": told.getvalue(),
+                  "files": files, "cpu_seconds": seconds}  # fmt: skip
+        text = json.dumps(answer).replace(str(out), "")
+        (out / f"{name}.answer").write_text(text)
+        print(f"{seconds:7.1f} {name}: {code}", flush=True)
 
 
-class Text(HTMLParser):
+class Page(HTMLParser):
     """What a page shows: text, and the JSON of its plots."""
 
-    def __init__(self) -> None:
+    def __init__(self, text: str) -> None:
         super().__init__()
         self.parts: list[str] = []
-        self.hidden = 0
+        self.hidden = False
+        self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         """Style and program are not shown; data of plots are."""
-        self.hidden = tag == "style" or (
-            tag == "script" and ("type", "application/json") not in attrs
-        )
+        data = ("type", "application/json") in attrs
+        self.hidden = tag == "style" or (tag == "script" and not data)
 
     def handle_endtag(self, tag: str) -> None:
         """Shown again."""
@@ -231,77 +236,79 @@ class Text(HTMLParser):
 
 
 def content(name: str, text: str) -> Any:
-    """A file or an output as something that compares."""
+    """An output as something that compares: JSON as it is, other text as words and numbers."""
     if name.endswith(".html"):
-        page = Text()
-        page.feed(text)
-        return [parsed(part) for part in page.parts]
-    return parsed(text)
-
-
-def parsed(text: str) -> Any:
-    """JSON as it is, other text as words and numbers."""
+        return [content("", part) for part in Page(text).parts]
     try:
         return json.loads(text)
     except ValueError:
-        text = CLOCKED.sub("TIME", text)
-        return [re.sub(r"\s+", " ", NUMBER.sub("#", text)), *map(float, NUMBER.findall(text))]
+        lines = CLOCKED.sub("", text).splitlines()
+    return [[re.sub(r"\s+", " ", NUMBER.sub("#", line)), *map(float, NUMBER.findall(line))]
+            for line in lines]  # fmt: skip
 
 
-def differences(one: Any, other: Any, rel: float, at: str = "") -> Iterator[str]:
-    """Where two contents differ; a number may be off relative to the largest beside it."""
+def answer_of(folder: Path, name: str) -> dict[str, Any]:
+    """What a command did, its outputs as what compares; of a file for others its bytes too."""
+    found: dict[str, Any] = json.loads((folder / f"{name}.answer").read_text())
+    for stream in ("stdout", "stderr"):
+        found[stream] = content("", found[stream])
+    for file, text in found["files"].items():
+        mine = Path(file).suffix in (".json", ".csv", ".html") and not name.startswith("export")
+        numbers = content(file, text)
+        found["files"][file] = numbers if mine else {"as numbers": numbers, "bytes": text}
+    return found
+
+
+# ---- two revisions -------------------------------------------------------------------------------
+
+
+def differences(one: Any, other: Any, rel: float, at: str) -> Iterator[str]:
+    """Where two contents differ, but for what the tables accept."""
+    for place, what in unlike(one, other, rel, at):
+        table = {ONLY_BEFORE: GONE, ONLY_NOW: ADDED}.get(what, CHANGED)
+        if not any(fnmatchcase(place, pattern) for pattern in table):
+            yield f"{place}: {what}"
+
+
+ONLY_BEFORE, ONLY_NOW = "only before", "only now"
+
+
+def unlike(one: Any, other: Any, rel: float, at: str) -> Iterator[tuple[str, str]]:
+    """Places and how they differ; a number may be off relative to the largest beside it."""
     if isinstance(one, dict) and isinstance(other, dict):
-        for key in sorted(one.keys() | other.keys()):
-            new = RENAMED.get(key, key)
-            new_here = key not in one and (key in ADDED or key in RENAMED.values())
-            if key in TIMES or new_here:
-                continue
-            if key not in one or new not in other:
-                yield f"{at}/{key}: only {'before' if key in one else 'now'}"
+        one = {RENAMED.get(key, key): value for key, value in one.items()}
+        for key in sorted((one.keys() | other.keys()) - TIMES):
+            if key not in one or key not in other:
+                yield f"{at}/{key}", ONLY_BEFORE if key in one else ONLY_NOW
             else:
-                yield from differences(one[key], other[new], rel, f"{at}/{key}")
+                yield from unlike(one[key], other[key], rel, f"{at}/{key}")
     elif isinstance(one, list) and isinstance(other, list):
-        if len(one) != len(other):
-            yield f"{at}: {len(one)} and {len(other)} entries"
-            return
-        numbers = [abs(x) for x in one if isinstance(x, int | float) and x == x]
-        for i, (a, b) in enumerate(zip(one, other, strict=True)):
+        size = max((abs(x) for x in one if isinstance(x, int | float) and x == x), default=0.0)
+        for i, (a, b) in enumerate(zip(one, other, strict=False)):
             if isinstance(a, int | float) and isinstance(b, int | float):
-                if not close(a, b, rel, max(numbers, default=0.0)):
-                    yield f"{at}[{i}]: {a!r} and {b!r}"
+                if not close(a, b, rel, size):
+                    yield f"{at}[{i}]", f"{a!r} and {b!r}"
             else:
-                yield from differences(a, b, rel, f"{at}[{i}]")
+                yield from unlike(a, b, rel, f"{at}[{i}]")
+        if len(one) != len(other):
+            yield at, f"{len(one)} and {len(other)} entries"
     elif isinstance(one, int | float) and isinstance(other, int | float):
         if not close(one, other, rel, abs(one)):
-            yield f"{at}: {one!r} and {other!r}"
+            yield at, f"{one!r} and {other!r}"
     elif one != other:
-        yield f"{at}: {str(one)[:300]!r} and {str(other)[:300]!r}"
+        yield at, f"{shown(one, other)} and {shown(other, one)}"
+
+
+def shown(text: Any, other: Any) -> str:
+    """A text from shortly before where it departs from another."""
+    pairs = enumerate(zip(str(text), str(other), strict=False))
+    start = next((i for i, (a, b) in pairs if a != b), 0)
+    return repr(str(text)[max(start - 20, 0) : start + 80])
 
 
 def close(a: float, b: float, rel: float, size: float) -> bool:
     """Whether two numbers are the same, to a share of a size."""
     return a == b or (a != a and b != b) or abs(a - b) <= rel * max(size, abs(b))
-
-
-def compare(before: Path, now: Path, rel: float, only: str) -> list[str]:
-    """What differs between the answers of two revisions."""
-    out = []
-    for path in sorted(before.glob("*.answer.json")):
-        if only and re.sub(r"[^\w.]+", "-", only) not in path.name:
-            continue
-        if not (now / path.name).exists():
-            out.append(f"{path.name}: no answer now")
-            continue
-        one, other = (json.loads((folder / path.name).read_text()) for folder in (before, now))
-        for folder, answer in ((before, one), (now, other)):
-            for key in ("code", "stdout", "stderr"):
-                answer[key] = str(answer[key]).replace(str(folder), "")
-        for side in (one, other):
-            side["stdout"] = parsed(side["stdout"])
-            side["stderr"] = parsed(side["stderr"])
-            side["files"] = {name: content(name, text) for name, text in side["files"].items()}
-        out += [f"{path.name}{line}" for line in differences(one, other, rel)]
-    return out
 
 
 def git(*words: str) -> str:
@@ -310,60 +317,63 @@ def git(*words: str) -> str:
     return done.stdout.decode().strip()
 
 
+def started(tree: Path, out: Path, shared: Path, only: str) -> subprocess.Popen[bytes]:
+    """A revision at work, in a process of its own."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    command = [sys.executable, str(Path(__file__).resolve()), "--only", only]
+    command += ["--inside", str(tree), str(out), str(shared)]
+    log = (out / "log.txt").open("wb")
+    return subprocess.Popen(
+        command, stdout=log, stderr=log, env={**os.environ, "PYTHONPATH": str(tree)}
+    )
+
+
 def main() -> int:
     """Compare; 1 where something differs."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("revision", nargs="?", default="HEAD")
-    parser.add_argument("--rel", type=float, default=1e-12, help="how far numbers may be off")
+    parser.add_argument("--rel", type=float, default=1e-9, help="how far numbers may be off")
     parser.add_argument("--only", default="", help="commands whose name holds this")
     parser.add_argument("--inside", nargs=3, type=Path, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.inside:
         run(*chosen.inside, chosen.only)
         return 0
-    sys.path[:0] = [str(ROOT)]
-    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    commit = git("rev-parse", chosen.revision)
-    asked = inspect.getsource(cases) + inspect.getsource(prepare)
-    mark = hashlib.sha256(asked.encode()).hexdigest()[:8]
-    data, before, now = STORE / f"data-{mark}", STORE / f"{commit[:12]}-{mark}", STORE / "now"
-    data.mkdir(parents=True, exist_ok=True)
-    prepare(data)
-    shutil.rmtree(now, ignore_errors=True)
-    now.mkdir()
-    running = [started(ROOT, now, data, chosen.only)]
-    tree = STORE / "tree"
-    if not (before / "done").exists():
-        shutil.rmtree(before, ignore_errors=True)
-        before.mkdir()
-        git("worktree", "prune")
-        subprocess.run(
-            ["git", "-C", str(ROOT), "worktree", "remove", "--force", str(tree)],
-            check=False,
-            capture_output=True,
-        )
-        git("worktree", "add", "--detach", str(tree), commit)
-        running.append(started(tree, before, data, ""))
-    for process in running:
-        if process.wait():
-            raise SystemExit("a revision could not be run; see what it printed")
-    (before / "done").write_text("")
-    if not list(now.glob("*.answer.json")):
+    single = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MINIMAX_CAL_NO_FSYNC")
+    os.environ |= dict.fromkeys(single, "1")
+    common = git("rev-parse", "--path-format=absolute", "--git-common-dir")
+    shared = Path(common).parent.parent / "shared" / "data"  # beside the first of all worktrees
+    commit, asked = git("rev-parse", chosen.revision), cases(shared)
+    names = list(chosen_cases(asked, chosen.only))
+    if not names:
         raise SystemExit(f"no command's name holds {chosen.only!r}: nothing is compared")
-    found = compare(before, now, chosen.rel, chosen.only)
+    if not shared.is_dir():
+        print(f"skipped: real arms, for {shared} is not there")
+    mark = hashlib.sha256(json.dumps(asked).encode())
+    for path in sorted(INPUTS.rglob("*.*")):
+        mark.update(path.read_bytes())
+    before, now = STORE / f"{commit[:12]}-{mark.hexdigest()[:8]}", STORE / "now"
+    tree = STORE / "tree"
+    running = [started(ROOT, now, shared, chosen.only)]
+    if not (before / "done").exists():
+        if tree.exists():
+            git("worktree", "remove", "--force", str(tree))
+        git("worktree", "add", "--detach", str(tree), commit)
+        running.append(started(tree, before, shared, ""))
+    if sum(process.wait() != 0 for process in running):
+        raise SystemExit(f"a revision could not be run; see {STORE}/*/log.txt")
+    (before / "done").write_text("")
+    found = [
+        line
+        for name in names
+        for line in differences(answer_of(before, name), answer_of(now, name), chosen.rel, name)
+    ]
     print("\n".join(found[:200]))
-    print(f"{len(found)} differences from {commit[:12]} at {chosen.rel:g} relative")
+    spent = sum(json.loads((now / f"{name}.answer").read_text())["cpu_seconds"] for name in names)
+    print(f"{len(names)} commands in {spent:.0f} s of a processor; "
+          f"{len(found)} differences from {commit[:12]} at {chosen.rel:g} relative")  # fmt: skip
     return int(bool(found))
-
-
-def started(tree: Path, out: Path, data: Path, only: str) -> subprocess.Popen[bytes]:
-    """A revision at work, in a process of its own."""
-    command = [sys.executable, str(Path(__file__).resolve()), "--only", only]
-    command += ["--inside", str(tree), str(out), str(data)]
-    log = (out / "log.txt").open("wb")
-    return subprocess.Popen(
-        command, stdout=log, stderr=log, env={**os.environ, "PYTHONPATH": str(tree)}
-    )
 
 
 if __name__ == "__main__":
