@@ -38,10 +38,6 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.algorithm_1",
         "Paper M's Algorithm 1 to the letter, with and without a line search",
     ),
-    "random_arms": (
-        "experiments.random_arms",
-        "Arms of any kind with gross errors of all angles: how many reach the noise",
-    ),
     "conditions": (
         "experiments.conditions",
         "Errors, training and held out, under each way to fit, simulated and real",
@@ -55,10 +51,6 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.courses",
         "Error against iteration from paper S's start, simulated and real",
     ),
-    "calibration_process": (
-        "experiments.calibration_process",
-        "Error against iteration for all methods and backends, on real data",
-    ),
     "solver_accuracy": (
         "experiments.solver_accuracy",
         "What each QP backend is worth: accuracy, reliability and time",
@@ -67,22 +59,6 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.external",
         "Do claimed accuracies hold on poses set aside: halves, regions, ends of the session",
     ),
-    "ablation": (
-        "experiments.ablation",
-        "Which rules of the diagnosis pay: each taken out in turn, simulated and real arms",
-    ),
-    "ten_splits": (
-        "experiments.ten_splits",
-        "Do names of causes hold, whichever poses are held out",
-    ),
-    "halves": (
-        "experiments.halves",
-        "Do the sigmas of effects tell how far two halves of a measurement differ",
-    ),
-    "closed": (
-        "experiments.closed",
-        "Does the interval of the share of the gap that is closed hold it on new poses",
-    ),
     "blind_gap": (
         "experiments.blind_gap",
         "Does a diagnosis name the true cause: sealed arms, wrong laws, deleted causes",
@@ -90,10 +66,6 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
     "machine_gap": (
         "experiments.machine_gap",
         "The same on arms as shops have them: more makes, worse conditions, other forms of laws",
-    ),
-    "black_box": (
-        "experiments.black_box",
-        "What free functions predict beside geometry, and beside the effects that are named",
     ),
     "relative": (
         "experiments.relative",
