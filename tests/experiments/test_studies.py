@@ -1,12 +1,15 @@
 """The studies' own arithmetic on a small scale; CI runs them all in their quick form."""
 
+from multiprocessing.pool import Pool
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from experiments import any_base, conditions, off_starts
+from experiments import any_base, conditions, off_starts, solver_accuracy
 from experiments.off_starts import Job, Setting
 from experiments.pseudo_inverse import CONVERGED
+from qp_backends import Problem
 
 
 def test_the_grid_is_the_papers() -> None:
@@ -56,3 +59,15 @@ def test_minimax_has_the_least_rmse_phi_in_training() -> None:
     # a fit of one target is the minimax where that target stays the worst: equal then
     assert phi["minimax"] <= min(phi.values()) * (1 + 1e-7)
     assert phi["sum"] > phi["minimax"]
+
+
+def test_a_solver_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = np.eye(1)
+    problem = Problem(one, -np.ones(1), one, np.array([-1.0]), np.array([0.5]))
+    pools: list[Pool] = []
+    solution, _ = solver_accuracy.in_time(pools, problem, "daqp")
+    assert_allclose(solution.x, 0.5, rtol=1e-9)
+    monkeypatch.setattr(solver_accuracy, "LIMIT", 0.0)
+    with pytest.raises(TimeoutError):
+        solver_accuracy.in_time(pools, problem, "daqp")
+    assert not pools
