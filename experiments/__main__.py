@@ -83,14 +83,6 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.worst_point",
         "The worst point as objective: gain, three solvers, time and its growth",
     ),
-    "planning": (
-        "experiments.planning",
-        "What 40 planned poses are worth against random ones, predicted and true",
-    ),
-    "measuring_loop": (
-        "experiments.measuring_loop",
-        "Measure a few, fit, plan the next: poses until the promise is met",
-    ),
     "outliers": (
         "experiments.outliers",
         "Wrong points: losses, trimming and suspects, simulated and real",
