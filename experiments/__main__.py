@@ -95,10 +95,6 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.one_session",
         "Is anything said to have moved within one session, and is a move found",
     ),
-    "watch": (
-        "experiments.watch",
-        "Is a shifted joint found by ten poses, and how often is one named that did not move",
-    ),
     "errata": ("experiments.errata", "What is wrong in the papers as printed, by counter-example"),
     "simulator_gap": (
         "experiments.simulator_gap",
