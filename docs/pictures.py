@@ -20,8 +20,6 @@ sys.path += [str(DOCS), str(ROOT / "examples")]
 STUDIES = {  # picture: the study, and what it calls the picture in its folder
     "blind_detectability.png": ("blind_gap", "blind_gap_detectability"),
     "coverage.png": ("coverage", "coverage"),
-    "outliers.png": ("outliers", "outliers"),
-    "worst_growth.png": ("worst_point", "growth"),
     "relative.png": ("relative", "relative"),
     "simulator_gap.png": ("simulator_gap", "simulator_gap_ladder"),
     "subgradient.png": ("solver_accuracy", "subgradient"),

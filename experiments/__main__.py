@@ -79,14 +79,6 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.pixels",
         "What cameras tell of an arm: lenses that are wrong, bad starts, pixels that are too weak",
     ),
-    "worst_point": (
-        "experiments.worst_point",
-        "The worst point as objective: gain, three solvers, time and its growth",
-    ),
-    "outliers": (
-        "experiments.outliers",
-        "Wrong points: losses, trimming and suspects, simulated and real",
-    ),
     "coverage": (
         "experiments.coverage",
         "Do 95 % intervals hold the truth: parameters, positions, held-out accuracy, bootstrap",
