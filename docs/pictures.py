@@ -20,9 +20,6 @@ sys.path += [str(DOCS), str(ROOT / "examples")]
 STUDIES = {  # picture: the study, and what it calls the picture in its folder
     "blind_detectability.png": ("blind_gap", "blind_gap_detectability"),
     "coverage.png": ("coverage", "coverage"),
-    "outliers.png": ("outliers", "outliers"),
-    "worst_growth.png": ("worst_point", "growth"),
-    "planning.png": ("planning", "planning"),
     "relative.png": ("relative", "relative"),
     "simulator_gap.png": ("simulator_gap", "simulator_gap_ladder"),
     "subgradient.png": ("solver_accuracy", "subgradient"),
@@ -35,7 +32,6 @@ STUDIES = {  # picture: the study, and what it calls the picture in its folder
     "papers_m_fig5.png": ("papers", "conditions/sums_irb120"),
     "papers_m_fig6.png": ("papers", "conditions/accuracy_irb120"),
     "papers_splits.png": ("papers", "splits/splits"),
-    "papers_loop.png": ("papers", "measuring_loop/measuring_loop"),
 }
 
 

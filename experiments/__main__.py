@@ -38,10 +38,6 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.algorithm_1",
         "Paper M's Algorithm 1 to the letter, with and without a line search",
     ),
-    "random_arms": (
-        "experiments.random_arms",
-        "Arms of any kind with gross errors of all angles: how many reach the noise",
-    ),
     "conditions": (
         "experiments.conditions",
         "Errors, training and held out, under each way to fit, simulated and real",
@@ -55,10 +51,6 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.courses",
         "Error against iteration from paper S's start, simulated and real",
     ),
-    "calibration_process": (
-        "experiments.calibration_process",
-        "Error against iteration for all methods and backends, on real data",
-    ),
     "solver_accuracy": (
         "experiments.solver_accuracy",
         "What each QP backend is worth: accuracy, reliability and time",
@@ -67,22 +59,6 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.external",
         "Do claimed accuracies hold on poses set aside: halves, regions, ends of the session",
     ),
-    "ablation": (
-        "experiments.ablation",
-        "Which rules of the diagnosis pay: each taken out in turn, simulated and real arms",
-    ),
-    "ten_splits": (
-        "experiments.ten_splits",
-        "Do names of causes hold, whichever poses are held out",
-    ),
-    "halves": (
-        "experiments.halves",
-        "Do the sigmas of effects tell how far two halves of a measurement differ",
-    ),
-    "closed": (
-        "experiments.closed",
-        "Does the interval of the share of the gap that is closed hold it on new poses",
-    ),
     "blind_gap": (
         "experiments.blind_gap",
         "Does a diagnosis name the true cause: sealed arms, wrong laws, deleted causes",
@@ -90,10 +66,6 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
     "machine_gap": (
         "experiments.machine_gap",
         "The same on arms as shops have them: more makes, worse conditions, other forms of laws",
-    ),
-    "black_box": (
-        "experiments.black_box",
-        "What free functions predict beside geometry, and beside the effects that are named",
     ),
     "relative": (
         "experiments.relative",
@@ -107,22 +79,6 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.pixels",
         "What cameras tell of an arm: lenses that are wrong, bad starts, pixels that are too weak",
     ),
-    "worst_point": (
-        "experiments.worst_point",
-        "The worst point as objective: gain, three solvers, time and its growth",
-    ),
-    "planning": (
-        "experiments.planning",
-        "What 40 planned poses are worth against random ones, predicted and true",
-    ),
-    "measuring_loop": (
-        "experiments.measuring_loop",
-        "Measure a few, fit, plan the next: poses until the promise is met",
-    ),
-    "outliers": (
-        "experiments.outliers",
-        "Wrong points: losses, trimming and suspects, simulated and real",
-    ),
     "coverage": (
         "experiments.coverage",
         "Do 95 % intervals hold the truth: parameters, positions, held-out accuracy, bootstrap",
@@ -130,10 +86,6 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
     "one_session": (
         "experiments.one_session",
         "Is anything said to have moved within one session, and is a move found",
-    ),
-    "watch": (
-        "experiments.watch",
-        "Is a shifted joint found by ten poses, and how often is one named that did not move",
     ),
     "errata": ("experiments.errata", "What is wrong in the papers as printed, by counter-example"),
     "simulator_gap": (

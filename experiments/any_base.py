@@ -18,7 +18,7 @@ import click
 import numpy as np
 
 from experiments import sweep
-from experiments.off_starts import SAME, STEP, Setting, problem_of, starts_of
+from experiments.convergence import SAME, STEP, Setting, problem_of, starts_of
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.start import fit_base, search
 from minimax_cal.ground.tables import Cell, Table
@@ -69,7 +69,7 @@ def trials(seed: int, count: int, span: float) -> list[Trial]:
 
 def run(trial: Trial) -> Result:
     """The paper's start and ours on one trial."""
-    robot, model = problem_of(trial.setting, "identifiable")
+    robot, model = problem_of(trial.setting)
     points = float(model.counts.sum())
     least = truth_cost(robot, model)
     off = robot.mdh.copy()

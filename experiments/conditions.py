@@ -28,6 +28,7 @@ from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.reporting.plots.figures import AFTER, BEFORE
 from minimax_cal.robots.robot import Robot, load_robot
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ PAPER = {  # Table 3 of the paper: F_1, F_2, F_3 [mm^2, 100 poses], RMSE(phi) [m
     "minimax": (13.86, 12.49, 13.86, 0.372),
     "pose": (15.94, 11.88, 14.00, 0.399),
 }
+KINDS = (("ap", "AP (mm)"), ("ao", "AO (mrad)"), ("ao_angle", "AO' (mrad)"))
 
 
 @dataclass(frozen=True)
@@ -171,15 +173,32 @@ def boxes(title: str, found: dict[str, Outcome]) -> Figure:
 
     figure = Figure(figsize=(12, 6), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True)
-    kinds = (("ap", "AP (mm)"), ("ao", "AO (mrad)"), ("ao_angle", "AO' (mrad)"))
     for row, where in zip(panels, ("train", "held"), strict=True):
-        for axes, (kind, name) in zip(row, kinds, strict=True):
+        for axes, (kind, name) in zip(row, KINDS, strict=True):
             values = [getattr(getattr(outcome, where), kind) for outcome in found.values()]
             axes.boxplot(values, tick_labels=[str(i) for i in range(len(found))], whis=(5, 95))
             poses = "training" if where == "train" else "held out"
             axes.set(yscale="log", ylabel=f"{name}, {poses}")
             axes.grid(visible=True, axis="y", alpha=0.3)
     figure.suptitle(title + ": " + ", ".join(f"{i} {name}" for i, name in enumerate(found)))
+    return figure
+
+
+def pose_by_pose(title: str, found: dict[str, Outcome]) -> Figure:
+    """The right halves of Fig. 2-4: training poses in their order, a dot a reflector."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 3.2), layout="constrained")
+    for axes, (kind, name) in zip(figure.subplots(1, 3), KINDS, strict=True):
+        for condition, colour in (("nominal", BEFORE), ("minimax", AFTER)):
+            errors = found[condition].train
+            value = np.asarray(getattr(errors, kind)).reshape(len(errors.ao), -1)
+            pose = np.repeat(np.arange(1, len(value) + 1), value.shape[1])
+            axes.plot(pose, value.ravel(), ".", ms=3, color=colour, label=condition)
+        axes.set(xlabel="pose", ylabel=name, yscale="log")
+        axes.grid(visible=True, alpha=0.3)
+    axes.legend(frameon=False, fontsize="small")
+    figure.suptitle(title)
     return figure
 
 
@@ -253,6 +272,7 @@ def save(study: Study, found: Found) -> None:
     figures = {}
     for name in found:
         figures[f"accuracy_{name}"] = boxes(ROBOTS[name][0], found[name])
+        figures[f"by_pose_{name}"] = pose_by_pose(ROBOTS[name][0], found[name])
         figures[f"sums_{name}"] = sums_figure(ROBOTS[name][0], found[name])
     rows = [
         {"robot": row[0], "poses": row[1], "minimax_over_best_other": row[4], "best": row[5]}

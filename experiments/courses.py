@@ -3,7 +3,7 @@
     python -m experiments.courses [--quick] [--out FOLDER] [--json FILE] [--seed N] ...
 
 The four methods to the letter, in millimetres: from the four deviations of Fig. 5 on the simulated
-arm of `off_starts`; NLLM alone for ten times as long from starts that it has not come back from
+arm of `convergence`; NLLM alone for ten times as long from starts that it has not come back from
 (Fig. 4); and on real arms, 100 poses, one target, from the base at the identity, the target at the
 origin and nominal parameters (Fig. 6).  Steps without separation amplify rounding, so that each
 start of both runs again and again, each of its values moved by a unit of rounding or not.  Fig. 7
@@ -21,7 +21,7 @@ import click
 import numpy as np
 
 from experiments import pseudo_inverse, sweep
-from experiments.off_starts import CAP, PAPER, SAME, Setting, flat, grid, letter, measured, nudged
+from experiments.convergence import CAP, PAPER, SAME, Setting, flat, grid, letter, measured, nudged
 from experiments.real import here, real
 from experiments.speed import identified
 from experiments.sweep import Study, study_options

@@ -26,12 +26,10 @@ import click
 from experiments import (
     algorithm_1,
     any_base,
-    by_pose,
     conditions,
     convergence,
     courses,
     errata,
-    measuring_loop,
     methods,
     splits,
     sweep,
@@ -39,7 +37,6 @@ from experiments import (
     verdicts_s,
 )
 from experiments.real import SHARED
-from experiments.record import save_figure
 from experiments.sweep import Study, study_options
 from experiments.verdicts import HEADER, HOLDS, MISSING, NO, Verdict, of_quick, table_of
 from minimax_cal.ground.files import write_whole
@@ -61,20 +58,6 @@ def made_by(
         return judged(found)
 
     return make
-
-
-def from_conditions(study: Study) -> list[Verdict]:
-    """Paper M, Table 3 and Fig. 2-6."""
-    found = conditions.study_of(study)
-    conditions.save(study, found)
-    for robot, outcomes in found.items():
-        name = conditions.ROBOTS[robot][0]
-        save_figure(study.out, f"by_pose_{robot}", by_pose.picture(name, outcomes))
-    return [
-        *verdicts_m.condition_3(found),
-        *verdicts_m.improvements(found),
-        verdicts_m.worst(found),
-    ]
 
 
 def from_methods(study: Study) -> list[Verdict]:
@@ -103,10 +86,9 @@ STUDIES: dict[str, Callable[[Study], list[Verdict]]] = {
     "convergence": made_by(convergence, verdicts_s.table_2),
     "courses": made_by(courses, verdicts_s.courses),
     "any_base": made_by(any_base, verdicts_s.anywhere),
-    "conditions": from_conditions,
+    "conditions": made_by(conditions, verdicts_m.conditions),
     "methods": from_methods,
     "splits": made_by(splits, verdicts_m.many_splits),
-    "measuring_loop": made_by(measuring_loop, verdicts_m.measuring),
     "algorithm_1": made_by(algorithm_1, verdicts_m.to_the_letter),
     "errata": from_errata,
 }
@@ -127,7 +109,6 @@ def study_of(study: Study) -> list[Verdict]:
         *found["algorithm_1"],
         *verdicts_m.subproblems(study.quick),
         *verdicts_m.own_cell(),
-        *found["measuring_loop"],
         *found["errata"],
     ]
     return [of_quick(verdict) for verdict in verdicts] if study.quick else verdicts

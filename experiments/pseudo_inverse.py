@@ -2,8 +2,7 @@
 
 The library frees only identifiable parameters and works on normal equations; this is the papers'
 way, written for itself, without a line of the library.  Where numba is installed it is compiled
-(pip install 'minimax-cal[fast]'), which makes it several times as fast; the results agree.  What is
-not separable has a compiled twin, `pseudo_inverse_fast`, several times as fast again.
+(pip install 'minimax-cal[fast]'), which makes it several times as fast; the results agree.
 
 The parameters, `at`: (5n + 9,), are all a, d, theta, alpha, beta, then the base X_b, Y_b, Z_b, Phi,
 Theta, Psi, then the target.  Lengths are in the unit of y, and that unit matters: (J'J + mu I) adds

@@ -8,9 +8,6 @@ import numpy as np
 
 from experiments import algorithm_1, splits
 from experiments.conditions import PAPER, ROBOTS, Errors, Outcome
-from experiments.measuring_loop import Found as Loops
-from experiments.measuring_loop import Job as Loop
-from experiments.measuring_loop import counts_of
 from experiments.methods import METHODS as COMPARED
 from experiments.methods import MINIMAX, PARTS, PRINTED, SINGLE, Studies, figure_of
 from experiments.methods import POSE as POSE_FIT
@@ -25,6 +22,11 @@ Found = dict[str, dict[str, Outcome]]
 SMR = ("smr:1", "smr:2", "smr:3")
 FIVE = ("smr:1", "smr:2", "smr:3", "sum", "minimax", "pose")
 RAW_STEPS = 10_000
+
+
+def conditions(found: Found) -> list[Verdict]:
+    """Table 3 and Fig. 2-6."""
+    return [*condition_3(found), *improvements(found), worst(found)]
 
 
 def condition_3(found: Found) -> list[Verdict]:
@@ -270,27 +272,6 @@ def subproblems(quick: bool) -> list[Verdict]:
                 f"median of {len(cases)} QPs; subgradient:raw is the paper's, subgradient is PDHG "
                 "(Chambolle-Pock) restarted and averaged as in PDLP", "relative KKT residual below "
                 "1e-6; in part: on one form", len(cases)),
-    ]  # fmt: skip
-
-
-def measuring(found: dict[Loop, Loops]) -> list[Verdict]:
-    """The measuring loop of both papers' cells."""
-    counts = counts_of(list(found.values()))
-    middle = {way: float(np.median(count)) for way, count in counts.items()}
-    saved = {
-        way: 100.0 * (1.0 - float(np.median(counts["loop"] / counts[way])))
-        for way in ("one plan", "random")
-    }
-    goal = 1e6 * next(iter(found)).goal
-    return [
-        Verdict("S 2.1, M IV-A: robot to pose, tracker measures, next", "measuring_loop",
-                "100 poses, arbitrary",
-                f"planned after each few {middle['loop']:.0f} poses, one plan "
-                f"{middle['one plan']:.0f}, random {middle['random']:.0f}",
-                told(saved["random"] > 0.0),
-                f"until the predicted sigma is {goal:g} µm, medians of {len(found)} arms; the loop "
-                f"saves {saved['random']:.0f} % against random, {saved['one plan']:.0f} % against "
-                "one plan", "fewer poses than random ones, in the median", len(found)),
     ]  # fmt: skip
 
 

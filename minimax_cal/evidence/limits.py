@@ -1,8 +1,8 @@
 """Every number that the diagnosis compares with a statistic, and what set it.
 
-The budget of errors is 1 % of sound arms: half of it for names, half for structure.  `machine_gap`,
-`blind_gap`, `ten_splits` and `ablation` are studies of `experiments`, with seeds other than those
-of the printed tables.  `python tests/thresholds.py` lists them with the places where they decide.
+The budget of errors is 1 % of sound arms: half of it for names, half for structure.  `machine_gap`
+and `blind_gap` are studies of `experiments`, with seeds other than those of the printed tables.
+`python tests/thresholds.py` lists them with the places where they decide.
 """
 
 # ---- what is named -------------------------------------------------------------------------------

@@ -70,7 +70,7 @@ MIN_HOPELESS_MISS = 10.0 * POOR_FIT
 LAST_STEPS = 20  # of the SQP are enough to say so; its QPs then go from backend to backend
 # Relative singular value from which a parameter joins at the answer.  Axes drawn parallel show it
 # by about their angle in rad: a few 1e-3 in whole arms, where it would be noise.  Of random arms
-# whose angles are off by up to 0.5 rad some need 2e-2 (`experiments random_arms`).
+# whose angles are off by up to 0.5 rad some need 2e-2.
 MIN_GROWN_SINGULAR = 1e-2
 # of the cost: one that shows less joins if so much is left (of those arms, 0.1 to 0.4)
 MAX_REMAINING_COST = 0.5

@@ -3,6 +3,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.testing import assert_allclose
 
+from experiments.gap_cases import Case, Cause, make
+from minimax_cal import diagnose
 from minimax_cal.diagnosing.joint import Joint, joint
 from minimax_cal.diagnosing.remainder import Beside, Block, Left, begun, far_apart, remainder
 from minimax_cal.diagnosing.study import SUM, studied
@@ -132,3 +134,19 @@ def test_what_no_pose_shows_is_nothing(rng: np.random.Generator) -> None:
         for kept in (np.arange(4) != 2, np.ones(4, dtype=bool))
     )
     assert_allclose(whole.error, some.error, atol=1e-12)
+
+
+def test_what_a_name_takes_no_free_function_predicts() -> None:
+    """Play, of which functions of the joints know nothing."""
+    made = make(Case("irb2600", "single", (Cause("backlash", "J2", 2000.0),), seed=11))
+    told = diagnose(made.robot, made.data, quick=True)
+    train = told.data.take(~told.held)
+    study = studied(made.robot, train, fit_cell(made.robot, train, SUM, silent))
+    bare, named = (
+        remainder(joint(study, terms), told.floor) for terms in ((), told.cells[-1].effects.terms)
+    )
+    geometry, left = (np.hypot(r.predictable_mm, r.unpredictable_mm) for r in (bare, named))
+    assert left < 0.7 * geometry
+    assert bare.unpredictable_mm > 0.9 * geometry
+    assert named.unpredictable_mm > 0.9 * left
+    assert 0.7 < told.ladder[-1].trusted.rms_mm / left < 1.4

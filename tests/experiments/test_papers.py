@@ -12,14 +12,12 @@ from click.testing import CliRunner
 from conftest import ROOT, shared
 from numpy.testing import assert_allclose
 
-from experiments import errata, measuring_loop, splits
+from experiments import errata, splits
 from experiments.__main__ import STUDIES
 from experiments.conditions import PAPER, Errors
-from experiments.convergence import Row, moved_of
+from experiments.convergence import Row, grid, moved_of
 from experiments.courses import Course, rises
 from experiments.index import tables_of
-from experiments.measuring_loop import Job
-from experiments.off_starts import grid
 from experiments.splits import Held
 from experiments.verdicts import (
     HEADER,
@@ -149,16 +147,6 @@ def test_splits_hold_every_region_out_once_and_tell_their_spread() -> None:
     s = splits.spread_of(found, "irb2600", "by groups", 0)
     assert_allclose([s.median, s.low, s.high], [1.15, 1.025, 1.275])
     assert (s.wins, s.splits) == (1, 6)
-
-
-def test_the_measuring_loop_ends_where_its_promise_is_met() -> None:
-    job = Job(0, 45e-6, 120, 1)
-    found = measuring_loop.run(job)
-    for course in (found.loop, *found.random):
-        assert course.promise[-1] <= job.goal < min((*course.promise[:-1], np.inf))
-        assert np.all(np.diff(course.poses) == measuring_loop.MORE)
-        assert course.error[-1] < 4.0 * course.promise[-1]  # a promise, not a fancy
-    assert found.once.poses[0] >= measuring_loop.FIRST
 
 
 # ---- the page ----------------------------------------------------------------------------------

@@ -1,45 +1,48 @@
 """The studies' own arithmetic on a small scale; CI runs them all in their quick form."""
 
+from multiprocessing.pool import Pool
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from experiments import any_base, black_box, conditions, off_starts
-from experiments.off_starts import Job, Setting
+from experiments import any_base, conditions, convergence, solver_accuracy
+from experiments.convergence import Job, Setting
 from experiments.pseudo_inverse import CONVERGED
+from qp_backends import Problem
 
 
 def test_the_grid_is_the_papers() -> None:
-    theta, alpha = off_starts.grid(1)
+    theta, alpha = convergence.grid(1)
     assert len(theta) == 63 * 63
     assert_allclose([theta.min(), theta.max(), alpha.min(), alpha.max()], [-3.1, 3.1, -3.1, 3.1])
-    few, _ = off_starts.grid(3)
+    few, _ = convergence.grid(3)
     assert len(few) == 21 * 21
     assert set(few) <= set(theta)
     assert 0.0 in few  # the nominal start is on every grid
 
 
-@pytest.mark.parametrize("method", off_starts.PAPER)
-@pytest.mark.parametrize("unit", off_starts.UNITS)
+@pytest.mark.parametrize("method", convergence.PAPER)
+@pytest.mark.parametrize("unit", convergence.UNITS)
 def test_the_letter_and_the_library_reach_the_same_minimum(method: str, unit: str) -> None:
     setting = Setting(seed=1)
-    least = off_starts.least_cost(setting)
-    robot, model = off_starts.problem_of(setting, "identifiable")
-    begin = off_starts.flat(robot, 0.2, -0.1)
-    _, cost, ended, _ = off_starts.letter(method, unit, model, begin, 2000)
+    least = convergence.least_cost(setting)
+    robot, model = convergence.problem_of(setting)
+    begin = convergence.flat(robot, 0.2, -0.1)
+    _, cost, ended, _ = convergence.letter(method, unit, model, begin, 2000)
     assert ended == CONVERGED
     assert_allclose(cost, least, rtol=1e-6)
-    ours = off_starts.run(Job(setting, method, "identifiable", (0.2,), (-0.1,), 2000))
+    ours = convergence.run(Job(setting, method, "identifiable", (0.2,), (-0.1,), 2000))
     assert ours.converged == (True,)
     assert_allclose(ours.cost[0], least, rtol=1e-6)
 
 
 def test_separable_methods_come_back_from_radians_away() -> None:
     setting = Setting(seed=1)
-    least = off_starts.least_cost(setting)
+    least = convergence.least_cost(setting)
     corners = (-3.1, -3.1, 3.1, 3.1, 1.5), (-3.1, 3.1, -3.1, 3.1, -2.0)
     for method in ("snlgn", "snllm"):
-        found = off_starts.run(Job(setting, method, "identifiable", *corners, 500))
+        found = convergence.run(Job(setting, method, "identifiable", *corners, 500))
         assert_allclose(found.cost, least, rtol=1e-6)
 
 
@@ -58,10 +61,13 @@ def test_minimax_has_the_least_rmse_phi_in_training() -> None:
     assert phi["sum"] > phi["minimax"]
 
 
-def test_what_a_name_takes_no_free_function_predicts() -> None:
-    found = black_box.run(black_box.Job(black_box.SIMULATED, 0))
-    geometry, free, named, left, held = found.rms_mm
-    assert named < 0.7 * geometry  # play, of which functions of the joints know nothing
-    assert free > 0.9 * geometry
-    assert left > 0.9 * named
-    assert 0.7 < held / named < 1.4
+def test_a_solver_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = np.eye(1)
+    problem = Problem(one, -np.ones(1), one, np.array([-1.0]), np.array([0.5]))
+    pools: list[Pool] = []
+    solution, _ = solver_accuracy.in_time(pools, problem, "daqp")
+    assert_allclose(solution.x, 0.5, rtol=1e-9)
+    monkeypatch.setattr(solver_accuracy, "LIMIT", 0.0)
+    with pytest.raises(TimeoutError):
+        solver_accuracy.in_time(pools, problem, "daqp")
+    assert not pools

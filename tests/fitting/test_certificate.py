@@ -1,15 +1,14 @@
 from dataclasses import dataclass, replace
 from functools import partial
 
+import cvxpy as cp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from problems_fit import solve
 
 import minimax_cal as mc
-from experiments import cones
 from experiments.speed import identified
-from experiments.worst_point import Case, by_cones, by_cvxpy, by_sqp, linear_optimum
 from minimax_cal.fitting.certificate import PointCones, certify
 from minimax_cal.fitting.minimax_problem import (
     Distances,
@@ -18,10 +17,12 @@ from minimax_cal.fitting.minimax_problem import (
     minimax_problem,
 )
 from minimax_cal.ground import files
+from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Model, Prior
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import Simulation, simulate
 from minimax_cal.solvers import minimax
+from minimax_cal.solvers.dual_bound import Rows
 from minimax_cal.solvers.minimax import Optimum, Sqp
 from minimax_cal.solvers.status import Status
 from qp_backends import solve as solve_qp
@@ -41,12 +42,36 @@ class Setup:
     def worst(self) -> MinimaxProblem:
         return minimax_problem(self.model, self.start, self.distances, self.form, "point")
 
-    @property
-    def case(self) -> Case:
-        return Case(self.data, self.start, self.worst)
-
     def sqp(self, **settings: object) -> Optimum[State]:
         return minimax.solve(self.worst, self.start, QP, Sqp(**settings))  # type: ignore[arg-type]
+
+    def value(self) -> float:
+        """The largest distance by the SQP on squared distances [m]."""
+        return float(np.sqrt(self.sqp().value * self.worst.size))
+
+
+def linear_optimum(rows: Rows, lower: Array, upper: Array) -> tuple[Array, float]:
+    """Step and value of min max |r_i + J_i d|, lower <= c + C d <= upper, by cvxpy."""
+    n, w, p = rows.J.shape
+    d, t = cp.Variable(p), cp.Variable()
+    r = rows.r + cp.reshape(rows.J.reshape(n * w, p) @ d, (n, w), order="C")
+    kept = [cp.norm(r, axis=1) <= t]
+    kept += [rows.c + rows.C @ d >= lower, rows.c + rows.C @ d <= upper] if len(rows.c) else []
+    problem = cp.Problem(cp.Minimize(t), kept)
+    problem.solve(solver="CLARABEL", tol_gap_abs=1e-9, tol_gap_rel=1e-9, tol_feas=1e-9)
+    return np.asarray(d.value), float(problem.value)
+
+
+def by_cones(here: Setup) -> float:
+    """The largest distance by cone programs stated for cvxpy, until it stands still [m]."""
+    points, x, value = PointCones.of(here.worst), here.start, np.inf
+    for _ in range(20):
+        rows = points.linearise(x)
+        x = points.step(x, linear_optimum(rows, points.lower, points.upper)[0])
+        before, value = value, float(points.linearise(x).norms.max())
+        if abs(before - value) <= 1e-9 * value:
+            break
+    return value * float(np.sqrt(here.worst.size))
 
 
 def setup(robot: mc.Robot, data: mc.Measurements) -> Setup:
@@ -125,11 +150,9 @@ def test_norms_are_the_sqps_functions(name: str, robot: mc.Robot, noisy: Simulat
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_three_ways_end_at_the_same_value(name: str, robot: mc.Robot, noisy: Simulation) -> None:
-    """SQP on squares, our cone programs, and cone programs stated for cvxpy."""
+def test_cone_programs_end_at_the_same_value(name: str, robot: mc.Robot, noisy: Simulation) -> None:
     here = CASES[name](robot, noisy)
-    values = [way(here.case) for way in (by_sqp, by_cones, by_cvxpy)]
-    assert_allclose(values, values[-1], rtol=1e-8)
+    assert_allclose(here.value(), by_cones(here), rtol=1e-8)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -215,14 +238,11 @@ def test_a_certificate_does_not_depend_on_the_scaling(robot: mc.Robot, noisy: Si
         assert_allclose(other.multiplier, same.multiplier, rtol=1e-6)
 
 
-def test_cones_find_their_way_from_the_nominal_arm(robot: mc.Robot, noisy: Simulation) -> None:
-    """Errors of millimetres, not of the fit: the trust region and several programs are needed."""
+def test_the_sqp_finds_its_way_from_the_nominal_arm(robot: mc.Robot, noisy: Simulation) -> None:
+    """Errors of millimetres, not of the fit."""
     model, begin = identified(robot, noisy.data)
     here = Setup(noisy.data, model, begin, measured_distances(noisy.data))
-    found = cones.solve(PointCones.of(here.worst), begin)
-    assert found.status is Status.CONVERGED
-    reference = by_sqp(plain(robot, noisy).case)
-    assert_allclose(found.value * np.sqrt(here.worst.size), reference, rtol=1e-8)
+    assert_allclose(here.value(), by_cones(plain(robot, noisy)), rtol=1e-8)
 
 
 def test_thousands_of_points(robot: mc.Robot) -> None:
@@ -231,4 +251,6 @@ def test_thousands_of_points(robot: mc.Robot) -> None:
     assert many.sqp().iterations <= few.sqp().iterations + 3
     proof = certify(many.worst, many.sqp(), many.data.line)
     assert abs(proof.gap) < 1e-8
-    assert_allclose(by_cones(many.case), proof.value, rtol=1e-8)
+    points = PointCones.of(many.worst)
+    _, optimum = linear_optimum(points.linearise(many.sqp().x), points.lower, points.upper)
+    assert_allclose(optimum * np.sqrt(many.worst.size), proof.value, rtol=1e-7)

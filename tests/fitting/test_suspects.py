@@ -11,7 +11,6 @@ from problems_robust import EVEN, NOISE, Case, fit, misread, shifted, state_of
 from scipy import stats
 
 import minimax_cal as mc
-from experiments import outliers
 from minimax_cal.fitting.suspects import (
     FALSE_DISCOVERY_RATE,
     Scores,
@@ -271,33 +270,3 @@ def test_lines_are_those_of_the_file(robot: mc.Robot) -> None:
     lines = [[one.line for one in each.robust().suspects] for each in (case, moved)]
     assert lines[0]
     assert_allclose(lines[1], np.array(lines[0]) + 100)
-
-
-# ---- the study's own arithmetic --------------------------------------------------------------
-
-
-def test_the_study_moves_the_share_it_says(robot: mc.Robot) -> None:
-    data = simulate(robot, 40, 3, 0, EVEN).data
-    moved, wrong = outliers.spoilt(data, outliers.Job("irb2600", 40, 5, 0.7, 3))
-    off = np.linalg.norm(moved.y - data.y, axis=-1)
-    assert len(wrong) == np.count_nonzero(off) == 6
-    assert_allclose(off[off > 0.0], 0.7e-3, rtol=1e-9)
-    assert wrong == {
-        (data.line[row], data.target_names[column]) for row, column in np.argwhere(off > 0.0)
-    }
-
-
-def test_the_study_counts_over_all_fits() -> None:
-    one = outliers.Result(0.03, 0.03, 0.003, 0.004, 9, 10, 1, "converged")
-    two = outliers.Result(0.05, 0.04, 0.003, 0.004, 10, 10, 0, "stalled")
-    row = outliers.Row.of("sum, tukey", 5, 1.0, [one, two])
-    assert row.ratio == pytest.approx(np.hypot(0.03, 0.05) / np.hypot(0.03, 0.04))
-    assert row.worst_ratio == pytest.approx(1.25)
-    assert (row.recall, row.others, row.converged) == (0.95, 0.05, 1)
-    assert row.kept == "no"
-    assert outliers.Row.of("sum, tukey", 5, 1.0, [one]).kept == "no"  # recall 90 %
-    best = replace(one, found=10)
-    assert outliers.Row.of("sum, tukey", 5, 1.0, [best]).kept == "yes"
-    clean = outliers.Row.of("sum", 0, 1.0, [replace(one, found=0, wrong=0)])
-    assert np.isnan(clean.recall)
-    assert clean.clean_lists == 1.0  # a suspect where nothing is wrong

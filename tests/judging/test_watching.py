@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from conftest import run, shared
 from numpy.testing import assert_allclose
+from problems_watch import SHIFT, checked, seen_anew, shifted
 
 import minimax_cal as mc
 from experiments import one_session
 from experiments.one_session import Job
-from experiments.watch import SHIFT, Trial, seen_anew, shifted
-from experiments.watch import run as trial
 from minimax_cal.judging.watching import moved
 from minimax_cal.modelling.effects import EFFECTS
 from minimax_cal.modelling.simulate import Simulation, Truth, gravity, simulate
@@ -51,9 +50,8 @@ def knocked(fit: mc.Fit, made: Simulation):  # type: ignore[no-untyped-def]
 
 @pytest.mark.parametrize("arm", ["irb120", "ur10"])
 def test_a_shifted_joint_is_found_and_nothing_else(arm: str) -> None:
-    """The short form of `python -m experiments watch`."""
     for seed in (0, 1):
-        found = trial(Trial(arm, seed, 0.0))
+        found = checked(arm, seed)
         assert found.named == (found.joint,)
         assert found.alarms == ()
         assert "theta1" in found.hidden
@@ -62,7 +60,7 @@ def test_a_shifted_joint_is_found_and_nothing_else(arm: str) -> None:
 
 @pytest.mark.slow
 def test_rates_are_those_promised() -> None:
-    results = [trial(Trial(arm, seed, 0.0)) for arm in ("irb2600", "ur10") for seed in range(150)]
+    results = [checked(arm, seed) for arm in ("irb2600", "ur10") for seed in range(150)]
     assert np.mean([r.joint in r.named for r in results]) >= 0.95
     assert np.mean([bool(r.alarms) for r in results]) < 0.01
 

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from experiments import planning as study
 from minimax_cal.diagnosing import next_measurement
 from minimax_cal.evidence.alternatives import ENOUGH
 from minimax_cal.ground.arrays import Array
@@ -25,6 +24,7 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import gravity
 from minimax_cal.planning import plan as module
 from minimax_cal.planning import separating, task
+from minimax_cal.planning.candidates import free_poses
 from minimax_cal.planning.designs.criteria import (
     Criterion,
     Determinant,
@@ -38,6 +38,7 @@ from minimax_cal.planning.designs.criteria import (
 from minimax_cal.planning.designs.exchange import Menu, exchange, floor, greedy, lower_bound, polar
 from minimax_cal.planning.designs.search import best_design, first_design, worth
 from minimax_cal.planning.observability import observability
+from minimax_cal.planning.options import PlanOptions
 from minimax_cal.planning.outlook import sigmas
 from minimax_cal.planning.plan import plan
 from minimax_cal.planning.prospect import (
@@ -50,6 +51,7 @@ from minimax_cal.planning.prospect import (
 )
 from minimax_cal.planning.result import POWER, Plan
 from minimax_cal.planning.route import lengths, shortest, travel, visits
+from minimax_cal.planning.setting import surroundings
 from minimax_cal.robots.sampling import random_poses
 
 ROUNDING = 1e-9  # relative: the same numbers by other algebra
@@ -436,6 +438,25 @@ def test_a_plan_is_better_than_random_poses(planned: Plan) -> None:
         assert other > 0.0
 
 
+def test_a_plan_is_better_at_poses_that_it_does_not_know(planned: Plan) -> None:
+    room, _, _ = surroundings(planned.cell, PlanOptions(targets=1))
+    fresh = free_poses(room, 1000, 1_000_003)
+    every = planned.candidates
+    ahead = prospect(planned.cell, planned.instrument, every.q, every.seen)
+    b = ahead.predictions(fresh)
+    squares = (b.swapaxes(1, 2) @ b).reshape(len(b), -1)
+
+    def told(q: Array, seen: Array, chosen: list[Array]) -> Array:
+        menu = Menu(ahead.ahead(q, seen), np.zeros((len(ahead.scale),) * 2))
+        return sigmas(menu, chosen, squares)[:, 0]
+
+    (ours,) = told(planned.q, planned.seen, [np.arange(12)])
+    rng = np.random.default_rng(0)
+    drawn = [rng.choice(every.drawn, 12, replace=False) for _ in range(20)]
+    assert_allclose(ours, planned.here.mean[0], rtol=0.1)
+    assert ours < told(every.q, every.seen, drawn).min()
+
+
 def test_predicted_sigmas_are_those_of_the_information(planned: Plan, robot: mc.Robot) -> None:
     ahead = prospect(planned.cell, planned.instrument, planned.candidates.q,
                      planned.candidates.seen)  # fmt: skip
@@ -643,25 +664,3 @@ def test_a_fit_tells_where_things_are(robot: mc.Robot, noisy: object) -> None:
     strange = mc.measurements(np.zeros((1, 6)), np.ones((1, 3, 3)))
     with pytest.raises(mc.OptionError, match="target smr2 is not one of the fit's"):
         plan(robot, 10, fit=cell, data=strange)
-
-
-# ---- the study ---------------------------------------------------------------------------------
-
-
-def test_the_study_judges_at_poses_that_the_plan_does_not_know() -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(study, "FRESH", 100)
-        patch.setattr(study, "DRAWS", 20)
-        job = study.Job("anywhere", 1, "I", 0, 150, 1)
-        found = study.run(job)
-    assert found.planned[0] < found.random[0, 0]
-    assert np.all(np.diff(found.random[:, 0]) < 0.0)  # more poses, less variance
-    assert 40.0 < found.worth <= found.most * 1.1
-    assert set(found.errors) == set(study.ARMS)
-    for errors in found.errors.values():
-        assert errors.shape == (1, 3, 2)
-        assert np.all(errors[..., 0] <= errors[..., 1])
-    # noise alone: the true errors are near those predicted; bending that is not fitted is far off
-    assert found.errors["geometry"][0, 0, 0] < 2.5 * found.planned[0]
-    assert found.errors["compliance, not fitted"][0, 0, 0] > 5.0 * found.planned[0]
-    assert {job.criterion for job in study.jobs_of(False, 0)} == {"D", "A", "E", "G", "I"}

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import run
+from problems_watch import shifted
 
 import minimax_cal as mc
-from experiments.watch import shifted
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.reporting.fleet.overview import Fleet
 from minimax_cal.reporting.fleet.work import Row
