@@ -375,7 +375,7 @@ def beside_priors(at: At, index: Array, ridge: Array) -> Array:
     """
     each = range(len(index))
     gram = at.lines[:, :, index].copy()
-    gram[:, each, each] += LEAST * at.whole[:, index]
+    gram[:, each, each] = np.maximum(gram[:, each, each], LEAST * at.whole[:, index])
     gram[:, each, each] += np.pad(ridge, (len(index) - len(ridge), 0))
     return gram
 

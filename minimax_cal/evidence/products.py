@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from minimax_cal.evidence.limits import LEAST_NOISE_DOF
-from minimax_cal.evidence.noise import Noise, Problem, costs, noise_of, told_apart, triangles
+from minimax_cal.evidence.noise import RANK, Noise, Problem, costs, noise_of, told_apart, triangles
 from minimax_cal.evidence.ratios import NODES, RATIOS, ZERO, find_ratio, interpolation, nodes
 from minimax_cal.ground.arrays import Array
 
-LEAST = 1e-13  # of a column's square: what is left of one that geometry imitates is no less
+LEAST = RANK**2  # of a column's square: what is left of one that geometry imitates is no less
 BLOCK = 1_000_000  # weighed numbers that are held at once
 SHRINK = np.array([1.0, 0.4, 0.12, 0.03, 0.0])  # of the ratio, when an effect is added
 
@@ -410,7 +410,8 @@ class Products:
             gram[here] = np.tensordot(between, beside.square(chosen), 1)
             least[here] = LEAST * (between @ beside.sums.squares()[index].T)
             logs[here] = between @ beside.logs
-        gram[:, range(len(index)), range(len(index))] += least
+        each = range(len(index))
+        gram[:, each, each] = np.maximum(gram[:, each, each], least)
         return gram, logs
 
     @property
