@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import run
-from dynamics.motions import Extra, fourier, simulated, three_joints
+from dynamics.motions import Extra, driven_torque, fourier, simulated, three_joints
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
@@ -32,8 +32,8 @@ def at(j: int, law: Extra) -> Extra:
     return more
 
 
-def compliant(j: int, compliance: float) -> Extra:
-    """A joint that turns back by its torque."""
+def compliant(j: int, compliance: float, turns: Array | None = None) -> Extra:
+    """A drive whose gear turns back by its torque.  turns: as `driven_torque`."""
 
     def more(motion: Motion, rigid: Array, time: Array) -> Array:
         by = np.zeros_like(rigid)
@@ -41,7 +41,7 @@ def compliant(j: int, compliance: float) -> Extra:
         rate = np.gradient(by, time, axis=0)
         change = np.gradient(rate, time, axis=0)
         moved = Motion(motion.q + by, motion.qd + rate, motion.qdd + change)
-        return inverse_dynamics(ARM, moved, inertial_parameters(ARM)) - rigid
+        return driven_torque(moved, inertial_parameters(ARM), turns) - rigid
 
     return more
 
@@ -86,6 +86,16 @@ def test_one_effect_is_named_with_its_size(name: str) -> None:
     assert after < 0.8 * before
     usual = {f"{e.effect}:{e.place}" for e in found.effects if e.effect in ("coulomb", "viscous")}
     assert usual == {f"{kind}:J{j}" for kind in ("coulomb", "viscous") for j in (1, 2, 3)}
+
+
+def test_flexibility_of_a_drive_that_moves_two_joints() -> None:
+    """Joint 3 turns by q3 - q2: gear 2 winds up by the torque of drive 2, and turns both back."""
+    turns = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 1.0]])
+    runs = simulated(compliant(1, 4e-4, turns), seed=3, turns=turns)
+    found = mc.diagnose_motion(replace(ARM, coupling=turns), runs)
+    assert (found.verdict, names(found)) == ("named", {"joint_flexibility:J2"})
+    value = next(e for e in found.main if e.effect == "joint_flexibility").parameters[0].value
+    assert value == pytest.approx(4e-4, rel=0.1)
 
 
 def test_a_rigid_body_alone_has_no_cause() -> None:
