@@ -10,7 +10,7 @@ import numpy as np
 
 from minimax_cal.dynamics.laws import Term
 from minimax_cal.dynamics.model import FRICTION, RIGID, Normal, held_friction, solve_scaled
-from minimax_cal.dynamics.rows import Logs, rms_by_joint
+from minimax_cal.dynamics.rows import QUARTERS, Logs, rms_by_joint
 from minimax_cal.dynamics.search import Columns
 from minimax_cal.ground.arrays import Array
 
@@ -117,6 +117,20 @@ def folds_of(logs: Logs, share: float, named: Sequence[str]) -> Array:
         return np.asarray(logs.quarter)
     parts = min(count, max(2, round(1.0 / share)))
     return np.asarray((np.arange(count) % parts)[logs.run])
+
+
+def by_loads(fold: Array, logs: Logs, terms: Sequence[Term]) -> Array:
+    """(R,) folds in which runs whose load no other fold has are left out by quarters.
+
+    fold: (R,) of whole runs.  terms: laws found, with the payloads of runs.
+    """
+    carried = [tuple(t.text for t in terms if dict(t.tuned).get(name)) for name in logs.names]
+    out, parts = fold.copy(), int(fold.max()) + 1
+    for load in set(carried):
+        rows = np.isin(logs.run, [r for r, each in enumerate(carried) if each == load])
+        if len(np.unique(fold[rows])) == 1 and parts > 1:
+            out[rows] = logs.quarter[rows] % min(parts, QUARTERS)
+    return out
 
 
 def steps_of(terms: Sequence[Term]) -> list[tuple[str, tuple[Term, ...]]]:

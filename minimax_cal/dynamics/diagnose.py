@@ -11,7 +11,14 @@ import numpy as np
 from scipy.special import ndtr
 from threadpoolctl import threadpool_limits
 
-from minimax_cal.dynamics.budget import LeftOut, drawn_missed, folds_of, parts_of, steps_of
+from minimax_cal.dynamics.budget import (
+    LeftOut,
+    by_loads,
+    drawn_missed,
+    folds_of,
+    parts_of,
+    steps_of,
+)
 from minimax_cal.dynamics.given import (
     Payload,
     gains_of,
@@ -21,7 +28,7 @@ from minimax_cal.dynamics.given import (
     with_payload,
 )
 from minimax_cal.dynamics.laws import ANGLE, CURVE, LAWS, USUAL, Term, terms_of
-from minimax_cal.dynamics.links import LinkChange, body_as_given
+from minimax_cal.dynamics.links import LinkChange, body_as_given, carried
 from minimax_cal.dynamics.model import FRICTION, RIGID, Body, Normal, TorqueModel, first_body
 from minimax_cal.dynamics.probes import Unexplained, unexplained
 from minimax_cal.dynamics.result import (
@@ -180,7 +187,10 @@ def search(arm: Arm, logs: Logs, exclude: Sequence[str]) -> Found:
     scene = Scene.of(arm, logs)
     context = first_body(Columns(scene))
     columns = Columns(context.in_scene(scene))
-    terms, lacking = terms_of(columns.scene, exclude)
+    every, lacking = terms_of(columns.scene, exclude)
+    terms = [term for term in every if term.effect != "payload"]
+    if len(terms) < len(every):
+        terms += carried(columns, terms)
     white = whitening(logs, generous(columns, terms))
     library = Library.of(dictionary_of(columns, white), terms, [])
     choice = select(library)
@@ -241,6 +251,7 @@ def examined(
     if len(learning) < len(logs.names):
         columns = Columns(found.context.scene(arm, logs))
     normal = fitted(found, columns)
+    fold, whole = by_loads(fold, logs, found.terms), fold
     known = columns.error()
     before = known + (early.y - logs.y).T
     judge = LeftOut.of(normal, known, before, fold)
@@ -267,7 +278,7 @@ def examined(
         too_little=too_little,
         models=models,
         runs=logs.names,
-        held_out=held_words(logs, fold),
+        held_out=held_words(logs, fold, whole),
         held_run=held_run(judge, logs, parts_of(found.terms)),
         curves=curves(found, normal, judge),
         notices=tuple(body_notices(arm, given, change, logs)),
@@ -280,14 +291,16 @@ def named_free(fold: Array, logs: Logs, run: int) -> bool:
     return not (only_some_judge and fold[logs.run == run][0] >= 0)
 
 
-def held_words(logs: Logs, fold: Array) -> str:
-    """How rows were held out."""
+def held_words(logs: Logs, fold: Array, whole: Array) -> str:
+    """How rows were held out.  fold: (R,); whole: before runs were left out by quarters."""
     if (fold < 0).any():
         names = dict.fromkeys(logs.names[r] for r in logs.run[fold >= 0])
         return f"runs kept out: {', '.join(names)}"
     if len(logs.names) == 1:
         return "one run: its quarters left out in turn"
-    return "runs left out in turn"
+    alone = [name for r, name in enumerate(logs.names) if np.any((fold != whole)[logs.run == r])]
+    quarters = f", the only ones with their load by quarters: {', '.join(alone)}" if alone else ""
+    return f"runs left out in turn{quarters}"
 
 
 def worth_of(judge: LeftOut, whole: Array, missed: Array) -> dict[str, tuple[float, float]]:
