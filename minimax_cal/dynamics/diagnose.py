@@ -18,6 +18,7 @@ from minimax_cal.dynamics.budget import (
     folds_of,
     parts_of,
     steps_of,
+    without_harmful,
 )
 from minimax_cal.dynamics.given import (
     Payload,
@@ -63,6 +64,7 @@ LEAST_SECONDS = 25.0  # of trajectories: in less, laws stand in for each other
 LEAST_PEAK = 0.25  # speed that some joint must reach [rad/s, m/s]: slower, most laws are invisible
 MINOR = 0.05  # of the squared error that the step before leaves at a joint: worth less, it is minor
 MATTERS = 0.28  # of the remaining error's square at a joint, 15 % of its RMS: more has no name
+FOLD = 0.2  # about this share of the trajectories is left out in turn to judge a law
 SPLITS = 2  # of the groups in complementary halves, in which names are sought again
 FOUND_AGAIN = 0.75  # share of the halves in which a confirmed name is found
 SEED = 0  # of the halves
@@ -208,6 +210,17 @@ def fitted(found: Found, columns: Columns) -> Normal:
     return Normal.of(columns, whitening(columns.scene.logs, rest), found.terms)
 
 
+def helpful(found: Found) -> Found:
+    """What was found, less the laws that harm the joints of runs left out more than they help."""
+    logs = found.columns.scene.logs
+    normal, known = fitted(found, found.columns), found.columns.error()
+    fold = by_loads(folds_of(logs, FOLD, ()), logs, found.terms)
+    kept = without_harmful(LeftOut.of(normal, known, known, fold), found.terms)
+    choice = replace(found.choice, found=tuple(
+        one for one in found.choice.found if one.candidate.term in kept))  # fmt: skip
+    return replace(found, choice=choice, terms=tuple(kept))
+
+
 def frequencies(choice: Choice) -> dict[tuple[str, str], float]:
     """In which share of complementary halves of the groups each name is found again."""
     group = choice.library.rows.group
@@ -247,6 +260,7 @@ def examined(
         logs = logs.earlier(late)
         found = search(arm, logs.only(learning), exclude)
     progress("judging causes on trajectories left out")
+    found = helpful(found)
     columns = found.columns
     if len(learning) < len(logs.names):
         columns = Columns(found.context.scene(arm, logs))

@@ -185,6 +185,17 @@ def test_what_has_no_law_is_unexplained() -> None:
     assert "J2 follow the other joints and have no name" in found.headline()
 
 
+@pytest.mark.parametrize("law", [
+    at(1, lambda m, r, t: 1.5 * np.sin(2.0 * m.q[:, 2]) * np.cos(m.q[:, 0])),
+    at(2, lambda m, r, t: 0.6 * m.qdd[:, 0]),
+])  # fmt: skip
+def test_a_law_that_harms_the_joints_together_is_not_kept(law: Extra) -> None:
+    """Two short runs with a law that has no name: others were kept that tripled a joint's error."""
+    budget = mc.diagnose_motion(ARM, simulated(law, seed=2, runs=2, seconds=14.0)).budget
+    usual, last = (np.array(budget[step].holdout_rms_moving) for step in (2, -1))
+    assert np.log(last / usual).mean() < 0.1
+
+
 def test_too_little_motion_is_said_before_any_name() -> None:
     short = mc.diagnose_motion(ARM, simulated(runs=1, seconds=20.0, seed=1))
     assert short.verdict == "unknown"
