@@ -122,7 +122,7 @@ class Left:
         return Left(
             y=poses.error - poses.jacobian @ held,
             columns=poses.jacobian,
-            arm=poses.arm * unit,
+            arm=poses.arm @ scene.linkage * unit,
             root=np.repeat(np.sqrt(last.model.weight), 3, axis=0).T,
             prior=poses.prior,
             q=(scene.q / unit[:, None]).T,

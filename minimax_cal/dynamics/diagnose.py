@@ -11,7 +11,15 @@ import numpy as np
 from scipy.special import ndtr
 from threadpoolctl import threadpool_limits
 
-from minimax_cal.dynamics.budget import LeftOut, drawn_missed, folds_of, parts_of, steps_of
+from minimax_cal.dynamics.budget import (
+    LeftOut,
+    by_loads,
+    drawn_missed,
+    folds_of,
+    parts_of,
+    steps_of,
+    without_harmful,
+)
 from minimax_cal.dynamics.given import (
     Payload,
     gains_of,
@@ -21,7 +29,7 @@ from minimax_cal.dynamics.given import (
     with_payload,
 )
 from minimax_cal.dynamics.laws import ANGLE, CURVE, LAWS, USUAL, Term, terms_of
-from minimax_cal.dynamics.links import LinkChange, body_as_given
+from minimax_cal.dynamics.links import LinkChange, body_as_given, carried
 from minimax_cal.dynamics.model import FRICTION, RIGID, Body, Normal, TorqueModel, first_body
 from minimax_cal.dynamics.probes import Unexplained, unexplained
 from minimax_cal.dynamics.result import (
@@ -56,6 +64,7 @@ LEAST_SECONDS = 25.0  # of trajectories: in less, laws stand in for each other
 LEAST_PEAK = 0.25  # speed that some joint must reach [rad/s, m/s]: slower, most laws are invisible
 MINOR = 0.05  # of the squared error that the step before leaves at a joint: worth less, it is minor
 MATTERS = 0.28  # of the remaining error's square at a joint, 15 % of its RMS: more has no name
+FOLD = 0.2  # about this share of the trajectories is left out in turn to judge a law
 SPLITS = 2  # of the groups in complementary halves, in which names are sought again
 FOUND_AGAIN = 0.75  # share of the halves in which a confirmed name is found
 SEED = 0  # of the halves
@@ -180,7 +189,10 @@ def search(arm: Arm, logs: Logs, exclude: Sequence[str]) -> Found:
     scene = Scene.of(arm, logs)
     context = first_body(Columns(scene))
     columns = Columns(context.in_scene(scene))
-    terms, lacking = terms_of(columns.scene, exclude)
+    every, lacking = terms_of(columns.scene, exclude)
+    terms = [term for term in every if term.effect != "payload"]
+    if len(terms) < len(every):
+        terms += carried(columns, terms)
     white = whitening(logs, generous(columns, terms))
     library = Library.of(dictionary_of(columns, white), terms, [])
     choice = select(library)
@@ -196,6 +208,17 @@ def fitted(found: Found, columns: Columns) -> Normal:
     rough = Normal.of(columns, first, found.terms)
     rest = rough.rest(rough.solve(parts_of(found.terms)))
     return Normal.of(columns, whitening(columns.scene.logs, rest), found.terms)
+
+
+def helpful(found: Found) -> Found:
+    """What was found, less the laws that harm the joints of runs left out more than they help."""
+    logs = found.columns.scene.logs
+    normal, known = fitted(found, found.columns), found.columns.error()
+    fold = by_loads(folds_of(logs, FOLD, ()), logs, found.terms)
+    kept = without_harmful(LeftOut.of(normal, known, known, fold), found.terms)
+    choice = replace(found.choice, found=tuple(
+        one for one in found.choice.found if one.candidate.term in kept))  # fmt: skip
+    return replace(found, choice=choice, terms=tuple(kept))
 
 
 def frequencies(choice: Choice) -> dict[tuple[str, str], float]:
@@ -237,10 +260,12 @@ def examined(
         logs = logs.earlier(late)
         found = search(arm, logs.only(learning), exclude)
     progress("judging causes on trajectories left out")
+    found = helpful(found)
     columns = found.columns
     if len(learning) < len(logs.names):
         columns = Columns(found.context.scene(arm, logs))
     normal = fitted(found, columns)
+    fold, whole = by_loads(fold, logs, found.terms), fold
     known = columns.error()
     before = known + (early.y - logs.y).T
     judge = LeftOut.of(normal, known, before, fold)
@@ -267,7 +292,7 @@ def examined(
         too_little=too_little,
         models=models,
         runs=logs.names,
-        held_out=held_words(logs, fold),
+        held_out=held_words(logs, fold, whole),
         held_run=held_run(judge, logs, parts_of(found.terms)),
         curves=curves(found, normal, judge),
         notices=tuple(body_notices(arm, given, change, logs)),
@@ -280,14 +305,16 @@ def named_free(fold: Array, logs: Logs, run: int) -> bool:
     return not (only_some_judge and fold[logs.run == run][0] >= 0)
 
 
-def held_words(logs: Logs, fold: Array) -> str:
-    """How rows were held out."""
+def held_words(logs: Logs, fold: Array, whole: Array) -> str:
+    """How rows were held out.  fold: (R,); whole: before runs were left out by quarters."""
     if (fold < 0).any():
         names = dict.fromkeys(logs.names[r] for r in logs.run[fold >= 0])
         return f"runs kept out: {', '.join(names)}"
     if len(logs.names) == 1:
         return "one run: its quarters left out in turn"
-    return "runs left out in turn"
+    alone = [name for r, name in enumerate(logs.names) if np.any((fold != whole)[logs.run == r])]
+    quarters = f", the only ones with their load by quarters: {', '.join(alone)}" if alone else ""
+    return f"runs left out in turn{quarters}"
 
 
 def worth_of(judge: LeftOut, whole: Array, missed: Array) -> dict[str, tuple[float, float]]:

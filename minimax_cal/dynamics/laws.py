@@ -114,11 +114,10 @@ def gravity_spring(scene: Scene, j: int, choice: Choice) -> Array:
 
 
 def payload(scene: Scene, j: int, choice: Choice) -> Array:
-    """The last link from one run on: mass, first moment and inertia."""
-    later = scene.logs.since + 0.0
-    for number, (a, b) in enumerate(zip(scene.logs.start[:-1], scene.logs.start[1:], strict=True)):
-        later[a:b] = float(number >= choice["run"])
-    return np.asarray(scene.regressor[:, :, -PER_LINK:] * later[:, None, None])
+    """The last link in the runs that a choice names: mass, first moment and inertia."""
+    carries = np.array([choice.get(name, 0.0) for name in scene.logs.names])
+    each = np.repeat(carries, np.diff(scene.logs.start))
+    return np.asarray(scene.regressor[:, :, -PER_LINK:] * each[:, None, None])
 
 
 def compliant(scene: Scene, j: int, choice: Choice) -> Array:
@@ -156,11 +155,6 @@ def by_warmth(scene: Scene, j: int) -> list[Choice]:
     if np.isfinite(scene.logs.temperature[:, j]).all():
         return [{}]
     return [{"seconds": s} for s in (60.0, 240.0, 1000.0)]
-
-
-def by_run(scene: Scene, j: int) -> list[Choice]:
-    """From which run on."""
-    return [{"run": float(r)} for r in range(1, len(scene.logs.names))]
 
 
 def moves(scene: Scene, j: int) -> str:
@@ -203,8 +197,8 @@ def has_ratio(scene: Scene, j: int) -> str:
 
 
 def has_runs(scene: Scene, j: int) -> str:
-    """Whether there are several runs."""
-    return "" if len(scene.logs.names) > 1 else "runs with and without the payload"
+    """Whether there are several runs, and gains without which no torque is a mass."""
+    return has_gains(scene, j) if len(scene.logs.names) > 1 else "runs with and without the payload"
 
 
 def turns(scene: Scene, j: int) -> str:
@@ -244,7 +238,8 @@ LAWS: dict[str, Law] = {
     "payload": Law(payload, ("mass", *(f"moment_{k}" for k in "xyz"),
                              *(f"inertia_{k}" for k in ("xx", "xy", "xz", "yy", "yz", "zz"))),
                    ("kg", *("kg m",) * 3, *("kg m^2",) * 6), "payload that changes between runs",
-                   by_run, has_runs, typical=10.0, of_torque=False, whole=True, arm_wide=True),
+                   needs=has_runs, typical=10.0, of_torque=False, whole=True, arm_wide=True,
+                   repeats=True),
     "joint_flexibility": Law(compliant, ("compliance",), ("rad/(N m)",), "joint flexibility",
                              needs=has_gains, nonnegative=True, typical=1e-3, of_torque=False,
                              whole=True),

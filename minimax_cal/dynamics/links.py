@@ -1,21 +1,28 @@
-"""Whether the masses that a model gives are the arm's, all of them or all but one link's."""
+"""Whether masses are as given, all of them or all but one link's, and which runs carry alike."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import fdtrc
 
 from minimax_cal.dynamics.budget import parts_of
+from minimax_cal.dynamics.laws import Term
 from minimax_cal.dynamics.model import FRICTION, Normal
 from minimax_cal.dynamics.regressor import PER_LINK
-from minimax_cal.evidence.noise import inflation
+from minimax_cal.dynamics.rows import whitening
+from minimax_cal.dynamics.search import Columns, generous, one_of_each
+from minimax_cal.evidence.noise import inflation, orthonormal
 from minimax_cal.ground.arrays import Array
 
 CONTRADICTS = 1e-4  # p-value below which rows contradict a body that is not refitted
 ALIKE = 12.0  # of log likelihood, twice: links that explain as much
 SURE = 4.0  # standard deviations by which a parameter of a changed link differs from the given
+ROUNDING = 1e-10  # of the largest singular value: what all runs carry alike is the last link's
 LINK = "link"  # part of a fit: parameters of the link that may have changed
 
 
@@ -115,3 +122,56 @@ def changed(
 
     before = rms(alone.solve([FRICTION]))
     return LinkChange(link, value[count:], sigma[count:], before, rms(value), others)
+
+
+def carried(columns: Columns, terms: Sequence[Term]) -> list[Term]:
+    """The payloads that runs carry more than the lightest does: runs that carry alike have one.
+
+    Each run is fitted with a last link of its own, beside one variant of every other law.  Runs are
+    joined, the most alike first, until their rows contradict it.
+    """
+    logs = columns.scene.logs
+    white = whitening(logs, generous(columns, terms))
+    kept, count = white.kept, len(logs.names)
+    run, group = (np.broadcast_to(each, kept.shape)[kept] for each in (logs.run, logs.quarter))
+    basis = orthonormal(white.white(one_of_each(columns, terms)[kept]))
+    link = np.moveaxis(logs.filtered(columns.scene.regressor[:, :, -PER_LINK:]), 1, 0)
+    link = white.white(link[kept])
+    link /= np.maximum(np.linalg.norm(link, axis=0), 1e-300)
+    error = white.white(columns.error()[kept])
+    error = error - basis @ (basis.T @ error)
+    each = [(link[run == r], basis[run == r]) for r in range(count)]
+    shared = np.concatenate([own.T @ rows for rows, own in each], axis=1)
+    gram = block_diag(*(rows.T @ rows for rows, _ in each)) - shared.T @ shared
+    pull = np.concatenate([rows.T @ error[run == r] for r, (rows, _) in enumerate(each)])
+
+    def left(value: Array) -> Array:
+        """(N,) what last links (R, 10) of the runs leave."""
+        moved = (link * value[run]).sum(axis=1)
+        return np.asarray(error - moved + basis @ (basis.T @ moved))
+
+    label = np.arange(count)  # which load a run has
+    while True:
+        loads = np.eye(label.max() + 1)[label]
+        own = np.kron(loads, np.eye(PER_LINK))
+        inverse = np.linalg.pinv(own.T @ gram @ own, ROUNDING, hermitian=True)
+        value = inverse @ own.T @ pull
+        pairs = []
+        for a, b in combinations(range(loads.shape[1]), 2):
+            apart = np.kron(np.eye(loads.shape[1])[a] - np.eye(loads.shape[1])[b], np.eye(PER_LINK))
+            toward = inverse @ apart.T @ np.linalg.pinv(apart @ inverse @ apart.T, ROUNDING)
+            off = toward @ (apart @ value)
+            pairs.append((float(off @ own.T @ gram @ own @ off), a, b, off))
+        full, dof = left((own @ value).reshape(count, -1)), len(error) - basis.shape[1] - len(value)
+        if not pairs:
+            break
+        _, a, b, off = min(pairs, key=lambda pair: pair[0])
+        joined = left((own @ (value - off)).reshape(count, -1))
+        if contradiction(joined, full, group, PER_LINK, dof) < CONTRADICTS:
+            break
+        label = np.where(label == b, a, label)
+        label -= label > b
+    lightest = int(np.argmin(value[::PER_LINK]))
+    return [Term("payload", f"L{logs.joints}",
+                 tuple((logs.names[r], 1.0) for r in np.flatnonzero(label == k)))
+            for k in range(loads.shape[1]) if k != lightest]  # fmt: skip

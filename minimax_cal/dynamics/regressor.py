@@ -39,11 +39,14 @@ def link_axes(links: Chain) -> Array:
     return np.asarray(np.stack([cross(links.y, z), links.y, z], axis=1))
 
 
-def link_motion(robot: Robot, links: Chain, qd: Array, qdd: Array) -> tuple[Array, Array, Array]:
-    """Turning rate, its derivative, acceleration of the origin of each link, (n, 3, m) in the base.
+def moving_chain(robot: Robot, motion: Motion) -> tuple[Chain, Array]:
+    """The chain that the drives move by the robot's couplings, and how: (3, n, 3, m) in the base.
 
-    The base accelerates upwards with g, which stands for gravity.  qd, qdd: (m, n), signs applied.
+    Turning rate, its derivative and acceleration of the origin of each link.  The base accelerates
+    upwards with g, which stands for gravity.
     """
+    q, qd, qdd = (robot.turned(part) for part in (motion.q, motion.qd, motion.qdd))
+    links = chain(robot.mdh, np.ascontiguousarray(q), robot.prismatic)
     n, _, m = links.z.shape
     rate, change = np.zeros((3, m)), np.zeros((3, m))
     speeding = np.broadcast_to(G * robot.up[:, None], (3, m))
@@ -59,7 +62,12 @@ def link_motion(robot: Robot, links: Chain, qd: Array, qdd: Array) -> tuple[Arra
         inward = cross(rate, cross(rate, arm))
         speeding = speeding + cross(change, arm) + inward + slide
         out[:, j] = rate, change, speeding
-    return out[0], out[1], out[2]
+    return links, out
+
+
+def at_drives(robot: Robot, torque: Array) -> Array:
+    """(m, n, ...) torque of each drive, in the controller's sense, of the chain's (n, ..., m)."""
+    return np.asarray(np.moveaxis(np.einsum("ij,i...->j...", robot.turning, torque), -1, 0))
 
 
 def wrench(rate: Array, change: Array, speeding: Array) -> tuple[Array, Array]:
@@ -84,15 +92,12 @@ def wrench(rate: Array, change: Array, speeding: Array) -> tuple[Array, Array]:
 
 
 def regressor(robot: Robot, motion: Motion) -> Array:
-    """(m, n, 10 n) torque of each joint [N m, N] per inertial parameter, in the controller's sense.
+    """(m, n, 10 n) torque of each drive [N m, N] per inertial parameter, in the controller's sense.
 
     Newton and Euler, each link's wrench projected on the joints before it.
     """
-    q, qd, qdd = (robot.turned(part) for part in (motion.q, motion.qd, motion.qdd))
-    links = chain(robot.mdh, np.ascontiguousarray(q), robot.prismatic)
-    axes = link_axes(links)
-    moving = link_motion(robot, links, qd, qdd)
-    n, m = robot.joints, len(q)
+    links, moving = moving_chain(robot, motion)
+    axes, n, m = link_axes(links), robot.joints, len(motion.q)
     out = np.zeros((n, n * PER_LINK, m))
     for k in range(n):
         own = (np.einsum("abm,bm->am", axes[k], part[k]) for part in moving)
@@ -106,18 +111,16 @@ def regressor(robot: Robot, motion: Motion) -> Array:
             lever = cross(links.z[j], links.after[k] - links.before[j])
             lever = np.einsum("abm,bm->am", axes[k], lever)
             part[:] = np.einsum("am,apm->pm", z, moment) + np.einsum("am,apm->pm", lever, force)
-    return np.asarray(np.moveaxis(np.einsum("ij,i...->j...", robot.turning, out), -1, 0))
+    return at_drives(robot, out)
 
 
 def inverse_dynamics(robot: Robot, motion: Motion, parameters: Array) -> Array:
-    """(m, n) torque of each joint [N m, N] of known inertial parameters (n, 10).
+    """(m, n) torque of each drive [N m, N] of known inertial parameters (n, 10).
 
     Newton and Euler in the base frame: as the regressor's, without its columns.
     """
-    q, qd, qdd = (part * robot.sign for part in (motion.q, motion.qd, motion.qdd))
-    links = chain(robot.mdh, np.ascontiguousarray(q), robot.prismatic)
+    links, (rate, change, speeding) = moving_chain(robot, motion)
     axes = link_axes(links)
-    rate, change, speeding = link_motion(robot, links, qd, qdd)
     mass = parameters[:, 0, None, None]
     first = np.einsum("nabm,na->nbm", axes, parameters[:, 1:4])
     own = np.empty((robot.joints, 3, 3))
@@ -134,7 +137,7 @@ def inverse_dynamics(robot: Robot, motion: Motion, parameters: Array) -> Array:
     force, moment = (np.cumsum(part[::-1], axis=0)[::-1] for part in (force, moment))
     turning = links.z * (moment - cross(links.before, force))
     along = np.where(robot.prismatic[:, None, None], links.z * force, turning)
-    return np.asarray(along.sum(axis=1).T * robot.sign)
+    return at_drives(robot, along.sum(axis=1))
 
 
 def link_parameters(mass: float, com: Array, inertia: Array) -> Array:

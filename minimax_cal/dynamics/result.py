@@ -14,6 +14,7 @@ from pydantic import Field
 from minimax_cal.dynamics.laws import LAWS, USUAL, Term
 from minimax_cal.dynamics.model import Body, TorqueModel
 from minimax_cal.dynamics.probes import Unexplained
+from minimax_cal.dynamics.regressor import PER_LINK
 from minimax_cal.dynamics.scene import YIELD, Arm
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
@@ -79,8 +80,9 @@ class MotionEffect:
 
     @property
     def words(self) -> str:
-        """For people, as `joint flexibility at J2`."""
-        return f"{WORDS[self.effect]} {name_place(self.place)}"
+        """For people, as `joint flexibility at J2`; of a payload with the runs that carry it."""
+        runs = ", ".join(p.name for p in self.parameters[PER_LINK:] if self.effect == "payload")
+        return f"{WORDS[self.effect]} {name_place(self.place)}" + (f" ({runs})" if runs else "")
 
 
 @dataclass(frozen=True)
@@ -256,7 +258,7 @@ def grouped(effects: tuple[MotionEffect, ...]) -> str:
         places.setdefault(WORDS[one.effect], []).append(one.place)
     usual = [WORDS[name] for name in USUAL]
     order = sorted(places, key=lambda words: words in usual)  # what a toolbox has comes last
-    return "; ".join(f"{words} at {', '.join(sorted(places[words]))}" for words in order)
+    return "; ".join(f"{words} at {', '.join(sorted(set(places[words])))}" for words in order)
 
 
 def table_by_joint(title: str, what: str, rows: Sequence[tuple[str, Sequence[float]]]) -> Table:

@@ -143,11 +143,16 @@ def dictionary_of(columns: Columns, white: Whitening) -> TorqueLaws:
     return TorqueLaws(problem, columns, white, np.sqrt((logs.y**2).mean(axis=0)))
 
 
+def one_of_each(columns: Columns, terms: Sequence[Term]) -> Array:
+    """(n, R, p) rigid body, usual friction, one variant of every law, and all that runs carry."""
+    first = {t.text if t.effect == "payload" else t.key: t for t in reversed(terms)}
+    every = (columns.at_all(term) for term in first.values())
+    return np.concatenate([columns.rigid(), columns.usual(), *every], axis=2)
+
+
 def generous(columns: Columns, terms: Sequence[Term]) -> Array:
     """(N,) what a fit of one variant of every law leaves: noise, were one of them true."""
-    first = {term.key: term for term in reversed(terms) if term.effect != "payload"}
-    parts = [columns.rigid(), columns.usual(), *(columns.at_all(t) for t in first.values())]
     kept = columns.scene.logs.fitted.T
-    matrix = np.concatenate(parts, axis=2)[kept]
+    matrix = one_of_each(columns, terms)[kept]
     error = columns.error()[kept]
     return np.asarray(error - matrix @ least_squares(matrix, error))

@@ -104,7 +104,7 @@ def bent(arm: Cell, data: Measurements) -> tuple[Array, Array]:
     if not shift.any():
         return turn, still_there
     mdh, prismatic = arm.robot.mdh, arm.robot.prismatic
-    before = seen(kinematics.forward(mdh, scene.q.T + turn, prismatic), arm.target_positions)
+    before = seen(kinematics.forward(mdh, scene.angles.T + turn, prismatic), arm.target_positions)
     return turn, motion(before, before + np.moveaxis(shift, -1, 0))
 
 

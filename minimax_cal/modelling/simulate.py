@@ -145,7 +145,7 @@ def simulate(
 
 
 def gravity(robot: Robot, q: Array) -> Array:
-    """Gravity torques (m, n), in the controller's sense [N m]; assumed masses where unknown."""
+    """(m, n) gravity torques of the drives, in the controller's sense [N m], masses told or not."""
     links = kinematics.chain(robot.mdh, robot.turned(q), robot.prismatic)
-    bend = torques(links, *masses_of(robot), robot.up).T * robot.sign
-    return np.where(robot.prismatic, 0.0, bend)
+    bend = torques(links, *masses_of(robot), robot.up).T
+    return np.asarray(np.where(robot.prismatic, 0.0, bend) @ robot.turning)

@@ -16,8 +16,12 @@ from minimax_cal.diagnosing.gap import closed_share
 from minimax_cal.diagnosing.result import VERDICTS
 from minimax_cal.evidence.limits import STRUCTURE
 from minimax_cal.fitting.checks import misplaced, put_right
+from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.modelling.simulate import Simulation
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.gravity import G, tubes
+from minimax_cal.robots.sampling import random_poses
 
 
 def sealed(*causes: Cause, seed: int = 1, condition: str = "single") -> Sealed:
@@ -51,6 +55,32 @@ def test_nothing_is_named_on_a_sound_arm() -> None:
     assert found.effects == ()
     assert abs(found.floor.value / (1e3 * made.floor) - 1.0) < 0.1
     assert "No cause beyond geometry" in found.headline()
+
+
+def test_the_gear_of_a_drive_that_moves_two_joints_is_named(rng: np.random.Generator) -> None:
+    """Joint 3 turns by q3 - q2, drive 2 winds up by what it carries: minus the energy's slope."""
+    arm = mc.load_robot("irb2600")
+    mass, com = tubes(arm.mdh)
+    linked = np.eye(6) - np.eye(6)[:, 2:3] * np.eye(6)[1]
+    robot = replace(arm, mass=mass, com=com, coupling=linked)
+    spots = np.array([[0.1, 0.0, 0.05], [-0.05, 0.09, 0.05], [-0.05, -0.08, 0.06]])
+    q, carried = random_poses(robot, 60, rng), rng.choice([0.0, 40.0], 60)
+
+    def energy(values: Array) -> Array:
+        turned, out = values @ linked.T * arm.sign, 0.0
+        for i in range(6):
+            last = kinematics.forward(arm.mdh[: i + 1], turned[:, : i + 1], arm.prismatic[: i + 1])
+            out = out + mass[i] * G * (last[:, 2, :3] @ com[i] + last[:, 2, 3])
+        return np.asarray(out + carried * G * (last[:, 2, :3] @ spots.mean(axis=0) + last[:, 2, 3]))
+
+    torque = -energy(q + 1e-30j * np.eye(6)[1]).imag / 1e-30
+    pose = robot.pose(q + 2e-6 * np.outer(torque, np.eye(6)[1]))
+    y = spots @ np.swapaxes(pose[:, :3, :3], 1, 2) + pose[:, None, :3, 3] + [3.0, 1.0, 0.0]
+    data = mc.measurements(q, y + 2e-5 * rng.normal(size=y.shape), payload=carried)
+    found = mc.diagnose(robot, data, quick=True)
+    (one,) = found.effects
+    assert (found.verdict, one.term.effect, one.term.place) == ("named", "joint_compliance", "J2")
+    assert abs(one.values[0] - 2e-6) < 4.0 * one.sigmas[0] < 1e-7
 
 
 def test_a_plain_effect_is_named_with_its_size(plain: mc.Diagnosis) -> None:

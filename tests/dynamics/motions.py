@@ -57,28 +57,35 @@ def three_joints() -> mc.Robot:
     return robot_from_dict({"name": "three joints", "units": units, "joints": joints})
 
 
+def driven_torque(motion: Motion, body: Array, turns: Array | None = None) -> Array:
+    """Torques (m, 3) of the drives of the arm.  turns: (3, 3) of its joints per turn of a drive."""
+    c = np.eye(3) if turns is None else turns
+    moved = Motion(*(part @ c.T for part in (motion.q, motion.qd, motion.qdd)))
+    return np.asarray(inverse_dynamics(three_joints(), moved, body) @ c)
+
+
 def simulated(
     extra: Extra | None = None,
     *,
     seed: int = 0,
     runs: int = 3,
     seconds: float = 20.0,
-    carried: float = 0.0,
+    carried: float | Sequence[float] = 0.0,
     friction: bool = True,
-    loaded: Sequence[int] | None = None,
+    turns: Array | None = None,
 ) -> list[Run]:
     """Runs of the arm with usual friction, noise, and something more.
 
-    carried: kg at the flange, 50 mm along z of the last frame, in all runs or those in loaded.
+    carried: kg at the flange, 50 mm along z of the last frame, in all runs or in each.
+    turns: (3, 3) of the joints per turn of a drive.
     """
     rng, robot, out = np.random.default_rng(seed), three_joints(), []
-    for number in range(runs):
+    for number, mass in enumerate(np.broadcast_to(carried, runs)):
         time = np.arange(0.0, seconds, 1.0 / RATE)
         motion = Motion(*fourier(rng, time, 3, 0.1 + 0.05 * (number % 3)))
         body = inertial_parameters(robot)
-        if loaded is None or number in loaded:
-            body[-1] += link_parameters(carried, np.array([0.0, 0.0, 0.05]), np.zeros(6))
-        rigid = inverse_dynamics(robot, motion, body)
+        body[-1] += link_parameters(float(mass), np.array([0.0, 0.0, 0.05]), np.zeros(6))
+        rigid = driven_torque(motion, body, turns)
         torque = rigid + NOISE * rng.normal(size=rigid.shape)
         if friction:
             torque += np.sign(motion.qd) * [4.0, 3.0, 1.5] + motion.qd * [3.0, 4.0, 1.0]

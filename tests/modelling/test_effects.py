@@ -55,7 +55,7 @@ def visited(robot: mc.Robot, poses: int = 40, seed: int = 0) -> mc.Measurements:
 
 
 def scene_of(robot: mc.Robot, data: mc.Measurements) -> Scene:
-    return Scene.of(robot, data, BASE, SPOTS, data.q * robot.sign)
+    return Scene.of(robot, data, BASE, SPOTS, robot.turned(data.q))
 
 
 def all_terms(scene: Scene) -> list[Term]:
@@ -74,8 +74,11 @@ SCENE = scene_of(ROBOT, DATA)
 NO_MASSES = replace(ROBOT, mass=np.full(6, np.nan), com=np.full((6, 3), np.nan))
 SLIDING = replace(ROBOT, prismatic=np.arange(6) == 2)
 TAU = {f"tau{j + 1}": np.random.default_rng(j).normal(size=40) for j in range(6)}
+LINKED = np.eye(6) - np.eye(6, k=-1) * [0, 1, 0, 0.5, 0, 0]  # J3 by q3 - q2, J5 by q5 - q4 / 2
+COUPLED = replace(ROBOT, coupling=LINKED)
 SCENES = {
     "masses": SCENE,
+    "coupled": scene_of(COUPLED, DATA),
     "no masses": scene_of(NO_MASSES, DATA),
     "a slide": scene_of(SLIDING, visited(SLIDING)),
     "torques": scene_of(ROBOT, replace(DATA, columns={**DATA.columns, **TAU})),
@@ -205,12 +208,12 @@ def potential(scene: Scene, q: Array) -> Array:
     return np.asarray(energy + payload * G * (tip @ robot.up))
 
 
-@pytest.mark.parametrize("which", ["masses", "no masses"])
+@pytest.mark.parametrize("which", ["masses", "no masses", "coupled"])
 def test_torque_is_minus_the_slope_of_the_potential_energy(which: str) -> None:
+    """Of a drive that moves several joints, by its own value."""
     scene = SCENES[which]
-    step = 1e-30j
     for j in range(6):
-        moved = scene.q.T + step * np.eye(6)[j]
+        moved = scene.robot.turned(DATA.q + 1e-30j * scene.robot.sign[j] * np.eye(6)[j])
         jacobian = potential(scene, moved).imag / 1e-30
         assert_allclose(scene.gravity[j], -jacobian, rtol=0, atol=EXACT * 1e4)
 
@@ -245,6 +248,31 @@ def test_compliant_joints_turn_with_their_torque() -> None:
         assert found.names == (f"c{j + 1}",)
         assert_allclose(found.turn[0, j], SCENE.gravity[j], rtol=EXACT)
         assert not np.delete(found.turn[0], j, axis=0).any()
+
+
+def test_gears_act_at_drives_and_bearings_at_joints() -> None:
+    """A gear's error moves the arm as an error of its drive's value; bearings as if uncoupled."""
+    scene = SCENES["coupled"]
+    alike = scene_of(ROBOT, replace(DATA, q=COUPLED.turned(DATA.q) * ROBOT.sign))
+    for term in all_terms(scene):
+        found = term.columns(scene)
+        if term.effect in ("axis_wobble", "link_bending"):
+            ours, theirs = (term.columns(each).displacement(each) for each in (scene, alike))
+            assert_allclose(ours, theirs, rtol=0, atol=EXACT * np.abs(theirs).max())
+        elif found.only_turns and term.effect != "joint_coupling" and term.place[0] == "J":
+            j = int(term.place[1:]) - 1
+            by = 1e-7 * found.turn[:, j] * ROBOT.sign[j]
+            moved = [COUPLED.pose(DATA.q + one[:, None] * np.eye(6)[j]) for one in by]
+            there = [pose[:, :3, :3] @ SPOTS.T + pose[:, :3, 3:] for pose in moved]
+            fields = np.moveaxis(there, (1, 2, 3), (3, 2, 1)) - scene.points
+            second = max(1e-10, 20.0 * (by**2).max())
+            wanted = 1e-7 * found.displacement(scene)
+            assert_allclose(fields, wanted, rtol=0, atol=second, err_msg=term.text)
+    error = Term("joint_coupling", "J3", {"source": 2.0})  # an entry of the matrix that is wrong
+    turn = Fitted((error,), (np.array([1e-3]),)).turn(scene)
+    off = replace(COUPLED, coupling=LINKED + 1e-3 * np.eye(6)[:, 2:3] * np.eye(6)[1])
+    wanted = off.turned(DATA.q) - COUPLED.turned(DATA.q)
+    assert_allclose(turn * ROBOT.sign[2], wanted, rtol=0, atol=EXACT)
 
 
 def test_a_joint_that_stiffens_gives_way_to_the_first_of_its_torque() -> None:

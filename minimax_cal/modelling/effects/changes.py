@@ -103,7 +103,9 @@ ENCODER_ZERO = Effect(
     "the zero of a joint has changed: a new motor or encoder, a collision, mastering",
     "the joint turns by c more from a session, or a moment, on",
     lambda scene: (
-        tuple(f"J{joint + 1}" for joint in range(scene.joints)) if can_change(scene) else ()
+        tuple(f"J{joint + 1}" for joint in np.flatnonzero(~scene.robot.passive))
+        if can_change(scene)
+        else ()
     ),
     zero,
     finer=finer_moments,

@@ -152,9 +152,10 @@ ENCODER_GAIN = Effect(
 
 
 def coupling(scene: Scene, place: str, choice: Choice) -> Columns:
-    """dq_j = c q_i, i = source."""
+    """dq_j = c q_i, i = source: drive i moves joint j, an entry of the robot file's `coupling`."""
     j, i = joint_of(place), int(choice["source"]) - 1
-    turn = one_joint(scene, j, scene.q[i][None])
+    turn = np.zeros((1, scene.joints, scene.poses))
+    turn[0, j] = scene.q[i]
     return Columns((f"c{j + 1}{i + 1}",), ("1",), turn, fixed={"source_joint": i + 1.0})
 
 
@@ -168,7 +169,11 @@ JOINT_COUPLING = Effect(
     "joint_coupling",
     "a joint's motor turns another joint too (wrist gears, linked arms)",
     "dq_j = c q_i",
-    lambda scene: tuple(f"J{j + 1}" for j in turning(scene) if j and sources(scene, f"J{j + 1}")),
+    lambda scene: tuple(
+        f"J{j + 1}"
+        for j in np.flatnonzero(~scene.robot.prismatic)
+        if j and sources(scene, f"J{j + 1}")
+    ),
     coupling,
     choices=sources,
     typical=1e-2,

@@ -1,4 +1,9 @@
-"""What the law of an effect may look at, and what it answers with."""
+"""What the law of an effect may look at, and what it answers with.
+
+Gears, motors and encoders act at the drives: a law of theirs sees the value of a drive and the
+torque that it carries, and turns all joints that it moves (`one_joint`).  Bearings and links act at
+the joints of the chain, at their `angles`.  Without couplings both are the same.
+"""
 
 from __future__ import annotations
 
@@ -72,11 +77,26 @@ class Scene:
 
     @cached_property
     def q(self) -> Array:
-        """(n, m) joint values, signs applied [rad, m]."""
+        """(n, m) values of the drives, signs applied [rad, m]."""
+        return np.ascontiguousarray((self.data.q * self.robot.sign).T)
+
+    @cached_property
+    def angles(self) -> Array:
+        """(n, m) values of the joints, as the drives move them [rad, m]."""
         return np.ascontiguousarray(self.robot.turned(self.data.q).T)
+
+    @property
+    def linkage(self) -> Array:
+        """(n, n) how far each joint goes per unit of each drive, signs applied."""
+        return self.robot.turning * self.robot.sign
 
     @cached_property
     def jacobian(self) -> Array:
+        """(n, k, 3, m) motion of every target per unit of every drive [m per rad or m]."""
+        return np.asarray(np.tensordot(self.linkage, self.by_joint, (0, 0)))
+
+    @cached_property
+    def by_joint(self) -> Array:
         """(n, k, 3, m) motion of every target per unit of every joint [m per rad or m]."""
         z, o = self.links.z[:, None], self.links.before[:, None]
         turned = kinematics.cross(np.broadcast_to(z, (self.joints, *self.points.shape)),
@@ -158,9 +178,9 @@ class Scene:
         return masses_of(self.robot)
 
     def torque(self, mass: Array, com: Array) -> Array:
-        """(n, m) gravity's torque about each joint, 0 at slides [N m]."""
+        """(n, m) gravity's torque that each drive carries, 0 at slides [N m]."""
         found = torques(self.links, mass, com, self.robot.up)
-        return np.where(self.robot.prismatic[:, None], 0.0, found)
+        return np.asarray(self.linkage.T @ np.where(self.robot.prismatic[:, None], 0.0, found))
 
     @cached_property
     def payload(self) -> Array:
@@ -206,7 +226,7 @@ class Scene:
 
     @cached_property
     def gravity(self) -> Array:
-        """(n, m) the joints' static torques: measured where they are, else computed [N m]."""
+        """(n, m) the drives' static torques: measured where they are, else computed [N m]."""
         if self.measured_torques:
             return self.each("tau")
         return self.torque(*self.masses) + self.payload
@@ -283,7 +303,7 @@ class Columns:
         """(d, k, 3, m) motion of every target per unit, to first order [m per unit]."""
         out = np.zeros((len(self.names), *scene.points.shape))
         if self.turn.size:
-            out = out + np.einsum("dnm,nkcm->dkcm", self.turn, scene.jacobian, optimize=True)
+            out = out + np.einsum("dnm,nkcm->dkcm", self.turn, scene.by_joint, optimize=True)
         if self.shift.size:
             out = out + self.shift
         return out
@@ -414,12 +434,10 @@ def unmasked(mask: float) -> list[int]:
 
 
 def turning(scene: Scene) -> list[int]:
-    """The joints that turn."""
-    return [j for j in range(scene.joints) if not scene.robot.prismatic[j]]
+    """The joints that turn by a drive of their own."""
+    return [j for j in range(scene.joints) if not (scene.robot.prismatic | scene.robot.passive)[j]]
 
 
 def one_joint(scene: Scene, joint: int, values: Array) -> Array:
-    """(d, n, m) turns of one joint.  values: (d, m)."""
-    out = np.zeros((len(values), scene.joints, scene.poses))
-    out[:, joint] = values
-    return out
+    """(d, n, m) turns of all joints that a joint's drive moves, turning by values (d, m)."""
+    return np.asarray(scene.linkage[:, joint, None] * values[:, None])

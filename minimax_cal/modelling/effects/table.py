@@ -332,7 +332,7 @@ class Fitted:
         if not self.terms:
             return scene.points
         links = kinematics.chain(
-            scene.robot.mdh, scene.q.T + self.turn(scene), scene.robot.prismatic
+            scene.robot.mdh, scene.angles.T + self.turn(scene), scene.robot.prismatic
         )
         return kinematics.points(links, scene.target_positions) + self.shift(scene)
 

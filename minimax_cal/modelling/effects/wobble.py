@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from minimax_cal.modelling.effects.bending import turned_about
-from minimax_cal.modelling.effects.gears import sweeping
+from minimax_cal.modelling.effects.gears import LEAST_SWEEP
 from minimax_cal.modelling.effects.scene import Choice, Columns, Effect, Scene, joint_of
 from minimax_cal.robots.kinematics import cross
 
@@ -20,18 +20,24 @@ def tilts(scene: Scene, place: str, choice: Choice) -> Columns:
     """
     joint, turns = joint_of(place), choice["turns"]
     z, x = scene.links.z[joint], scene.links.x[joint]
-    angle = scene.q[joint] + scene.robot.mdh[joint, 2]
+    angle = scene.angles[joint] + scene.robot.mdh[joint, 2]
     u = np.cos(angle) * x - np.sin(angle) * cross(z, x)  # the link's own x, turned back
     v = cross(z, u)
     ways = (-1.0,) if turns == 1.0 else (-1.0, 1.0)
     fields, names = [], []
     for way in ways:
-        c, s = (f(way * turns * scene.q[joint]) for f in (np.cos, np.sin))
+        c, s = (f(way * turns * scene.angles[joint]) for f in (np.cos, np.sin))
         for name, tilt in (("cos", c * u + s * v), ("sin", c * v - s * u)):
             fields.append(turned_about(scene, tilt, scene.links.before[joint]))
             names.append(name if len(ways) == 1 else f"{name} {'against' if way < 0.0 else 'with'}")
     return Columns(tuple(names), ("rad",) * len(names), shift=np.stack(fields),
                    fixed={"waves_per_turn": turns})  # fmt: skip
+
+
+def places(scene: Scene) -> tuple[str, ...]:
+    """Joints that turn far enough, whatever drives them, but the last of these."""
+    wide = ~scene.robot.prismatic & (np.ptp(scene.angles, axis=1) > LEAST_SWEEP)
+    return tuple(f"J{j + 1}" for j in np.flatnonzero(wide)[:-1])
 
 
 def orders(scene: Scene, place: str) -> Sequence[Choice]:
@@ -43,7 +49,7 @@ AXIS_WOBBLE = Effect(
     "axis_wobble",
     "the axis of a joint tilts as it turns: a bearing out of true",
     "omega = R(-k q_j) (a u + b v), and R(+k q_j), k = 1, 2",
-    lambda scene: tuple(f"J{j + 1}" for j in sweeping(scene)[:-1]),
+    places,
     tilts,
     choices=orders,
     typical=2e-4,
