@@ -195,6 +195,18 @@ def drives(model: Any, actuator: int, joint: int) -> bool:
     return kind == 0 and number == joint
 
 
+def braked(model: Any) -> Array:
+    """(njnt,) True where a joint holds the damper of its servo, as those of a new file of ours do.
+
+    Whatever the integrator of the scene that the file is attached to, it takes that implicitly.
+    """
+    ours = mujoco().mj_name2id(model, mujoco().mjtObj.mjOBJ_TEXT, ROBOT) >= 0
+    bias = model.actuator_biasprm
+    bare = [i for i in range(model.nu) if ours and bias[i, 1] < 0.0 and bias[i, 2] == 0.0]
+    joints = range(model.njnt)
+    return np.array([any(drives(model, i, j) for i in bare) for j in joints], dtype=bool)
+
+
 def carrier(chain: Chain) -> int:
     """Id of the body that carries the targets: a tool of ours that sags, else the last one."""
     found = int(mujoco().mj_name2id(chain.model, mujoco().mjtObj.mjOBJ_BODY, "tool"))

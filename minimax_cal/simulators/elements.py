@@ -149,7 +149,7 @@ def write_servos(layout: Layout, arm: Arm, servos: Servos) -> None:
         gear = 1.0 / (1.0 + arm.gain[i])
         gain, damper = servos.gain[i] / gear**2, servos.damper[i]
         if not (servos.kept[i] and not arm.gain[i]):
-            if not layout.drives.implicit:
+            if layout.drives.braked[i]:
                 layout.joints[i].set("damping", numbers([damper]))
                 damper = 0.0
             tune(servo, gain, max(damper - layout.drives.own[i], 0.0) / gear**2)

@@ -4,6 +4,7 @@ import difflib
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -67,6 +68,45 @@ def test_one_compliant_joint_among_stiff_ones_has_a_spring() -> None:
     model = mujoco.MjModel.from_xml_string(text)
     assert model.jnt_stiffness[model.joint("flex2").id] == pytest.approx(1.0 / 3e-6, rel=0.3)
     assert model.actuator_gainprm[:, 0].max() < LARGEST_GAIN
+
+
+def in_default_scene(text: str) -> Any:
+    """The model attached to a scene that sets nothing: MuJoCo's integrator, 2 ms, its gravity."""
+    scene = mujoco.MjSpec()
+    child = mujoco.MjSpec.from_string(text)
+    scene.attach(child, prefix="arm/", frame=scene.worldbody.add_frame())
+    return scene.compile()
+
+
+@pytest.mark.filterwarnings("ignore:Attach conflict")
+@pytest.mark.parametrize("name", ["ur10", "irb2600", "meca500", "scara_600", "seven_axes"])
+def test_a_new_file_stands_and_moves_in_a_default_scene(name: str) -> None:
+    robot = robot_called(name)
+    effects = [] if name == "ur10" else ["joint_compliance:J2", "encoder_gain:J1"]
+    cell = cell_with(robot, *effects, size=1e-7)
+    text = write(job_of("cell", cell)).content.decode()
+    model, q = in_default_scene(text), poses(robot, 3)
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    assert model.opt.timestep == 0.002
+    if name == "seven_axes":  # its vertical is not the scene's
+        model.opt.gravity = mujoco.MjModel.from_xml_string(text).opt.gravity
+    alone = drive_alone(text, q, cell.target_names)
+    attached = drive_alone(model, q, tuple(f"arm/{name}" for name in cell.target_names))
+    assert attached.speed < STILL
+    np.testing.assert_allclose(attached.sites, alone.sites, rtol=0, atol=1e-6)
+
+
+def test_a_file_corrected_again_stays_braked_in_its_joints(tmp_path: Path) -> None:
+    robot = with_masses(robot_called("ur10"))
+    cell = cell_with(robot, "joint_compliance:all", size=3e-6)
+    path = tmp_path / "arm.xml"
+    path.write_bytes(write(job_of("cell", cell_with(robot))).content)
+    job = replace(job_of("cell", cell), nominal=robot, fitted=True, model=path,
+                  path=tmp_path / "out.xml")  # fmt: skip
+    text = write(job).content.decode()
+    model = mujoco.MjModel.from_xml_string(text)
+    assert (model.actuator_biasprm[:, 2] == 0.0).all()
+    check_held(text, cell, poses(robot, 3))
 
 
 def measured(folder: Path, model: Path) -> mc.Fit:
