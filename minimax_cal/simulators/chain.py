@@ -42,7 +42,8 @@ def mujoco() -> Any:
 class Chain:
     """An arm in a compiled model.
 
-    model: of MuJoCo.  joints: their n ids, from the foot.  seen: the same arm as a URDF's would be,
+    model: of MuJoCo; its contacts are off from then on: the arm is judged, not what is around it.
+    joints: their n ids, from the foot.  seen: the same arm as a URDF's would be,
     world to last body.  robot: that it is, nominal; masses NaN where they are assumed.
     base: (4, 4) frame 0 of the robot in the world [m].  gravity: [m/s^2].
     """
@@ -53,6 +54,9 @@ class Chain:
     robot: Robot
     base: Array
     gravity: float
+
+    def __post_init__(self) -> None:
+        self.model.opt.disableflags |= int(mujoco().mjtDisableBit.mjDSBL_CONTACT)
 
     @property
     def bodies(self) -> tuple[int, ...]:
