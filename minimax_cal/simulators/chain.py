@@ -148,7 +148,7 @@ def told_robot(model: Any, source: str) -> Robot | None:
 def joints_of(model: Any, count: int, source: str, tip: str) -> tuple[int, ...]:
     """Ids of the joints from the foot to the tip, or of the only arm of so many joints.
 
-    Where more lie on the way, those that an actuator drives.
+    Where more lie on the way, those that an actuator drives; of several the driven arm.
     """
     found: dict[tuple[int, ...], list[str]] = {}
     for body in range(1, model.nbody):
@@ -162,8 +162,9 @@ def joints_of(model: Any, count: int, source: str, tip: str) -> tuple[int, ...]:
             found.setdefault(way, []).append(name)
     if tip and not any(model.body(i).name == tip for i in range(model.nbody)):
         raise RobotError(f"{source}: has no body {tip!r}")
-    if len(found) == 1:
-        return next(iter(found))
+    actuated = [way for way in found if all(driven(model, joint) for joint in way)]
+    if len(found) == 1 or len(actuated) == 1:
+        return actuated[0] if actuated else next(iter(found))
     if not found:
         most = max((len(way_to(model, b)) for b in range(1, model.nbody)), default=0)
         raise RobotError(
