@@ -41,6 +41,7 @@ from minimax_cal.simulators.given import (
 from minimax_cal.simulators.mjcf import beside, told
 from minimax_cal.simulators.placing import placed_error
 from minimax_cal.simulators.result import Rung, SimulatorGap
+from minimax_cal.simulators.standing import resting
 from minimax_cal.solvers.status import Status
 
 AGREES, AGREES_MM = 0.1, 0.002  # of an error by a fit's formulas, and the simulator's [-, mm]
@@ -308,10 +309,7 @@ class Run:
         """Drive a model to every pose and judge where it comes to rest; whether servos drove it."""
         q = self.data.q
         asked = q if commands is None else commands
-        play = None
-        if arm is not None and arm.play.any():
-            sides = [self.data.columns[f"approach{i + 1}"] for i in range(q.shape[1])]
-            play = 0.5 * arm.play * np.stack(sides, axis=1)
+        play = None if arm is None else resting(arm, self.data)
         count = len(q)
 
         def heard(done: int) -> None:

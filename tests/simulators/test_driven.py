@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import minimax_cal as mc
+from minimax_cal.correcting.export import exported
 from minimax_cal.correcting.exporters.job import job_of
+from minimax_cal.modelling.cell import still
 from minimax_cal.simulators.exporter import write
 from minimax_cal.simulators.result import SimulatorGap
 from tests.conftest import run
@@ -107,6 +109,36 @@ def test_a_file_corrected_again_stays_braked_in_its_joints(tmp_path: Path) -> No
     model = mujoco.MjModel.from_xml_string(text)
     assert (model.actuator_biasprm[:, 2] == 0.0).all()
     check_held(text, cell, poses(robot, 3))
+
+
+def test_what_is_delivered_is_what_the_file_reaches() -> None:
+    """One set of masses and springs stands for the torques that a fit takes apart, as it can."""
+    name, effects = (
+        "fanuc_r2000ic_165f",
+        ("joint_compliance:all", "link_bending:L1", "link_bending:L2"),
+    )
+    real, rng = with_masses(robot_called(name)), np.random.default_rng(0)
+    truth = cell_with(real, *effects, size=2e-6, link_bending=[1e-6])
+    q = rng.uniform(np.maximum(real.lower, -2.0), np.minimum(real.upper, 2.0), (24, 6))
+    y = truth.predict(q) + 1e-5 * rng.normal(size=(24, 3, 3))
+    data = replace(still(q, truth.target_names, real), y=y, source="twin.csv")
+    fit = mc.calibrate(name, data, "sum", effects=effects)
+    made = exported(fit, "mjcf")
+    held = data.take(fit.held)
+    reached = drive_alone(
+        made.file.content.decode(), held.q[[0, *range(len(held.q))]], held.target_names
+    )
+    points = reached.sites @ fit.cell.base[:3, :3].T + fit.cell.base[:3, 3]
+
+    def squares(error: np.ndarray) -> float:
+        return 1e6 * float((error**2).sum(axis=-1).mean())
+
+    own, formulas = squares(held.y - points), squares(fit.cell.error(held))
+    assert abs(own - formulas) > 0.01 * formulas
+    whole = fit.within.after.rms_mm
+    assert made.delivered is not None
+    assert made.delivered.figures.rms**2 == pytest.approx(whole**2 + own - formulas, rel=1e-3)
+    assert mc.deliver(fit, "mjcf").figures == made.delivered.figures
 
 
 def measured(folder: Path, model: Path) -> mc.Fit:
