@@ -125,7 +125,7 @@ def with_motors(robot: Robot) -> bytes:
     for body in root.iter("body"):
         body.attrib.pop("gravcomp", None)
     for joint in root.iter("joint"):
-        for key in ("actuatorgravcomp", "actuatorfrclimited", "actuatorfrcrange"):
+        for key in ("actuatorgravcomp", "actuatorfrclimited", "actuatorfrcrange", "damping"):
             joint.attrib.pop(key, None)
     for actuators in root.iter("actuator"):
         for servo in list(actuators):

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -123,15 +124,19 @@ class Reached:
 
 
 def drive_alone(
-    path: Path | str, commands: np.ndarray, names: tuple[str, ...], play: np.ndarray | None = None
+    path: Any, commands: np.ndarray, names: tuple[str, ...], play: np.ndarray | None = None
 ) -> Reached:
     """Smooth moves from command to command and 1.5 s of rest, in a loop that shares no code.
 
+    path: of a model, its text, or itself compiled.
     The first row is where the arm begins, and not judged.  play: (m, n) where play hinges rest.
     """
     mujoco = import_module("mujoco")
-    model = (mujoco.MjModel.from_xml_path(str(path)) if isinstance(path, Path)
-             else mujoco.MjModel.from_xml_string(path))  # fmt: skip
+    model = path
+    if isinstance(path, Path):
+        model = mujoco.MjModel.from_xml_path(str(path))
+    elif isinstance(path, str):
+        model = mujoco.MjModel.from_xml_string(path)
     data, n = mujoco.MjData(model), commands.shape[1]
     joints = [model.joint(j) for j in range(model.njnt) if not springs(model.joint(j).name)][:n]
     slides = np.array([joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE for joint in joints])
@@ -167,7 +172,7 @@ def drive_alone(
 
 def springs(name: str) -> bool:
     """Whether a joint of a written file is passive."""
-    return name.startswith(("flex", "play", "bend", "base_flex", "tool_"))
+    return name.split("/")[-1].startswith(("flex", "play", "bend", "base_flex", "tool_"))
 
 
 def bodies(robot: mc.Robot) -> str:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from minimax_cal.correcting.exporters.job import Export, job_of
 from minimax_cal.correcting.exporters.table import EXPORTERS
 from minimax_cal.fitting.calibrate import fit_split
 from minimax_cal.fitting.fit import Fit
@@ -18,7 +19,7 @@ from minimax_cal.fitting.opened import GEOMETRIC, Opened, Result, open_result
 from minimax_cal.fitting.options import OFFSETS, Progress, silent
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import finite
-from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import EFFECTS, Term
@@ -95,6 +96,7 @@ class Delivered:
     nominal: before the calibration, None where the result does not tell it.  figures: its own;
     whole: those of the full model.  fit: the calibration that `cell` is of, None where there is
     none.  reason: why it was not fitted again though it does not hold all; else empty.
+    missed: the held-out poses by the formulas of the fit and by the file, where they may differ.
     """
 
     format: str
@@ -108,6 +110,18 @@ class Delivered:
     fit: Fit | None = None
     rest: str = ""
     reason: str = ""
+    missed: tuple[Accuracy, Accuracy] | None = None
+
+    def rms_of_file(self, size: float) -> float:
+        """Of a file, where that of its fit is some size [mm]."""
+        if self.missed is None:
+            return size
+        before, after = (one.rms_mm**2 for one in self.missed)
+        return math.sqrt(max(size**2 + after - before, 0.0))
+
+    def largest_of_file(self, size: float) -> float:
+        """The same for a largest error."""
+        return size + self.missed[1].max_mm - self.missed[0].max_mm if self.missed else size
 
     @property
     def holds(self) -> str:
@@ -197,7 +211,12 @@ def deliver(
     """
     if to not in DELIVERABLES:
         raise OptionError(f"{to}: no such format; choose one of {', '.join(DELIVERABLES)}")
-    return delivered(open_result(fit, rung), to, clock, progress)
+    known = open_result(fit, rung)
+    made = delivered(known, to, clock, progress)
+    if not (to in EXPORTERS and EXPORTERS[to].simulated and known.held.any()):
+        return made
+    job = job_of(known.source, made.cell, made.nominal, known.train.q)
+    return as_written(made, known, EXPORTERS[to].write(job))
 
 
 def check_kept(known: Opened, keep_anyway: bool) -> None:
@@ -258,6 +277,19 @@ def delivered(
     placed = known.fit.geometric if known.fit and not (held or only) else fit.cell
     figures = Figures.of(fit, crossed=known.fit is not None)  # as the full model was judged
     return replace(made, cell=placed, nominal=fit.nominal, figures=figures, fit=fit)
+
+
+def as_written(made: Delivered, known: Opened, file: Export) -> Delivered:
+    """The same with the figures of the file: its own, where it stands off the formulas."""
+    if file.off is None or math.isnan(made.figures.rms):
+        return made
+    rows = with_history(known.data).take(known.held)
+    error = made.cell.error(rows)
+    found = replace(made, missed=(accuracy(error), accuracy(error + file.off(rows))))
+    own, rms = made.figures, found.rms_of_file
+    figures = Figures(rms(own.rms), found.largest_of_file(own.largest), rms(own.typical),
+                      rms(own.worst))  # fmt: skip
+    return replace(found, figures=figures)
 
 
 def held_by(to: str, cell: Cell) -> tuple[Term, ...]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from minimax_cal.correcting.deliverable import Delivered, block, kept
+from minimax_cal.correcting.deliverable import Delivered, as_written, block, kept
 from minimax_cal.correcting.exporters import table
 from minimax_cal.correcting.exporters.job import Export, Job, job_of, read_source
 from minimax_cal.fitting.opened import Result
@@ -136,7 +136,10 @@ def exported(
     job = replace(
         job, originals=originals, model=model, path=path, tip=tip, experimental=experimental
     )
-    return Exported(to, table.export(job, to), found)
+    file = table.export(job, to)
+    if found is not None and not isinstance(source, Job):
+        found = as_written(found, source, file)
+    return Exported(to, file, found)
 
 
 def written(made: Export, path: Path | None) -> None:

@@ -42,7 +42,8 @@ def mujoco() -> Any:
 class Chain:
     """An arm in a compiled model.
 
-    model: of MuJoCo.  joints: their n ids, from the foot.  seen: the same arm as a URDF's would be,
+    model: of MuJoCo; its contacts are off from then on: the arm is judged, not what is around it.
+    joints: their n ids, from the foot.  seen: the same arm as a URDF's would be,
     world to last body.  robot: that it is, nominal; masses NaN where they are assumed.
     base: (4, 4) frame 0 of the robot in the world [m].  gravity: [m/s^2].
     """
@@ -53,6 +54,9 @@ class Chain:
     robot: Robot
     base: Array
     gravity: float
+
+    def __post_init__(self) -> None:
+        self.model.opt.disableflags |= int(mujoco().mjtDisableBit.mjDSBL_CONTACT)
 
     @property
     def bodies(self) -> tuple[int, ...]:
@@ -144,7 +148,7 @@ def told_robot(model: Any, source: str) -> Robot | None:
 def joints_of(model: Any, count: int, source: str, tip: str) -> tuple[int, ...]:
     """Ids of the joints from the foot to the tip, or of the only arm of so many joints.
 
-    Where more lie on the way, those that an actuator drives.
+    Where more lie on the way, those that an actuator drives; of several the driven arm.
     """
     found: dict[tuple[int, ...], list[str]] = {}
     for body in range(1, model.nbody):
@@ -158,8 +162,9 @@ def joints_of(model: Any, count: int, source: str, tip: str) -> tuple[int, ...]:
             found.setdefault(way, []).append(name)
     if tip and not any(model.body(i).name == tip for i in range(model.nbody)):
         raise RobotError(f"{source}: has no body {tip!r}")
-    if len(found) == 1:
-        return next(iter(found))
+    actuated = [way for way in found if all(driven(model, joint) for joint in way)]
+    if len(found) == 1 or len(actuated) == 1:
+        return actuated[0] if actuated else next(iter(found))
     if not found:
         most = max((len(way_to(model, b)) for b in range(1, model.nbody)), default=0)
         raise RobotError(
@@ -193,6 +198,18 @@ def drives(model: Any, actuator: int, joint: int) -> bool:
         name = model.joint(joint).name
         return bool(name) and bool(model.tendon(number).name == f"{name}_drive")
     return kind == 0 and number == joint
+
+
+def braked(model: Any) -> Array:
+    """(njnt,) True where a joint holds the damper of its servo, as those of a new file of ours do.
+
+    Whatever the integrator of the scene that the file is attached to, it takes that implicitly.
+    """
+    ours = mujoco().mj_name2id(model, mujoco().mjtObj.mjOBJ_TEXT, ROBOT) >= 0
+    bias = model.actuator_biasprm
+    bare = [i for i in range(model.nu) if ours and bias[i, 1] < 0.0 and bias[i, 2] == 0.0]
+    joints = range(model.njnt)
+    return np.array([any(drives(model, i, j) for i in bare) for j in joints], dtype=bool)
 
 
 def carrier(chain: Chain) -> int:

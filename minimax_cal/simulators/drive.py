@@ -18,7 +18,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
-from minimax_cal.simulators.chain import Chain, body_pose, carrier, mujoco, way_to
+from minimax_cal.simulators.chain import Chain, body_pose, carrier, holders, mujoco, way_to
 
 MOVE, REST = 2.0, 1.5  # a move lasts at least, and a rest after it [s]
 FASTEST, FASTEST_SLIDE = 1.0, 0.25  # no joint is commanded faster [rad/s, m/s]
@@ -26,7 +26,6 @@ STILL, STILL_SLIDE = 2e-3, 1e-3  # slower is at rest [rad/s, m/s]
 PEAK = 1.875  # largest speed of a minimum-jerk move of length 1 in time 1
 RUNS = 4  # of neighbouring poses, whatever the machine: its results are those of any other
 LOOKS = 10  # timesteps of a rest between two looks at its forces
-TOUCH = 1e-6  # a smaller force of a contact is none [N]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +35,7 @@ class Driven:
     poses: (m, 4, 4) of the body that carries the targets, in the world [m].
     q: (m, n) where the joints were [rad, m].  speed: (m,) largest of all joints, springs with them,
     as a share of what counts as rest.  limited: (n,) share of the timesteps at which a joint's
-    actuator was at its force limit.  touching: (m,) True where something pressed on the arm.
+    actuator was at its force limit.
     driven: whether servos moved it; else its joints were set.
     """
 
@@ -44,7 +43,6 @@ class Driven:
     q: Array
     speed: Array
     limited: Array
-    touching: Array
     driven: bool
 
     @property
@@ -90,7 +88,6 @@ def drive(
         q=np.array([visit.q for visit in found]),
         speed=np.array([visit.speed for visit in found]),
         limited=np.mean([visit.limited for visit in found], axis=0),
-        touching=np.array([visit.touching for visit in found]),
         driven=True,
     )
 
@@ -103,7 +100,6 @@ class Visit:
     q: Array
     speed: float
     limited: Array
-    touching: bool
 
 
 def visits(
@@ -143,7 +139,6 @@ def visits(
         out.append(Visit(
             body_pose(data, carrier(chain_here)), np.array(data.qpos[at]),
             float((np.abs(data.qvel[dofs]) / rest).max()), share,
-            bool(data.ncon) and pressed(mj, model, data),
         ))  # fmt: skip
         start = commands[row]
         heard()
@@ -236,19 +231,23 @@ def set_joints(chain: Chain, commands: Array, play: Array | None) -> Driven:
             data.qpos[place] = 0.0 if play is None else play[row, joint]
         mj.mj_kinematics(model, data)
         out.append(body_pose(data, carrier(chain)))
-    count, still = len(commands), np.zeros(len(commands))
-    limited = np.zeros(commands.shape[1])
-    return Driven(np.array(out), commands, still, limited, np.zeros(count, dtype=bool), False)
+    still, limited = np.zeros(len(commands)), np.zeros(commands.shape[1])
+    return Driven(np.array(out), commands, still, limited, False)
 
 
-def pressed(mj: Any, model: Any, data: Any) -> bool:
-    """Whether a contact carries force."""
-    force = np.zeros(6)
-    for i in range(data.ncon):
-        mj.mj_contactForce(model, data, i, force)
-        if abs(force[0]) > TOUCH:
-            return True
-    return False
+def touching(chain: Chain, model: Any, q: Array) -> Array:
+    """(m,) True where the arm touches something, or itself, at joint values (m, n) [rad, m].
+
+    model: that of the chain, with its contacts.
+    """
+    mj, carried = mujoco(), holders(model, chain.bodies) >= 0
+    data, out = mj.MjData(model), np.zeros(len(q), dtype=bool)
+    for row, values in enumerate(q):
+        data.qpos[chain.places] = values
+        mj.mj_fwdPosition(model, data)
+        sides = carried[model.geom_bodyid[data.contact.geom]].any(axis=-1)
+        out[row] = bool((sides & (data.contact.dist < 0.0)).any())
+    return out
 
 
 def plays(chain: Chain) -> dict[int, int]:

@@ -149,7 +149,7 @@ def write_servos(layout: Layout, arm: Arm, servos: Servos) -> None:
         gear = 1.0 / (1.0 + arm.gain[i])
         gain, damper = servos.gain[i] / gear**2, servos.damper[i]
         if not (servos.kept[i] and not arm.gain[i]):
-            if not layout.drives.implicit:
+            if layout.drives.braked[i]:
                 layout.joints[i].set("damping", numbers([damper]))
                 damper = 0.0
             tune(servo, gain, max(damper - layout.drives.own[i], 0.0) / gear**2)
@@ -168,12 +168,14 @@ def write_servos(layout: Layout, arm: Arm, servos: Servos) -> None:
 
 
 def servo_of(layout: Layout, joint: str) -> ET.Element:
-    """The position actuator of a joint, a new one where there is none."""
-    actuators = section(layout.root, "actuator")
+    """The position actuator of a joint, a new one of a free name where there is none."""
+    actuators, name = section(layout.root, "actuator"), joint
     for element in actuators:
         if element.get("joint") == joint and element.tag in ("position", "general"):
             return element
-    return part(actuators, "position", name=joint, joint=joint)
+    while any(element.get("name") == name for element in layout.root.findall("actuator/*")):
+        name += "_servo"
+    return part(actuators, "position", name=name, joint=joint)
 
 
 def tune(servo: ET.Element, gain: float, damper: float) -> None:

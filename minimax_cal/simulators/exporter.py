@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import numpy as np
 
+from minimax_cal.correcting.exporters.correct import match
 from minimax_cal.correcting.exporters.job import Export, Job
 from minimax_cal.correcting.exporters.urdf import assumptions
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.simulators.arm import arm_of, assumed, held_terms, sample
-from minimax_cal.simulators.chain import chain_of
+from minimax_cal.simulators.chain import chain_of, mujoco
 from minimax_cal.simulators.given import (
     check_limits,
     content_for,
@@ -19,6 +22,7 @@ from minimax_cal.simulators.given import (
     told_masses,
 )
 from minimax_cal.simulators.mjcf import beside, new_tree, text_of, told
+from minimax_cal.simulators.standing import Written
 
 
 def write(job: Job) -> Export:
@@ -28,7 +32,12 @@ def write(job: Job) -> Export:
     cell = job.cell or Cell(job.robot, np.eye(4), (), np.zeros((0, 3)))
     arm = arm_of(cell, job.q)
     content = text_of(new_tree(arm, cell.target_names))
-    return Export(content, (assumptions(job.robot), *told(arm)), beside(cell, arm))
+    off = None
+    if find_spec("mujoco") and cell.target_names:
+        chain = chain_of(mujoco().MjModel.from_xml_string(content.decode()), job.robot.joints,
+                         job.source)  # fmt: skip
+        off = Written(chain, cell, arm, np.eye(4)).off
+    return Export(content, (assumptions(job.robot), *told(arm)), beside(cell, arm), off)
 
 
 def carries(cell: Cell) -> tuple[Term, ...]:
@@ -51,4 +60,6 @@ def correct(job: Job) -> Export:
     check_limits(chain, sample(job.robot) if job.q is None else job.q, given.source)
     document, notices = corrected(given, chain, job.nominal, arm, job.cell.target_names)
     content = content_for(document, given.folder, job.path)
-    return Export(content, (*notices, *told(arm)), beside(job.cell, arm))
+    made = chain.in_model(given.compiled(document.root))
+    off = Written(made, job.cell, arm, match(job.nominal, chain.seen)[0]).off
+    return Export(content, (*notices, *told(arm)), beside(job.cell, arm), off)

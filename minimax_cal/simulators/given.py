@@ -32,6 +32,7 @@ from minimax_cal.simulators.chain import (
     Chain,
     at_zero,
     body_pose,
+    braked,
     mujoco,
     own_pose,
     shifted,
@@ -372,8 +373,9 @@ def drives_of(chain: Chain) -> Drives:
     floating = model.body_gravcomp[list(chain.bodies)] > 0.0
     free = bool(floating.any() and not model.jnt_actgravcomp[list(chain.joints)].any())
     return Drives(
-        gain, damper + own, own, limits, largest_inertia(chain), float(model.opt.timestep), free,
-        int(model.opt.integrator) in IMPLICIT,
+        gain, damper + own, own, limits, largest_inertia(chain),
+        braked(model)[list(chain.joints)] | (int(model.opt.integrator) not in IMPLICIT),
+        float(model.opt.timestep), free,
     )  # fmt: skip
 
 

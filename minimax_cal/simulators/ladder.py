@@ -29,7 +29,7 @@ from minimax_cal.simulators.causes import Causes, causes_of
 from minimax_cal.simulators.chain import Chain, chain_of, mujoco
 from minimax_cal.simulators.commands import Commands
 from minimax_cal.simulators.document import Document
-from minimax_cal.simulators.drive import Driven, drive
+from minimax_cal.simulators.drive import Driven, drive, touching
 from minimax_cal.simulators.given import (
     Given,
     check_limits,
@@ -41,6 +41,7 @@ from minimax_cal.simulators.given import (
 from minimax_cal.simulators.mjcf import beside, told
 from minimax_cal.simulators.placing import placed_error
 from minimax_cal.simulators.result import Rung, SimulatorGap
+from minimax_cal.simulators.standing import resting
 from minimax_cal.solvers.status import Status
 
 AGREES, AGREES_MM = 0.1, 0.002  # of an error by a fit's formulas, and the simulator's [-, mm]
@@ -48,7 +49,7 @@ WORSE = 0.01  # relative rise of an error that is one
 AT_LIMIT = 0.01  # an arm that follows is at a force limit in no larger share of the timesteps
 COMMANDED = ".commands.xml"  # ending of a model that a command map belongs to
 FIRST_MOVES = 4  # that show whether a model is stable
-TRAINING = 100  # poses that place base and targets
+TRAINING, FEWEST = 100, 4  # poses that place base and targets, at most and at least
 
 
 def simulator_gap(
@@ -126,7 +127,7 @@ def simulator_gap(
         floor=causes.floor.value if causes.floor else float("nan"),
         floor_from=causes.floor.source if causes.floor else "",
         train_poses=int((~causes.held).sum()),
-        holdout_poses=int(causes.held.sum()),
+        holdout_poses=int(run.held.sum()),
         status=best.fit.status,
         beyond=best.fit.beyond.to_dict(),
         left_out=made.left_out,
@@ -177,13 +178,16 @@ class Run:
 
     def __init__(self, given: Given, chain: Chain, causes: Causes, progress: Progress) -> None:
         self.given, self.chain, self.causes, self.progress = given, chain, causes, progress
-        train = np.flatnonzero(~causes.held)
+        touched = touching(chain, given.compiled(), causes.data.q)
+        judge = judging(causes.held, touched)
+        train = np.flatnonzero(judge & ~causes.held)
         some = train[np.linspace(0, len(train) - 1, min(len(train), TRAINING)).astype(int)]
-        self.rows = np.sort(np.concatenate([some, np.flatnonzero(causes.held)]))
+        self.rows = np.sort(np.concatenate([some, np.flatnonzero(judge & causes.held)]))
         self.data = causes.data.take(self.rows)
         self.held = causes.held[self.rows]
         self.nominal = causes.geometry.nominal
         self.notices: list[str] = []
+        self.tell(f"{given.source}: the arm touches something", causes.data, touched, judge)
 
     def before(self) -> list[Rung]:
         """The model as given, and without the sag of its servos."""
@@ -305,10 +309,7 @@ class Run:
         """Drive a model to every pose and judge where it comes to rest; whether servos drove it."""
         q = self.data.q
         asked = q if commands is None else commands
-        play = None
-        if arm is not None and arm.play.any():
-            sides = [self.data.columns[f"approach{i + 1}"] for i in range(q.shape[1])]
-            play = 0.5 * arm.play * np.stack(sides, axis=1)
+        play = None if arm is None else resting(arm, self.data)
         count = len(q)
 
         def heard(done: int) -> None:
@@ -316,36 +317,36 @@ class Run:
                 self.progress(f"{name}: {done} of {count} poses")
 
         driven = drive(chain, asked, self.given.source, play, heard)
-        self.tell(name, driven)
+        judge = judging(self.held, driven.moving)
+        self.tell(f"{name}: the simulated arm did not come to rest within 1.5 s of its move",
+                  self.data, driven.moving, judge)  # fmt: skip
+        self.tell_limits(name, driven)
         error = placed_error(
-            driven.poses, self.data, ~self.held, guess(start, driven.poses[0], q[0])
+            driven.poses, self.data, judge & ~self.held, guess(start, driven.poses[0], q[0])
         )
-        held, train = accuracy(error[:, self.held]), accuracy(error[:, ~self.held])
-        off = np.abs(driven.q - asked)[:, ~chain.robot.prismatic]
+        held, train = (accuracy(error[:, judge & rows]) for rows in (self.held, ~self.held))
+        off = np.abs(driven.q - asked)[judge][:, ~chain.robot.prismatic]
         rung = Rung(
             name, held.rms_mm, held.max_mm, train.rms_mm, train.max_mm,
-            1e3 * float(off.max(initial=0.0)), self.predicted(fit),
+            1e3 * float(off.max(initial=0.0)), self.predicted(fit, judge & self.held),
             moving_poses=int(driven.moving.sum()), at_limit=float(driven.limited.max()),
         )  # fmt: skip
         return rung, driven.driven
 
-    def predicted(self, fit: Fit | None) -> float:
-        """Held-out RMS of the driven poses by the formulas of a fit, NaN where it has others."""
+    def predicted(self, fit: Fit | None, rows: Array) -> float:
+        """RMS of some driven poses by the formulas of a fit, NaN where it has others."""
         if fit is None or not self.causes.same:
             return float("nan")
-        return accuracy(fit.cell.error(self.data)[:, self.held]).rms_mm
+        return accuracy(fit.cell.error(self.data)[:, rows]).rms_mm
 
-    def tell(self, name: str, driven: Driven) -> None:
-        """Notices on poses that did not come to rest, or where something held the arm up."""
-        for rows, what in (
-            (driven.moving, "did not come to rest within 1.5 s of its move"),
-            (driven.touching, "touched something"),
-        ):
-            if rows.any():
-                self.notices.append(
-                    f"{name}: the simulated arm {what} at {rows.sum()} poses "
-                    f"({self.data.list_rows(rows)})"
-                )
+    def tell(self, what: str, data: Measurements, rows: Array, judge: Array) -> None:
+        """A notice on poses that do not judge.  rows: (m,) where; judge: (m,) those that do."""
+        if rows.any():
+            how = "they count, too few would be left" if judge.all() else "they are left out"
+            self.notices.append(f"{what} at {rows.sum()} poses ({data.list_rows(rows)}): {how}")
+
+    def tell_limits(self, name: str, driven: Driven) -> None:
+        """Notices on joints that were at their force limits."""
         for i in np.flatnonzero(driven.limited > AT_LIMIT):
             self.notices.append(
                 f"{name}: joint {i + 1} is at its force limit in {driven.limited[i]:.0%} of the "
@@ -362,6 +363,13 @@ def disagreement(rungs: Sequence[Rung]) -> list[str]:
         if abs(rung.holdout_rms_mm - rung.predicted_rms_mm)
         > max(AGREES * rung.predicted_rms_mm, AGREES_MM)
     ]
+
+
+def judging(held: Array, out: Array) -> Array:
+    """(m,) True at poses that judge: all but those that are out, unless too few would be left."""
+    left = ~out
+    enough = (left & held).any() and (left & ~held).sum() >= FEWEST
+    return left if enough else np.ones_like(left)
 
 
 def worse(rung: Rung, before: Rung) -> bool:

@@ -20,7 +20,7 @@ from minimax_cal.ground.errors import RobotError
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots.transforms import to_rpy, transform
 from minimax_cal.simulators.arm import arm_of
-from minimax_cal.simulators.chain import mujoco
+from minimax_cal.simulators.chain import braked, mujoco
 from minimax_cal.simulators.elements import numbers
 from minimax_cal.simulators.given import read_model
 from minimax_cal.simulators.mjcf import new_tree, text_of
@@ -187,7 +187,7 @@ def write_joint(arm: ET.Element, placed: Placed, body: int) -> None:
         element(limit, "effort", float(np.abs(model.jnt_actfrcrange[j]).max()))
     dynamics = ET.SubElement(axis, "dynamics")
     dof = int(model.jnt_dofadr[j])
-    element(dynamics, "damping", float(model.dof_damping[dof]))
+    element(dynamics, "damping", 0.0 if braked(model)[j] else float(model.dof_damping[dof]))
     element(dynamics, "friction", float(model.dof_frictionloss[dof]))
     element(dynamics, "spring_reference", float(model.qpos_spring[model.jnt_qposadr[j]]))
     element(dynamics, "spring_stiffness", float(model.jnt_stiffness[j]))

@@ -37,7 +37,7 @@ class Drives:
     limits: (n, 2) of the torque of each joint's actuators [N m].
     inertia: (n,) largest about each joint [kg m^2].  timestep: [s].
     gravity_free: whether actuators carry no gravity because the model's bodies float already.
-    implicit: whether the integrator takes the dampers of servos implicitly, as those of joints.
+    braked: (n,) True where the joint is to hold its servo's damper, which is implicit there.
     """
 
     gain: Array
@@ -45,15 +45,16 @@ class Drives:
     own: Array
     limits: Array
     inertia: Array
+    braked: Array
     timestep: float = 0.002
     gravity_free: bool = False
-    implicit: bool = True
 
     @staticmethod
     def none(joints: int) -> Drives:
         """Of a new file."""
         nothing = np.zeros(joints)
-        return Drives(nothing, nothing, nothing, np.array([[-np.inf, np.inf]] * joints), nothing)
+        ends = np.array([[-np.inf, np.inf]] * joints)
+        return Drives(nothing, nothing, nothing, ends, nothing, np.ones(joints, dtype=bool))
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,12 +4,15 @@ import difflib
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import minimax_cal as mc
+from minimax_cal.correcting.export import exported
 from minimax_cal.correcting.exporters.job import job_of
+from minimax_cal.modelling.cell import still
 from minimax_cal.simulators.exporter import write
 from minimax_cal.simulators.result import SimulatorGap
 from tests.conftest import run
@@ -67,6 +70,75 @@ def test_one_compliant_joint_among_stiff_ones_has_a_spring() -> None:
     model = mujoco.MjModel.from_xml_string(text)
     assert model.jnt_stiffness[model.joint("flex2").id] == pytest.approx(1.0 / 3e-6, rel=0.3)
     assert model.actuator_gainprm[:, 0].max() < LARGEST_GAIN
+
+
+def in_default_scene(text: str) -> Any:
+    """The model attached to a scene that sets nothing: MuJoCo's integrator, 2 ms, its gravity."""
+    scene = mujoco.MjSpec()
+    child = mujoco.MjSpec.from_string(text)
+    scene.attach(child, prefix="arm/", frame=scene.worldbody.add_frame())
+    return scene.compile()
+
+
+@pytest.mark.filterwarnings("ignore:Attach conflict")
+@pytest.mark.parametrize("name", ["ur10", "irb2600", "meca500", "scara_600", "seven_axes"])
+def test_a_new_file_stands_and_moves_in_a_default_scene(name: str) -> None:
+    robot = robot_called(name)
+    effects = [] if name == "ur10" else ["joint_compliance:J2", "encoder_gain:J1"]
+    cell = cell_with(robot, *effects, size=1e-7)
+    text = write(job_of("cell", cell)).content.decode()
+    model, q = in_default_scene(text), poses(robot, 3)
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    assert model.opt.timestep == 0.002
+    if name == "seven_axes":  # its vertical is not the scene's
+        model.opt.gravity = mujoco.MjModel.from_xml_string(text).opt.gravity
+    alone = drive_alone(text, q, cell.target_names)
+    attached = drive_alone(model, q, tuple(f"arm/{name}" for name in cell.target_names))
+    assert attached.speed < STILL
+    np.testing.assert_allclose(attached.sites, alone.sites, rtol=0, atol=1e-6)
+
+
+def test_a_file_corrected_again_stays_braked_in_its_joints(tmp_path: Path) -> None:
+    robot = with_masses(robot_called("ur10"))
+    cell = cell_with(robot, "joint_compliance:all", size=3e-6)
+    path = tmp_path / "arm.xml"
+    path.write_bytes(write(job_of("cell", cell_with(robot))).content)
+    job = replace(job_of("cell", cell), nominal=robot, fitted=True, model=path,
+                  path=tmp_path / "out.xml")  # fmt: skip
+    text = write(job).content.decode()
+    model = mujoco.MjModel.from_xml_string(text)
+    assert (model.actuator_biasprm[:, 2] == 0.0).all()
+    check_held(text, cell, poses(robot, 3))
+
+
+def test_what_is_delivered_is_what_the_file_reaches() -> None:
+    """One set of masses and springs stands for the torques that a fit takes apart, as it can."""
+    name, effects = (
+        "fanuc_r2000ic_165f",
+        ("joint_compliance:all", "link_bending:L1", "link_bending:L2"),
+    )
+    real, rng = with_masses(robot_called(name)), np.random.default_rng(0)
+    truth = cell_with(real, *effects, size=2e-6, link_bending=[1e-6])
+    q = rng.uniform(np.maximum(real.lower, -2.0), np.minimum(real.upper, 2.0), (24, 6))
+    y = truth.predict(q) + 1e-5 * rng.normal(size=(24, 3, 3))
+    data = replace(still(q, truth.target_names, real), y=y, source="twin.csv")
+    fit = mc.calibrate(name, data, "sum", effects=effects)
+    made = exported(fit, "mjcf")
+    held = data.take(fit.held)
+    reached = drive_alone(
+        made.file.content.decode(), held.q[[0, *range(len(held.q))]], held.target_names
+    )
+    points = reached.sites @ fit.cell.base[:3, :3].T + fit.cell.base[:3, 3]
+
+    def squares(error: np.ndarray) -> float:
+        return 1e6 * float((error**2).sum(axis=-1).mean())
+
+    own, formulas = squares(held.y - points), squares(fit.cell.error(held))
+    assert abs(own - formulas) > 0.01 * formulas
+    whole = fit.within.after.rms_mm
+    assert made.delivered is not None
+    assert made.delivered.figures.rms**2 == pytest.approx(whole**2 + own - formulas, rel=1e-3)
+    assert mc.deliver(fit, "mjcf").figures == made.delivered.figures
 
 
 def measured(folder: Path, model: Path) -> mc.Fit:

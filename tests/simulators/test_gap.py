@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from minimax_cal.diagnosing.result import load_diagnosis
+from minimax_cal.modelling.cell import still
 from minimax_cal.modelling.effects.table import Fitted, Term, terms
 from minimax_cal.reporting.html import read_sources
 from minimax_cal.robots.gravity import tubes
@@ -29,6 +30,7 @@ from minimax_cal.simulators.given import read_model  # noqa: E402
 
 AGREES = 0.01  # between simulator and fit, held-out RMS [mm]
 PLACED = 0.15  # of an error that the poses it is judged by have placed
+NOISE_MM = 0.03  # RMS of 10 um an axis, with what 9 poses leave open
 WITHIN = 1.1  # of the rung that holds only effects with an element
 KEYS = {"name", "holdout_rms_mm", "holdout_max_mm"}
 
@@ -281,6 +283,90 @@ def test_laws_chosen_for_guessed_masses_are_chosen_anew_for_told_ones() -> None:
     ]  # fmt: skip
     assert carried_over((known, soft), mc.load_robot("irb2600")) == (known, soft)
     assert carried_over((known,), told) == (known,)
+
+
+POST = "<geom name='pillar' type='capsule' size='.03 .6' pos='.45 0 .5'/>"
+
+
+def beside_a_pillar(pillar: str = POST, servo: str = "position kp='3000' kv='90'") -> str:
+    """An arm of three joints that turns its link of .4 m about a pillar .45 m away."""
+    names = [f"turn{i}" for i in (1, 2, 3)]
+    servos = "".join(f"<{servo} name='{name}' joint='{name}'/>" for name in names)
+    axes, at = ("0 0 1", "0 1 0", "0 1 0"), ("0 0 .4", "0 0 .1", ".4 0 0")
+    links = "".join(
+        f"<body name='link{i}' pos='{place}'><joint name='{name}' axis='{axis}' armature='.1'/>"
+        f"<geom type='capsule' fromto='0 0 0 {reach} 0 0' size='.02' mass='1'/>"
+        for i, name, axis, place, reach in zip(
+            "abc", names, axes, at, (0.01, 0.4, 0.2), strict=True
+        )
+    )
+    return (
+        "<mujoco><compiler angle='radian'/><option integrator='implicitfast'/><worldbody>"
+        f"{pillar}{links}{3 * '</body>'}</worldbody><actuator>{servos}</actuator></mujoco>"
+    )
+
+
+def robot_of(path: Path) -> mc.Robot:
+    given = read_model(path)
+    return chain_of(given.compiled(), 3, given.source).robot
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, mc.Measurements]:
+    """Poses on either side of the pillar by turns, the first three in it."""
+    folder, rng = tmp_path_factory.mktemp("pillar"), np.random.default_rng(5)
+    side = np.where(np.arange(40) % 2, 1.0, -1.0)
+    q = np.column_stack([side * rng.uniform(0.5, 1.3, 40), rng.uniform(-0.5, 0.5, (40, 2))])
+    q[:3, 0] = 0.0
+    model = mujoco.MjModel.from_xml_string(beside_a_pillar())
+    model.body_pos[1:] += 1e-3 * rng.normal(size=(3, 3))
+    data, spots = mujoco.MjData(model), np.array([[0.2, 0.05, 0.0], [0.15, -0.05, 0.03]])
+    y = np.empty((40, 2, 3))
+    for row, values in enumerate(q):
+        data.qpos[:] = values
+        mujoco.mj_forward(model, data)
+        assert bool(data.ncon) == (row < 3)
+        y[row] = data.xpos[3] + spots @ data.xmat[3].reshape(3, 3).T
+    (folder / "arm.xml").write_text(beside_a_pillar())
+    rows = still(q, ("smr1", "smr2"), robot_of(folder / "arm.xml"))
+    y += 1e-5 * rng.normal(size=y.shape)
+    return folder, replace(rows, y=y, source="poses.csv")
+
+
+def test_a_pillar_between_poses_is_nothing_that_an_arm_rests_on(
+    turned: tuple[Path, mc.Measurements],
+) -> None:
+    folder, data = turned
+    (folder / "post.xml").write_text(beside_a_pillar())
+    (folder / "free.xml").write_text(beside_a_pillar(""))
+    apart = data.take(np.arange(3, len(data.q)))
+    fit = mc.calibrate(robot_of(folder / "free.xml"), apart, "sum")
+    post, free = (mc.simulator_gap(folder / f"{name}.xml", apart, fit=fit)
+                  for name in ("post", "free"))  # fmt: skip
+    for with_post, without in zip(post.rungs, free.rungs, strict=True):
+        assert with_post.holdout_rms_mm == pytest.approx(without.holdout_rms_mm, rel=1e-6)
+        assert with_post.sag_mrad == pytest.approx(without.sag_mrad, rel=1e-6)
+    assert free.rungs[-1].holdout_rms_mm < NOISE_MM
+    assert not any("touches" in text for text in post.notices)
+    fit = mc.calibrate(fit.nominal.robot, data, "sum")
+    whole = mc.simulator_gap(folder / "post.xml", data, fit=fit)
+    (notice,) = [text for text in whole.notices if "touches" in text]
+    assert "at 3 poses" in notice
+    assert notice.endswith("they are left out")
+    assert whole.holdout_poses == int(fit.held[3:].sum())
+    assert whole.rungs[-1].holdout_rms_mm < NOISE_MM
+
+
+def test_motors_named_as_their_joints(turned: tuple[Path, mc.Measurements]) -> None:
+    folder, data = turned
+    (folder / "named.xml").write_text(beside_a_pillar("", "motor"))
+    fit = mc.calibrate(robot_of(folder / "named.xml"), data, "sum")
+    gap = mc.simulator_gap(folder / "named.xml", data, fit=fit, write=folder / "corrected.xml")
+    assert gap.rungs[-1].holdout_rms_mm < NOISE_MM
+    model = mujoco.MjModel.from_xml_path(str(folder / "corrected.xml"))
+    assert [model.actuator(i).name for i in range(6)] == [
+        f"turn{i}{ending}" for ending in ("", "_servo") for i in (1, 2, 3)
+    ]
 
 
 def test_poses_of_another_arm_are_refused(arm: Path) -> None:

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -31,7 +32,9 @@ from experiments.driven_arms import (  # noqa: E402
 from minimax_cal.simulators.motion import bodies  # noqa: E402
 from minimax_cal.simulators.motion.fit import least_within, levelling, speeds  # noqa: E402
 from minimax_cal.simulators.motion.module import loaded  # noqa: E402
+from minimax_cal.simulators.motion.opened import open_model  # noqa: E402
 from minimax_cal.simulators.motion.result import MotionGap  # noqa: E402
+from minimax_cal.simulators.sdf import convert  # noqa: E402
 
 STEP = 0.002
 LACKS = Withheld(
@@ -321,3 +324,19 @@ def test_damping_that_levels_off_falls_nowhere() -> None:
     v = np.linspace(0.0, 5.0, 200)
     for speed in (0.5, 2.0):
         assert (np.diff(speeds(v) @ levelling(speed)) >= -1e-12).all()
+
+
+def test_the_damper_of_a_servo_is_no_friction(tmp_path: Path) -> None:
+    """Joints of an exported file hold the dampers of their servos: not along logs, nor in SDF."""
+    path = tmp_path / "arm.xml"
+    assert run("export", "ur10", "--to", "mjcf", "-o", path) == 0
+    model = mujoco.MjModel.from_xml_path(str(path))
+    opened = open_model(path, 6).chain.model
+    assert (opened.dof_damping == 0.0).all()
+    np.testing.assert_allclose(-opened.actuator_biasprm[:, 2], model.dof_damping, rtol=1e-12)
+    np.testing.assert_array_equal(opened.actuator_gainprm, model.actuator_gainprm)
+    sdf = ElementTree.fromstring(convert(path).content)
+    assert [float(str(e.text)) for e in sdf.iter("damping")] == [0.0] * 6
+    text = path.read_text().replace('kv="0.0"', 'kv="10"')  # it has one of its own: friction then
+    path.write_text(text)
+    np.testing.assert_array_equal(open_model(path, 6).chain.model.dof_damping, model.dof_damping)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +11,7 @@ import numpy as np
 
 from minimax_cal.fitting.opened import Opened, Result, open_result
 from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, NotSaved, saved_content, still
 from minimax_cal.modelling.effects.compliance import JOINT_COMPLIANCE, stiffens
 from minimax_cal.modelling.effects.scene import joint_of
@@ -53,11 +54,14 @@ class Export:
     """A file's content, and what people should know about it.
 
     beside: contents of files that belong to it, by the ending that takes the place of its own.
+    off: how far (k, m, 3) its targets stand from the formulas of the fit at measured poses, as the
+    instrument sees it [m]; None where they stand where these say, or no simulator is there.
     """
 
     content: bytes
     notices: tuple[str, ...] = ()
     beside: Mapping[str, bytes] = field(default_factory=dict)
+    off: Callable[[Measurements], Array] | None = None
 
     @staticmethod
     def of(text: str, *notices: str) -> Export:

@@ -37,13 +37,14 @@ class Exporter:
 
     write: its file.  carries: the effects of a cell that the file holds.  only: of the geometry it
     holds no more than a fit with this `only` finds; all of it where empty.  couples: whether it
-    holds that a joint follows others.
+    holds that a joint follows others.  simulated: whether its file tells how far it stands off.
     """
 
     write: Callable[[Job], Export]
     carries: Carries = nothing
     only: str = ""
     couples: bool = False
+    simulated: bool = False
 
 
 def later(module: str, verb: str) -> Callable[..., Any]:
@@ -60,7 +61,7 @@ EXPORTERS: dict[str, Exporter] = {
     "dh-csv": Exporter(dh_csv.write),
     "json": Exporter(robot_json.write, couples=True),
     "moc": Exporter(moc.write, moc.carries),
-    "mjcf": Exporter(later(MJCF, "write"), later(MJCF, "carries")),
+    "mjcf": Exporter(later(MJCF, "write"), later(MJCF, "carries"), simulated=True),
     "sdf": Exporter(later(SDF, "write")),
 }
 

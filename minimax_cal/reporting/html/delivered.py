@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from minimax_cal.correcting.deliverable import COMPENSATED, Delivered, deliver
 from minimax_cal.fitting.fit import Fit
@@ -93,12 +93,23 @@ def rows_of(
             )
         elif found.fit and found.fit is not source:
             claims = claims_of(found.fit)
+        claims = tuple(claim_of_file(claim, found) for claim in claims)
         chosen = next((claim for claim in claims if claim.name == which), None)
         if chosen is None:
             why = "this result makes no such claim"
             chosen = Claim(which, NOWHERE, NOWHERE, 0, "", reason=why)
         out.append(Row(found, claims, tuple(judge(limit, chosen) for limit in limits)))
     return tuple(out)
+
+
+def claim_of_file(claim: Claim, made: Delivered) -> Claim:
+    """What is claimed of a file, where that of its fit is known."""
+    rms, largest = claim.rms, claim.largest
+    return replace(
+        claim,
+        rms=Bound(made.rms_of_file(rms.value), made.rms_of_file(rms.high)),
+        largest=Bound(made.largest_of_file(largest.value), made.largest_of_file(largest.high)),
+    )
 
 
 def has_effects(sources: Sources, rung: int | None) -> bool:

@@ -21,7 +21,7 @@ from minimax_cal.simulators.given import (
     told_masses,
 )
 from minimax_cal.simulators.mjcf import new_tree
-from minimax_cal.simulators.motion.written import new_model, weigh_drawn
+from minimax_cal.simulators.motion.written import free_joints, new_model, weigh_drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +44,11 @@ class Opened:
         chain = chain_along(model, joints, given.source, unknown=given.assumed)
         return replace(self, given=given, chain=chain)
 
+    def with_free_joints(self) -> Opened:
+        """The same with the dampers of servos in the servos."""
+        free_joints(self.given.document.root, self.chain)
+        return self.again(self.given.document)
+
     def content(self, path: Path | None) -> bytes:
         """The file, to be written at a path."""
         return content_for(self.given.document, self.given.folder, path)
@@ -64,13 +69,13 @@ def open_model(model: Path | str, joints: int, tip: str = "") -> Opened:
     if is_mjcf(model):
         given = read_model(model)
         chain = chain_of(given.compiled(), joints, given.source, tip, unknown=given.assumed)
-        return Opened(given, chain, new=False)
+        return Opened(given, chain, new=False).with_free_joints()
     robot = load_robot(model)
     if robot.joints != joints:
         raise OptionError(f"{model}: has {robot.joints} joints, the logs have {joints}")
     given = Given(str(model), new_model(robot), Path())
     chain = chain_of(given.compiled(), joints, given.source)
-    return Opened(given, chain, new=True)
+    return Opened(given, chain, new=True).with_free_joints()
 
 
 def calibrated(opened: Opened, fit: Fit) -> tuple[Opened, tuple[str, ...]]:
@@ -81,7 +86,7 @@ def calibrated(opened: Opened, fit: Fit) -> tuple[Opened, tuple[str, ...]]:
         document = Document(new_tree(arm, names, springs=True))
         weigh_drawn(document.root, fit.cell.robot)
         given = replace(opened.given, document=document)
-        return opened.rebuilt(given), ()
+        return opened.rebuilt(given).with_free_joints(), ()
     nominal = fit.nominal.robot
     own = None if assumed(opened.chain.robot) else told_masses(opened.chain, nominal)
     arm = arm_of(fit.cell, fit.train.q, own)

@@ -13,7 +13,7 @@ from minimax_cal.robots.gravity import LEAST_MASS, masses_of, weighed
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import tail
 from minimax_cal.simulators.arm import stiff
-from minimax_cal.simulators.chain import Chain
+from minimax_cal.simulators.chain import Chain, braked
 from minimax_cal.simulators.document import Document
 from minimax_cal.simulators.elements import known, numbers, section, tune
 from minimax_cal.simulators.given import counts_degrees, elements_of
@@ -156,6 +156,18 @@ def stiffen(root: ET.Element, chain: Chain, found: Numbers) -> None:
             damper = 2.0 * np.sqrt(needed[i] * inertia)
             step = float(chain.model.opt.timestep)
             tune(servo, needed[i], max(damper, STEPS * step * needed[i]))
+
+
+def free_joints(root: ET.Element, chain: Chain) -> None:
+    """Give servos the dampers that joints of a new file hold for them.
+
+    Along logs the damping of a joint is friction, and a servo's damper is part of its torque.
+    """
+    for number, joint in zip(chain.joints, elements_of(root, chain), strict=True):
+        if braked(chain.model)[number]:
+            servo = chain.model.actuator(chain.servo(number))
+            damper = float(joint.attrib.pop("damping")) / float(servo.gear[0]) ** 2
+            known(section(root, "actuator"), "position", str(servo.name), kv=damper)
 
 
 def new_model(robot: Robot) -> Document:
