@@ -69,7 +69,8 @@ def rms_interval(
     mean = float(total.sum() / count.sum())
     if mean == 0.0:
         return Interval(0.0, 0.0)
-    logs = np.log(np.maximum(total / count, TINY * mean))
+    total = np.maximum(total, TINY * mean * count)
+    logs = np.log(total / count)
     width = min(float(logs.std(ddof=1)), 1.0) * m**-0.2
     drawn = rng.integers(0, m, (DRAWS, m))
     kernel = np.exp(width * rng.normal(size=drawn.shape) - 0.5 * width**2)

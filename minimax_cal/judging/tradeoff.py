@@ -212,6 +212,8 @@ class Tradeoff(Result):
             return (
                 f"Least squares misses by {first.train.rms_mm:.4g} mm RMS: this is no calibration."
             )
+        if not first.train.rms_mm:
+            return "Least squares leaves no error at the training poses: nothing is to be gained."
         grows = 100.0 * (last.train.rms_mm / first.train.rms_mm - 1.0)
         falls = 100.0 * (1.0 - last.train.max_mm / first.train.max_mm)
         text = (
@@ -220,6 +222,8 @@ class Tradeoff(Result):
         )
         if not first.holdout.poses:
             return f"{text}; no pose was held out."
+        if not first.holdout.rms_mm:
+            return f"{text}; at the held-out poses least squares leaves no error."
         rms = 100.0 * (last.holdout.rms_mm / first.holdout.rms_mm - 1.0)
         most = 100.0 * (last.holdout.max_mm / first.holdout.max_mm - 1.0)
         return (
