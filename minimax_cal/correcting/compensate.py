@@ -233,7 +233,10 @@ def compensate(
     check_choices(frame, tolerance, most_change, lever, clock)
     nominal = load_robot(nominal) if isinstance(nominal, str | Path) else nominal
     known = open_result(fit, rung)
-    made = kept(known, COMPENSATED, keep_anyway, None if np.isnan(clock) else clock)
+    data = path_of(targets, known.cell.robot, 0.0 if np.isnan(clock) else clock)
+    torques = arm_of(known.cell).scene(data).measured_torques
+    moment = None if np.isnan(clock) else clock
+    made = kept(known, COMPENSATED, keep_anyway, moment, torques=torques)
     cell, drawn = made.cell, made.nominal if known.placed else None
     robot = made.nominal.robot if made.nominal else None
     if nominal is not None and not (robot and same(nominal, robot)):
@@ -242,7 +245,7 @@ def compensate(
         source = fit if isinstance(fit, (str, Path)) else "the fit"
         raise CalibrationError(f"{source}: does not tell its nominal robot; give nominal=")
     check_like(robot, cell.robot)
-    arm, data = arm_of(cell), path_of(targets, cell.robot, 0.0 if np.isnan(clock) else clock)
+    arm = arm_of(cell)
     base, tool, said = placed(cell, arm, robot, drawn, frame)
     goal = base @ robot.pose(data.q) @ tool
     lever = lever_of(cell) if np.isnan(lever) else lever

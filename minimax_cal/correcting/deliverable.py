@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from minimax_cal.correcting.exporters.job import Export, job_of
 from minimax_cal.correcting.exporters.table import EXPORTERS
 from minimax_cal.fitting.calibrate import fit_split
@@ -21,6 +23,7 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import finite
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.words import name_kinds
@@ -91,7 +94,7 @@ class Delivered:
     """What a file, or corrected targets, hold of a result, and how well that does by itself.
 
     format: of `export`, or compensate.  part: of the geometry that it holds, in words; rest: what
-    it does not hold of the geometry, empty for nothing.  carries, not_carried: effects, as
+    it does not hold beside effects, empty for nothing.  carries, not_carried: effects, as
     joint_compliance:all.  cell: the arm as fitted for exactly that.
     nominal: before the calibration, None where the result does not tell it.  figures: its own;
     whole: those of the full model.  fit: the calibration that `cell` is of, None where there is
@@ -232,27 +235,40 @@ def kept_back(source: str, status: Status) -> OptionError:
     )
 
 
-def kept(known: Opened, to: str, keep_anyway: bool, clock: float | None = None) -> Delivered:
+def kept(
+    known: Opened,
+    to: str,
+    keep_anyway: bool,
+    clock: float | None = None,
+    *,
+    torques: bool = False,
+) -> Delivered:
     """As `deliver`; OptionError where the arm, or what of it is delivered, is no better than drawn.
 
-    keep_anyway: deliver it all the same.
+    keep_anyway: deliver it all the same.  torques: whether they are measured where it is used.
     """
     check_kept(known, keep_anyway)
-    found = delivered(known, to, clock)
+    found = delivered(known, to, clock, torques=torques)
     if found.fit is not None and found.fit.is_no_better and not keep_anyway:
         raise kept_back(f"{known.source}: {to}, without {found.lacks}", found.fit.status)
     return found
 
 
 def delivered(
-    known: Opened, to: str, clock: float | None = None, progress: Progress = silent
+    known: Opened,
+    to: str,
+    clock: float | None = None,
+    progress: Progress = silent,
+    *,
+    torques: bool = False,
 ) -> Delivered:
-    """As `deliver`, of an opened result."""
+    """As `deliver`, of an opened result.  torques: whether they are measured where it is used."""
     if known.status is Status.FAILED:
         raise OptionError(f"{known.source}: {Status.FAILED}: {Status.FAILED.advice}")
     cell, whole = known.cell, Figures.at_rung(known)
     only = EXPORTERS[to].only if to in EXPORTERS and known.number else ""
     held = carried(known, to, clock)
+    data = known.data if torques else without_torques(known)
     lost = tuple(term for term in cell.effects.causes if term not in held)
     own = known.fit if known.number else None
     made = Delivered(
@@ -260,14 +276,30 @@ def delivered(
     )
     if only and not (known.options and known.options.only == only):
         made = replace(made, rest="the rest of the geometry")
+    elif data is not known.data:
+        made = replace(made, rest="the measured torques")
     if not made.lacks:
         return made
     if known.options is None or known.nominal is None:
         return as_it_is(made, known)
-    options = replace(known.options, effects=held)
+    options, robot = known.options, known.nominal.robot
+    crossed = known.fit is not None  # judged as the full model was
     if only:  # what was freed beside the offsets is fixed now
         options = replace(options, only=only, free=())
-    fit = fit_split(known.nominal.robot, known.data, known.held, options, progress)
+
+    def refit(effects: tuple[Term, ...]) -> tuple[Fit, Figures]:
+        own = replace(options, effects=effects)
+        fit = fit_split(robot, data, known.held, own, progress)
+        return fit, Figures.of(fit, crossed)
+
+    fit, figures = refit(held)
+    light = tuple(term for term in held if EFFECTS[term.effect].follows != "load")
+    if data is not known.data and light != held:  # gravity alone may not explain them
+        other = refit(light)
+        if not figures.rms < other[1].rms:
+            held, (fit, figures) = light, other
+            lost = tuple(term for term in cell.effects.causes if term not in held)
+            made = replace(made, carries=labels(held), not_carried=labels(lost))
     if fit.status is Status.FAILED:
         raise OptionError(
             f"{known.source}: {to}: without {made.lacks} the fit is {fit.status}; "
@@ -275,7 +307,6 @@ def delivered(
         )
     # of geometry alone the digits are those that the result's own file holds
     placed = known.fit.geometric if known.fit and not (held or only) else fit.cell
-    figures = Figures.of(fit, crossed=known.fit is not None)  # as the full model was judged
     return replace(made, cell=placed, nominal=fit.nominal, figures=figures, fit=fit)
 
 
@@ -283,13 +314,26 @@ def as_written(made: Delivered, known: Opened, file: Export) -> Delivered:
     """The same with the figures of the file: its own, where it stands off the formulas."""
     if file.off is None or math.isnan(made.figures.rms):
         return made
-    rows = with_history(known.data).take(known.held)
+    rows = with_history(without_torques(known)).take(known.held)
     error = made.cell.error(rows)
     found = replace(made, missed=(accuracy(error), accuracy(error + file.off(rows))))
     own, rms = made.figures, found.rms_of_file
     figures = Figures(rms(own.rms), found.largest_of_file(own.largest), rms(own.typical),
                       rms(own.worst))  # fmt: skip
     return replace(found, figures=figures)
+
+
+def without_torques(known: Opened) -> Measurements:
+    """The poses of a result; where its effects use torques measured there, without these.
+
+    A file's arm, and targets, have those of gravity alone.
+    """
+    columns = {n: c for n, c in known.data.columns.items() if not n.startswith("tau")}
+    if len(columns) == len(known.data.columns) or not known.cell.effects.causes:
+        return known.data
+    plain = replace(known.data, columns=columns)
+    one, other = (known.cell.error(with_history(data)) for data in (known.data, plain))
+    return known.data if np.array_equal(one, other, equal_nan=True) else plain
 
 
 def held_by(to: str, cell: Cell) -> tuple[Term, ...]:

@@ -28,6 +28,7 @@ from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.modelling.effects.maps import range_of, sines, spread, waves_over
 from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.rows import MIN_COMPUTED_NOISE
 
 FEWEST = 10  # groups that can say anything
 LENGTHS = np.radians([4.0, 8.0, 20.0, 60.0]).tolist()  # of a joint's curve [rad]
@@ -286,7 +287,7 @@ class Beside:
     @property
     def variance(self) -> float:
         """Of a coordinate that is left out [m^2]."""
-        return self.square / self.y.size
+        return max(self.square / self.y.size, MIN_COMPUTED_NOISE**2)
 
     @cached_property
     def value(self) -> Array:

@@ -132,11 +132,7 @@ def restricted(rows: Problem, known: Array) -> Noise:
     columns = np.concatenate([rows.basis, known, rows.error[:, None]], axis=1)
     dof = rows.count - columns.shape[1] + 1
     if dof < LEAST_NOISE_DOF:
-        return Noise(
-            0.0,
-            float(rows.error @ rows.error) / max(rows.count, 1) + (ROUNDING * rows.exact) ** 2,
-            0.0,
-        )
+        return noise_of(0.0, float(rows.error @ rows.error) / max(rows.count, 1), rows)
 
     def cost(ratios: Array) -> tuple[Array, Array]:
         halves = (columns / np.sqrt(1.0 + r * rows.variance_ratio)[:, None] for r in ratios)
@@ -148,7 +144,8 @@ def restricted(rows: Problem, known: Array) -> Noise:
 
 
 def noise_of(ratio: float, variance: float, rows: Problem) -> Noise:
-    """Both noises of a ratio and of the variance of the instrument."""
+    """Both noises of a ratio and of the variance of the instrument, no less than rounding is."""
+    variance = max(variance, (ROUNDING * rows.exact) ** 2)
     return Noise(ratio, variance, float(np.sqrt(ratio * variance / rows.size)))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from minimax_cal.fitting.common_scale import LEAST_SHARE, scale_of
+from minimax_cal.fitting.common_scale import LEAST_SHARE, scale_of, with_links
 from minimax_cal.fitting.start import BaseFit, fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
@@ -121,9 +121,10 @@ def check_scale(robot: Robot, data: Measurements, given: BaseFit) -> None:
         return
     if np.sqrt(given.mean_square) > MOST_SCALE * robot.reach():
         return
-    found = scale_of(robot, data, given)
-    change = found.factor - 1.0
-    if found.gain >= MIN_SCALE_GAIN and LEAST_SHARE < abs(change) < MOST_SCALE:
+    found = scale_of(robot, data, given.state)
+    if found.gain >= MIN_SCALE_GAIN:  # of errors far larger than usual, links may tell it better
+        found = scale_of(robot, data, with_links(robot, data, given.state))
+    if found.gain >= MIN_SCALE_GAIN and LEAST_SHARE < abs(found.factor - 1.0) < MOST_SCALE:
         raise DataError(
             f"{data.source}: all points lie {found.factor:.5g} times as far apart as {robot.name} "
             "is drawn, as no error of links does: check the instrument's scale, units and "

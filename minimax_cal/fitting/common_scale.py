@@ -10,18 +10,18 @@ are, times an unknown factor; the evidence for s is the gain in marginal likelih
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import stdtr
 
 from minimax_cal.evidence.components import fit_components
-from minimax_cal.fitting.start import BaseFit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.lack import by_pose
 from minimax_cal.modelling.model import Model, model_of
-from minimax_cal.modelling.parameters import State, zero_positions
+from minimax_cal.modelling.near import nearby
+from minimax_cal.modelling.parameters import State, links_of, zero_positions
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
 
@@ -132,18 +132,22 @@ class Scale:
     gain: float
 
 
-def scale_of(robot: Robot, data: Measurements, given: BaseFit) -> Scale:
-    """The common factor that the points of a drawn arm suggest.  given: its base and targets."""
+def scale_of(robot: Robot, data: Measurements, at: State) -> Scale:
+    """The common factor that the points of a drawn arm suggest, its links linear at a state.
+
+    at: the drawn arm in its place; or as its links explain the points best, which far off are not
+    linear at the drawing: `with_links`.
+    """
     rows = np.linspace(0, data.poses - 1, min(data.poses, POSES)).astype(int)
     model = model_of(robot, data.take(rows))
     n, p = 5 * robot.joints, model.names.geometric
     seen = np.broadcast_to(model.seen[..., None], (*model.seen.shape, 3)).reshape(-1)
-    every = model.jacobian(given.state).reshape(-1, p)[seen]
-    error = model.error(given.state).reshape(-1)[seen]
-    links_at = kinematics.chain(given.state.mdh, model.q, model.prismatic)
-    drawn = kinematics.points(links_at, given.state.target_positions)  # measured ones hold error
+    every = model.jacobian(at).reshape(-1, p)[seen]
+    error = model.error(at).reshape(-1)[seen] + every[:, :n] @ links_of(at.mdh - robot.mdh)
+    links_at = kinematics.chain(at.mdh, model.q, model.prismatic)
+    drawn = kinematics.points(links_at, at.target_positions)  # measured ones hold error
     points = np.swapaxes(drawn, -1, -2).reshape(-1)[seen]
-    sigma = np.repeat([OFF_LENGTH, OFF_ANGLE], [2 * robot.joints, 3 * robot.joints])
+    sigma = off_by(robot)
     columns = np.column_stack([every[:, n:], every[:, :n] * sigma, points, error])
     triangle = np.asarray(np.linalg.qr(columns, mode="r"))
     reduced = triangle[p - n :, p - n :]  # beside base and targets
@@ -154,6 +158,20 @@ def scale_of(robot: Robot, data: Measurements, given: BaseFit) -> Scale:
     free = max(len(error) - p, 1) - len(size)
     without, with_it, change = best(size, inside, outside, free)
     return Scale(1.0 + change, 2.0 * (with_it - without))
+
+
+def with_links(robot: Robot, data: Measurements, at: State) -> State:
+    """As base, targets and links fit the points best, links that none shows as drawn."""
+    model = model_of(robot, data)
+    weight = np.zeros(model.names.count)
+    weight[: 5 * robot.joints] = (NOISES[0] / (FACTORS[-1] * off_by(robot))) ** 2
+    found = nearby(model.with_prior(replace(model.prior, weight=weight)), at)
+    return found.x.take(np.array(0))
+
+
+def off_by(robot: Robot) -> Array:
+    """(5n,) how far links are off as drawn, before any factor [m, rad]."""
+    return np.repeat([OFF_LENGTH, OFF_ANGLE], [2 * robot.joints, 3 * robot.joints])
 
 
 def best(size: Array, inside: Array, outside: Array, free: int) -> tuple[float, float, float]:

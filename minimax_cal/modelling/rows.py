@@ -13,12 +13,13 @@ from typing import Self
 
 import numpy as np
 
-from minimax_cal.evidence.noise import Problem, orthonormal
+from minimax_cal.evidence.noise import ROUNDING, Problem, orthonormal
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 
 MAX_COMPUTED_NOISE = 1e-8  # noise below which data were computed, not measured [m]
+MIN_COMPUTED_NOISE = ROUNDING * MAX_COMPUTED_NOISE  # no noise is estimated below it [m]
 
 
 @dataclass(frozen=True, eq=False)

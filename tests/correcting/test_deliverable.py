@@ -21,7 +21,7 @@ from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import Fitted
-from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.modelling.simulate import Truth, gravity, simulate
 from minimax_cal.robots.gravity import masses_of
 from minimax_cal.solvers.status import Status
 from tests.conftest import shared
@@ -298,3 +298,48 @@ def test_a_refit_that_is_no_better_than_the_drawing_is_not_delivered_unasked(
     with pytest.raises(mc.CalibrationError, match=r"urdf, without joint compliance.*keep"):
         mc.export(joint, "urdf")
     assert "<robot" in mc.export(joint, "urdf", keep_anyway=True, notify=lambda text: None)
+
+
+def with_torques(robot: mc.Robot, own: str) -> Measurements:
+    """An arm that bends under measured torques: gravity's, and what no model of it knows."""
+    made = simulate(robot, 150, 3, seed=3, truth=Truth(compliance=0.0, noise_per_metre=0.0))
+    rng, q = np.random.default_rng(7), made.data.q
+    torque = gravity(made.cell.robot, q)
+    size = np.abs(torque).max(axis=0)
+    torque = (
+        torque
+        + {
+            "bias": 0.5 * size,
+            "friction": 0.5 * size * rng.choice([-1.0, 1.0], q.shape),
+            "noise": 1.5 * size * rng.normal(size=q.shape),
+        }[own]
+    )
+    y = made.cell.predict(q + 3e-6 * torque)
+    columns = {f"tau{joint + 1}": torque[:, joint] for joint in range(robot.joints)}
+    y = y + 1e-5 * rng.normal(size=y.shape)
+    return replace(made.data.with_y(y), columns={**made.data.columns, **columns})
+
+
+@pytest.mark.parametrize("own", ["bias", "friction", "noise"])
+def test_what_was_fitted_to_measured_torques_is_fitted_to_those_of_gravity(own: str) -> None:
+    """No torque is measured where a file is used: its figure is what it reaches without."""
+    robot = mc.load_robot("irb2600")
+    data = with_torques(robot, own)
+    joint, plain, new = split_of(robot, data, EFFECTS)
+    assert joint.within.after.rms_mm < 0.03  # with the torques, noise alone is left
+    known = {name: values for name, values in new.columns.items() if not name.startswith("tau")}
+    bare = replace(new, columns=known)
+    alone = accuracy(plain.cell.error(new)).rms_mm
+    for to in ("mjcf", "compensate"):
+        made = mc.deliver(joint, to)
+        found = accuracy(made.cell.error(bare)).rms_mm
+        assert found == pytest.approx(made.figures.rms, rel=2.0 * TOLD)
+        assert found < WORSE * alone
+        assert made.figures.rms < WORSE * plain.within.after.rms_mm
+        assert "fitted without the measured torques" in made.sentence()
+    if own == "bias":  # geometry takes it up, and gravity is all that is left
+        assert found < 0.03
+    targets = data.take(np.arange(4))
+    measured = mc.compensate(joint, targets)
+    assert measured.delivered is not None
+    assert measured.delivered.figures.rms == joint.within.after.rms_mm

@@ -96,6 +96,20 @@ def test_an_upper_end_of_the_law_alone_is_not_told() -> None:
     assert told(Interval(0.5, 2.0), 1.0) == Interval(0.5, 2.0)
 
 
+@settings(max_examples=40, deadline=None)
+@given(st.integers(3, 30), st.data())
+def test_exact_poses_count_as_nearly_exact_ones(m: int, data: st.DataObject) -> None:
+    """Bootstrap samples of exact poses alone have no logarithm; the limit of small errors does."""
+    exact = data.draw(st.integers(1, m - 1))
+    error = rng_of(m).normal(size=(2, m, 3))
+    error[:, :exact] = 0.0
+    low, high, least, most = found = both(error)
+    assert 0.0 < low <= np.sqrt((error**2).sum(-1).mean()) <= high < np.inf
+    assert 0.0 < least <= most < np.inf
+    error[:, :exact] = 1e-9
+    assert_allclose(both(error), found, rtol=1e-6)
+
+
 def test_many_normal_errors_give_the_chi_square_interval(rng: np.random.Generator) -> None:
     """3m normal coordinates of one variance: its exact interval, within 10 % of its width."""
     error = rng.normal(size=(1, 2000, 3))
@@ -118,6 +132,7 @@ LAWS = {
     "tracker noise": (lambda rng, n: rng.chisquare(3, n), 3.0, 10, 0.01),
     "one axis": (lambda rng, n: rng.chisquare(1, n), 1.0, 20, 0.01),
     "skew": (lambda rng, n: np.exp(0.7 * rng.normal(size=n)), np.exp(0.245), 40, 0.015),
+    "half exact": (lambda rng, n: rng.chisquare(3, n) * rng.integers(0, 2, n), 1.5, 20, 0.01),
     "very skew": (lambda rng, n: np.exp(rng.normal(size=n)), np.exp(0.5), 20, 0.03),
 }
 

@@ -15,6 +15,7 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.fitting.checks import check_plausible, coarse_joints, fitted
 from minimax_cal.fitting.common_scale import common_share, scale_of
+from minimax_cal.fitting.unknown_arm import rough
 from minimax_cal.measuring import slips
 from minimax_cal.measuring.mending import mended
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
@@ -112,9 +113,32 @@ def test_the_wrong_convention_is_named(noisy: Simulation, robot: mc.Robot) -> No
 def test_a_common_scale_that_no_drawing_error_explains() -> None:
     robot = mc.load_robot("fanuc_r2000ic_165f")
     good = simulate(robot, 80, 3, seed=3, truth=Truth(length=0.1e-3, angle=0.2e-3, compliance=0))
-    assert abs(scale_of(robot, good.data, fitted(robot, good.data)).gain) < 16.0
+    assert abs(scale_of(robot, good.data, fitted(robot, good.data).state).gain) < 16.0
     with pytest.raises(mc.DataError, match=r"points lie 1\.00\d+ times .*--mend scale=0\.99"):
         mc.calibrate(robot, good.data.with_y(1.003 * good.data.y))
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_scale_is_named_only_where_links_cannot_do_it(seed: int) -> None:
+    """An arm with a slide whose twists are 36 mrad off: links to the noise, a scale to 2 mm."""
+    half, rng = np.pi / 2.0, np.random.default_rng(seed)
+    mdh = np.zeros((6, 5))
+    mdh[:, 1] = [0.4, 0.15, 0.5, 0.0, 0.0, 0.1]
+    mdh[:, 3] = [-half, half, 0.0, -half, half, 0.0]
+    slide = np.arange(6) == 2
+    robot = replace(rough("six joints", mdh, slide), rough=False)
+    twists = np.zeros((6, 5))
+    twists[:, 3] = 0.036 * rng.choice([-1.0, 1.0], 6)
+    q = rng.uniform(-1.0, 1.0, (60, 6)) * np.where(slide, 0.4, 2.0)
+    pose = robot.with_mdh(mdh + twists).pose(q)
+    spots = np.array([[0.1, 0.0, 0.15], [-0.05, 0.1, 0.15], [-0.05, -0.1, 0.2]])
+    y = spots @ np.swapaxes(pose[:, :3, :3], 1, 2) + pose[:, None, :3, 3]
+    data = replace(mc.measurements(q, y + 2e-5 * rng.normal(size=y.shape)), sliding=slide)
+    fit = mc.calibrate(robot, data, "sum")
+    assert fit.status == "converged"
+    assert fit.accuracy["holdout"].rms_mm < 2.0 * 0.02 * np.sqrt(3.0)
+    with pytest.raises(mc.DataError, match=r"points lie 1\.004\d+ times .*--mend scale=0\.99"):
+        mc.calibrate(robot, data.with_y(1.0044 * data.y))
 
 
 def test_a_fit_that_stretches_every_length_alike_says_so(robot: mc.Robot) -> None:

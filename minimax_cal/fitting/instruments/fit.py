@@ -32,6 +32,7 @@ from minimax_cal.modelling.effects.bounds import at_bounds
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.near import between, is_kept
 from minimax_cal.modelling.parameters import State, links_of
+from minimax_cal.modelling.rows import MIN_COMPUTED_NOISE
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import LeastSquares, method_of, solve_normal
@@ -288,7 +289,7 @@ def variances(problem: Squares, x: State) -> Array:
     """
     cost, spare = remaining(problem, x)
     weighing = len(problem.stack.blocks) > 1 or len(problem.weight)
-    left = np.maximum(cost / spare, LEAST_NOISE**2 if weighing else 0.0)
+    left = np.maximum(cost / spare, (LEAST_NOISE if weighing else MIN_COMPUTED_NOISE) ** 2)
     return np.where(np.isnan(problem.stack.given), left, problem.stack.given)
 
 

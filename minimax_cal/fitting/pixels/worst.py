@@ -26,6 +26,7 @@ from minimax_cal.solvers.minimax import Kkt, Linear, Optimum
 from minimax_cal.solvers.status import Status
 
 ACTIVE = 1e-6  # relative to the largest: functions so near to it decide
+MAX_ROUNDING = 1e-6  # an error below is rounding: pixels that were computed, not seen [px]
 NO_LIMITS: Array = np.zeros(0)
 
 OF: Mapping[str, Callable[[PixelData], Array]] = {  # (N,) whose mean square a pixel is part of
@@ -183,6 +184,8 @@ def fit_worst(
     problem = PixelMinimax.at(fit.model, of, fit.scene)
     qp, notices = solver_of(options.qp, QP_TOLERANCE)
     best: Optimum[Scene] = minimax.solve(problem, fit.scene, qp)
+    if best.status is Status.STALLED and best.value * problem.size < MAX_ROUNDING**2:
+        best = replace(best, status=Status.CONVERGED)
     before, after = (problem.sizes(x) for x in (fit.scene, best.x))
     names = data.parts if options.objective == WORST_TARGET else [c.name for c in data.cameras]
     functions = tuple(names[i] for i in seen)
