@@ -215,11 +215,6 @@ def reached(values: tuple[float, ...], step: int) -> float:
     return values[step] if step < len(values) else math.inf
 
 
-def works(values: tuple[float, ...]) -> bool:
-    """Whether it is near the optimum after ten outer steps."""
-    return reached(values, 10) <= GOOD
-
-
 def picture(found: Mapping[Job, Course]) -> Figure:
     """Course of every arm."""
     from matplotlib.figure import Figure

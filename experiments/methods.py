@@ -490,13 +490,6 @@ def figures(studies: Studies) -> dict[str, Figure]:
     return {f"methods_{i}": box_chart(*each) for i, each in enumerate(present, start=1)}
 
 
-def study(
-    quick: bool = False, seed: int = 0, folder: Path = SHARED, sweep: Sweep = one_by_one
-) -> list[Table]:
-    """The whole study as tables."""
-    return tables(run(quick, seed, folder, sweep), run_weights(quick, seed, folder, sweep))
-
-
 def numbers(studies: Studies) -> dict[str, object]:
     """Every figure by robot, method and name, for other programs."""
     return {

@@ -125,8 +125,6 @@ def table_2(found: Table2) -> list[Verdict]:
     factor = float(np.exp(max(abs(np.log(at(1, m) / printed[m][0])) for m in PAPER)))
     slow = at(1, "nllm") / at(1, "snllm")
     gentle = at(1, "nlgn") / at(1, "snlgn")
-    cost = at(3, "nllm") / at(3, "snllm")
-    cost_printed = PAPERS_TABLE["nllm"][2] / PAPERS_TABLE["snllm"][2]
     return [
         Verdict("S Table 2: iterations", "convergence", theirs(0), column(1),
                 told(gentle > 3.0 and slow > 10.0, factor < 3.0),
@@ -138,11 +136,6 @@ def table_2(found: Table2) -> list[Verdict]:
                      near(gap, printed["nlgn"][1] - printed["snlgn"][1])),
                 SEVERAL, "reproduced: NLGN above the others by the printed 76 mm within 25 %; in "
                 "part: above them, and these alike to 1 µm", few),
-        Verdict("S Table 2: time, NLLM over SNLLM", "convergence", f"{cost_printed:.1f}",
-                f"{cost:.1f}", told(near(cost, cost_printed)), "a start's mean time, as a ratio: "
-                "no two machines "
-                "are alike",
-                "within 25 % of the printed ratio, both ways", few),
         Verdict("S Table 2: converged %", "convergence", theirs(3), column(4),
                 told(alike[0], max(at(4, "nlgn"), at(4, "nllm")) < 100.0 and separable), where,
                 SHARES, few),

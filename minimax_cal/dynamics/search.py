@@ -15,7 +15,6 @@ from minimax_cal.evidence.noise import Noise, Problem, orthonormal
 from minimax_cal.ground.arrays import Array
 
 RIDGE = 1e-10  # of the squares of a column: keeps a fit of columns alike from running away
-ROUNDS = 2  # searches, each with the noise that the one before leaves
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,6 @@ NAMES = {  # of a header's cell, small letters: the schema's key
     "joint": "", "i": "", "link": "", "axis": "", "no": "", "no.": "", "j": "", "convention": "",
 }  # fmt: skip
 KEYS = ("a", "d", "theta", "alpha", "beta", "offset", "sign", "lower", "upper", "ratio", "mass_kg")
-WITH_UNIT = ("a", "d", "theta", "alpha", "beta", "offset", "lower", "upper")
 TYPES = {"r": "revolute", "rotation": "revolute", "rotary": "revolute", "p": "prismatic"}
 TYPES |= {"linear": "prismatic", "revolute": "revolute", "prismatic": "prismatic"}
 STATED = re.compile(r"[#%]\s*convention\s*[:=]\s*(\w+)", re.IGNORECASE)

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from experiments import algorithm_1
-from experiments.algorithm_1 import Job, course_of, problem_of, rows_of, subproblem, works
+from experiments.algorithm_1 import GOOD, Job, course_of, problem_of, rows_of, subproblem
 from qp_backends import Problem, subgradient
 
 
@@ -19,8 +19,7 @@ def course() -> algorithm_1.Course:
 def test_the_printed_algorithm_comes_near_the_optimum(course: algorithm_1.Course) -> None:
     """A thousandth of what the start is off by, within ten outer steps, full steps or searched."""
     for values in course.ways.values():
-        assert works(values)
-        assert values[10] < 1e-3 * values[0]
+        assert values[10] <= min(GOOD, 1e-3 * values[0])
         assert min(values) > -1e-9  # nothing is below the optimum
 
 

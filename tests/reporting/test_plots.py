@@ -174,15 +174,6 @@ def test_powers_on_a_logarithmic_axis_are_set_as_mathematics(tmp_path: Path) -> 
     assert all(label.get_parse_math() for label in labels)
 
 
-def test_labels_stand_clear_of_the_line() -> None:
-    axes = figures.new_figure(4, 4).subplots()
-    axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
-    spots = np.array([[0.2, 0.8], [0.5, 0.5], [0.8, 0.8]])  # a V: above its tip runs the line
-    side = figures.free_side(axes, spots, 1)
-    assert side[1] < 0.0
-    assert np.hypot(*side) == pytest.approx(figures.LABEL_AWAY)
-
-
 def test_workspaces_are_shown_in_millimetres() -> None:
     axes = figures.new_figure(4, 4).subplots()
     axes.set(xlim=(-1.0, 1.0), ylim=(0.0, 0.5))

@@ -1,4 +1,4 @@
-r"""ABB `MOC.cfg`: a reader, and a writer of corrections that is EXPERIMENTAL.
+r"""ABB `MOC.cfg`: a writer of corrections that is EXPERIMENTAL.
 
 Grammar: a header line ``MOC:CFG_1.0:6:0::``; ``#`` lines; ``SECTION:``; entries ``-name "x" -key
 value ...``, continued after ``\``, where a key without a value is a flag.  Metres and radians.  The
@@ -7,17 +7,13 @@ file holds no nominal geometry, and its maker documents neither frames nor signs
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from minimax_cal.correcting.exporters.job import Export, Job, compliance_of
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.files import read_raw
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.compliance import JOINT_COMPLIANCE
 from minimax_cal.modelling.effects.scene import joint_of
@@ -29,10 +25,6 @@ KEYS = (
     *(f"error_offset_{axis}" for axis in "xyz"),
     *(f"error_{turn}" for turn in ("roll", "pitch", "jaw")),  # sic
 )
-CALIBRATED = ("TOOL_INTERFACE", "ARM_CALIB", "JOINT_CALIB", "PARALLEL_ARM_CALIB")
-SECTION = re.compile(r"([A-Za-z][A-Za-z0-9_]*):\s*")
-KEY = re.compile(r"-([A-Za-z_][A-Za-z0-9_]*)")
-TOKEN = re.compile(r'"[^"]*"|[^\s"]+')
 WIDTH = 80
 NEGLIGIBLE = 1e-12  # a smaller correction is left out, as the maker leaves out defaults [m, rad]
 WARNING = (
@@ -44,113 +36,12 @@ WARNING = (
 Entry = tuple[tuple[str, str], ...]  # keys and raw values, the value of a flag is empty
 
 
-@dataclass(frozen=True)
-class Section:
-    """A section and its entries, in the file's order."""
-
-    name: str
-    entries: tuple[Entry, ...]
-
-
-@dataclass(frozen=True)
-class Moc:
-    """A file: every section, the text of every value."""
-
-    header: str
-    sections: tuple[Section, ...]
-
-    def corrections(self) -> dict[str, dict[str, dict[str, float]]]:
-        """Numbers of the calibration sections: by section, name and key [m, rad, rad/(N m)]."""
-        out: dict[str, dict[str, dict[str, float]]] = {}
-        for section in self.sections:
-            if section.name in CALIBRATED:
-                for entry in section.entries:
-                    row = out.setdefault(section.name, {}).setdefault(named(entry, section), {})
-                    row |= {k: real(v, k, section) for k, v in entry if v and k != "name"}
-        return out
-
-
-def named(entry: Entry, section: Section) -> str:
-    """The name of an entry.  Raises CalibrationError where it has none."""
-    name = dict(entry).get("name", "").strip('"')
-    if not name:
-        raise CalibrationError(f"MOC.cfg: {section.name}: an entry has no -name")
-    return name
-
-
-def real(text: str, key: str, section: Section) -> float:
-    """A number.  Raises CalibrationError."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise CalibrationError(f"MOC.cfg: {section.name}: -{key} {text}: expected a number")
-    return value
-
-
-def read_moc(path: Path | str) -> Moc:
-    """A controller's MOC.cfg, in UTF-8 or Latin-1.  Raises CalibrationError."""
-    raw = read_raw(path)
-    try:
-        text = raw.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = raw.decode("latin-1")
-    return parse_moc(text, str(path))
-
-
-def parse_moc(text: str, source: str = "MOC.cfg") -> Moc:
-    """The sections of a MOC.cfg.  Raises CalibrationError."""
-    lines = text.splitlines()
-    header = lines[0].strip() if lines else ""
-    if not header.startswith("MOC:CFG_"):
-        raise CalibrationError(f"{source}:1: is not a MOC.cfg; expected a first line {HEADER}")
-    names: list[str] = []
-    entries: list[list[Entry]] = []
-    open_line, begun = "", 0
-    for number, line in enumerate(lines[1:], 2):
-        stripped = line.strip()
-        if not open_line and (not stripped or stripped.startswith("#")):
-            continue
-        begun = begun if open_line else number
-        whole = f"{open_line} {stripped}".strip()
-        if whole.endswith("\\"):
-            open_line = whole[:-1].strip() or " "
-            continue
-        open_line = ""
-        if section := SECTION.fullmatch(whole):
-            names.append(section[1])
-            entries.append([])
-        elif not names:
-            raise CalibrationError(f"{source}:{begun}: an entry before any section")
-        else:
-            entries[-1].append(entry_of(whole, f"{source}:{begun}"))
-    if open_line:
-        raise CalibrationError(f"{source}:{begun}: ends in the middle of an entry (after \\)")
-    return Moc(header, tuple(Section(n, tuple(e)) for n, e in zip(names, entries, strict=True)))
-
-
-def entry_of(text: str, place: str) -> Entry:
-    """The keys and values of an entry.  Raises CalibrationError."""
-    if text.count('"') % 2:
-        raise CalibrationError(f"{place}: a quotation mark is not closed")
-    out: list[tuple[str, str]] = []
-    for token in TOKEN.findall(text):
-        if key := KEY.fullmatch(token):
-            out.append((key[1], ""))
-        elif out and not out[-1][1]:
-            out[-1] = (out[-1][0], token)
-        else:
-            raise CalibrationError(f"{place}: {token[:40]!r}: expected -key value")
-    return tuple(out)
-
-
-def text_of(moc: Moc, comment: str = "") -> str:
-    """A MOC.cfg that `parse_moc` reads as the same sections."""
-    lines = [moc.header, *(f"# {line}" for line in comment.splitlines())]
-    for section in moc.sections:
-        lines += ["#", f"{section.name}:"]
-        for entry in section.entries:
+def text_of(sections: Mapping[str, Sequence[Entry]], comment: str) -> str:
+    """A MOC.cfg of these sections."""
+    lines = [HEADER, *(f"# {line}" for line in comment.splitlines())]
+    for name, entries in sections.items():
+        lines += ["#", f"{name}:"]
+        for entry in entries:
             lines += ["", *folded(entry)]
     return "\n".join([*lines, ""])
 
@@ -189,7 +80,6 @@ def write(job: Job) -> Export:
         (name_of(i), *((("Compl", written(c)),) if np.isfinite(c) else ()))
         for i, c in enumerate(job.compliance)
     )
-    moc = Moc(HEADER, (Section("ARM_CALIB", arms), Section("JOINT_CALIB", joints)))
     comment = (
         "Written by minimax-cal for " + "".join(filter(str.isprintable, job.robot.name)) + ".\n"
         "EXPERIMENTAL: corrections only; the maker documents neither frames nor signs.\n"
@@ -197,7 +87,7 @@ def write(job: Job) -> Export:
         "in frame i after the link Rz(sign*q+theta) Tz(d) Tx(a) Rx(alpha) Ry(beta), base and\n"
         "tool as in the fit; Compl is the turn of the joint per torque [rad/(N m)]."
     )
-    return Export.of(text_of(moc, comment), WARNING)
+    return Export.of(text_of({"ARM_CALIB": arms, "JOINT_CALIB": joints}, comment), WARNING)
 
 
 def carries(cell: Cell) -> tuple[Term, ...]:

@@ -20,7 +20,6 @@ from minimax_cal.ground.files import read_text
 
 FLANGE, GROUND = "flange", "ground"  # what a camera is fixed to
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # those that can be fitted
-HELD = ("k4", "k5", "k6", "s1", "s2", "s3", "s4")  # of the rational and the thin prism model
 LENGTHS = (0, 4, 5, 8, 12, 14)  # of OpenCV's list of distortion coefficients
 TILT = 12  # from here on the list tilts the sensor
 UNDISTORTED, ROUNDS = 1e-13, 50  # when Newton's steps in the image plane end; at most so many

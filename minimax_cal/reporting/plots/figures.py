@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 PICTURES = (".png", ".svg", ".pdf")
 BEFORE, AFTER = "#d55e00", "#0072b2"  # told apart by colour-blind eyes too [Okabe and Ito 2008]
 MAP_COLOURS = "OrRd"  # pale is small, dark is large: one hue, for colour-blind eyes too
-LABEL_AWAY = 11.0  # of a label from its point, in points
 NEEDED = "a picture needs matplotlib: pip install '.[plot]' in a clone"
 
 
@@ -90,22 +89,6 @@ def in_millimetres(axes: Axes) -> None:
     """Show the ticks of a panel, whose axes are in metres, in millimetres."""
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(lambda value, _: f"{1e3 * value:.0f}")
-
-
-def free_side(axes: Axes, spots: Array, at: int) -> tuple[float, float]:
-    """Where the label of a point of a line stands clear of the line: its offset in points.
-
-    spots: (m, 2) of the line, in units of the axes.  at: which point.
-    """
-    scale = axes.transData.transform
-    way = scale(spots)
-    steps = np.linspace(0.0, 1.0, 20)[:, None, None]
-    line = (way[:-1] + steps * (way[1:] - way[:-1])).reshape(-1, 2)
-    turns = np.arange(8) * np.pi / 4.0 + np.pi / 4.0  # up and to the right first
-    sides = LABEL_AWAY * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    gaps = [np.linalg.norm(line - (way[at] + 2.0 * side), axis=1).min() for side in sides]
-    best = int(np.argmax(np.array(gaps) > 0.9 * max(gaps)))
-    return float(sides[best, 0]), float(sides[best, 1])
 
 
 def scale_bar(part: FigureBase, shown: Any, panels: Array, label: str, side: str) -> None:
