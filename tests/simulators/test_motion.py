@@ -11,8 +11,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
+from minimax_cal.dynamics.given import Payload, read_logs
 from minimax_cal.dynamics.logs import runs_text
 from minimax_cal.dynamics.regressor import link_parameters
+from minimax_cal.dynamics.run import Run
 from tests.conftest import run
 from tests.dynamics.motions import three_joints
 from tests.problems_mjcf import drive_alone
@@ -31,7 +33,8 @@ from experiments.driven_arms import (  # noqa: E402
 )
 from minimax_cal.simulators.motion import bodies  # noqa: E402
 from minimax_cal.simulators.motion.fit import least_within, levelling, speeds  # noqa: E402
-from minimax_cal.simulators.motion.module import loaded  # noqa: E402
+from minimax_cal.simulators.motion.judge import Judge  # noqa: E402
+from minimax_cal.simulators.motion.module import installed, loaded  # noqa: E402
 from minimax_cal.simulators.motion.opened import open_model  # noqa: E402
 from minimax_cal.simulators.motion.result import MotionGap  # noqa: E402
 from minimax_cal.simulators.sdf import convert  # noqa: E402
@@ -127,6 +130,41 @@ def test_the_ladder_says_so(made: SimpleNamespace) -> None:
         e.worth.values(), key=lambda ends: ends[0] / ends[1])])  # fmt: skip
     assert made.figure.read_bytes().startswith(b"\x89PNG")
     assert any(text.startswith("not in the file") for text in gap.sentences())
+
+
+def reached(path: Path, module: str, runs: list[Run], payload: Payload | None = None) -> np.ndarray:
+    """(n,) RMS torque that a file and its module miss on the last run, loaded again [N m]."""
+    opened = open_model(path, 3)
+    judge = Judge.of(opened, runs, (0.2, None), payload, None, None)
+    with installed(Path(module).read_text() if module else "", opened.chain):
+        return np.array(judge.torque(opened.chain).whole)
+
+
+def test_a_file_and_its_module_reach_the_last_rung(made: SimpleNamespace) -> None:
+    runs = read_logs(made.model, made.logs)
+    assert made.gap.module
+    last = made.gap.rungs[-1].torque_rms
+    assert_allclose(reached(made.out, made.gap.module, runs), last, rtol=1e-4)
+
+
+def test_a_drive_gain_that_no_file_holds_is_in_no_figure(
+    made: SimpleNamespace, tmp_path: Path
+) -> None:
+    """Torques of joint 2 are logged 17 % too large; position servos hold no gain, motors do."""
+    robot, out = tmp_path / "robot.json", tmp_path / "out.xml"
+    robot.write_text(json.dumps(three_joints().to_dict()))
+    runs = [replace(run, torque=run.torque * [1.0, 1.17, 1.0])
+            for run in read_logs(made.model, made.logs)]  # fmt: skip
+    payload = (LACKS.payload, (0.02, 0.0, 0.06))
+    new = mc.motion_gap(robot, runs, payload=payload, write=out, driven=False)
+    assert any("drive gain at joint 2" in text for text in new.left_out)
+    assert_allclose(reached(out, new.module, runs, payload), new.rungs[-1].torque_rms, rtol=1e-4)
+    given = mc.motion_gap(made.model, runs, payload=payload, write=out, driven=False)
+    gear = mujoco.MjModel.from_xml_path(str(out)).actuator_gear[:, 0]
+    assert gear[1] < 0.95
+    assert_allclose(gear[[0, 2]], 1.0)
+    assert any(e.name == "drive gain" for e in given.elements)
+    assert not any("drive gain" in text for text in given.left_out)
 
 
 def test_a_report_has_it_beside_a_calibration(made: SimpleNamespace, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -22,6 +23,7 @@ from minimax_cal.dynamics.result import (
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress
+from minimax_cal.simulators.chain import driven
 from minimax_cal.simulators.motion.bristles import fit_bristles
 from minimax_cal.simulators.motion.fit import (
     ARMATURE,
@@ -49,7 +51,7 @@ ATTRIBUTES = {  # of the elements, in the order in which they are shown
     ARMATURE: "armature",
     CURVE: "damping of v, v|v|, v^3",
     SPRINGS: "stiffness, springref",
-    GAIN: "gear, gain",
+    GAIN: "gear",
     DELAY: "delay",
     BRISTLES: "frictionloss, dcmotor with lugre",
 }
@@ -57,9 +59,10 @@ STAYS = 1e-3  # fall of the mean log RMS torque by which an element stays
 MODULE = 0.01  # the same, for a module beside the file, and of all rows for friction at rest
 LEVELS = ("degressive", "stribeck")  # laws that damping of higher powers comes near to
 SPRUNG, GEARED = ("cable",), ("drive_gain",)
-IN_FILE = frozenset({"armature", "delay", *LEVELS, *SPRUNG, *GEARED})
+IN_FILE = frozenset({"armature", "delay", *LEVELS, *SPRUNG})
 WHY = {  # laws that a model does not hold
     "torque_offset": "the torque is read with an offset, which is none of the arm's",
+    "drive_gain": "scales what is logged, and no motor of the model holds it: give drive_gain=",
     "payload": "changes between the runs; the model carries one load",
     "joint_flexibility": "give a static calibration (fit=), whose springs a model holds",
 }
@@ -119,6 +122,29 @@ class Bench:
         self.made[asked] = Candidate(asked, numbers, opened, missed, text)
         return self.made[asked]
 
+    def beside(self, plain: Candidate, laws: tuple[Term, ...]) -> Candidate:
+        """The file of a candidate as it is, with a module for some laws.
+
+        What the module sets is fitted for that file: each joint's friction and damping, the laws.
+        """
+        asked = replace(plain.asked, laws=laws)
+        if laws and asked not in self.made:
+            found, chain = plain.numbers, plain.opened.chain
+            chain = chain.in_model(copy(chain.model))
+            study = self.study.of_file(chain, found.gain)
+            own = Asked((plain.asked.elements & {DELAY}) | {FRICTION}, laws=laws,
+                        late=plain.asked.late)  # fmt: skip
+            numbers = fit_numbers(study, own).put(
+                bristles=found.bristles, yields=found.yields, damped=found.damped
+            )
+            text = module_text(chain, numbers, study.scene.arm.gain, self.judge.arm.ratio)
+            numbers = numbers.put(gain=found.gain)
+            with installed(text, chain):
+                missed = self.judge.torque(chain, numbers)
+            opened = replace(plain.opened, chain=chain)
+            self.made[asked] = Candidate(asked, numbers, opened, missed, text)
+        return self.made[asked] if laws else plain
+
     def with_bristles(self, numbers: Numbers) -> Numbers:
         """Numbers with bristles too, by the same runs."""
         opened = self.written(numbers)
@@ -175,12 +201,15 @@ def asked_of(found: MotionDiagnosis, bench: Bench) -> tuple[Asked, tuple[Term, .
         if t.effect == "delay")  # fmt: skip
     if abs(late) < SHORTEST * float(model.opt.timestep):
         late = 0.0
+    chain = bench.opened.chain
+    motors = [driven(model, joint) and chain.servo(joint) < 0 for joint in chain.joints]
+    geared = tuple(j for j in joints(terms, GEARED) if motors[j])
     curved = joints(terms, LEVELS) if has_powers(model) else ()
     elements = {FRICTION, MASSES, ARMATURE}
     for name, some in ((CURVE, curved), (SPRINGS, joints(terms, SPRUNG)),
-                       (GAIN, joints(terms, GEARED)), (DELAY, (0,) if late else ())):  # fmt: skip
+                       (GAIN, geared), (DELAY, (0,) if late else ())):  # fmt: skip
         elements |= {name} if some else set()
-    asked = Asked(frozenset(elements), link, curved, joints(terms, SPRUNG), joints(terms, GEARED),
+    asked = Asked(frozenset(elements), link, curved, joints(terms, SPRUNG), geared,
                   late=late)  # fmt: skip
     return asked, tuple(term for term in terms if term.effect in HELD)
 
@@ -196,16 +225,17 @@ def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Correct
     progress("fitting the elements of the model")
     full = without_idle(bench, first_choice(bench, whole, laws))
     plain = without_idle(bench, by_elements(bench, full, whole))
-    if not full.asked.laws or full.score > plain.score - MODULE:
+    if bench.beside(plain, full.asked.laws).score > plain.score - MODULE:
         full = plain
     if bench.bristled:
         plain, full = at_rest(bench, plain, full)
+    full = bench.beside(plain, full.asked.laws)
     rungs = tuple(ladder(bench, plain, full, progress))
     names = unwritten(plain.opened.chain, plain.numbers.bodies, plain.opened.chain.names)
     notices = tuple(f"link of {name}: MuJoCo did not take its mass and inertia from the file; give "
                     'the compiler inertiafromgeom="auto"' for name in names)  # fmt: skip
-    elements = (*worths(bench, plain), *law_worths(bench, full))
-    left = tuple(left_out(found))
+    elements = (*worths(bench, plain), *law_worths(bench, plain, full))
+    left = tuple(left_out(found, whole.geared))
     return Corrected(plain, full, rungs, elements, left, notices)
 
 
@@ -286,7 +316,7 @@ def ladder(
     some: tuple[Term, ...] = ()
     for effect in effects_of(full.asked.laws):
         some += tuple(term for term in full.asked.laws if term.effect == effect)
-        one = bench.candidate(replace(full.asked, laws=some))
+        one = bench.beside(plain, some)
         yield rung(bench, one, f"+ {WORDS[effect]} (module)", progress)
 
 
@@ -307,19 +337,25 @@ def worths(bench: Bench, plain: Candidate) -> Iterator[WrittenElement]:
             yield WrittenElement(name, "file", attributes, worth)
 
 
-def law_worths(bench: Bench, full: Candidate) -> Iterator[WrittenElement]:
+def law_worths(bench: Bench, plain: Candidate, full: Candidate) -> Iterator[WrittenElement]:
     """What each effect of the module is worth."""
     for effect in effects_of(full.asked.laws):
-        bare = bench.candidate(without_law(full.asked, effect))
+        bare = bench.beside(plain, without_law(full.asked, effect).laws)
         where = ", ".join(t.place for t in full.asked.laws if t.effect == effect)
         worth = changed_joints(worth_by_joint(bare.missed.moving, full.missed.moving))
         yield WrittenElement(WORDS[effect], "module", f"at {where}", worth)
 
 
-def left_out(found: MotionDiagnosis) -> Iterator[str]:
-    """What neither file nor module holds, and what that costs."""
+def left_out(found: MotionDiagnosis, geared: Sequence[int]) -> Iterator[str]:
+    """What neither file nor module holds, and what that costs.
+
+    geared: joints whose drive gain the file holds.
+    """
     for one in found.effects:
-        if one.effect in LAWS and one.effect not in IN_FILE.union(HELD) and not is_body(one):
+        held = one.effect in IN_FILE.union(HELD)
+        if one.effect in GEARED:
+            held = int(one.place[1:]) - 1 in geared
+        if one.effect in LAWS and not held and not is_body(one):
             joint, (without, with_it) = best_worth(one)
             cost = f"{joint} {without:.3g} in place of {with_it:.3g} {found.unit}"
             yield f"{one.words}: {WHY.get(one.effect, NO_ELEMENT)} (costs {cost})"

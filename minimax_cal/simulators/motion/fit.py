@@ -113,6 +113,17 @@ class Study:
         return Study(chain, bodies, given, scene, white, white.white(rows[white.kept]), inertia,
                      PRIOR_ASSUMED if assumed else PRIOR)  # fmt: skip
 
+    def of_file(self, chain: Chain, gain: Array) -> Study:
+        """The same logs, for a written model.  gain: (n,) of its drives over those of the logs."""
+        bodies = Bodies.of(chain)
+        given = given_numbers(chain, bodies)
+        arm = replace(self.scene.arm, gain=self.scene.arm.gain / gain)
+        scene = Scene.of(arm, self.scene.logs)
+        scene = scene.with_body(of_all(bodies.links(given.bodies)), self.scene.friction)
+        rows = np.moveaxis(scene.logs.filtered(scene.regressor), 1, 0)
+        links = self.white.white(rows[self.white.kept])
+        return replace(self, chain=chain, bodies=bodies, given=given, scene=scene, links=links)
+
     def error(self, late: float) -> Array:
         """(N,) whitened torques less those of a known payload; so much earlier [s]."""
         logs = self.scene.logs.earlier(late) if late else self.scene.logs

@@ -84,18 +84,13 @@ def weigh(body: ET.Element, pseudo: Array) -> None:
 
 
 def write_gains(root: ET.Element, chain: Chain, found: Numbers) -> None:
-    """Let actuators of a joint put out what its drive does, of what is commanded."""
+    """Let motors of a joint put out what its drive does, of what is commanded."""
     for name, gain in zip(chain.names, found.gain, strict=True):
         if gain == 1.0:
             continue
         for actuator in actuators_of(root, name):
-            for key in ("kp", "kv", "gainprm", "biasprm"):
-                if actuator.get(key):
-                    values = np.array([float(v) for v in str(actuator.get(key)).split()])
-                    actuator.set(key, numbers(values / gain))
-            if actuator.tag == "motor":
-                old = [float(v) for v in str(actuator.get("gear", "1")).split()]
-                actuator.set("gear", numbers([old[0] / gain, *old[1:]]))
+            old = [float(v) for v in str(actuator.get("gear", "1")).split()]
+            actuator.set("gear", numbers([old[0] / gain, *old[1:]]))
 
 
 def actuators_of(root: ET.Element, joint: str) -> list[ET.Element]:
