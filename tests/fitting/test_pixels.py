@@ -115,7 +115,8 @@ def scene_of(cell: Cell, data: PixelData) -> tuple[PixelModel, Scene]:
     model = PixelModel.of(cell.drawn, data, cell.on_flange)
     active = np.ones(model.names.count, dtype=bool)
     active[5 * cell.drawn.joints : model.names.geometric] = False
-    return replace(model.some(np.arange(0, data.count, 20)), active=active), x
+    rows = ("pose", "camera", "target", "pixel", "weight")
+    return replace(model, active=active, **{row: getattr(model, row)[::20] for row in rows}), x
 
 
 @pytest.mark.parametrize("board", [True, False], ids=["board", "tags"])

@@ -151,11 +151,6 @@ class PixelModel:
             prior=Prior(np.zeros(names.count), np.zeros(names.count)),
         )
 
-    def some(self, kept: Array) -> PixelModel:
-        """Some of the pixels.  kept: (N,) mask or indices."""
-        parts = ("pose", "camera", "target", "pixel", "weight")
-        return replace(self, **{name: getattr(self, name)[kept] for name in parts})
-
     # ---- what the solver asks ----------------------------------------------------------------
 
     @cached_property
