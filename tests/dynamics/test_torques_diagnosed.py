@@ -105,6 +105,13 @@ def test_a_rigid_body_alone_has_no_cause() -> None:
     assert_allclose(given.holdout_rms, refitted.holdout_rms, rtol=0.05)  # the masses are right
 
 
+@pytest.mark.parametrize("seed", [6, 11, 14])
+def test_little_noise_on_a_sound_arm_makes_no_name_of_reversals(seed: int) -> None:
+    """Rows so near that the filter mixes in the step of friction were taken for presliding."""
+    found = mc.diagnose_motion(ARM, simulated(seed=seed, noise=0.01))
+    assert {e.effect for e in found.effects} == {"coulomb", "viscous"}
+
+
 def test_a_payload_that_nobody_told_is_the_last_link() -> None:
     found = mc.diagnose_motion(ARM, simulated(carried=2.0, seed=3))
     (effect,) = (e for e in found.effects if e.effect == "payload")
