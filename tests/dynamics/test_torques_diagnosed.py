@@ -165,6 +165,22 @@ def test_currents_without_gains_show_no_kilograms() -> None:
     assert found.verdict == "unknown"
 
 
+@pytest.mark.parametrize("scale", [
+    [1.0, -1.0, 1.0], [1.0, 1.0 / 14.0, 1.0], [1.0 / 12.0, 1.0 / 14.0, 1.0 / 9.0],
+])  # fmt: skip
+def test_efforts_of_another_unit_or_sign_are_no_drive_gain(scale: list[float]) -> None:
+    runs = [replace(run, torque=run.torque * scale) for run in simulated(seed=3)]
+    found = mc.diagnose_motion(ARM, runs)
+    assert names(found) == set()
+    (said,) = (text for text in found.notices if text.startswith("the torques of joint 2 are "))
+    assert "another unit or sign; currents? then name the columns i1_A, i2_A" in said
+    assert "drive_gain" in {one.effect for one in found.not_testable}
+    coulomb = {e.place: e.parameters[0].value for e in found.effects if e.effect == "coulomb"}
+    for place, value in coulomb.items():
+        j = int(place[1]) - 1
+        assert value == pytest.approx([4.0, 3.0, 1.5][j] * scale[j], rel=0.05)
+
+
 def test_a_known_payload_tells_the_drive_gains() -> None:
     """Currents of drives that are all 5 % weaker than given: with a known load that shows."""
     runs = simulated(carried=(3.0, 0.0, 3.0), seed=3)
