@@ -30,6 +30,7 @@ from minimax_cal.dynamics.given import (
 )
 from minimax_cal.dynamics.laws import ANGLE, CURVE, LAWS, USUAL, Term, terms_of
 from minimax_cal.dynamics.links import LinkChange, body_as_given, carried
+from minimax_cal.dynamics.logs.with_robot import LEAST_SCALE, MOST_SCALE
 from minimax_cal.dynamics.model import FRICTION, RIGID, Body, Normal, TorqueModel, first_body
 from minimax_cal.dynamics.probes import Unexplained, unexplained
 from minimax_cal.dynamics.result import (
@@ -58,6 +59,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import check_left_out
 from minimax_cal.ground.stages import Progress, silent
+from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.robot import Robot, load_robot
 
 LEAST_SECONDS = 25.0  # of trajectories: in less, laws stand in for each other
@@ -71,6 +73,7 @@ SEED = 0  # of the halves
 SHOWN_ROWS = 750  # of the held-out run that is drawn
 CURVE_POINTS = 61
 TUNED_UNITS = {"length": "rad", "seconds": "s"}  # of tuned numbers that are no shares
+MAX_GAIN_ERROR = 0.3  # of a drive: what is off by more has another unit or sign
 LATE = 1e-4  # delays below it move no row [s]
 
 
@@ -202,6 +205,27 @@ def search(arm: Arm, logs: Logs, exclude: Sequence[str]) -> Found:
     return Found(columns, context, choice, chosen, (*lacking, *hidden))
 
 
+def unit_notices(found: Found) -> Iterator[str]:
+    """Notices of torques whose size no error of a drive or of the masses explains."""
+    scene, scales = found.columns.scene, dict[int, tuple[float, str]]()
+    if scene.arm.shared and weighed(scene.arm.robot).all():
+        drawn = scene.regressor @ scene.arm.drawn
+        j = int(np.argmax((drawn**2).sum(axis=0)))
+        scale = float(drawn[:, j] @ scene.load[:, j] / (drawn[:, j] @ drawn[:, j]))
+        if not LEAST_SCALE < scale < MOST_SCALE:
+            scales[j] = scale, f"the masses of {scene.arm.robot.name}"
+    for one, (value, _) in zip(found.choice.found, found.choice.estimates, strict=True):
+        term = one.candidate.term
+        if term.effect == "drive_gain" and abs(value[0]) > MAX_GAIN_ERROR:
+            scales[term.joint] = float(1.0 + value[0]), "masses that all joints share"
+    for j, (scale, masses) in scales.items():
+        yield (
+            f"the torques of joint {j + 1} are {scale:.3g} times what {masses} need: another unit "
+            "or sign; currents? then name the columns i1_A, i2_A, ... and give drive_gain=; here "
+            "each joint has masses of its own"
+        )
+
+
 def fitted(found: Found, columns: Columns) -> Normal:
     """Rows of what was found, whitened by what it leaves of them."""
     first = whitening(columns.scene.logs, generous(columns, found.terms))
@@ -251,6 +275,10 @@ def examined(
         progress("searching again with softer friction")
         arm = replace(arm, soft=soft)
         found = search(arm, logs.only(learning), exclude)
+    if units := list(unit_notices(found)):
+        progress("searching again with masses of each joint")
+        arm = replace(arm, gain=np.zeros(0))
+        found = search(arm, logs.only(learning), exclude)
     early, late, unsure = logs, 0.0, 0.0
     for one, (value, sigma) in zip(found.choice.found, found.choice.estimates, strict=True):
         if one.candidate.family == "delay" and abs(value[0]) > LATE:
@@ -295,7 +323,7 @@ def examined(
         held_out=held_words(logs, fold, whole),
         held_run=held_run(judge, logs, parts_of(found.terms)),
         curves=curves(found, normal, judge),
-        notices=tuple(body_notices(arm, given, change, logs)),
+        notices=(*units, *body_notices(arm, given, change, logs)),
     )
 
 

@@ -29,7 +29,8 @@ THIN = 2  # every second row is fitted: near the filter's cutoff, noise of fewer
 CUTOFF_HZ, FILTER_ORDER = 8.0, 4  # of the zero-phase filter [Butterworth]
 FORGETS_S = 2.0  # after which the filter has forgotten what went in, to 1e-16
 LEAST_TAP = 1e-7  # of the filter's largest: what it takes of samples further off is nothing
-REVERSAL_S = 0.1  # about rest and reversals, without a fit
+REVERSAL_S = 0.1  # about rest and reversals, where a joint does not count as moving
+UNFITTED_S = 0.15  # the same, without a fit: as far as the filter takes the step of friction
 REST = 0.01  # of the joint's largest speed: below it the joint is at rest
 SLOWEST = 2e-3  # below it a joint is at rest, however slow the log [rad/s, m/s]
 GAP_S = 0.1  # longer steps of time are gaps
@@ -165,18 +166,22 @@ class Logs:
         part = QUARTERS * (self.picked - self.start[self.run]) // long
         return np.asarray(QUARTERS * self.run + part)
 
-    @cached_property
-    def sliding(self) -> Array:
-        """(M, n) True where a joint is neither at rest nor near a reversal."""
+    def away(self, seconds: float) -> Array:
+        """(M, n) True where a joint is neither at rest nor so near a reversal [s]."""
         qd = self.motion.qd
         still = np.abs(qd) < np.maximum(REST * np.abs(qd).max(axis=0), SLOWEST)
         still[1:] |= qd[1:] * qd[:-1] < 0.0
         out = np.empty(qd.shape, dtype=bool)
-        reach = int(REVERSAL_S * SAMPLE_HZ)
+        reach = round(seconds * SAMPLE_HZ)
         for a, b in zip(self.start[:-1], self.start[1:], strict=True):
             count = np.cumsum(np.pad(still[a:b], ((reach + 1, reach), (0, 0))), axis=0)
             out[a:b] = count[2 * reach + 1 :] == count[: -2 * reach - 1]
         return out
+
+    @cached_property
+    def sliding(self) -> Array:
+        """(M, n) True where a joint moves: neither at rest nor near a reversal."""
+        return self.away(REVERSAL_S)
 
     @cached_property
     def moving(self) -> Array:
@@ -185,10 +190,10 @@ class Logs:
 
     @cached_property
     def fitted(self) -> Array:
-        """(R, n) True for rows that are fitted: every THIN-th, moving, no gap or end close by."""
+        """(R, n) True for rows that are fitted: every THIN-th, no reversal, gap or end close by."""
         number = (self.picked - self.start[self.run]) // int(SAMPLE_HZ / ROW_HZ)
         some = (number % THIN == 0) & ~self.gap[self.picked]
-        return np.asarray(self.moving & some[:, None])
+        return np.asarray(self.away(UNFITTED_S)[self.picked] & some[:, None])
 
     @cached_property
     def y(self) -> Array:

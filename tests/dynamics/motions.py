@@ -73,6 +73,7 @@ def simulated(
     carried: float | Sequence[float] = 0.0,
     friction: bool = True,
     turns: Array | None = None,
+    noise: float = NOISE,
 ) -> list[Run]:
     """Runs of the arm with usual friction, noise, and something more.
 
@@ -86,7 +87,7 @@ def simulated(
         body = inertial_parameters(robot)
         body[-1] += link_parameters(float(mass), np.array([0.0, 0.0, 0.05]), np.zeros(6))
         rigid = driven_torque(motion, body, turns)
-        torque = rigid + NOISE * rng.normal(size=rigid.shape)
+        torque = rigid + noise * rng.normal(size=rigid.shape)
         if friction:
             torque += np.sign(motion.qd) * [4.0, 3.0, 1.5] + motion.qd * [3.0, 4.0, 1.0]
         if extra is not None:

@@ -73,6 +73,9 @@ def test_rows_at_rest_near_reversals_and_gaps_are_not_fitted() -> None:
     speed = np.stack([np.interp(at, time, column) for column in qd.T], axis=1)
     flips = np.diff(np.sign(speed), axis=0) != 0
     assert not (logs.moving[1:] & flips)[at[1:] < 9.0].any()
+    near = np.abs(at[:, None] - at[1:][flips[:, 1] & (at[1:] < 9.0)]).min(axis=1)
+    assert near[logs.fitted[:, 1] & (at < 9.0)].min() > 0.15 - 0.04  # a row of 25 Hz apart at most
+    assert near[logs.moving[:, 1] & (at < 9.0)].min() < 0.14  # but counted as moving
     assert logs.fitted[at < 9.0].mean() > 0.25
     assert not logs.fitted[1::2].any()
 

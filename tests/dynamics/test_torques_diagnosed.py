@@ -105,6 +105,13 @@ def test_a_rigid_body_alone_has_no_cause() -> None:
     assert_allclose(given.holdout_rms, refitted.holdout_rms, rtol=0.05)  # the masses are right
 
 
+@pytest.mark.parametrize("seed", [6, 11, 14])
+def test_little_noise_on_a_sound_arm_makes_no_name_of_reversals(seed: int) -> None:
+    """Rows so near that the filter mixes in the step of friction were taken for presliding."""
+    found = mc.diagnose_motion(ARM, simulated(seed=seed, noise=0.01))
+    assert {e.effect for e in found.effects} == {"coulomb", "viscous"}
+
+
 def test_a_payload_that_nobody_told_is_the_last_link() -> None:
     found = mc.diagnose_motion(ARM, simulated(carried=2.0, seed=3))
     (effect,) = (e for e in found.effects if e.effect == "payload")
@@ -156,6 +163,22 @@ def test_currents_without_gains_show_no_kilograms() -> None:
     assert not [p for e in found.effects for p in e.parameters if "kg" in p.unit]
     assert "payload" in {one.effect for one in found.not_testable}
     assert found.verdict == "unknown"
+
+
+@pytest.mark.parametrize("scale", [
+    [1.0, -1.0, 1.0], [1.0, 1.0 / 14.0, 1.0], [1.0 / 12.0, 1.0 / 14.0, 1.0 / 9.0],
+])  # fmt: skip
+def test_efforts_of_another_unit_or_sign_are_no_drive_gain(scale: list[float]) -> None:
+    runs = [replace(run, torque=run.torque * scale) for run in simulated(seed=3)]
+    found = mc.diagnose_motion(ARM, runs)
+    assert names(found) == set()
+    (said,) = (text for text in found.notices if text.startswith("the torques of joint 2 are "))
+    assert "another unit or sign; currents? then name the columns i1_A, i2_A" in said
+    assert "drive_gain" in {one.effect for one in found.not_testable}
+    coulomb = {e.place: e.parameters[0].value for e in found.effects if e.effect == "coulomb"}
+    for place, value in coulomb.items():
+        j = int(place[1]) - 1
+        assert value == pytest.approx([4.0, 3.0, 1.5][j] * scale[j], rel=0.05)
 
 
 def test_a_known_payload_tells_the_drive_gains() -> None:
