@@ -3,9 +3,10 @@
     min over x of  max_i f_i(x)   subject to   lower <= c(x) <= upper
 
 Each step solves  min 1/2 d'Hd + v,  f + f'd - max f <= v,  lower - c <= c'd <= upper - c  with any
-QP solver.  Globalisation (the paper has none): a line search on max f + penalty * violation, with a
-second-order correction where the curvature of the active pieces spoils the full step [Maratos
-effect; Nocedal and Wright, Numerical Optimization, ch. 18], and damping of H as the last resort.
+QP solver, in units in which all is about one.  Globalisation (the paper has none): a line search on
+max f + price @ violation, with a second-order correction where the curvature of the active pieces
+spoils the full step [Maratos effect; Nocedal and Wright, Numerical Optimization, ch. 18], and
+damping of H as the last resort.
 The solver knows no robot; problem and iterate are the caller's.
 """
 
@@ -15,7 +16,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -23,6 +24,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.status import Status
 from qp_backends import Problem, Solution
+from qp_backends import Status as QpStatus
 from qp_backends.problem import COLD
 
 X = TypeVar("X")
@@ -34,13 +36,13 @@ EVEN: Array = np.zeros(0)
 NUMBER = re.compile(r"\d[\d.]*(e[+-]?\d+)?")
 
 # Differences of the merit function below this, relative, are rounding: the model is trusted there.
-ROUNDING = 1e-12
+ROUNDING, EPS = 1e-12, float(np.finfo(float).eps)
 SHARE = 3  # times the unknowns: of more functions than twice that, so many make a first QP
 PATIENCE = 10  # iterations without progress in value or optimality before giving up
-# With the QP methods of paper M as printed, whose answers are used as they are.  On the nine
-# built-in arms the search ends with a residual of at most 2e-3 (raw) and 3e-4 (eliminated).
-WORTH = 1e-8  # relative: a value that falls by less is no progress
-REACH = 5e-3  # optimal as far as these methods go
+WORTH = 1e-8  # relative: a fall by less is no progress where QP answers are used as they are
+NOTHING = 1e-12  # of the value at the start: what is as good as zero
+ENDLESS = 1e72  # times that: a value so large belongs to what falls without end
+CANCELLED = 1e-7  # a value below this share of the terms that make it is known no better
 MOST_DAMPING = 1e8  # of the Hessian's diagonal
 RELENTLESS = 1e6  # price of a violation, in slopes of f, beyond which it is there to stay
 NEARLY = 100.0  # times the tolerance: optimal as far as rounding lets one see
@@ -112,6 +114,15 @@ class Linear:
         """Some of the functions; their curvature is that of all."""
         return replace(self, f=self.f[rows], jacobian=self.jacobian[rows])
 
+    def lengths(self, level: float) -> Array:
+        """(p,) how far a variable alone may go until a function is above the largest by level.
+
+        By the derivatives here; 1 where no function depends on it.
+        """
+        room = level + self.f.max() - self.f
+        steepest = np.abs(self.jacobian / room[:, None]).max(axis=0)
+        return np.asarray(1.0 / np.where(steepest > 0.0, steepest, 1.0))
+
 
 class Minimax(Protocol[X]):
     """A smooth max-of-functions problem with two-sided constraints."""
@@ -134,11 +145,35 @@ class Minimax(Protocol[X]):
         """The point moved by d (p,)."""
 
 
+@dataclass(frozen=True, eq=False)
+class Units:
+    """Units in which a problem is about one: of the value, the variables (p,), constraints (l,)."""
+
+    value: float
+    x: Array
+    c: Array
+
+    @staticmethod
+    def of(here: Linear, value: float, x: Array, lower: Array, upper: Array) -> Units:
+        """A constraint's is its way to a bound, at least how much it changes along a variable's."""
+        way = np.minimum(np.abs(upper - here.c), np.abs(here.c - lower))
+        c = np.abs(here.normal * x).max(axis=1, initial=0.0)
+        c = np.maximum(c, np.where(np.isfinite(way), way, 0.0))
+        return Units(value, x, np.where(c > 0.0, c, 1.0))
+
+    def scaled(self, here: Linear) -> Linear:
+        """The problem in these units."""
+        return replace(
+            here, f=here.f / self.value, jacobian=here.jacobian * (self.x / self.value),
+            c=here.c / self.c, normal=here.normal * (self.x / self.c[:, None]),
+        )  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Sqp:
     """Settings of the SQP.
 
-    tolerance: on stationarity, complementarity and violation (problem scaled to about one).
+    tolerance: on stationarity, complementarity and violation, as `Kkt` has them.
     iterations: at most so many QPs.  floor: least weight of the functions in the Gauss-Newton
     Hessian, shared evenly, which inactive ones would otherwise leave singular.
     hessian: "gauss-newton" (the problem's own curvature, weighted by the multipliers) or "bfgs"
@@ -158,6 +193,9 @@ class Kkt:
     stationarity: largest entry of sum mu_i f_i' + sum lambda_l c_l'.
     complementarity: sum mu_i (max f - f_i) + sum |lambda_l| (distance of c_l to its bound).
     violation: largest violation of a constraint.
+
+    In an `Iterate`'s units.  By duality of linear programs the linearised problem then offers no
+    more, within a box of the variables' units, than complementarity + sum of stationarity.
     """
 
     stationarity: float
@@ -227,7 +265,8 @@ def solve(
     trace: list[Step] = []
     notes: list[str] = []
     for iteration in range(1, settings.iterations + 1):
-        if not (np.all(np.isfinite(at.here.f)) and np.all(np.isfinite(at.here.jacobian))):
+        numbers = np.all(np.isfinite(at.here.f)) and np.all(np.isfinite(at.here.jacobian))
+        if not numbers or at.units.value > ENDLESS * at.least:
             status = Status.FAILED
             break
         hessian = at.hessian(settings.floor)
@@ -237,11 +276,11 @@ def solve(
             status = Status.FAILED
             break
         if not plan.exact:
-            plan = at.balanced(plan)
-        penalty = priced(at, plan, tolerance)
-        at = at.after(plan, at.penalty if penalty is None else penalty)
-        enough = tolerance if plan.exact else REACH
-        if penalty is None:
+            best = at.balanced()
+            plan = replace(plan, mu=best.mu, lam=best.lam)
+        price = priced(at, plan, tolerance)
+        at = at.after(plan, at.price if price is None else price)
+        if price is None:
             status = Status.INFEASIBLE
             break
         length, move, end, there = 0.0, np.zeros_like(plan.d), at.x, at.here
@@ -250,13 +289,21 @@ def solve(
         value, kkt = float(at.here.f.max()), at.kkt
         trace.append(Step(iteration, value, kkt.violation, kkt.residual, length, plan.backend))
         progress(trace[-1])
-        ended = at.patience(tolerance, enough)
+        ended = at.patience(tolerance, plan.exact)
         if ended is None:
             at = at.moved(move, end, there) if length else at.damped()
-            ended = at.arrived(tolerance, enough)
+            ended = at.arrived(tolerance, plan.exact)
+        if ended is Status.STALLED or (ended is None and not length):
+            best = at.balanced()  # the multipliers of its QP may be to blame
+            if best.kkt.residual <= NEARLY * tolerance:
+                at, ended = best, Status.CONVERGED
         if ended is not None:
             status = ended
             break
+    if status is Status.STALLED:
+        notes.append(
+            f"to first order the largest function may still fall by {at.offer():.1e} of it"
+        )
     return Optimum(
         at.x, at.here.f, at.here.c, at.mu, at.lam, at.kkt, len(trace), status, tuple(trace),
         told_once(notes), dict(ask.answered), ask.warm, ask.residual,
@@ -278,10 +325,11 @@ def told_once(notes: Sequence[str]) -> tuple[str, ...]:
 class Iterate(Generic[X]):
     """Where the iteration stands.
 
-    here: the problem at x.  mu, lam: multipliers of the latest QP, kkt: how far from optimal x is
-    with them.  quasi: the Hessian where the problem has none of its own.  penalty: price of a
-    violation.  damping: of the Hessian's diagonal.  best, lowest: least residual and value so far.
-    idle: iterations since either fell.  step: QPs so far.
+    here: the problem at x.  mu, lam: multipliers of the latest QP.  quasi: the Hessian where the
+    problem has none of its own.  gone: (p,) from the start.  reach: (p,) the farthest of it, at
+    least as far as the start's derivatives suggest.  price: (l,) of a violation.  least: a value
+    that is as good as none.  damping: of the Hessian's diagonal.  best, lowest: least residual and
+    value so far.  idle: iterations since either fell.  step: QPs so far.
     """
 
     problem: Minimax[X]
@@ -289,9 +337,11 @@ class Iterate(Generic[X]):
     here: Linear
     mu: Array
     lam: Array
-    kkt: Kkt
     quasi: Bfgs | None
-    penalty: float = 0.0
+    gone: Array
+    reach: Array
+    price: Array
+    least: float
     damping: float = 0.0
     best: float = np.inf
     lowest: float = np.inf
@@ -302,21 +352,59 @@ class Iterate(Generic[X]):
     def begin(problem: Minimax[X], x: X, settings: Sqp, mu: Array) -> Iterate[X]:
         """The start; without mu all functions share the multipliers evenly."""
         here = problem.linearise(x)
-        k, p = here.jacobian.shape
-        mu, lam = mu if len(mu) else np.full(k, 1.0 / k), np.zeros(len(here.c))
-        kkt = optimality(here, mu, lam, problem.lower, problem.upper)
-        quasi = None if settings.hessian == "gauss-newton" else Bfgs.start(here, p)
-        return Iterate(problem, x, here, mu, lam, kkt, quasi)
+        (k, p), none = here.jacobian.shape, np.zeros(len(here.c))
+        f, slope = np.abs(here.f), np.abs(here.jacobian)
+        level = float(max(abs(here.f.max()), CANCELLED * f.mean()) or slope.max() or 1.0)
+        bent = level / here.lengths(level) ** 2
+        bfgs = Bfgs.start(here, bent)
+        reach = np.sqrt(level / np.maximum(bent, np.diag(bfgs.matrix)))
+        quasi = None if settings.hessian == "gauss-newton" else bfgs
+        mu, least = mu if len(mu) else np.full(k, 1.0 / k), NOTHING * level
+        return Iterate(problem, x, here, mu, none, quasi, np.zeros(p), reach, none, least)
+
+    @cached_property
+    def terms(self) -> float:
+        """Size of the terms that the value is the sum of; its rounding is relative to them."""
+        here, held = self.here, self.mu > 0.0
+        slopes = self.mu[held] @ np.abs(here.jacobian[held]) + np.abs(self.lam) @ np.abs(
+            here.normal
+        )
+        return float(self.mu @ np.abs(here.f) + slopes @ self.reach)
+
+    @cached_property
+    def units(self) -> Units:
+        """Of the value as large as it is, of variables as far as they go."""
+        level = max(abs(float(self.here.f.max())), CANCELLED * self.terms, self.least)
+        return Units.of(self.here, level, self.reach, self.problem.lower, self.problem.upper)
+
+    @cached_property
+    def kkt(self) -> Kkt:
+        """How far from optimal, in these units."""
+        units, low, high = self.units, self.problem.lower, self.problem.upper
+        lam = self.lam * units.c / units.value
+        return optimality(units.scaled(self.here), self.mu, lam, low / units.c, high / units.c)
+
+    @cached_property
+    def lengths(self) -> Array:
+        """(p,) as `Linear` has them."""
+        return self.here.lengths(self.units.value)
+
+    @cached_property
+    def fair(self) -> Array:
+        """(l,) prices at which a constraint's unit is worth what the functions can gain by it."""
+        units = self.units
+        return np.asarray(units.value / units.c * float((self.reach / self.lengths).max()))
 
     def hessian(self, floor: float) -> Array:
         """(p, p) of the Lagrangian, damped.  floor: as `Sqp.floor`."""
+        least = EPIGRAPH * np.diag(self.units.value / self.lengths**2)
         if self.quasi is None:
             matrix = self.here.curvature(np.maximum(self.mu, floor / len(self.mu)))
         else:
             matrix = self.quasi.matrix
         if not self.damping:
             return matrix
-        return np.asarray(matrix + self.damping * np.diag(np.maximum(np.diag(matrix), 1e-8)))
+        return np.asarray(matrix + self.damping * np.maximum(np.diag(np.diag(matrix)), least))
 
     def subproblem(
         self, hessian: Array, qp: Ask, f: Array | None = None, c: Array | None = None
@@ -325,19 +413,27 @@ class Iterate(Generic[X]):
 
         If its constraints contradict each other, of their elastic relaxation.
         """
+        bend = np.diag(hessian) / self.units.value
+        x = np.where(bend > 0.0, 1.0 / np.sqrt(np.where(bend > 0.0, bend, 1.0)), self.lengths)
+        units = replace(self.units, x=x)
         here = self.here if f is None or c is None else replace(self.here, f=f, c=c)
+        here, lower = units.scaled(here), self.problem.lower / units.c
+        bent, upper = (
+            hessian / units.value * np.outer(units.x, units.x),
+            self.problem.upper / units.c,
+        )
         missed = rows = self.likely(here)
         while len(missed):
             some = here if len(rows) == len(here.f) else here.of(rows)
-            plain = epigraph(some, here.f.max(), hessian, self.problem.lower, self.problem.upper)
+            plain = epigraph(some, here.f.max(), bent, lower, upper)
             solution = qp(plain)
             missed = forgotten(here, rows, solution)
             rows = np.concatenate([rows, missed])
-        if solution.usable or not len(here.c):
-            return read(solution, here, rows, relaxed=False, penalty=0.0)
-        weight = max(self.penalty, 1e2 * float(np.abs(here.jacobian).max(initial=1.0)))
-        relaxed = qp(elastic(plain, len(rows), weight))
-        return read(relaxed, here, rows, relaxed=True, penalty=weight)
+        if given(solution) or not len(here.c):
+            return read(solution, here, rows, units)
+        price = np.maximum(self.price, 1e2 * self.fair)
+        relaxed = qp(elastic(plain, len(rows), price * units.c / units.value))
+        return replace(read(relaxed, here, rows, units), relaxed=price)
 
     def likely(self, here: Linear) -> Array:
         """The functions that may be the largest after a step: all, or of many the largest now."""
@@ -348,69 +444,70 @@ class Iterate(Generic[X]):
         large = here.f >= np.partition(here.f, k - most)[k - most]
         return np.flatnonzero(large | (self.mu > 0.0) if self.step else large)
 
-    def after(self, plan: Plan, penalty: float) -> Iterate[X]:
+    def after(self, plan: Plan, price: Array) -> Iterate[X]:
         """The same point with the multipliers of a QP, one more iteration counted."""
-        kkt = optimality(self.here, plan.mu, plan.lam, self.problem.lower, self.problem.upper)
+        at = replace(self, mu=plan.mu, lam=plan.lam, price=price, step=self.step + 1)
         value, best, lowest, idle = float(self.here.f.max()), self.best, self.lowest, self.idle + 1
         worth = ROUNDING if plan.exact else WORTH
-        better = plan.exact and kkt.residual < 0.9 * best
+        better = plan.exact and at.kkt.residual < 0.9 * best
         if better or value < lowest - worth * abs(lowest):
-            best, lowest, idle = min(best, kkt.residual), value, 0
-        return replace(
-            self, mu=plan.mu, lam=plan.lam, kkt=kkt, penalty=penalty, best=best, lowest=lowest,
-            idle=idle, step=self.step + 1,
-        )  # fmt: skip
+            best, lowest, idle = min(best, at.kkt.residual), value, 0
+        return replace(at, best=best, lowest=lowest, idle=idle)
 
-    def balanced(self, plan: Plan) -> Plan:
-        """A step with the multipliers that balance the gradients here best, not those of its QP."""
-        lower, upper = self.problem.lower, self.problem.upper
-        mu, lam = multipliers_at(self.here, lower, upper)
-        return replace(plan, mu=mu, lam=lam)
+    def balanced(self) -> Iterate[X]:
+        """The same point with multipliers that balance the gradients here best, of no QP."""
+        units, rows, mu = self.units, self.likely(self.here), np.zeros(len(self.mu))
+        some, low, high = units.scaled(self.here).of(rows), self.problem.lower, self.problem.upper
+        mu[rows], lam = multipliers_at(some, low / units.c, high / units.c)
+        return replace(self, mu=mu, lam=lam * units.value / units.c)
 
-    def patience(self, tolerance: float, enough: float = 0.0) -> Status | None:
+    def offer(self) -> float:
+        """By how much of itself the value may still fall, to first order, within the units."""
+        here, lam = self.units.scaled(self.here), self.lam * self.units.c / self.units.value
+        slopes = np.abs(self.mu @ here.jacobian + lam @ here.normal)
+        return float(slopes.sum()) + self.kkt.complementarity
+
+    def patience(self, tolerance: float, exact: bool = True) -> Status | None:
         """How it ends here, if it is optimal or nothing has become better for long.
 
-        enough: for a residual, where the QP solver allows no better.
+        exact: whether QPs are solved to a tolerance; else a violation may be there to stay.
         """
         if self.kkt.residual <= tolerance:
             return Status.CONVERGED
-        if self.idle >= PATIENCE and self.kkt.violation <= max(tolerance, enough):
-            good = self.kkt.residual <= max(NEARLY * tolerance, enough)
-            return Status.CONVERGED if good else Status.STALLED
+        if self.idle >= PATIENCE and (self.kkt.violation <= tolerance or not exact):
+            return Status.STALLED
         return None
 
     def moved(self, move: Array, x: X, there: Linear) -> Iterate[X]:
         """At the end of a step, less damped."""
         quasi = self.quasi and self.quasi.update(move, self.here, there, self.mu, self.lam)
         damping = self.damping / 10.0 if self.damping > 1e-6 else 0.0
-        kkt = optimality(there, self.mu, self.lam, self.problem.lower, self.problem.upper)
-        return replace(self, x=x, here=there, kkt=kkt, quasi=quasi, damping=damping)
+        gone = self.gone + move
+        reach = np.maximum(self.reach, np.abs(gone))
+        return replace(self, x=x, here=there, quasi=quasi, damping=damping, gone=gone, reach=reach)
 
     def damped(self) -> Iterate[X]:
         """The same point, more damped, since no step led on."""
         return replace(self, damping=max(10.0 * self.damping, 1e-3))
 
-    def arrived(self, tolerance: float, enough: float = 0.0) -> Status | None:
+    def arrived(self, tolerance: float, exact: bool = True) -> Status | None:
         """How it ends after a step, if the point is optimal or no damping helps any more."""
         if self.kkt.residual <= tolerance:
             return Status.CONVERGED
         if self.damping > MOST_DAMPING:
-            stuck = self.kkt.violation > max(tolerance, enough)
-            if not stuck and enough > tolerance and self.kkt.residual <= enough:
-                return Status.CONVERGED
-            return Status.INFEASIBLE if stuck else Status.STALLED
+            return Status.INFEASIBLE if exact and self.kkt.violation > tolerance else Status.STALLED
         return None
 
 
-def priced(at: Iterate[X], plan: Plan, tolerance: float) -> float | None:
-    """The next price of a violation; None where no price makes the constraints agree."""
-    if not plan.relaxed:
-        return max(at.penalty, 1.5 * float(np.abs(plan.lam).max(initial=0.0)))
-    penalty = max(at.penalty, plan.penalty)
-    if not hopeless(at.here, plan, at.problem.lower, at.problem.upper, tolerance):
-        return penalty
-    steepest = max(1.0, float(np.abs(at.here.jacobian).max()))
-    return None if penalty > RELENTLESS * steepest else 10.0 * penalty
+def priced(at: Iterate[X], plan: Plan, tolerance: float) -> Array | None:
+    """(l,) the next prices of violations; None where no price makes the constraints agree."""
+    c, lower, upper = at.units.c, at.problem.lower, at.problem.upper
+    if plan.relaxed is None:
+        return np.asarray(np.maximum(at.price, 1.5 * np.abs(plan.lam * c).max(initial=0.0) / c))
+    price = np.maximum(at.price, plan.relaxed)
+    if not hopeless(at.units.scaled(at.here), plan.d / at.reach, lower / c, upper / c, tolerance):
+        return price
+    return None if np.all(price > RELENTLESS * at.fair) else 10.0 * price
 
 
 @dataclass(frozen=True, eq=False)
@@ -418,6 +515,7 @@ class Plan:
     """An answer of the QP: step d, multipliers, and which backend gave it.
 
     exact: whether the answer kept the tolerance; else it is one that is used as it is.
+    relaxed: (l,) prices at which it may violate constraints that contradict each other.
     """
 
     d: Array
@@ -426,12 +524,18 @@ class Plan:
     usable: bool
     backend: str
     notes: tuple[str, ...]
-    relaxed: bool
-    penalty: float
     exact: bool = True
+    relaxed: Array | None = None
 
 
 Resolve = Callable[[Array, Array], Plan]
+
+
+def given(answer: Solution) -> bool:
+    """Whether a QP has an answer, exact or not: what it is good for the search finds out."""
+    return answer.usable or (
+        answer.status is QpStatus.INACCURATE and bool(np.isfinite(answer.x).all())
+    )
 
 
 def forgotten(here: Linear, rows: Array, solution: Solution) -> Array:
@@ -442,7 +546,7 @@ def forgotten(here: Linear, rows: Array, solution: Solution) -> Array:
     k, p = here.jacobian.shape
     if len(rows) == k:
         return rows[:0]
-    if not solution.usable:
+    if not given(solution):
         return np.setdiff1d(np.arange(k), rows)
     over = here.f - here.f.max() + here.jacobian @ solution.x[:p] - solution.x[p]
     over[rows] = -np.inf
@@ -465,7 +569,7 @@ def epigraph(here: Linear, largest: float, hessian: Array, lower: Array, upper: 
     return Problem(quadratic, linear, rows, low, high)
 
 
-def elastic(problem: Problem, k: int, weight: float) -> Problem:
+def elastic(problem: Problem, k: int, price: Array) -> Problem:
     """The same QP with slacks s, t >= 0 on its constraint rows: c'd + s - t, at a price each."""
     n, m = len(problem.q), len(problem.l)
     slack = np.zeros((m, 2 * (m - k)))
@@ -474,33 +578,31 @@ def elastic(problem: Problem, k: int, weight: float) -> Problem:
     quadratic = np.zeros((n + 2 * (m - k),) * 2)
     quadratic[:n, :n] = problem.P
     quadratic[n:, n:] = EPIGRAPH * np.eye(2 * (m - k))
-    linear = np.concatenate([problem.q, np.full(2 * (m - k), weight)])
+    linear = np.concatenate([problem.q, price, price])
     low = np.concatenate([problem.l, np.zeros(2 * (m - k))])
     high = np.concatenate([problem.u, np.full(2 * (m - k), np.inf)])
     return Problem(quadratic, linear, rows, low, high)
 
 
-def read(answer: Solution, here: Linear, rows: Array, relaxed: bool, penalty: float) -> Plan:
+def read(answer: Solution, here: Linear, rows: Array, units: Units) -> Plan:
     """Step and multipliers of a QP answer; mu is brought back to sum one exactly.
 
-    rows: the functions that the QP knew.
+    rows: the functions that the QP knew.  units: of the QP.
     """
     k, p = here.jacobian.shape
-    usable, few = answer.usable, len(rows)
+    usable, few = given(answer), len(rows)
     mu = np.zeros(k) if usable else np.full(k, 1.0 / k)
     if usable:
         mu[rows] = np.maximum(answer.y[:few], 0.0)
     total = mu.sum()
     lam = answer.y[few : few + len(here.c)] if usable else np.zeros(len(here.c))
     return Plan(
-        d=answer.x[:p] if usable else np.zeros(p),
+        d=answer.x[:p] * units.x if usable else np.zeros(p),
         mu=mu / total if total > 0.0 else np.full(k, 1.0 / k),
-        lam=lam,
+        lam=lam * units.value / units.c,
         usable=usable,
         backend=answer.backend,
         notes=answer.notes,
-        relaxed=relaxed,
-        penalty=penalty,
         exact=answer.solved or not usable,
     )
 
@@ -545,10 +647,10 @@ def multipliers_at(here: Linear, lower: Array, upper: Array) -> tuple[Array, Arr
     return found[:k], lam
 
 
-def hopeless(here: Linear, plan: Plan, lower: Array, upper: Array, tolerance: float) -> bool:
+def hopeless(here: Linear, d: Array, lower: Array, upper: Array, tolerance: float) -> bool:
     """Whether constraints are violated and the relaxed QP sees no way to violate them less."""
     now = excess(here.c, lower, upper).sum()
-    ahead = excess(here.c + here.normal @ plan.d, lower, upper).sum()
+    ahead = excess(here.c + here.normal @ d, lower, upper).sum()
     return bool(now > tolerance and ahead > (1.0 - 1e-6) * now)
 
 
@@ -558,7 +660,7 @@ def excess(c: Array, lower: Array, upper: Array) -> Array:
 
 
 def search(at: Iterate[X], plan: Plan, resolve: Resolve) -> tuple[float, Array, X, Linear]:
-    """A step that lowers max f + penalty * violation: its length (0 if none), move and end.
+    """A step that lowers max f + price @ violation: its length (0 if none), move and end.
 
     The full step is nearly always taken, so its derivatives are computed at once.  resolve: solves
     the QP again with other values f, c, for the second-order correction.
@@ -568,13 +670,13 @@ def search(at: Iterate[X], plan: Plan, resolve: Resolve) -> tuple[float, Array, 
     def merit(f: Array, c: Array) -> float:
         value = float(f.max())
         if len(c):
-            value += at.penalty * float(excess(c, problem.lower, problem.upper).sum())
+            value += float(at.price @ excess(c, problem.lower, problem.upper))
         return value if np.isfinite(value) else float("inf")
 
     start = merit(here.f, here.c)
     ahead = merit(here.f + here.jacobian @ plan.d, here.c + here.normal @ plan.d)
     decrease = start - ahead
-    slack = ROUNDING * abs(start)
+    slack = ROUNDING * abs(start) + EPS * at.terms
     trial = problem.step(x, plan.d)
     there = problem.linearise(trial)
     value = merit(there.f, there.c)
@@ -583,7 +685,9 @@ def search(at: Iterate[X], plan: Plan, resolve: Resolve) -> tuple[float, Array, 
     if np.isfinite(value):
         # what the linear model missed at the full step goes into the constants
         bent = resolve(there.f - here.jacobian @ plan.d, there.c - here.normal @ plan.d)
-        if bent.usable and np.linalg.norm(bent.d) <= 2.0 * np.linalg.norm(plan.d):
+        if bent.usable and np.linalg.norm(bent.d / at.lengths) <= 2.0 * np.linalg.norm(
+            plan.d / at.lengths
+        ):
             trial = problem.step(x, bent.d)
             there = problem.linearise(trial)
             if merit(there.f, there.c) <= start - 1e-4 * decrease + slack:
@@ -609,12 +713,12 @@ class Bfgs:
     fresh: bool
 
     @staticmethod
-    def start(here: Linear, size: int) -> Bfgs:
-        """The mean Gauss-Newton Hessian where there is one, else the identity."""
+    def start(here: Linear, curvature: Array) -> Bfgs:
+        """The mean Gauss-Newton Hessian where there is one, else a guess of its diagonal (p,)."""
         mean = here.curvature(np.full(len(here.f), 1.0 / len(here.f)))
         if len(mean):
             return Bfgs(mean + 1e-3 * np.diag(np.diag(mean)), fresh=False)
-        return Bfgs(np.eye(size), fresh=True)
+        return Bfgs(np.diag(curvature), fresh=True)
 
     def update(self, s: Array, before: Linear, after: Linear, mu: Array, lam: Array) -> Bfgs:
         """With the change of the Lagrangian's gradient over the step s, same multipliers."""
@@ -624,7 +728,8 @@ class Bfgs:
             return self
         matrix = self.matrix
         if self.fresh and q @ s > 0:  # size of the first guess [Nocedal and Wright, eq. 6.20]
-            matrix = float(q @ q) / float(q @ s) * np.eye(len(s))
+            guess = np.diag(matrix)
+            matrix = float(q @ (q / guess)) / float(q @ s) * matrix
         bs = matrix @ s
         curve = float(s @ bs)
         if curve <= 0.0:

@@ -13,13 +13,12 @@ from scipy.optimize import (
     LinearConstraint,
     NonlinearConstraint,
     OptimizeResult,
-    approx_fprime,
 )
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.solvers import minimax
-from minimax_cal.solvers.minimax import Linear, Optimum, Solver, Sqp, Step, from_nothing
+from minimax_cal.solvers.minimax import Linear, Optimum, Solver, Sqp, Step, excess, from_nothing
 from minimax_cal.solvers.status import Status
 from qp_backends import Problem, Solution
 from qp_backends import solve as solve_qp
@@ -30,12 +29,11 @@ COMPLEX_STEP = 1e-30
 QP_TOLERANCE = 1e-9
 ESCAPES = 3  # from points where every gradient vanishes but better ones are near
 FLAT = 1e-6  # gradients below, of problems scaled to about one, count as none
+PROBE = 1e-4  # share of a variable's length over which that is tried
+TRIES, FASTER = 40, 1e4  # of a length; by how much it may be too short at each
 NEARBY = 1e-3  # how far a better point is looked for, relative to x
 DIRECTIONS = 3  # in which a given gradient is checked
 SLOPE_ERROR = 1e-2  # relative to the function's steepest slope; more is a wrong gradient
-# An answer below this share of what the start had may still be far from zero, relatively: it is
-# sought with a finer tolerance, at most so often, while that pays.
-SMALL, FINER, ROUNDS = 1e-2, 1e-3, 4
 FARTHER = (1.0, 1e2, 1e4, 1e6)  # times the way of a search that found no end
 MESSAGES = {
     "converged": "optimal to the tolerance",
@@ -43,7 +41,8 @@ MESSAGES = {
     "stalled": "no step lowers the largest function any more, yet the optimality test fails; give "
     "an exact jac, another QP backend, or a larger tol",
     "infeasible": "the constraints could not be met and may contradict each other; loosen them",
-    "failed": "fun or jac gave no finite numbers near the start; try another x0",
+    "failed": "fun or jac gave no finite numbers, or the QP backend no answer; try another x0, or "
+    "another qp",
     "unbounded": "the largest function falls without end; add bounds or constraints",
     "wrong_gradient": "jac is not the derivative of fun{}; mend it, or leave it out",
 }
@@ -72,7 +71,8 @@ def minimize_max(
         (n,).
     jac
         (n,) -> (m, n), or "cs" for the complex step (exact; fun must take complex numbers),
-        or "3-point" or "2-point" for finite differences (least accurate).
+        or "3-point" or "2-point" for finite differences (least accurate; where they do not
+        suffice, "3-point" follows).
     bounds, constraints
         scipy.optimize's Bounds, LinearConstraint, NonlinearConstraint; bounds also as n
         pairs, None where open.
@@ -81,7 +81,8 @@ def minimize_max(
     args
         Further arguments of fun and jac.
     tol
-        On the KKT residual, gradients taken relative to the largest at x0.
+        On the KKT residual relative to fun: what moving each variable as far as it went could
+        gain, to first order; and on violations relative to that way.
     maxiter
         QPs at most.
     callback
@@ -117,12 +118,13 @@ def minimize_max(
                           "and maxiter of 1 or more")  # fmt: skip
     listed = [constraints] if isinstance(constraints, Constraint) else list(constraints)
     box = bounds if bounds is None or isinstance(bounds, Bounds) else box_of(bounds, len(x))
-    rows = Rows.of(len(x), box, listed)
     ends = (-np.inf, np.inf) if box is None else (box.lb, box.ub)
     x = np.clip(x, *ends)
     count = Count()
     function = counted(lambda z: np.atleast_1d(fun(z, *args)), count)
-    problem = MaxOfFunctions.at(x, function, derivative(function, jac, args, count), rows)
+    length = lengths(function, x, *ends)
+    slopes = derivative(function, jac, args, count, length)
+    problem = MaxOfFunctions.at(x, function, slopes, Rows.of(length, box, listed), length)
     solver: Solver = (
         from_nothing(qp)
         if not isinstance(qp, str)
@@ -131,50 +133,26 @@ def minimize_max(
 
     def tell(step: Step) -> None:
         if callback is not None:
-            value = step.value * problem.size
-            callback(result(fun=value, nit=step.iteration, kkt=step.kkt))
+            callback(result(fun=step.value, nit=step.iteration, kkt=step.kkt))
 
     settings = Sqp(tolerance=tol, iterations=maxiter, hessian="bfgs")
     given = callable(jac) or jac == "cs"
     if given and (wrong := mistaken(problem, x, *ends)):
         return without_gradient(problem, x, count, wrong)
     best = minimax.solve(problem, x, solver, settings, tell)
+    if jac == "2-point" and best.status in (Status.STALLED, Status.FAILED):  # too coarse
+        slopes = derivative(function, "3-point", args, count, length)
+        problem = replace(problem, jacobian=slopes)
+        best = minimax.solve(problem, best.x, solver, settings, tell)
     for _ in range(ESCAPES):
         lower = below(problem, best.x) if best.status is Status.CONVERGED else None
         if lower is None:
             break
         best = minimax.solve(problem, lower, solver, settings, tell)
-    best = sharpened(problem, x, best, solver, settings, tell)
     far = best.status is not Status.CONVERGED and falls_on(problem, x, best.x)
     if given and not far and (wrong := mistaken(problem, best.x, *ends)):
         return without_gradient(problem, best.x, count, wrong)
-    return answer(best, function(best.x), problem.size, count, endless=far)
-
-
-def sharpened(
-    problem: MaxOfFunctions,
-    start: Array,
-    best: Optimum[Array],
-    solver: Solver,
-    settings: Sqp,
-    tell: Callable[[Step], None],
-) -> Optimum[Array]:
-    """The answer, or a lower one by a finer tolerance where it is small beside the start's."""
-    first = float(np.abs(problem.evaluate(start)[0]).max())
-    for _ in range(ROUNDS):
-        if best.status is not Status.CONVERGED or abs(best.value) > SMALL * first:
-            break
-        settings = replace(settings, tolerance=FINER * settings.tolerance)
-        finer = minimax.solve(problem, best.x, solver, settings, tell)
-        keeps = finer.kkt.violation <= max(best.kkt.violation, settings.tolerance)
-        if not (keeps and finer.value < best.value):
-            break
-        gained = best.value - finer.value
-        status, steps = Status.CONVERGED, best.iterations + finer.iterations
-        best = replace(finer, status=status, iterations=steps)
-        if gained <= settings.tolerance * first:
-            break
-    return best
+    return answer(problem, best, count, endless=far)
 
 
 def mistaken(problem: MaxOfFunctions, x: Array, low: Any, high: Any) -> str:
@@ -183,11 +161,11 @@ def mistaken(problem: MaxOfFunctions, x: Array, low: Any, high: Any) -> str:
     Along a few directions between the bounds, at x and, against a kink just there, beside it.
     """
     rng = np.random.default_rng(0)
-    reach = np.maximum(np.abs(x), 1.0)
+    reach = problem.reach(x)
     found: list[set[int]] = []
     beside = x + NEARBY * reach * rng.uniform(-1.0, 1.0, size=len(x))
     for place in (x, np.clip(beside, low, high)):
-        slopes, values = problem.jacobian(place) / problem.size, problem.evaluate(place)[0]
+        slopes, values = problem.jacobian(place), problem.evaluate(place)[0]
         if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(values))):
             return ""
         off = np.zeros(len(values), dtype=bool)
@@ -247,13 +225,13 @@ def below(problem: MaxOfFunctions, x: Array) -> Array | None:
     None where there is none, or where the multipliers balance gradients that do not vanish.
     """
     here = problem.linearise(x)
-    worst = float(here.f.max())
-    active = here.f >= worst - FLAT * max(abs(worst), 1.0)
-    if np.abs(here.jacobian[active]).max(initial=0.0) > FLAT:
+    worst, reach = float(here.f.max()), problem.reach(x)
+    level = max(abs(worst), problem.size)
+    active = here.f >= worst - FLAT * level
+    if np.abs(here.jacobian[active] * reach).max(initial=0.0) > FLAT * level:
         return None
-    reach = NEARBY * np.maximum(np.abs(x), 1.0)
-    steps = np.concatenate([np.diag(reach), -np.diag(reach)])
-    best, found = worst - FLAT**2 * max(abs(worst), 1.0), None
+    steps = NEARBY * np.concatenate([np.diag(reach), -np.diag(reach)])
+    best, found = worst - FLAT**2 * level, None
     for step in steps:
         f, c = problem.evaluate(x + step)
         inside = np.all(c >= problem.lower) and np.all(c <= problem.upper)
@@ -270,14 +248,14 @@ def result(**fields: Any) -> OptimizeResult:
 
 
 def answer(
-    best: Optimum[Array], values: Array, size: float, count: Count, *, endless: bool
+    problem: MaxOfFunctions, best: Optimum[Array], count: Count, *, endless: bool
 ) -> OptimizeResult:
-    """The result of a minimisation.  size: by which the functions were divided."""
+    """The result of a minimisation."""
     status = "unbounded" if endless else str(best.status)
     return result(
         x=best.x,
-        fun=float(values.max()),
-        values=values,
+        fun=best.value,
+        values=best.f,
         success=status == Status.CONVERGED,
         status=status,
         message=MESSAGES[status],
@@ -285,9 +263,9 @@ def answer(
         nfev=count.function,
         njev=count.jacobian,
         multipliers=best.mu,
-        constraint_multipliers=best.lam * size,
+        constraint_multipliers=best.lam,
         kkt=best.kkt.residual,
-        violation=best.kkt.violation,
+        violation=float(excess(best.c, problem.lower, problem.upper).max(initial=0.0)),
         notes=best.notes,
     )
 
@@ -312,20 +290,24 @@ def counted(function: Function, count: Count) -> Function:
 
 
 def derivative(
-    function: Function, jac: Callable[..., Any] | str, args: tuple[Any, ...], count: Count
+    function: Function,
+    jac: Callable[..., Any] | str,
+    args: tuple[Any, ...],
+    count: Count,
+    length: Array,
 ) -> Function:
-    """The Jacobian as a function of x alone.  Raises OptionError for an unknown kind."""
+    """The Jacobian as a function of x alone, differences by shares of x or of a length (n,).
+
+    Raises OptionError for an unknown kind.
+    """
 
     def run(x: Array) -> Array:
         count.jacobian += 1
         if callable(jac):
-            matrix = jac(x, *args)
-            return dense(matrix)
+            return dense(jac(x, *args))
         if jac == "cs":
             return complex_step(function, x)
-        if jac == "3-point":
-            return central(function, x)
-        return np.atleast_2d(approx_fprime(x, function))
+        return differences(function, x, np.maximum(np.abs(x), length), jac == "3-point")
 
     if not callable(jac) and jac not in ("cs", "3-point", "2-point"):
         raise OptionError(
@@ -340,14 +322,43 @@ def dense(matrix: Any) -> Array:
     return np.atleast_2d(np.array(whole, dtype=float))
 
 
-def central(function: Function, x: Array) -> Array:
-    """Derivative (m, n) by central differences; the error of the formula is of second order."""
-    size = np.finfo(float).eps ** (1.0 / 3.0) * np.maximum(np.abs(x), 1.0)
-    slopes = [
-        (function(x + step) - function(x - step)) / (2.0 * length)
-        for step, length in zip(np.diag(size), size, strict=True)
-    ]
-    return np.stack(slopes, axis=-1)
+def lengths(function: Function, x: Array, low: Any, high: Any) -> Array:
+    """(n,) over which a variable alone changes the functions by their size, at most its bounds.
+
+    By slopes and curvatures, since either may vanish at x; |x|, or 1 at 0, where both do.  Raises
+    OptionError for functions that make no sense at x.
+    """
+    f = function(x)
+    if f.ndim != 1 or not np.all(np.isfinite(f)):
+        raise OptionError("minimize_max: fun(x0) must be a vector of finite numbers")
+    size, width = np.abs(f).max(initial=0.0) or 1.0, np.where(high > low, high - low, np.inf)
+    first = length = np.minimum(np.where(x, np.abs(x), 1.0), width)
+    for _ in range(TRIES):
+        steps = PROBE * length
+        beyond, short = x + steps > high, x - steps < low
+        ahead = (
+            np.array([function(x + s) - f for s in np.diag(np.where(beyond, 0.0, steps))]) / size
+        )
+        back = np.array([function(x - s) - f for s in np.diag(np.where(short, 0.0, steps))]) / size
+        ahead = np.where(beyond[:, None], -back, ahead)
+        back = np.where(short[:, None] | ~np.isfinite(back), -ahead, back)
+        change = np.maximum(np.abs(ahead - back) / 2.0, np.sqrt(np.abs(ahead + back)))
+        seen = change.max(axis=1, initial=0.0)
+        found = steps / np.maximum(np.where(np.isfinite(seen), seen, 1.0), PROBE / FASTER)
+        found = np.minimum(found, width)
+        if np.all((found >= 0.1 * length) & (found <= 10.0 * length)):
+            break
+        length = np.where(found < length, found, np.sqrt(found * length))
+    return np.where(seen > 0.0, found, first)
+
+
+def differences(function: Function, x: Array, length: Array, central: bool) -> Array:
+    """The derivative (m, n) by differences, central or forward, in shares of a length (n,)."""
+    size = np.finfo(float).eps ** (1.0 / 3.0 if central else 0.5) * length
+    behind = [function(x - step) for step in np.diag(size)] if central else [function(x)] * len(x)
+    ahead = [function(x + step) for step in np.diag(size)]
+    rise = np.stack(ahead, axis=-1) - np.stack(behind, axis=-1)
+    return np.asarray(rise / ((1 + central) * size))
 
 
 def complex_step(function: Function, x: Array) -> Array:
@@ -370,8 +381,9 @@ class Rows:
     upper: Array
 
     @staticmethod
-    def of(n: int, bounds: Bounds | None, constraints: Sequence[Constraint]) -> Rows:
-        """Raises OptionError where sizes do not fit or a kind is unknown."""
+    def of(length: Array, bounds: Bounds | None, constraints: Sequence[Constraint]) -> Rows:
+        """Of variables with lengths (n,).  Raises OptionError where sizes or a kind do not fit."""
+        n = len(length)
         blocks = [] if bounds is None else [bound_rows(bounds, n)]
         curved = []
         for constraint in constraints:
@@ -389,7 +401,7 @@ class Rows:
         upper = [*(high for _, _, high in blocks), *(one_row(c.ub) for c in curved), nothing]
         rows = Rows(
             np.concatenate([np.zeros((0, n)), *(matrix for matrix, _, _ in blocks)]),
-            tuple(with_derivative(constraint) for constraint in curved),
+            tuple(with_derivative(constraint, length) for constraint in curved),
             np.concatenate(lower),
             np.concatenate(upper),
         )
@@ -426,12 +438,12 @@ def linear_rows(constraint: LinearConstraint, n: int) -> tuple[Array, Array, Arr
     return matrix, low.astype(float), high.astype(float)
 
 
-def with_derivative(constraint: NonlinearConstraint) -> tuple[Function, Function]:
+def with_derivative(constraint: NonlinearConstraint, length: Array) -> tuple[Function, Function]:
     """The function of a constraint and its derivative."""
     function = counted(lambda x: one_row(constraint.fun(x)), Count())
     kind = constraint.jac
     kind = kind if callable(kind) or kind in ("cs", "3-point") else "2-point"
-    return function, derivative(function, kind, (), Count())
+    return function, derivative(function, kind, (), Count(), length)
 
 
 def one_row(values: Any) -> Array:
@@ -446,31 +458,34 @@ def unknown(weights: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class MaxOfFunctions:
-    """A problem over R^n as `solvers.minimax` wants it; functions are divided by size."""
+    """A problem over R^n as `solvers.minimax` wants it.
+
+    size, length: of the functions and (n,) of the variables at the start.
+    """
 
     function: Function
     jacobian: Function
     rows: Rows
     size: float
+    length: Array
 
     @staticmethod
-    def at(x: Array, function: Function, jacobian: Function, rows: Rows) -> MaxOfFunctions:
-        """Divided by the largest gradient at x, or of its size where that is flat.
-
-        Raises OptionError for functions, gradients or constraints that make no sense at x.
-        """
-        first = function(x)
-        if first.ndim != 1 or not np.all(np.isfinite(first)):
-            raise OptionError("minimize_max: fun(x0) must be a vector of finite numbers")
-        slope = jacobian(x)
+    def at(
+        x: Array, function: Function, jacobian: Function, rows: Rows, length: Array
+    ) -> MaxOfFunctions:
+        """Raises OptionError for gradients that make no sense at x."""
+        first, slope = function(x), jacobian(x)
         if slope.shape != (len(first), len(x)):
             raise OptionError(
                 f"minimize_max: jac(x0) has shape {slope.shape}; {len(first)} functions of "
                 f"{len(x)} variables need {(len(first), len(x))}"
             )
-        steep = float(np.abs(slope).max(initial=0.0))
-        size = steep if steep > FLAT * float(np.abs(first).max()) else float(np.abs(first).max())
-        return MaxOfFunctions(function, jacobian, rows, size if size > 0.0 else 1.0)
+        size = float(np.abs(first).max(initial=0.0)) or 1.0
+        return MaxOfFunctions(function, jacobian, rows, size, length)
+
+    def reach(self, x: Array) -> Array:
+        """(n,) what counts as far at x."""
+        return np.maximum(np.abs(x), self.length)
 
     @property
     def lower(self) -> Array:
@@ -484,12 +499,12 @@ class MaxOfFunctions:
 
     def evaluate(self, x: Array) -> tuple[Array, Array]:
         """f and c."""
-        return self.function(x) / self.size, self.rows.values(x)
+        return self.function(x), self.rows.values(x)
 
     def linearise(self, x: Array) -> Linear:
         """f, c and their derivatives; the curvature is left to BFGS."""
         f, c = self.evaluate(x)
-        return Linear(f, self.jacobian(x) / self.size, c, self.rows.jacobians(x), unknown)
+        return Linear(f, self.jacobian(x), c, self.rows.jacobians(x), unknown)
 
     def step(self, x: Array, d: Array) -> Array:
         """The point moved."""

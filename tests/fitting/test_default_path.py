@@ -101,11 +101,10 @@ def test_steps_of_variable_projection_start_from_the_best_lengths(
 @pytest.mark.parametrize(("method", "least"), [("eliminated", 1e-5), ("raw", 1e-3)])
 @pytest.mark.parametrize("arm", ["irb2600", "irb120", "ur5e"])
 def test_the_papers_subgradient_answers_by_itself(arm: str, method: str, least: float) -> None:
-    """RMSE(phi) over the optimum; other arms end alike."""
+    """RMSE(phi) over the optimum; it is no success unless it is one, and says how far it came."""
     drawn = mc.load_robot(arm)
     data = mc.simulate(drawn, 60, 3, seed=0).data
     best, found = (mc.calibrate(drawn, data, qp=qp) for qp in ("daqp", f"subgradient:{method}"))
-    assert found.status == "converged"
     assert found.answered == {f"subgradient:{method}": found.work.qps}
     assert found.work.qp_residual > 1e-8
     assert found.work.warm_starts == 0
@@ -113,4 +112,12 @@ def test_the_papers_subgradient_answers_by_itself(arm: str, method: str, least: 
     assert found.minimax is not None
     over = np.sqrt(found.minimax.size.max() / best.minimax.size.max()) - 1.0
     assert over <= least
+    told = [n for n in found.notices if n.startswith("QP: to first order the largest function may")]
+    if found.status == "converged":
+        assert over <= 1e-6
+        assert not told
+    else:
+        assert found.status == "stalled"
+        offered = float(told[0].split(" fall by ")[1].split()[0])
+        assert 2.0 * over <= offered <= 0.05
     assert f"by subgradient:{method} (used as they are, relative residual up to" in found.headline()

@@ -270,8 +270,10 @@ def test_the_minimax_is_that_of_slsqp(objective: str, count: int) -> None:
         lambda x: x[-1], begin, jac=lambda x: slope, method="SLSQP",
         constraints={"type": "ineq", "fun": sizes}, options={"maxiter": 200, "ftol": 1e-12},
     )  # fmt: skip
-    assert theirs.success
-    assert_allclose(found.worst.size.max() ** 2, theirs.fun, rtol=1e-6)
+    reached = theirs.x[-1] - sizes(theirs.x).min()  # whatever it says of itself
+    assert found.worst.size.max() ** 2 <= reached * (1.0 + 1e-6)
+    assert_allclose(found.worst.size.max() ** 2, reached, rtol=1e-3)
+    assert found.worst.kkt.residual <= 1e-6
     assert found.worst.size.max() < found.worst.before
     assert_allclose(found.worst.multiplier.sum(), 1.0)
     assert found.worst.answered.keys() == {"daqp"}

@@ -180,7 +180,9 @@ def slsqp_value(problem: MinimaxProblem, x: State) -> float:
 def test_value_is_slsqps(robot: mc.Robot, noisy: Simulation) -> None:
     model, x = warm(robot, noisy.data)
     problem = worst_target(model, x, measured_distances(noisy.data), "two-sided")
-    assert_allclose(run(problem, x).value, slsqp_value(problem, x), rtol=1e-6)
+    ours, theirs = run(problem, x).value, slsqp_value(problem, x)
+    assert ours <= theirs * (1.0 + 1e-6)
+    assert_allclose(ours, theirs, rtol=1e-3)
 
 
 @pytest.mark.parametrize("form", ["two-sided", "squared", "off"])

@@ -1,8 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from problems import CLASSICS, Classic
-from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, approx_fprime
+from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, approx_fprime, linprog
 from scipy.sparse import csr_array
 
 import minimax_cal as mc
@@ -10,9 +12,13 @@ from minimax_cal.solvers.minimize import (
     MaxOfFunctions,
     Rows,
     below,
-    central,
     complex_step,
+    differences,
+    lengths,
 )
+from qp_backends import Problem, Solution
+from qp_backends import Status as QpStatus
+from qp_backends import solve as solve_qp
 
 
 @pytest.mark.parametrize("name", CLASSICS)
@@ -31,13 +37,16 @@ def test_complex_step_is_the_gradient(name: str) -> None:
         assert_allclose(exact[:, i], jacobian, rtol=0, atol=1e-7 * scale)
 
 
-def solve(classic: Classic, **more: object):  # type: ignore[no-untyped-def]
+def solve(classic: Classic, unit: object = 1.0, **more: object):  # type: ignore[no-untyped-def]
+    """The classic in variables times a unit, one for all or (n,)."""
+    unit = np.broadcast_to(np.asarray(unit, dtype=float), len(classic.start))
+    box = classic.bounds
     return mc.minimize_max(
-        classic.fun,
-        classic.start,
+        lambda x: classic.fun(x / unit),
+        classic.start * unit,
         jac="cs",
-        bounds=classic.bounds,
-        constraints=classic.constraints,
+        bounds=box and Bounds(box.lb * unit, box.ub * unit),
+        constraints=[LinearConstraint(c.A / unit, c.lb, c.ub) for c in classic.constraints],
         **more,  # type: ignore[arg-type]
     )
 
@@ -60,6 +69,92 @@ def test_classics_reach_their_published_optimum(name: str) -> None:
     assert np.abs(gradient).max() <= 1e-6 * max(1.0, np.abs(jacobians).max())
     assert_allclose(found.multipliers.sum(), 1.0, rtol=1e-12)
     assert found.multipliers.min() >= 0.0
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6, "mixed"])
+@pytest.mark.parametrize("name", CLASSICS)
+def test_the_unit_of_the_variables_does_not_matter(name: str, unit: float | str) -> None:
+    classic = CLASSICS[name]
+    if unit == "mixed":
+        unit = 10.0 ** np.random.default_rng(7).choice([-6, 0, 6], len(classic.start))
+    found = solve(classic, unit)
+    assert found.success, found.message
+    assert abs(found.fun - classic.best) <= 1e-6 * max(1.0, abs(classic.best))
+
+
+def least_polynomial(powers: np.ndarray, f: np.ndarray) -> float:
+    """The least of max |V z - f| by linprog, in an orthonormal basis of the powers, after scaling.
+
+    First the least squares are taken off, so that linprog's tolerances are relative to the value.
+    """
+    basis = np.sqrt(len(f)) * np.linalg.qr(powers / powers.max(axis=0))[0]
+    rest = f - basis @ np.linalg.lstsq(basis, f, rcond=None)[0]
+    size, (m, n) = np.abs(rest).max(), basis.shape
+    both = np.block([[basis, -np.ones((m, 1))], [-basis, -np.ones((m, 1))]])
+    found = linprog(
+        np.append(np.zeros(n), 1.0), both, np.concatenate([rest, -rest]) / size,
+        bounds=[(None, None)] * n + [(0.0, None)],
+        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+    )  # fmt: skip
+    return float(size * np.abs(rest / size - basis @ found.x[:n]).max())
+
+
+@pytest.mark.parametrize("jac", ["given", "2-point"])
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1e6], ids=["km", "m", "mm"])
+@pytest.mark.parametrize("degree", range(2, 10))
+def test_polynomials_are_fitted_in_any_unit(degree: int, unit: float, jac: str) -> None:
+    """Columns from 1 to 1e65; the value is linprog's, or it is no success."""
+    h = np.linspace(0.0, 30.0, 61)
+    powers = (unit * h[:, None]) ** np.arange(degree + 1)
+    slope = np.concatenate([powers, -powers])
+    succeeded = 0
+    for f in (np.exp(-h / 7.0), np.sin(h / 6.0), np.abs(h - 12.0)):
+        found = mc.minimize_max(
+            lambda z, f=f: slope @ z - np.concatenate([f, -f]),
+            np.zeros(degree + 1),
+            jac=jac if jac != "given" else lambda z: slope,
+        )
+        succeeded += found.success
+        if found.success:
+            assert_allclose(found.fun, least_polynomial(powers, f), rtol=1e-5)
+    assert succeeded >= (3 if degree < 7 else 1)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6, (1e6, 1e-6)])
+def test_constraints_scale_along(unit: object) -> None:
+    """min max(x, y) with x^2 + y^2 = 1, x - y >= 0.4, y >= -0.5, in any units: the same corner."""
+    found = mc.minimize_max(
+        lambda x: x / unit,
+        np.array([1.0, -0.1]) * unit,
+        jac="cs",
+        bounds=Bounds(np.array([-np.inf, -0.5]) * unit, np.inf),
+        constraints=[
+            LinearConstraint(np.array([[1.0, -1.0]]) / unit, 0.4, np.inf),
+            NonlinearConstraint(lambda x: ((x / unit) ** 2).sum(), 1.0, 1.0),
+        ],
+    )
+    assert found.success
+    assert_allclose(found.x / unit, [np.sqrt(0.75), -0.5], atol=1e-8)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_contradictions_are_said_in_any_unit(unit: float) -> None:
+    both = [LinearConstraint([[1.0 / unit]], 2.0, np.inf), LinearConstraint([[1.0]], -np.inf, unit)]
+    found = mc.minimize_max(lambda x: (x / unit) ** 2, [0.0], jac="cs", constraints=both)
+    assert (found.success, found.status) == (False, "infeasible")
+
+
+def test_a_qp_that_is_solved_badly_is_no_success() -> None:
+    """Answers a tenth off in every entry: the search goes on, and says how far it came."""
+
+    def rough(problem: Problem) -> Solution:
+        answer = solve_qp(problem, "daqp", tolerance=1e-9)
+        return replace(answer, x=0.9 * answer.x, y=1.1 * answer.y, status=QpStatus.INACCURATE)
+
+    for name in ("CB2", "Wong1", "Shor"):
+        found = solve(CLASSICS[name], qp=rough)
+        over = found.fun / CLASSICS[name].best - 1.0
+        assert over <= 1e-6 if found.success else found.status == "stalled"
 
 
 @pytest.mark.parametrize("qp", ["clarabel", "osqp", "proxqp"])
@@ -246,46 +341,56 @@ def test_a_constraint_has_the_derivative_that_it_names(jac: object) -> None:
 
 def test_central_differences_are_of_second_order() -> None:
     """On exp, whose third derivative is itself: h^2/6 with h = 6e-6, and rounding eps/h."""
-    x = np.array([0.3, 40.0])
-    found = central(lambda z: np.array([np.exp(z[0]), np.log(z[1])]), x)
-    assert_allclose(found, np.diag([np.exp(0.3), 1.0 / 40.0]), rtol=1e-9, atol=1e-10)
+    x, length = np.array([0.3, 40.0]), np.array([1.0, 40.0])
+    slopes = np.diag([np.exp(0.3), 1.0 / 40.0])
+
+    def fun(z: np.ndarray) -> np.ndarray:
+        return np.array([np.exp(z[0]), np.log(z[1])])
+
+    found = differences(fun, x, length, central=True)
+    assert_allclose(found, slopes, rtol=1e-9, atol=1e-10)
+    found = differences(fun, x, length, central=False)
+    assert_allclose(found, slopes, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_the_length_of_a_variable_is_found_from_zero(unit: float) -> None:
+    """Where exp, a square, a line and a fourth power at 0 change by the size 1 of all."""
+
+    def fun(x: np.ndarray) -> np.ndarray:
+        a, b, c, d, _ = x / unit
+        return np.array([np.exp(a), 1.0 + 4.0 * b**2, 0.1 * c - 1.0, d**4])
+
+    with np.errstate(over="ignore"):
+        found = lengths(fun, np.zeros(5), -np.inf, np.inf)
+    assert_allclose(np.log10(found[:3] / unit), np.log10([1.0, 0.5, 10.0]), rtol=0, atol=1.0)
+    assert 0.1 < found[3] / unit < 1e4  # by steps of 1e-4 of it, flat
+    assert found[4] == 1.0  # on which nothing depends
 
 
 def scaled(fun: object, x: np.ndarray, rows: Rows | None = None) -> MaxOfFunctions:
-    jacobian = lambda z: complex_step(fun, z)  # noqa: E731
-    return MaxOfFunctions.at(x, fun, jacobian, rows or Rows.of(len(x), None, []))
+    jacobian, length = lambda z: complex_step(fun, z), lengths(fun, x, -np.inf, np.inf)
+    return MaxOfFunctions.at(x, fun, jacobian, rows or Rows.of(length, None, []), length)
 
 
-@pytest.mark.parametrize(
-    ("fun", "size"),
-    [
-        (lambda x: np.array([3.0 * x[0], -7.0 * x[0]]), 7.0),
-        (lambda x: np.array([1e9 - 1.0 + x[0]]), 1e9),  # flat: a slope of a part in 1e9
-        (lambda x: np.array([0.0 * x[0]]), 1.0),
-    ],
-)
-def test_functions_are_divided_by_their_slope_or_else_their_size(fun: object, size: float) -> None:
-    problem = scaled(fun, np.array([1.0]))
-    assert problem.size == size
-    assert_allclose(problem.evaluate(np.array([2.0]))[0], np.real(fun(np.array([2.0]))) / size)  # type: ignore[operator]
-
-
-def test_the_way_down_from_a_flat_point_is_the_steepest() -> None:
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_the_way_down_from_a_flat_point_is_the_steepest(unit: float) -> None:
+    """A thousandth of the length over which the functions change by their size."""
     nowhere = np.zeros(2)
 
     def top(x: np.ndarray) -> np.ndarray:
-        a, b = x
+        a, b = x / unit
         return np.array([1.0 - a**2 - 3.0 * b**2 - 1e3 * b**3, -(a**2) - 1.0])
 
-    assert_allclose(below(scaled(top, nowhere), nowhere), [0.0, 1e-3])  # type: ignore[arg-type]
-    only = Rows.of(2, Bounds([-1.0, -1.0], [1.0, 0.0]), [])
-    assert_allclose(below(scaled(top, nowhere, only), nowhere), [0.0, -1e-3])  # type: ignore[arg-type]
+    down = below(scaled(top, nowhere), nowhere)
+    assert_allclose(down, [0.0, 1e-3 * np.sqrt(1.0 / 6.0) * unit], rtol=1e-4)  # type: ignore[arg-type]
+    only = Rows.of(np.ones(2), Bounds([-unit, -unit], [unit, 0.0]), [])
+    other = below(scaled(top, nowhere, only), nowhere)  # the cubic is against it there
+    assert_allclose(other, [1e-3 * np.sqrt(1.0 / 2.0) * unit, 0.0], rtol=1e-4)  # type: ignore[arg-type]
     for flat in (
         lambda x: np.array([1.0 + 0.0 * x[0]]),
         lambda x: np.array([1.0 + x[0] ** 2 + x[1] ** 2]),
         lambda x: np.array([1.0 + x[0]]),  # a slope: the search itself goes down
-        lambda x: np.array([1.0 - 1e-9 * x[0] ** 2]),  # less than rounding can tell
-        lambda x: np.array([-1e-7 * x[0] ** 2]),
     ):
         assert below(scaled(flat, nowhere), nowhere) is None
 
