@@ -203,8 +203,9 @@ def beyond_of(
     geometric = None
     if len(every) > len(free):
         train, names = data.take(~held), data.target_names
-        active = solved.identification.active[: 5 * robot.joints + 6 + 3 * len(names)]
-        model, state = refitted(robot, train, solved.state, active)
+        own = slice(5 * robot.joints + 6 + 3 * len(names))
+        active, weight = solved.identification.active[own], solved.estimator.model.prior.weight[own]
+        model, state = refitted(robot, train, solved.state, active, weight)
         geometric = Estimator(model, np.ones(len(names))), state
     found, error_of = parts(data, options.holdout_by), errors_of(robot, data, solved)
     claim = left_out(

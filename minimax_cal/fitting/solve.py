@@ -10,7 +10,7 @@ import numpy as np
 from minimax_cal.fitting import identify, start
 from minimax_cal.fitting.certificate import Certificate, certify
 from minimax_cal.fitting.checks import POOR_FIT
-from minimax_cal.fitting.identify import Identification, Reason
+from minimax_cal.fitting.identify import MAX_NAMED, Because, Identification, Reason
 from minimax_cal.fitting.minimax_problem import Distances, minimax_problem, trusted_distances
 from minimax_cal.fitting.options import (
     OFFSETS,
@@ -28,6 +28,7 @@ from minimax_cal.fitting.stations import steps_of, turned_in
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, point_share, uncertainty_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.grouping import clusters, groups
 from minimax_cal.measuring.history import Clock
@@ -74,6 +75,9 @@ LAST_STEPS = 20  # of the SQP are enough to say so; its QPs then go from backend
 MIN_GROWN_SINGULAR = 1e-2
 # of the cost: one that shows less joins if so much is left (of those arms, 0.1 to 0.4)
 MAX_REMAINING_COST = 0.5
+# times the drawing's own doubt, or as many times a usual link's: of a larger sigma the poses
+# hardly determine a link
+MAX_DOUBT = 10.0
 MAX_GROWTHS = 3  # times that it is asked again
 LEAST_POSES = 3  # of a target in the fit; with fewer its own place explains all
 PER = {"minimax": "target", "point": "point"}  # objectives that ask for the worst of something
@@ -262,7 +266,7 @@ def fit_cell(
     mix = NO_MIX
     if options.objective == "pose":
         check_poses(data)
-    stage = geometry(task, progress)
+    task, stage = by_drawing(task, geometry(task, progress), progress)
     if options.effects or data.frames:
         progress("effects")
         task, stage = with_effects(task, stage)
@@ -374,6 +378,44 @@ def geometry(task: Task, progress: Progress) -> Stage:
             break
         identification, robust = more, task.robust(model, squares)
     return Stage(task.base, identification, robust, robust.fit, notices=notices)
+
+
+def by_drawing(task: Task, stage: Stage, progress: Progress) -> tuple[Task, Stage]:
+    """The fit in which the drawing holds, by its own doubt, what the poses hardly determine.
+
+    Where the sigma of a link, by the poses alone, is many times the drawing's, the drawing is a
+    prior of all that it knows better: noise moves such links together, however far.  Not where
+    all sigmas are as large, nor where the drawing contradicts the data: as of another arm.
+    """
+    model, names, judged = stage.robust.model, task.base.names, task.judged
+    active, reasons = model.active, stage.identification.reasons
+    within = np.full(names.count, np.inf)
+    within[names.links] = np.repeat(task.robot.drawn_within, np.array([2, 3]) * names.joints)
+    spare = 3.0 * (model.counts[judged].sum() + (~judged).sum()) - active.sum()
+    noise, times = stage.squares.cost[0] / max(spare, 1.0), np.zeros(names.count)
+    for state in (task.frame.state, stage.state):  # the fit may have gone astray
+        gram = SumOfSquares(model).normal(state)[2]
+        variance = noise * np.diag(solve_normal(gram, np.eye(len(gram))))
+        sigma = np.sqrt(np.maximum(variance, 0.0))
+        times[active] = np.maximum(times[active], sigma / within[active])
+    usual = max(float(np.median(times[active & names.links])), 1.0) if times.any() else 1.0
+    vague = (times > MAX_DOUBT * usual) & np.isinf(task.sigma)
+    if task.robot.rough or not vague.any():
+        return task, stage
+    not_told = [name for name, why in reasons.items() if why.kind is Because.NOT_TOLD]
+    better = (times > usual) | np.isin(names.all, not_told)  # what the drawing knows better
+    sigma = np.where(better, np.minimum(task.sigma, within), task.sigma)
+    held = replace(task, sigma=sigma)
+    found = geometry(held, progress)
+    if stage.squares.cost[0] < MAX_REMAINING_COST * found.squares.cost[0]:
+        return task, stage  # the drawing contradicts the data
+    named = name_first([names.all[i] for i in np.flatnonzero(vague)], MAX_NAMED)
+    length, angle = 1e3 * np.array(task.robot.drawn_within)
+    said = (
+        f"these poses hardly determine {named}: the drawing holds them, to {length:g} mm and "
+        f"{angle:g} mrad (drawn_within of the robot); move all joints farther"
+    )
+    return held, replace(found, notices=(*found.notices, said))
 
 
 def wider(

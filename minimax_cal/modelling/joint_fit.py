@@ -95,12 +95,16 @@ def model_at(cell: Cell, poses: Measurements | Array) -> tuple[Model, State]:
     return extended(model, cell.robot, hidden, cell.state, cell.effects.terms)
 
 
-def refitted(robot: Robot, data: Measurements, start: State, active: Array) -> tuple[Model, State]:
+def refitted(
+    robot: Robot, data: Measurements, start: State, active: Array, weight: float | Array = 0.0
+) -> tuple[Model, State]:
     """Geometry alone by least squares, from a fit that is near, and where it ends.
 
     active: (p,) the geometric parameters that are free; so are the frames of further sessions.
+    weight: (p,) of the drawing as a prior.
     """
     model, begin = model_of(robot, data).only(active), replace(start, effects=np.zeros(0))
+    model = model.with_prior(replace(model.prior, weight=model.prior.weight + weight))
     if free := of_sessions(data.frames):
         model, begin = extended(model, robot, data, begin, free)
     return model, nearby(model, begin).x.take(np.array(0))
