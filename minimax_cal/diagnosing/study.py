@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -55,6 +55,8 @@ def studied(robot: Robot, data: Measurements, fit: Solved) -> Study:
     """A geometric fit linearised."""
     data = seen_from(data, fit.frames)
     model, state = model_of(robot, data), fit.state
+    weight = fit.estimator.model.prior.weight[: model.names.geometric]
+    model = model.with_prior(replace(model.prior, weight=weight))
     if fit.effects.terms:
         model, _ = extended(model, robot, data, state, fit.effects.terms)
     scene = scene_of(robot, data, model, state)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import minimax_cal as mc
+from minimax_cal.fitting.opened import open_result
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots.sampling import random_poses
@@ -58,3 +59,12 @@ def test_poses_that_determine_all_need_no_drawing() -> None:
     fit = mc.calibrate("ur10", data, "sum")
     assert not fit.prior.any()
     assert not any("drawing holds" in text for text in fit.notices)
+
+
+def test_a_diagnosis_holds_them_as_well() -> None:
+    """Its geometry is that of the calibration, to the rounds that weigh the prior."""
+    data, _ = measured(2, 1.0)
+    fit = mc.calibrate("ur10", data, "sum", holdout=0.2)
+    found = open_result(mc.diagnose("ur10", data, quick=True), 1)
+    own = found.cell.robot.mdh
+    assert np.abs(own - fit.cell.robot.mdh).max() < 1e-4
