@@ -527,7 +527,8 @@ def worst_case(
         effects = settled(optimum.x.effects, model.room)
         optimum = replace(optimum, x=replace(optimum.x, effects=effects))
     if optimum.status is Status.STALLED and optimum.value * problem.size < MAX_ROUNDING**2:
-        optimum = replace(optimum, status=Status.CONVERGED)  # nothing but rounding is left
+        # nothing but rounding is left; the last note says how much that is
+        optimum = replace(optimum, status=Status.CONVERGED, notes=optimum.notes[:-1])
     certificate = None
     if per == "point" and optimum.status is not Status.FAILED:
         certificate = certify(problem, optimum, task.data.line)

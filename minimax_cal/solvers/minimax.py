@@ -301,9 +301,8 @@ def solve(
             status = ended
             break
     if status is Status.STALLED:
-        notes.append(
-            f"to first order the largest function may still fall by {at.offer():.1e} of it"
-        )
+        may = 100.0 * at.offer()
+        notes.append(f"to first order the largest function may still fall by {may:.2g} %")
     return Optimum(
         at.x, at.here.f, at.here.c, at.mu, at.lam, at.kkt, len(trace), status, tuple(trace),
         told_once(notes), dict(ask.answered), ask.warm, ask.residual,

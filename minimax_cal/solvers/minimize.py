@@ -141,9 +141,10 @@ def minimize_max(
         return without_gradient(problem, x, count, wrong)
     best = minimax.solve(problem, x, solver, settings, tell)
     if jac == "2-point" and best.status in (Status.STALLED, Status.FAILED):  # too coarse
-        slopes = derivative(function, "3-point", args, count, length)
+        slopes, steps = derivative(function, "3-point", args, count, length), best.iterations
         problem = replace(problem, jacobian=slopes)
         best = minimax.solve(problem, best.x, solver, settings, tell)
+        best = replace(best, iterations=steps + best.iterations)
     for _ in range(ESCAPES):
         lower = below(problem, best.x) if best.status is Status.CONVERGED else None
         if lower is None:

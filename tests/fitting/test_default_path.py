@@ -119,5 +119,5 @@ def test_the_papers_subgradient_answers_by_itself(arm: str, method: str, least: 
     else:
         assert found.status == "stalled"
         offered = float(told[0].split(" fall by ")[1].split()[0])
-        assert 2.0 * over <= offered <= 0.05
+        assert 200.0 * over <= offered <= 5.0
     assert f"by subgradient:{method} (used as they are, relative residual up to" in found.headline()

@@ -99,9 +99,11 @@ def least_polynomial(powers: np.ndarray, f: np.ndarray) -> float:
     return float(size * np.abs(rest / size - basis @ found.x[:n]).max())
 
 
-@pytest.mark.parametrize("jac", ["given", "2-point"])
 @pytest.mark.parametrize("unit", [1.0, 1e3, 1e6], ids=["km", "m", "mm"])
-@pytest.mark.parametrize("degree", range(2, 10))
+@pytest.mark.parametrize(
+    ("degree", "jac"),
+    [*((degree, "given") for degree in range(2, 10)), (3, "2-point"), (6, "2-point")],
+)
 def test_polynomials_are_fitted_in_any_unit(degree: int, unit: float, jac: str) -> None:
     """Columns from 1 to 1e65; the value is linprog's, or it is no success."""
     h = np.linspace(0.0, 30.0, 61)
