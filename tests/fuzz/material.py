@@ -11,6 +11,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import numpy as np
+import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
@@ -51,9 +52,10 @@ MADE: dict[str, bytes] = {}  # a process that runs cases is handed those of its 
 
 
 def material() -> dict[str, bytes]:
-    """Files by name, all of one simulated arm, made once."""
+    """Files by name, all of one simulated arm, made once.  Skips without MuJoCo."""
     if MADE:
         return MADE
+    pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
     before = Path.cwd()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)

@@ -143,7 +143,8 @@ def chinese(d: mc.Measurements) -> Export:
 
 
 def workbook(rows: list[list[object]]) -> bytes:
-    """A workbook of one sheet, in as little XML as a reader takes."""
+    """A workbook of one sheet, in as little XML as a reader takes.  Skips without a reader."""
+    pytest.importorskip("python_calamine", reason="python-calamine is not installed")
 
     def cell(value: object) -> str:
         if isinstance(value, str):
@@ -179,7 +180,6 @@ def workbook(rows: list[list[object]]) -> bytes:
 
 
 def excel(d: mc.Measurements) -> Export:
-    pytest.importorskip("python_calamine", reason="python-calamine is not installed")
     head: list[object] = ["Pkt", *(f"A{i + 1} [Grad]" for i in range(6))]
     head += [f"T{t + 1} {axis} [mm]" for t in range(TARGETS) for axis in "XYZ"]
     rows: list[list[object]] = [["Messung vom 24.11.2026"], head]
@@ -303,7 +303,6 @@ def test_patterns_of_names(
 
 
 def test_a_workbook_is_measurements(truth: mc.Measurements, tmp_path: Path) -> None:
-    pytest.importorskip("python_calamine", reason="python-calamine is not installed")
     head: list[object] = [*(f"q{i + 1}_rad" for i in range(6)), "smr1_x_mm", "smr1_y_mm"]
     rows: list[list[object]] = [[*head, "smr1_z_mm", "session"]]
     rows += [[*q.tolist(), *(1e3 * y[0]).tolist(), "may"]
