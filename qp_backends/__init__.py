@@ -5,13 +5,14 @@ from __future__ import annotations
 from .accuracy import Accuracy, accuracy
 from .elimination import eliminate
 from .judge import solve
-from .problem import BackendError, Problem, Solution, Status
+from .problem import BackendError, Problem, ProblemError, Solution, Status
 from .registry import available, fallback_order, names, register
 
 __all__ = [
     "Accuracy",
     "BackendError",
     "Problem",
+    "ProblemError",
     "Solution",
     "Status",
     "accuracy",

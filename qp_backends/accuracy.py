@@ -39,28 +39,34 @@ class Accuracy:
 
 HUGE = 1e100  # what is larger is as good as infinite, and its square may be
 NOWHERE = Accuracy(*(7 * [math.inf]))
+FINE = 1e-10  # residuals up to which the cheap sizes of the terms are good enough
+ROUNDING = 1e-6  # part of what could be there that counts as being there: rounding, at 1e-8
+CANCELS = 1e2  # times the largest that is left: so much of terms that cancel counts
+TINY = 1e-200  # makes 0 / 0 nothing
 
 
 def accuracy(problem: Problem, solution: Solution) -> Accuracy:
     """How far a solution is from optimal, by one formula for every backend.
 
-    The relative numbers divide by the size of what had to cancel, so that they do not change when
-    the objective or a row is multiplied by a number (‖.‖ is the largest absolute entry):
+    The relative numbers divide each entry by the size of its own terms, so that they do not change
+    when a variable, a row or the objective is given in other units (|.| is by entries)
+    [Oettli and Prager 1964: by how much the data must change for x and y to be exact]:
 
-    primal: violation / max(‖Ax‖, λ), each row first divided by its Euclidean norm, so that a
-    violation is the distance of x from the row's half-space.
-    dual: ‖Px + q + Aᵀy‖ / δ with δ = max(‖Px‖, ‖q‖, ‖Aᵀy‖).
-    gap: |gap| / max(|xᵀPx|, |qᵀx|, |uᵀy⁺ - lᵀy⁻|, δλ).
+    primal: the largest distance of a row to its bounds / max(|A||x|, |bound|).
+    dual: the largest entry of |Px + q + Aᵀy| / max(|P||x| + |A|ᵀ|y|, |q|).
+    gap: |gap| / max(|xᵀPx|, |qᵀx|, |uᵀy⁺ - lᵀy⁻|), or that of a row where it is larger: the
+    distance to the bound at which y pushes / max(|A||x|, |bound|), times the part of y in the
+    forces on the row's variables.
 
-    λ = min(1, δ / ‖P‖), the step on which the largest gradient meets the largest curvature, stands
-    in for the size of x where x vanishes (1 for a linear program, which has no curvature). Without
-    it an exact x = 0 with a rounding error would have an infinite relative residual.  For the same
-    reason δ, where q = 0, is at least ‖P‖ (1 if P = 0) times the distance to the farthest bound, or
-    times 1 if that is nearer.
+    Two limits keep rounding apart from terms (`_closely`).  Terms that cancel count for at most
+    CANCELS times the largest row or force that is left, in units in which P and A are well scaled:
+    else rows that contradict each other would be met by an x that is large enough.  And terms that
+    vanish count for a part of the largest that could be there.
     """
     if solution.x.shape != problem.q.shape or solution.y.shape != problem.l.shape:
         return NOWHERE
-    return _judged(problem, solution.x, solution.y)
+    with np.errstate(all="ignore"):
+        return _judged(problem, solution.x, solution.y)
 
 
 def _judged(problem: Problem, x: Array, y: Array) -> Accuracy:
@@ -77,44 +83,71 @@ def _judged(problem: Problem, x: Array, y: Array) -> Accuracy:
     Px, Ax, Aty = P @ x, A @ x, y @ A
     xPx, qx = float(x @ Px), float(q @ x)
     gap = abs(xPx + qx + support)
-    if not math.isfinite(gap):
+    inside = np.minimum(np.maximum(Ax, l), u)
+    outside, slope = np.abs(Ax - inside), np.abs(Px + q + Aty)
+    primal, dual = _size(outside), _size(slope)
+    if not (math.isfinite(gap) and math.isfinite(primal)):
         return NOWHERE
-    outside = Ax - np.minimum(np.maximum(Ax, l), u)
-    far = outside.any()
-    slope, dual = _size(q), _size(Px + q + Aty)
-    delta = max(slope, _size(Px), _size(Aty))
-    curvature = problem.curvature
-    if slope == 0.0:
-        delta = max(delta, (curvature or 1.0) * _reach(problem))
-    step = min(1.0, delta / curvature) if curvature > 0 else 1.0
-    return Accuracy(
-        primal=_size(outside) if far else 0.0,
-        dual=dual,
-        gap=gap,
-        primal_relative=_ratio(
-            _size(outside / problem.row_norm), max(_size(Ax / problem.row_norm), step)
-        )
-        if far
-        else 0.0,
-        dual_relative=_ratio(dual, delta),
-        gap_relative=_ratio(gap, max(abs(xPx), abs(qx), abs(support), delta * step)),
-        objective=0.5 * xPx + qx,
+    energy = max(abs(xPx), abs(qx), abs(support))
+    curved, rows = problem.magnitudes
+    parts, moved = curved @ np.abs(x) + np.abs(y) @ rows, rows @ np.abs(x)
+    force = np.maximum(np.maximum(np.abs(Px), np.abs(Aty)), np.abs(q))
+    goal = np.where(y == 0, inside, bound)
+    off = np.maximum(np.abs(Ax - goal), outside)
+    off = _size(off / (np.where(goal == 0, moved, np.abs(goal)) + TINY))
+    found = off, _size(slope / (parts + np.abs(q) + TINY)), max(off, gap / (energy + TINY))
+    most = CANCELS**2  # times FINE is no more than CANCELS times a tolerance of 1e-8
+    cancels = _size(moved) > most * _size(Ax) or _size(parts) > most * _size(force)
+    if cancels or not max(found) <= FINE:
+        apart = np.where(y == 0, 0.0, Ax - bound)
+        residuals = outside, slope, apart, gap
+        found = _closely(problem, x, y, Ax, residuals, (force, parts, moved, inside, bound), energy)
+    return Accuracy(primal, dual, gap, *found, 0.5 * xPx + qx)
+
+
+def _closely(
+    problem: Problem,
+    x: Array,
+    y: Array,
+    Ax: Array,
+    residuals: tuple[Array, Array, Array, float],
+    sizes: tuple[Array, ...],
+    energy: float,
+) -> tuple[float, float, float]:
+    """primal, dual and gap, relative, from residuals and the sizes of their terms.
+
+    length: how far rows go, by x, by their bounds, or by the step on which the largest pull meets
+    the largest curvature, all in good units.  reach: how far a variable goes, so far or until its
+    own gradient meets its own curvature.  A row whose bound is 0 is measured by what its variables
+    reach; a force on a variable without a pull of its own (q = 0), and all others, by a millionth
+    of such a limit.
+    """
+    outside, slope, apart, gap = residuals
+    force, parts, moved, *ends = sizes
+    (s, t), rows, bend = problem.scales, problem.magnitudes[1], problem.P.diagonal()
+    curvature, strength, rounding = _size(s * s * bend), _size(s * force), ROUNDING
+    newton = _size(s * problem.q) / (curvature + TINY)
+    length = max(_size(t * Ax), problem.farthest, min(newton, _size(x / s)))
+    if not problem.q.any():
+        strength = max(strength, length * curvature or 1.0)
+        rounding = ROUNDING if bend.any() else 1.0  # without objective no multiplier matters
+    force = np.maximum(force, np.minimum(parts, CANCELS * strength / s))
+    force += np.where(problem.q == 0, rounding, 0.0) * strength / s
+    reach = length * s
+    reach = np.where(bend > 0, np.minimum(reach, force / bend), reach)
+    moved, least = np.minimum(moved, CANCELS * length / t), rows @ reach
+    here, there = (
+        np.maximum(np.abs(end), moved) + np.where(end == 0, 1.0, ROUNDING) * least for end in ends
     )
-
-
-def _reach(problem: Problem) -> float:
-    """Distance from 0 to the farthest finite bound, at most 1; 1 where all bounds are 0 or open."""
-    ends = np.abs((problem.l, problem.u)) / problem.row_norm
-    farthest = float(np.where(np.isfinite(ends), ends, 0.0).max(initial=0.0))
-    return min(1.0, farthest or 1.0)
+    share = np.minimum(np.abs(y) * (rows @ (1.0 / (force + TINY))), 1.0)
+    gap /= energy + rounding * float(force @ reach) + TINY
+    return (
+        _size(outside / (here + TINY)),
+        _size(slope / (force + TINY)),
+        max(gap, _size(apart * share / (there + TINY))),
+    )
 
 
 def _size(vector: Array) -> float:
     """Largest absolute entry; NaN if there is one."""
     return float(np.abs(vector).max()) if vector.size else 0.0
-
-
-def _ratio(part: float, whole: float) -> float:
-    if part == 0:
-        return 0.0
-    return part / whole if whole > 0 else math.inf

@@ -13,6 +13,7 @@ from .problem import EMPTY, Status
 if TYPE_CHECKING:
     from .problem import Array, Matrix, Problem
 
+ROUNDING = 8 * float(np.finfo(float).eps)  # of a sum, relative to its terms
 CLEAR = 1e-7  # how clearly a proof must hold, relative to the size of its terms
 
 
@@ -81,10 +82,11 @@ def _farkas(problem: Problem, limit: float) -> Array:
     y = np.zeros(norm.size)
     y[up] += z[: up.size]
     y[low] -= z[up.size :]
-    # An x that the proof does not exclude would have to be larger than value / |Aᵀy|.
-    value, rest = -float(cost @ z), float(np.abs(A.T @ y).max(initial=0.0))
-    size = float(np.abs(cost[z > 0]).max(initial=0.0))
-    return y / norm if value > CLEAR * size and value > rest / CLEAR else EMPTY
+    # Aᵀy is 0 but for rounding, which an x as far away as the farthest row must not outweigh.
+    reach = problem.farthest * problem.scales[0]
+    rounding = ROUNDING * y.size * float(np.abs(y) @ (abs(A) @ reach))
+    clear = -float(cost @ z) > max(CLEAR * float(np.abs(cost) @ z), rounding)
+    return y / norm if clear and _vanishes(A.T, y) else EMPTY
 
 
 def _ray(problem: Problem, limit: float) -> Array:
@@ -109,8 +111,17 @@ def _ray(problem: Problem, limit: float) -> Array:
     )
     if not d.size:
         return EMPTY
+    d = np.where(np.abs(d) > 1e-9, d, 0.0)
+    clear = -float(problem.q @ d) > CLEAR * float(np.abs(problem.q) @ np.abs(d))
     Ad = A @ d
-    leaves = max(np.max(Ad - high, initial=0.0), np.max(low - Ad, initial=0.0))
-    bends = float(np.abs(P @ d).max(initial=0.0))
-    falls = -float(problem.q @ d) / slope
-    return d if falls > CLEAR and max(leaves, bends) < 1e-8 * falls else EMPTY
+    leaves = np.flatnonzero((Ad > high) | (Ad < low))
+    return d if clear and _vanishes(P, d) and _vanishes(A[leaves], d) else EMPTY
+
+
+def _vanishes(matrix: Any, vector: Array) -> bool:
+    """Whether each entry of matrix @ vector is the rounding of its own terms, in any units.
+
+    What is left of x1 + a x2 along x2 is a, however small: it has nothing to cancel with.
+    """
+    left, terms = np.abs(matrix @ vector), abs(matrix) @ np.abs(vector)
+    return bool(np.all(left <= ROUNDING * len(vector) * terms))

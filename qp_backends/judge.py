@@ -6,15 +6,17 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from .accuracy import accuracy
 from .certificates import proof
 from .polish import polish
 from .problem import COLD, Problem, Solution, Status, nothing
 from .registry import Solver, backend, fallback_order
+from .scaling import equilibrate, in_units
 
 NO_ANSWER = (Status.INFEASIBLE, Status.UNBOUNDED, Status.FAILED)
-NEAR = 1e-2  # relative residual up to which an answer is worth polishing; beyond, it is wrong
+NEAR = 1e-2  # relative residuals up to which an answer is worth polishing; beyond, it is wrong
 # Methods of paper M as printed.  They answer every QP, none to a tolerance that an exact solver is
 # asked for, and are shown as they are: judged, but not replaced unless that is asked for.
 AS_THEY_ARE = ("subgradient:raw", "subgradient:eliminated")
@@ -69,8 +71,10 @@ def solve(
     given = fallback if fallback is not None else True
     others = fallback_order(problem) if given is True else tuple(given or ())
     queue = (name, *(other for other in others if other != name.partition(":")[0]))
-    job = Job(problem, tolerance, warm_start, start, start + time_limit)
-    return _persist(job, queue, raw)
+    scaled, s, t = equilibrate(problem)
+    to_scaled = partial(in_units, s=1.0 / s, t=1.0 / t)
+    job = Job(scaled, tolerance, to_scaled(warm_start), start, start + time_limit)
+    return in_units(_persist(job, queue, to_scaled(raw)), s, t)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +163,8 @@ def _improved(job: Job, name: str, raw: Solution) -> Solution:
 
 def _polished(job: Job, answer: Solution) -> Solution:
     """An answer, polished if it is nearly right."""
-    near = accuracy(job.problem, answer).worst <= NEAR
+    judged = accuracy(job.problem, answer)
+    near = max(judged.primal_relative, judged.dual_relative) <= NEAR  # the gap comes last
     return polish(job.problem, answer, job.tolerance) if near else answer
 
 

@@ -16,12 +16,17 @@ Array: TypeAlias = NDArray[np.float64]
 Matrix: TypeAlias = Any  # a dense Array or a csc_array; both know @, .T and .shape
 
 OPEN = 1e20  # what QP files write for infinity
+RIDGE = 1e-10  # of the diagonal of P: rounding, by which an eigenvalue may be below 0
 EMPTY: Array = np.zeros(0)
 EMPTY.flags.writeable = False
 
 
 class BackendError(ValueError):
     """A mistake of the caller: a wrong name, a missing package, data of the wrong shape."""
+
+
+class ProblemError(BackendError):
+    """Data of a problem that cannot be meant."""
 
 
 class Status(Enum):
@@ -63,9 +68,9 @@ def _matrix(value: Any, name: str) -> Matrix:
     else:
         matrix = entries = _array(value)
     if matrix.ndim != 2:
-        raise BackendError(f"{name} must have two dimensions, not {matrix.ndim}")
+        raise ProblemError(f"{name} must have two dimensions, not {matrix.ndim}")
     if not np.isfinite(entries).all():
-        raise BackendError(f"{name} holds NaN or infinite entries")
+        raise ProblemError(f"{name} holds NaN or infinite entries")
     return matrix
 
 
@@ -79,7 +84,7 @@ def _vector(value: Any, name: str, size: int) -> Array:
     """A float64 vector of the given size."""
     vector = _array(value)
     if vector.shape != (size,):
-        raise BackendError(f"{name} has shape {vector.shape}, expected ({size},)")
+        raise ProblemError(f"{name} has shape {vector.shape}, expected ({size},)")
     return vector
 
 
@@ -104,18 +109,23 @@ class Problem:
         P, A = _matrix(self.P, "P"), _matrix(self.A, "A")
         n, m = P.shape[0], A.shape[0]
         if P.shape != (n, n):
-            raise BackendError(f"P has shape {P.shape}, expected a square matrix")
+            raise ProblemError(f"P has shape {P.shape}, expected a square matrix")
         if A.shape[1] != n:
-            raise BackendError(f"A has {A.shape[1]} columns, but P has {n}")
+            raise ProblemError(f"A has {A.shape[1]} columns, but P has {n}")
         q = _vector(self.q, "q", n)
         l, u = _vector(self.l, "l", m), _vector(self.u, "u", m)  # noqa: E741
         if not np.isfinite(q).all():
-            raise BackendError("q holds NaN or infinite entries")
+            raise ProblemError("q holds NaN or infinite entries")
         if np.isnan(l).any() or np.isnan(u).any():
-            raise BackendError("l or u holds NaN; an open side is -inf or inf")
+            raise ProblemError("l or u holds NaN; an open side is -inf or inf")
         l, u = np.where(l > -OPEN, l, -np.inf), np.where(u < OPEN, u, np.inf)  # noqa: E741
         if not symmetric(P):
-            raise BackendError("P is not symmetric; give both triangles, for example (P + P.T) / 2")
+            raise ProblemError("P is not symmetric; give both triangles, for example (P + P.T) / 2")
+        if not convex(P):
+            raise ProblemError(
+                "P is not positive semidefinite: along some direction the objective curves down, "
+                "and what a solver finds is no minimum; add curvature to the diagonal of P"
+            )
         for name, value in (("P", P), ("q", q), ("A", A), ("l", l), ("u", u)):
             object.__setattr__(self, name, value)
 
@@ -129,9 +139,22 @@ class Problem:
         return np.where(norm > 0, norm, 1.0)
 
     @cached_property
-    def curvature(self) -> float:
-        """The largest entry of P, which stands on the diagonal, P being semi-definite."""
-        return float(self.P.diagonal().max(initial=0.0))
+    def magnitudes(self) -> tuple[Matrix, Matrix]:
+        """Absolute entries of P and A."""
+        return abs(self.P), abs(self.A)
+
+    @cached_property
+    def scales(self) -> tuple[Array, Array]:
+        """Units of x and of the rows in which P and A are well scaled: s (n,) and t (m,)."""
+        from .scaling import factors
+
+        return factors(*self.magnitudes)
+
+    @cached_property
+    def farthest(self) -> float:
+        """Distance from 0 to the farthest finite bound in these units, 1 if all are 0 or open."""
+        ends = np.abs((self.l, self.u)) * self.scales[1]
+        return float(np.where(np.isfinite(ends), ends, 0.0).max(initial=0.0)) or 1.0
 
     @cached_property
     def above(self) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -158,7 +181,37 @@ def symmetric(P: Matrix) -> bool:
     """Whether P equals its transpose but for rounding.  P: (n, n)."""
     if is_sparse(P):
         return bool(abs(P - P.T).max() <= 1e-9 * abs(P).max()) if P.nnz else True
-    return P.size == 0 or bool((P == P.T).all()) or bool(np.allclose(P, P.T, rtol=1e-9, atol=1e-9))
+    return bool((P == P.T).all()) or bool(np.abs(P - P.T).max() <= 1e-9 * np.abs(P).max())
+
+
+def convex(P: Matrix) -> bool:
+    """Whether P is positive semidefinite but for rounding.  P: (n, n) symmetric.
+
+    A Cholesky factorisation, which no unit of a variable changes, with RIDGE on the diagonal.
+    """
+    diagonal = P.diagonal()
+    lowest = diagonal.min(initial=np.inf)
+    if lowest < 0.0:
+        return False
+    if lowest == 0.0 and abs(P).sum(axis=0)[diagonal == 0.0].any():
+        return False
+    ridged = np.where(diagonal > 0.0, (1.0 + RIDGE) * diagonal, 1.0)
+    if not is_sparse(P):
+        factor = P.copy()
+        factor.flat[:: len(P) + 1] = ridged
+        return not P.size or bool(scipy.linalg.lapack.dpotrf(factor.T, overwrite_a=1)[1] == 0)
+    if P.nnz == np.count_nonzero(diagonal):
+        return True
+    matrix: Any = scipy.sparse.csc_matrix(P, copy=True)
+    matrix.setdiag(ridged)
+    try:  # without exchanges of rows this is the factorisation of a symmetric matrix
+        factors: Any = scipy.sparse.linalg.splu(
+            matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+    except RuntimeError:  # a pivot is exactly 0
+        return False
+    kept = bool((factors.perm_r == factors.perm_c).all())
+    return kept and bool(factors.U.diagonal().min() > 0.0)
 
 
 @dataclass(frozen=True, eq=False)

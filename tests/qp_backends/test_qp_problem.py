@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import sparse
 
-from qp_backends import BackendError, Problem
+from qp_backends import Problem, ProblemError
 
 
 def test_data_become_float_arrays_and_far_bounds_open():
@@ -37,7 +37,7 @@ def test_read_only_data_are_copied():
 )
 def test_what_cannot_be_meant_is_refused(change, message):
     data = {"P": np.eye(2), "q": np.zeros(2), "A": np.ones((1, 2)), "l": [0.0], "u": [1.0]}
-    with pytest.raises(BackendError, match=message):
+    with pytest.raises(ProblemError, match=message):
         Problem(**(data | change))
 
 
@@ -62,3 +62,35 @@ def test_one_sided_rows_say_the_same() -> None:
         assert inside == bool((rows @ x >= bound).all())
     assert problem.boxed
     assert not Problem(np.eye(2), np.zeros(2), A, [0.0, 1.0, 2.0], [0.0, 2.0, 3.0]).boxed
+
+
+STORED = pytest.mark.parametrize("stored", [np.array, sparse.csc_array])
+
+
+def free(P):
+    return Problem(P, np.zeros(P.shape[0]), np.zeros((0, P.shape[0])), [], [])
+
+
+@STORED
+@pytest.mark.parametrize("unit", [1e-8, 1.0, 1e8])
+@pytest.mark.parametrize("e", [1e-2, 1e-6, 1e-9])
+def test_a_saddle_or_a_maximum_is_refused(stored, unit, e):
+    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
+    units = np.outer([1.0, unit], [1.0, unit])
+    for P in (np.diag([1.0, -e]), -np.eye(2), turn @ np.diag([1.0, -e]) @ turn.T):
+        with pytest.raises(ProblemError, match="not positive semidefinite"):
+            free(stored(P * units))
+    for P in (np.array([[0.0, e], [e, 1.0]]), np.array([[1.0, 1.0 + e], [1.0 + e, 1.0]])):
+        with pytest.raises(ProblemError, match="not positive semidefinite"):
+            free(stored(P * units))
+
+
+@STORED
+def test_rounding_of_a_semidefinite_matrix_is_not_curvature(stored):
+    """Gram matrices of every rank, in units from 1e-8 to 1e8; the data are not changed."""
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        n = int(rng.integers(1, 12))
+        root = rng.normal(size=(rng.integers(0, n + 1), n)) * 10.0 ** rng.uniform(-8.0, 8.0, n)
+        P = root.T @ root
+        assert_array_equal(np.asarray(free(stored(P)).P @ np.eye(n)), P)

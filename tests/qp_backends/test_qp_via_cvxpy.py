@@ -8,11 +8,18 @@ from problems_qp import epigraph
 from qp_backends import Problem, solve
 
 pytest.importorskip("cvxpy")
+import cvxpy as cp
+
 from qp_backends import via_cvxpy
 
 
 @pytest.mark.parametrize("name", via_cvxpy.solvers())
 def test_each_of_its_solvers_gives_x_and_multipliers(name):
+    x = cp.Variable()
+    try:
+        cp.Problem(cp.Minimize(x**2), [x >= 1.0]).solve(solver=name)
+    except Exception as error:
+        pytest.skip(f"cvxpy lists {name} and cannot run it: {type(error).__name__}")
     problem = epigraph(np.random.default_rng(0))
     exact = solve(problem, "daqp")
     solution = solve(problem, f"cvxpy:{name}", fallback=False)
