@@ -101,12 +101,13 @@ def _judged(problem: Problem, x: Array, y: Array) -> Accuracy:
     if cancels or not max(found) <= FINE:
         apart = np.where(y == 0, 0.0, Ax - bound)
         residuals = outside, slope, apart, gap
-        found = _closely(problem, y, Ax, residuals, (force, parts, moved, inside, bound), energy)
+        found = _closely(problem, x, y, Ax, residuals, (force, parts, moved, inside, bound), energy)
     return Accuracy(primal, dual, gap, *found, 0.5 * xPx + qx)
 
 
 def _closely(
     problem: Problem,
+    x: Array,
     y: Array,
     Ax: Array,
     residuals: tuple[Array, Array, Array, float],
@@ -115,16 +116,20 @@ def _closely(
 ) -> tuple[float, float, float]:
     """primal, dual and gap, relative, from residuals and the sizes of their terms.
 
-    reach: how far a variable can go: until its gradient meets its curvature, or to the farthest
-    row.  A row whose bound is 0 is measured by what its variables can reach; a force on a variable
-    without a pull of its own (q = 0), and all others, by a millionth of such a limit.
+    length: how far rows go, by x, by their bounds, or by the step on which the largest pull meets
+    the largest curvature, all in good units.  reach: how far a variable goes, so far or until its
+    own gradient meets its own curvature.  A row whose bound is 0 is measured by what its variables
+    reach; a force on a variable without a pull of its own (q = 0), and all others, by a millionth
+    of such a limit.
     """
     outside, slope, apart, gap = residuals
     force, parts, moved, *ends = sizes
     (s, t), rows, bend = problem.scales, problem.magnitudes[1], problem.P.diagonal()
-    length, strength, rounding = max(_size(t * Ax), problem.farthest), _size(s * force), ROUNDING
+    curvature, strength, rounding = _size(s * s * bend), _size(s * force), ROUNDING
+    newton = _size(s * problem.q) / (curvature + TINY)
+    length = max(_size(t * Ax), problem.farthest, min(newton, _size(x / s)))
     if not problem.q.any():
-        strength = max(strength, length * _size(s * s * bend) or 1.0)
+        strength = max(strength, length * curvature or 1.0)
         rounding = ROUNDING if bend.any() else 1.0  # without objective no multiplier matters
     force = np.maximum(force, np.minimum(parts, CANCELS * strength / s))
     force += np.where(problem.q == 0, rounding, 0.0) * strength / s

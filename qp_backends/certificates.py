@@ -82,7 +82,10 @@ def _farkas(problem: Problem, limit: float) -> Array:
     y = np.zeros(norm.size)
     y[up] += z[: up.size]
     y[low] -= z[up.size :]
-    clear = -float(cost @ z) > CLEAR * float(np.abs(cost) @ z)
+    # Aᵀy is 0 but for rounding, which an x as far away as the farthest row must not outweigh.
+    reach = problem.farthest * problem.scales[0]
+    rounding = ROUNDING * y.size * float(np.abs(y) @ (abs(A) @ reach))
+    clear = -float(cost @ z) > max(CLEAR * float(np.abs(cost) @ z), rounding)
     return y / norm if clear and _vanishes(A.T, y) else EMPTY
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from . import child
 from .problem import COLD, BackendError, Problem, Solution, Status
+from .scaling import in_good_units
 
 Solver = Callable[..., Solution]
 
@@ -42,6 +43,7 @@ BACKENDS: dict[str, tuple[str, str]] = {  # name: (module, method)
     "subgradient": ("subgradient", "restarted"),  # also "subgradient:raw", "subgradient:eliminated"
 }
 DIRECT = {"daqp": "via_daqp", "quadprog": "via_quadprog"}  # "daqp:direct": without qpsolvers
+FRAIL = ("highs",)  # HiGHS 1.16 kills the process on P = diag(3e-14, 2e-4)
 CHOOSING = ("cvxpy", "subgradient", *DIRECT)  # those that take a choice after a colon
 PACKAGES = {  # where the package is not called like the backend: (module, distribution)
     "proxqp": ("proxsuite", "proxsuite"),
@@ -112,7 +114,7 @@ def _imported(family: str, choice: str) -> Solver:
     if choice:
         loaded.check(choice)
     solver: Solver = partial(loaded.solve, method=choice or method)
-    return solver
+    return in_good_units(solver) if (choice or method).lower() in FRAIL else solver
 
 
 def _pip(name: str) -> str:

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from .problem import Problem, Solution, Status, is_sparse
+from .problem import COLD, Problem, Solution, Status, is_sparse
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from .problem import Array, Matrix
 
 NEAR_ONE = 3.0  # powers of 2: solvers do not mind such units
@@ -43,7 +45,19 @@ def in_units(solution: Solution, s: Array, t: Array) -> Solution:
     certificate = solution.certificate
     if certificate.size:
         certificate = certificate * (t if solution.status is Status.INFEASIBLE else s)
-    return replace(solution, x=solution.x * s, y=solution.y * t, certificate=certificate)
+    with np.errstate(all="ignore"):  # an answer may be infinitely wrong
+        return replace(solution, x=solution.x * s, y=solution.y * t, certificate=certificate)
+
+
+def in_good_units(run: Callable[..., Solution]) -> Callable[..., Solution]:
+    """A backend that is given equilibrated problems only."""
+
+    def solve(problem: Problem, *, warm_start: Solution = COLD, **keywords: Any) -> Solution:
+        scaled, s, t = equilibrate(problem)
+        start = in_units(warm_start, 1.0 / s, 1.0 / t)
+        return in_units(run(scaled, warm_start=start, **keywords), s, t)
+
+    return solve
 
 
 def factors(P: Matrix, A: Matrix) -> tuple[Array, Array]:

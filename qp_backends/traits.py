@@ -25,7 +25,7 @@ class Trait:
     sparse_pace: the same for sparse data [s].
     warm: what of a warm start it takes, through qpsolvers' `initvals` and its own settings: "x",
     "dual" (x too, where multipliers are not at hand) or "all"; empty when it takes none.
-    shortest: rows of A that are shorter are scaled to length 1 first.
+    shortest: with rows of A that are shorter the problem is equilibrated first.
     definite: whether it refuses a P that is only semi-definite.
     fixed: settings of the first run.
     rescue: settings that are changed for a second run when the first finds nothing.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from . import child
 from .problem import COLD, EMPTY, BackendError, Solution, Status, dense
 from .quiet import ungreeted
 from .rows import Rows, multipliers, parts, split
+from .scaling import in_good_units
 from .traits import TRAITS, Trait, reason, settings
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def solve(
         return child.run(__name__, problem, method, tolerance, time_limit, warm_start)
     if trait.shortest and problem.row_norm.min(initial=1.0) < trait.shortest:
         run = partial(solve, method=method, tolerance=tolerance, time_limit=time_limit)
-        return _lengthened(problem, run, warm_start)
+        return in_good_units(run)(problem, warm_start=warm_start)
     rows = split(problem, trait.box)
     chosen = settings(method, tolerance, time_limit)
     given = warm_start.x.size == problem.q.size and bool(np.isfinite(warm_start.x).all())
@@ -58,17 +59,6 @@ def solve(
             raw = _run(qp, method, settings(method, tolerance, left) | dict(trait.rescue))
     answer = _answer(problem, rows, raw, method, time.perf_counter() - start)
     return replace(answer, warm=warm)
-
-
-def _lengthened(problem: Problem, run: Callable[..., Solution], guess: Solution) -> Solution:
-    """The answer by way of the problem with rows of length 1."""
-    row = problem.row_norm
-    A = sparse.diags_array(1.0 / row) @ problem.A
-    long = replace(problem, A=A, l=problem.l / row, u=problem.u / row)
-    if guess.y.shape == row.shape:
-        guess = replace(guess, y=guess.y * row)
-    answer = run(long, warm_start=guess)
-    return replace(answer, y=answer.y / row)
 
 
 def _model(problem: Problem, rows: Rows, trait: Trait) -> qpsolvers.Problem:

@@ -146,8 +146,8 @@ def test_the_users_own_order_is_kept(problem, own):
 
 
 def test_when_all_fail_the_best_answer_comes_back_with_all_reasons(problem, truth, own):
-    own("bad", lambda p: (truth.x + 0.05, truth.y))
-    own("worse", lambda p: (truth.x + 1.0, truth.y))
+    own("bad", lambda p: (truth.x + 0.5, truth.y))
+    own("worse", lambda p: (truth.x + 9.0, truth.y))
     solution = solve(problem, "worse", fallback=("bad",))
     assert solution.status is Status.INACCURATE
     assert solution.backend == "bad"
@@ -202,6 +202,17 @@ def test_rows_that_miss_each_other_by_little_are_still_contradictory(scale):
     A, bounds = scale * np.array([[1.0], [1.0]]), scale * np.array([1.0, 1.0001])
     problem = Problem([[1.0]], [0.0], A, [-np.inf, bounds[1]], [bounds[0], np.inf])
     assert solve(problem).status is Status.INFEASIBLE
+
+
+def test_rounding_of_a_bound_is_no_contradiction():
+    """x1 + x2 = 0 and 2 (x1 + x2) = 1e-16, in a box of 1."""
+    rows = np.vstack([[1.0, 1.0], [2.0, 2.0], np.eye(2)])
+    low, high = np.array([0.0, 1e-16, -1.0, -1.0]), np.array([0.0, 1e-16, 1.0, 1.0])
+    problem = Problem(np.eye(2), [1.0, -1.0], rows, low, high)
+    assert proof(problem)[0] is Status.FAILED
+    solution = solve(problem)
+    assert solution.solved
+    assert_allclose(solution.x, [-1.0, 1.0], rtol=1e-12)
 
 
 def test_an_unbounded_objective_over_contradictory_rows_is_infeasible():

@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from qp_backends import Problem, Status, available, solve
+from qp_backends.child import call
 
 BACKENDS = [*available(), *(["daqp:direct"] if "daqp" in available() else [])]
 INF = np.inf
@@ -134,3 +135,13 @@ def test_a_long_step_in_one_variable_hides_nothing_of_another():
             assert solution.status not in NEGATIVE
             if solution.solved:
                 assert_allclose(solution.x, [1e16, truth], rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.skipif("highs" not in available(), reason="HiGHS is not installed")
+def test_no_backend_takes_the_process_down():
+    """HiGHS 1.16 does on these data as they are: free() of an invalid pointer."""
+    rows = np.array([[8.86e-7, 7.98e-2], [2.139e-2, 1.927e3]])
+    P, bounds = np.diag([2.7e-14, 2.2e-4]), np.array([0.0, 1.298e5])
+    problem = Problem(P, [-1.8e-8, -4.04e-2], rows, bounds, bounds)
+    found = call("qp_backends.judge", "solve", problem, {"name": "highs"}, 60.0)
+    assert not any("process ended" in note for note in found.notes)
