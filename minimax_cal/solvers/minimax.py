@@ -272,8 +272,10 @@ def solve(
         hessian = at.hessian(settings.floor)
         plan = at.subproblem(hessian, ask)
         notes += plan.notes
-        if not plan.usable:
-            status = Status.FAILED
+        if not plan.usable:  # the point may be optimal all the same
+            best, status = at.balanced(), Status.FAILED
+            if best.is_nearly_optimal(tolerance):
+                at, status = best, Status.CONVERGED
             break
         if not plan.exact:
             best = at.balanced()
@@ -295,7 +297,7 @@ def solve(
             ended = at.arrived(tolerance, plan.exact)
         if ended is Status.STALLED or (ended is None and not length):
             best = at.balanced()  # the multipliers of its QP may be to blame
-            if best.kkt.residual <= NEARLY * tolerance:
+            if best.is_nearly_optimal(tolerance):
                 at, ended = best, Status.CONVERGED
         if ended is not None:
             status = ended
@@ -476,6 +478,13 @@ class Iterate(Generic[X]):
         if self.idle >= PATIENCE and (self.kkt.violation <= tolerance or not exact):
             return Status.STALLED
         return None
+
+    def is_nearly_optimal(self, tolerance: float) -> bool:
+        """Whether what is offered is the rounding of the value, or of that at the start."""
+        kkt, start = self.kkt, self.least / NOTHING
+        offered = max(kkt.stationarity, kkt.complementarity) * self.units.value
+        nothing = offered <= EPS * start and kkt.violation <= tolerance
+        return nothing or kkt.residual <= NEARLY * tolerance
 
     def moved(self, move: Array, x: X, there: Linear) -> Iterate[X]:
         """At the end of a step, less damped."""
