@@ -24,7 +24,7 @@ def test_the_result_is_the_one_of_the_first_command() -> None:
 def test_the_three_commands_print_what_is_quoted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
+    mujoco = pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
     part = README.partition("## Three commands")[2].partition("\n## ")[0]
