@@ -29,7 +29,7 @@ from minimax_cal.dynamics.given import (
     with_payload,
 )
 from minimax_cal.dynamics.laws import ANGLE, CURVE, LAWS, USUAL, Term, terms_of
-from minimax_cal.dynamics.links import LinkChange, body_as_given, carried
+from minimax_cal.dynamics.links import LinkChange, body_as_given, carried, weighing
 from minimax_cal.dynamics.logs.with_robot import LEAST_SCALE, MOST_SCALE
 from minimax_cal.dynamics.model import FRICTION, RIGID, Body, Normal, TorqueModel, first_body
 from minimax_cal.dynamics.probes import Unexplained, unexplained
@@ -195,10 +195,9 @@ def search(arm: Arm, logs: Logs, exclude: Sequence[str]) -> Found:
     every, lacking = terms_of(columns.scene, exclude)
     terms = [term for term in every if term.effect != "payload"]
     if len(terms) < len(every):
-        terms += carried(columns, terms)
+        terms += weighing(columns, terms, carried(columns, terms))
     white = whitening(logs, generous(columns, terms))
-    library = Library.of(dictionary_of(columns, white), terms, [])
-    choice = select(library)
+    choice = select(Library.of(dictionary_of(columns, white), terms, []))
     chosen = tuple(one.candidate.term for one in choice.found)
     hidden = [(effect, "all", "motion in which the rigid body does not imitate it")
               for effect, _ in choice.library.untestable]  # fmt: skip

@@ -13,9 +13,14 @@ from dynamics.motions import Extra, driven_torque, fourier, simulated, three_joi
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
+from experiments.motion_cases import MUJOCO, RATIO, Case, make
 from minimax_cal.cli import torques
+from minimax_cal.dynamics.laws import Term
+from minimax_cal.dynamics.links import weighing
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
-from minimax_cal.dynamics.rows import ROW_HZ
+from minimax_cal.dynamics.rows import ROW_HZ, prepare
+from minimax_cal.dynamics.scene import Arm, Scene
+from minimax_cal.dynamics.search import Columns
 from minimax_cal.ground.arrays import Array
 
 ARM = three_joints()
@@ -154,6 +159,22 @@ def test_two_payloads_are_two() -> None:
     assert found.keys() == {("run1", "run4"), ("run2", "run5")}
     for (mass, sigma), true in zip(found.values(), (2.6, 1.2), strict=True):
         assert abs(mass - true) < 4.0 * sigma < 0.03
+
+
+@pytest.mark.parametrize("mass", [0.0, 0.2])
+def test_what_has_no_weight_is_no_payload(mass: float) -> None:
+    logs = prepare(simulated(carried=(0.0, mass, 0.0), seed=3))
+    arm = Arm.of(ARM, np.ones(3), ARM.ratio, np.zeros(10), logs)
+    columns, term = Columns(Scene.of(arm, logs)), Term("payload", "L3", (("run1", 1.0),))
+    assert weighing(columns, [], [term]) == ([term] if mass else [])
+
+
+def test_runs_that_differ_by_an_inertia_carry_no_payload() -> None:
+    """Friction of another curve than the first that is tried made them differ."""
+    pytest.importorskip("mujoco")
+    made = make(Case("single", MUJOCO, (("degressive", 8),), 2078605665))
+    found = mc.diagnose_motion(made.robot, made.runs, ratio=RATIO, payload=made.payload)
+    assert names(found) == {"degressive:J1"}
 
 
 def test_currents_without_gains_show_no_kilograms() -> None:
