@@ -29,7 +29,7 @@ from minimax_cal.dynamics.given import (
     with_payload,
 )
 from minimax_cal.dynamics.laws import ANGLE, CURVE, LAWS, USUAL, Term, terms_of
-from minimax_cal.dynamics.links import SURE, LinkChange, body_as_given, carried
+from minimax_cal.dynamics.links import LinkChange, body_as_given, carried, weighing
 from minimax_cal.dynamics.logs.with_robot import LEAST_SCALE, MOST_SCALE
 from minimax_cal.dynamics.model import FRICTION, RIGID, Body, Normal, TorqueModel, first_body
 from minimax_cal.dynamics.probes import Unexplained, unexplained
@@ -67,7 +67,6 @@ LEAST_PEAK = 0.25  # speed that some joint must reach [rad/s, m/s]: slower, most
 MINOR = 0.05  # of the squared error that the step before leaves at a joint: worth less, it is minor
 MATTERS = 0.28  # of the remaining error's square at a joint, 15 % of its RMS: more has no name
 FOLD = 0.2  # about this share of the trajectories is left out in turn to judge a law
-WEIGHT = 4  # parameters of a payload that gravity shows: its mass and first moments
 SPLITS = 2  # of the groups in complementary halves, in which names are sought again
 FOUND_AGAIN = 0.75  # share of the halves in which a confirmed name is found
 SEED = 0  # of the halves
@@ -196,10 +195,9 @@ def search(arm: Arm, logs: Logs, exclude: Sequence[str]) -> Found:
     every, lacking = terms_of(columns.scene, exclude)
     terms = [term for term in every if term.effect != "payload"]
     if len(terms) < len(every):
-        terms += carried(columns, terms)
+        terms += weighing(columns, terms, carried(columns, terms))
     white = whitening(logs, generous(columns, terms))
-    library = Library.of(dictionary_of(columns, white), terms, [])
-    choice = select(library)
+    choice = select(Library.of(dictionary_of(columns, white), terms, []))
     chosen = tuple(one.candidate.term for one in choice.found)
     hidden = [(effect, "all", "motion in which the rigid body does not imitate it")
               for effect, _ in choice.library.untestable]  # fmt: skip
@@ -236,15 +234,11 @@ def fitted(found: Found, columns: Columns) -> Normal:
 
 
 def helpful(found: Found) -> Found:
-    """What was found, less payloads without weight, and laws that harm runs left out."""
-    logs, every = found.columns.scene.logs, parts_of(found.terms)
+    """What was found, less the laws that harm the joints of runs left out more than they help."""
+    logs = found.columns.scene.logs
     normal, known = fitted(found, found.columns), found.columns.error()
-    value = normal.solve(every)
-    sure = np.abs(value) > SURE * normal.spread(every, value)
-    weighing = [term for term in found.terms if term.effect != "payload"
-                or sure[normal.place[term.text]][:WEIGHT].any()]  # fmt: skip
-    fold = by_loads(folds_of(logs, FOLD, ()), logs, weighing)
-    kept = without_harmful(LeftOut.of(normal, known, known, fold), weighing)
+    fold = by_loads(folds_of(logs, FOLD, ()), logs, found.terms)
+    kept = without_harmful(LeftOut.of(normal, known, known, fold), found.terms)
     choice = replace(found.choice, found=tuple(
         one for one in found.choice.found if one.candidate.term in kept))  # fmt: skip
     return replace(found, choice=choice, terms=tuple(kept))

@@ -22,6 +22,7 @@ from minimax_cal.ground.arrays import Array
 CONTRADICTS = 1e-4  # p-value below which rows contradict a body that is not refitted
 ALIKE = 12.0  # of log likelihood, twice: links that explain as much
 SURE = 4.0  # standard deviations by which a parameter of a changed link differs from the given
+WEIGHT = 4  # parameters of a link that gravity shows: its mass and first moments
 ROUNDING = 1e-10  # of the largest singular value: what all runs carry alike is the last link's
 LINK = "link"  # part of a fit: parameters of the link that may have changed
 
@@ -175,3 +176,13 @@ def carried(columns: Columns, terms: Sequence[Term]) -> list[Term]:
     return [Term("payload", f"L{logs.joints}",
                  tuple((logs.names[r], 1.0) for r in np.flatnonzero(label == k)))
             for k in range(loads.shape[1]) if k != lightest]  # fmt: skip
+
+
+def weighing(columns: Columns, terms: Sequence[Term], loads: Sequence[Term]) -> list[Term]:
+    """The payloads that gravity shows, beside one variant of every other law: others are none."""
+    every = [*{term.key: term for term in reversed(terms)}.values(), *loads]
+    white = whitening(columns.scene.logs, generous(columns, every))
+    normal, parts = Normal.of(columns, white, every), parts_of(every)
+    value = normal.solve(parts)
+    sure = np.abs(value) > SURE * normal.spread(parts, value)
+    return [term for term in loads if sure[normal.place[term.text]][:WEIGHT].any()]

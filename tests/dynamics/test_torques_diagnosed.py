@@ -15,11 +15,12 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from experiments.motion_cases import MUJOCO, RATIO, Case, make
 from minimax_cal.cli import torques
-from minimax_cal.dynamics.diagnose import helpful, search
 from minimax_cal.dynamics.laws import Term
+from minimax_cal.dynamics.links import weighing
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
 from minimax_cal.dynamics.rows import ROW_HZ, prepare
-from minimax_cal.dynamics.scene import Arm
+from minimax_cal.dynamics.scene import Arm, Scene
+from minimax_cal.dynamics.search import Columns
 from minimax_cal.ground.arrays import Array
 
 ARM = three_joints()
@@ -164,9 +165,8 @@ def test_two_payloads_are_two() -> None:
 def test_what_has_no_weight_is_no_payload(mass: float) -> None:
     logs = prepare(simulated(carried=(0.0, mass, 0.0), seed=3))
     arm = Arm.of(ARM, np.ones(3), ARM.ratio, np.zeros(10), logs)
-    term = Term("payload", "L3", (("run1", 1.0),))
-    kept = helpful(replace(search(arm, logs, ()), terms=(term,))).terms
-    assert kept == ((term,) if mass else ())
+    columns, term = Columns(Scene.of(arm, logs)), Term("payload", "L3", (("run1", 1.0),))
+    assert weighing(columns, [], [term]) == ([term] if mass else [])
 
 
 def test_runs_that_differ_by_an_inertia_carry_no_payload() -> None:
