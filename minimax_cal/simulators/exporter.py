@@ -59,7 +59,7 @@ def correct(job: Job) -> Export:
     arm = arm_of(job.cell, job.q, own)
     check_limits(chain, sample(job.robot) if job.q is None else job.q, given.source)
     document, notices = corrected(given, chain, job.nominal, arm, job.cell.target_names)
+    made = chain.in_model(given.compiled(document.root))  # before its files are named from there
     content = content_for(document, given.folder, job.path)
-    made = chain.in_model(given.compiled(document.root))
     off = Written(made, job.cell, arm, match(job.nominal, chain.seen)[0]).off
     return Export(content, (*notices, *told(arm)), beside(job.cell, arm), off)

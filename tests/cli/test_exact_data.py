@@ -67,7 +67,6 @@ def test_commands_take_exact_points(off: Any, tmp_path: Path, robot: mc.Robot) -
         ("compare", fit, fit),
         ("map", fit, poses, "--samples", "200"),
         ("iso9283", fit),
-        ("tradeoff", "irb2600", poses, "--steps", "2"),
         ("compensate", fit, targets, "--keep-anyway", "-o", tmp_path / "out.csv"),
         ("plan", "irb2600", "--poses", "3", "--fit", fit, "--candidates", "30"),
         ("report", fit, gap, "--date", "2026-01-01", "-o", tmp_path / "r.html"),
