@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from minimax_cal.evidence.limits import LEAST_NOISE_DOF
-from minimax_cal.evidence.noise import Noise, Problem, costs, noise_of, told_apart, triangles
+from minimax_cal.evidence.noise import RANK, Noise, Problem, costs, noise_of, told_apart, triangles
 from minimax_cal.evidence.ratios import NODES, RATIOS, ZERO, find_ratio, interpolation, nodes
 from minimax_cal.ground.arrays import Array
 
-LEAST = 1e-13  # of a column's square: what is left of one that geometry imitates is no less
+LEAST = RANK**2  # of a column's square: what is left of one that geometry imitates is no less
 BLOCK = 1_000_000  # weighed numbers that are held at once
 SHRINK = np.array([1.0, 0.4, 0.12, 0.03, 0.0])  # of the ratio, when an effect is added
 
@@ -303,6 +303,15 @@ class At:
     among: Callable[[Array], Array]
 
 
+def regularised(square: Array, whole: Array) -> Array:
+    """Squares of what geometry leaves of columns, such that no sum of unit columns is rounding.
+
+    whole: squares of the columns as they are.  What is added is a share of what is left: a column
+    and the same column with more geometry in it are one.
+    """
+    return np.asarray((1.0 + LEAST) * np.maximum(square, LEAST * whole))
+
+
 class Products:
     """Products for any ratio, of all rows.  kept: (N,) whether a row counts.
 
@@ -405,12 +414,13 @@ class Products:
         """
         chosen = np.append(1 + index, 0)
         gram = np.empty((len(ratios), len(chosen), len(chosen)))
-        logs, least = np.empty(len(ratios)), np.empty((len(ratios), len(index)))
+        logs, whole = np.empty(len(ratios)), np.empty((len(ratios), len(index)))
         for here, beside, between in self.views(ratios):
             gram[here] = np.tensordot(between, beside.square(chosen), 1)
-            least[here] = LEAST * (between @ beside.sums.squares()[index].T)
+            whole[here] = between @ beside.sums.squares()[index].T
             logs[here] = between @ beside.logs
-        gram[:, range(len(index)), range(len(index))] += least
+        each = range(len(index))
+        gram[:, each, each] = regularised(gram[:, each, each], whole)
         return gram, logs
 
     @property

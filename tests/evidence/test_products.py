@@ -13,6 +13,7 @@ from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence.bench import bench
 from minimax_cal.evidence.library import Library
+from minimax_cal.evidence.products import LEAST
 from minimax_cal.evidence.ratios import NODES, interpolation, nodes
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
@@ -91,6 +92,21 @@ def test_columns_are_stored_without_what_geometry_imitates(lib: Library, rough: 
     assert np.all(ROUNDING * size >= np.abs(clear @ rough.rows.basis).T)
     assert_allclose(lib.columns - clear.T, rough.rows.basis @ (rough.rows.basis.T @ lib.columns),
                     rtol=0, atol=ROUNDING * np.abs(lib.columns).max())  # fmt: skip
+
+
+def test_what_is_left_of_a_column_is_that_of_the_column_and_geometry(rough: Study) -> None:
+    """A thousand times as much geometry in it changes no product; geometry alone leaves least."""
+    products = arm_library(rough.scene, rough.rows).products
+    columns, basis = products.columns, rough.rows.basis
+    column = columns.raw[:, 3]
+    more = 1e3 * np.linalg.norm(column) * basis[:, 0]
+    (again, alone) = columns.append(np.stack([column + more, more], axis=1))
+    gram, _ = products.gram(np.zeros(1), np.array([3, again]))
+    rest = columns.clear[columns.fixed + 3]
+    assert_allclose(gram[0, :2, :2], rest @ rest, rtol=ROUNDING)
+    assert np.linalg.eigvalsh(gram[0, :2, :2])[0] > 0.5 * LEAST * rest @ rest  # the same, twice
+    gram, _ = products.gram(np.zeros(1), np.array([alone]))
+    assert gram[0, 0, 0] == pytest.approx(LEAST * more @ more, rel=ROUNDING)
 
 
 def test_candidates_stored_nowhere_compare_as_stored_ones(lib: Library) -> None:
