@@ -145,7 +145,7 @@ def read_back_fault(study: Study, choice: Choice) -> list[Fault]:
     """
     if not any(EFFECTS[c.term.effect].of_move for c in choice.chosen):
         return []
-    rest = rest_of(study.rows, choice.noise, choice.known, study.rows.width)
+    rest = rest_of(study.rows, choice.noise, choice.known, study.rows.turn)
     error = np.moveaxis(study.rows.back(rest.rows / rest.root), -1, 1)
     error = np.where(study.model.seen[..., None], error, np.nan)
     error = error @ study.fit.state.rotation.T

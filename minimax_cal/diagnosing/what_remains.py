@@ -38,7 +38,7 @@ def left_over(
     """What geometry and known columns (N, q) leave.  named: motions as `components` has them."""
     noise = anchored(restricted(rows, known), rows)
     asked = list(components(scene, rows, named))
-    return remains(rest_of(rows, noise, known, rows.width), asked) or (NOTHING,)
+    return remains(rest_of(rows, noise, known, rows.turn), asked) or (NOTHING,)
 
 
 def anchored(noise: Noise, rows: Problem) -> Noise:

@@ -85,8 +85,8 @@ class Rest:
     """What is left, white under the null hypothesis.
 
     rows: (N,).  basis: (N, p) orthonormal span of all that was fitted.  root: (N,) square roots of
-    the weights.  dof: degrees of freedom.  group: (m,) of visits to one pose, from 0.  width: of
-    rows a visit.
+    the weights.  dof: degrees of freedom.  group: (m,) of visits to one pose, from 0.  turn:
+    (m, r, r) rotations of a visit's measurements into its rows.
     """
 
     rows: Array
@@ -94,7 +94,12 @@ class Rest:
     root: Array
     dof: int
     group: Array
-    width: int
+    turn: Array
+
+    @property
+    def width(self) -> int:
+        """Rows of a visit."""
+        return int(self.turn.shape[1])
 
     @property
     def total(self) -> float:
@@ -121,8 +126,8 @@ class Rest:
         return np.asarray(np.einsum("mwd,mwb->dmb", moved, rows.reshape(shape), optimize=True))
 
 
-def rest_of(rows: Problem, noise: Noise, known: Array, width: int) -> Rest:
-    """Weighted rows without the span of nuisance and known columns (N, q)."""
+def rest_of(rows: Problem, noise: Noise, known: Array, turn: Array) -> Rest:
+    """Weighted rows without the span of nuisance and known columns (N, q).  turn: as in `Rest`."""
     root = np.sqrt(noise.weights(rows))
     columns = np.concatenate([rows.basis, known], axis=1) * root[:, None]
     norm = np.linalg.norm(columns, axis=0)
@@ -130,7 +135,7 @@ def rest_of(rows: Problem, noise: Noise, known: Array, width: int) -> Rest:
     rest = rows.error * root
     rest = rest - basis @ (basis.T @ rest)
     dof = rows.count - basis.shape[1]
-    return Rest(rest, basis, root, dof, rows.group[::width], width)
+    return Rest(rest, basis, root, dof, rows.group[:: turn.shape[1]], turn)
 
 
 def remains(rest: Rest, components: Sequence[Component]) -> tuple[Remains, ...]:
@@ -139,7 +144,10 @@ def remains(rest: Rest, components: Sequence[Component]) -> tuple[Remains, ...]:
     moving = [one for one in components if np.any(one.motion)]
     if not moving:
         return ()
-    drawn = rest.beside(rng.normal(size=(len(rest.rows), DRAWS)) * (rest.root > 0.0)[:, None])
+    # Drawn as measurements: the axes of rows that are alike, and all signs, are rounding's choice.
+    measured = rng.normal(size=(len(rest.group), rest.width, DRAWS))
+    white = (np.swapaxes(rest.turn, 1, 2) @ measured).reshape(-1, DRAWS)
+    drawn = rest.beside(white * (rest.root > 0.0)[:, None])
     drawn[:, 1:] *= np.sqrt(rest.total / max(rest.dof, 1))
     score, chance = largest(scores_of(rest, moving, drawn))
     order = np.argsort(-score).tolist()

@@ -13,6 +13,7 @@ from minimax_cal.ground.arrays import Array
 
 VISITS, WIDTH = 80, 6
 PLAIN = Noise(0.0, 1.0, 0.0)
+STRAIGHT = np.tile(np.eye(WIDTH), (VISITS, 1, 1))
 
 
 def problem(rng: np.random.Generator, error: Array) -> Problem:
@@ -43,7 +44,7 @@ def asked(rng: np.random.Generator) -> list[Component]:
 def rest(rng: np.random.Generator, error: Array) -> Rest:
     """What is left of an error."""
     none = np.zeros((len(error), 0))
-    return rest_of(problem(rng, error), PLAIN, none, WIDTH)
+    return rest_of(problem(rng, error), PLAIN, none, STRAIGHT)
 
 
 def test_what_fades_is_the_root_of_its_covariance() -> None:
@@ -96,8 +97,27 @@ def test_what_was_fitted_does_not_remain() -> None:
     what = asked(rng)
     field = what[4].motion[:, 0] * np.repeat(what[4].feature[0, 0], WIDTH)
     rows = problem(rng, rng.normal(size=VISITS * WIDTH) + 3.0 * field)
-    beside = rest_of(rows, PLAIN, field[:, None], WIDTH)
+    beside = rest_of(rows, PLAIN, field[:, None], STRAIGHT)
     assert remains(beside, what)[0].p > 0.01
     assert beside.dof == VISITS * WIDTH - 9
     fixed = [replace(one, motion=np.zeros_like(one.motion)) for one in what]
     assert remains(beside, fixed) == ()
+
+
+def test_the_axes_of_a_visits_rows_do_not_matter() -> None:
+    """Rows that are alike have any axes: those of `eigh` differ between processors."""
+    rng = np.random.default_rng(9)
+    what, rows = asked(rng), problem(rng, rng.normal(size=VISITS * WIDTH))
+    turn = np.linalg.qr(rng.normal(size=(VISITS, WIDTH, WIDTH)))[0]
+
+    def turned(columns: Array) -> Array:
+        shape = VISITS, WIDTH, -1
+        return np.asarray((np.swapaxes(turn, 1, 2) @ columns.reshape(shape)).reshape(columns.shape))
+
+    other = replace(rows, error=turned(rows.error), basis=turned(rows.basis))
+    none = np.zeros((VISITS * WIDTH, 0))
+    straight = remains(rest_of(rows, PLAIN, none, STRAIGHT), what)
+    what = [replace(one, motion=turned(one.motion)) for one in what]
+    for one, same in zip(straight, remains(rest_of(other, PLAIN, none, turn), what), strict=True):
+        assert (one.name, one.p) == (same.name, same.p)
+        assert (one.score, one.share) == pytest.approx((same.score, same.share), rel=1e-9)
