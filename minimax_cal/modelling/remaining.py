@@ -113,7 +113,7 @@ def sight(scene: Scene, i: int) -> tuple[Array, Array]:
 
 def own(scene: Scene, j: int) -> Drivers:
     """What one joint's turn may follow of its own: (f, m) each."""
-    q, u = scene.q[j], unit(scene.gravity[j])
+    q, u = scene.q[j], unit(scene.gravity[j], scene.gravity)
     side, v = scene.each("approach")[j], unit(scene.each("move")[j])
     others = [i for i in turning(scene) if i != j]
     pairs = list(combinations(turning(scene), 2))
@@ -148,9 +148,7 @@ def together(scene: Scene) -> Drivers:
     """What bodies follow: attitude, loads, their past, all joints."""
     g = (scene.links.axes * -scene.robot.up[:, None]).sum(axis=1)
     attitude = [*g, g[0] * g[1], g[1] * g[2], g[2] * g[0], g[0] ** 2 - g[1] ** 2]
-    load = np.array([unit(row) for row in scene.gravity if row.any()])
-    if not len(load):
-        load = np.zeros((1, scene.poses))
+    load = np.array([unit(row, scene.gravity) for row in scene.gravity])
     moment = hanging(scene)
     return {
         "the tool's attitude": np.array(attitude),
@@ -199,7 +197,7 @@ def hanging(scene: Scene) -> Array:
     """(3, m) moment of what hangs on the foot, of one size."""
     mass, com = scene.masses
     moment, _ = scene.load_beyond(0, mass, com)
-    return np.array([unit(row) for row in moment])
+    return np.array([unit(row, moment) for row in moment])
 
 
 def curve(x: Array, length: float) -> Array:
@@ -247,6 +245,8 @@ def wound(move: Array) -> Array:
     return out / max(usual, MIN_SPAN)
 
 
-def unit(x: Array) -> Array:
-    """Values scaled to a largest size of 1; zeros stay."""
-    return np.asarray(x / max(float(np.abs(x).max(initial=0.0)), 1e-300))
+def unit(x: Array, beside: Array | float = 0.0) -> Array:
+    """Values scaled to a largest size of 1; zeros stay, and rounding beside larger ones is 0."""
+    size = float(np.abs(x).max(initial=0.0))
+    is_real = size > MIN_SPAN * float(np.abs(beside).max(initial=0.0))
+    return np.asarray(x / max(size, 1e-300) * is_real)

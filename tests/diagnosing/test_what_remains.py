@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from problems_fit import study
 
 from experiments import machines
@@ -19,7 +20,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.remaining import curve, faded, tilts, wound
+from minimax_cal.modelling.remaining import curve, faded, own, tilts, together, wound
 from minimax_cal.robots.kinematics import chain, points
 from minimax_cal.robots.robot import Robot
 
@@ -171,3 +172,13 @@ def test_drivers_of_the_past_are_those_of_the_past() -> None:
     assert (
         curve(np.linspace(0.0, 3.0, 50), 0.15).shape[0] > curve(np.linspace(0, 3, 50), 1.0).shape[0]
     )
+
+
+def test_a_load_that_is_rounding_drives_nothing(rng: np.random.Generator) -> None:
+    """An upright joint carries none: what rounding leaves of it is no load of its own size."""
+    scene = study(3e-6, 1.0, 2).scene
+    rounded = replace(scene)
+    vars(rounded)["gravity"] = scene.gravity + 1e-13 * rng.normal(size=scene.gravity.shape)
+    assert not own(rounded, 0)["its load"].any()
+    for name, feature in together(scene).items():
+        assert_allclose(together(rounded)[name], feature, rtol=0, atol=1e-9, err_msg=name)
