@@ -40,10 +40,19 @@ GONE: dict[str, str] = {}
 ADDED: dict[str, str] = {}
 CHANGED: dict[str, str] = {}
 RENAMED: dict[str, str] = {}  # keys of before by what they are called now
+# What rounding leaves of larger numbers, and how far off it may be: a difference of coordinates of
+# metres, a certificate.
+ROUNDING = {
+    **dict.fromkeys(("*_mm*", "*_mrad*", "*_deg*", "*/power", "*multiplier", "*/gap"), 1e-9),
+    **dict.fromkeys(("*/kkt*", "*violation", "*qp_residual"), 1e-8),
+    "*/arrays/*": 1e-11,
+}
 TIMES = {"seconds", "versions", "date", "cpu_seconds"}  # keys that no two runs share
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 # What no two runs share: progress, durations, hashes of files that hold one.
-CLOCKED = re.compile(r"^progress: .*\n|\b\d+\.\d+ s\b|\b[0-9a-f]{64}\b", re.M)
+CLOCKED = re.compile(
+    r"^(?:progress: |compiling kernels ).*\n|\b\d+\.\d+ s\b|\b[0-9a-f]{64}\b", re.M
+)
 
 # name: command.  @ is a file of INPUTS; others were written by the commands above.
 COMMANDS = """
@@ -264,22 +273,24 @@ def answer_of(folder: Path, name: str) -> dict[str, Any]:
 
 def differences(one: Any, other: Any, rel: float, at: str) -> Iterator[str]:
     """Where two contents differ, but for what the tables accept."""
-    for place, what in unlike(one, other, rel, at):
+    for place, what, off in unlike(one, other, rel, at):
+        least = max((ROUNDING[name] for name in ROUNDING if fnmatchcase(place, name)), default=0.0)
         table = {ONLY_BEFORE: GONE, ONLY_NOW: ADDED}.get(what, CHANGED)
-        if not any(fnmatchcase(place, pattern) for pattern in table):
+        if not (off <= least or any(fnmatchcase(place, pattern) for pattern in table)):
             yield f"{place}: {what}"
 
 
-ONLY_BEFORE, ONLY_NOW = "only before", "only now"
+ONLY_BEFORE, ONLY_NOW, WHOLLY = "only before", "only now", float("inf")
+Unlike = tuple[str, str, float]
 
 
-def unlike(one: Any, other: Any, rel: float, at: str) -> Iterator[tuple[str, str]]:
-    """Places and how they differ; a number may be off relative to the largest beside it."""
+def unlike(one: Any, other: Any, rel: float, at: str) -> Iterator[Unlike]:
+    """Where, how and how far; a number may be off relative to the largest beside it."""
     if isinstance(one, dict) and isinstance(other, dict):
         one = {RENAMED.get(key, key): value for key, value in one.items()}
         for key in sorted((one.keys() | other.keys()) - TIMES):
             if key not in one or key not in other:
-                yield f"{at}/{key}", ONLY_BEFORE if key in one else ONLY_NOW
+                yield f"{at}/{key}", ONLY_BEFORE if key in one else ONLY_NOW, WHOLLY
             else:
                 yield from unlike(one[key], other[key], rel, f"{at}/{key}")
     elif isinstance(one, list) and isinstance(other, list):
@@ -287,16 +298,16 @@ def unlike(one: Any, other: Any, rel: float, at: str) -> Iterator[tuple[str, str
         for i, (a, b) in enumerate(zip(one, other, strict=False)):
             if isinstance(a, int | float) and isinstance(b, int | float):
                 if not close(a, b, rel, size):
-                    yield f"{at}[{i}]", f"{a!r} and {b!r}"
+                    yield f"{at}[{i}]", f"{a!r} and {b!r}", abs(a - b)
             else:
                 yield from unlike(a, b, rel, f"{at}[{i}]")
         if len(one) != len(other):
-            yield at, f"{len(one)} and {len(other)} entries"
+            yield at, f"{len(one)} and {len(other)} entries", WHOLLY
     elif isinstance(one, int | float) and isinstance(other, int | float):
         if not close(one, other, rel, abs(one)):
-            yield at, f"{one!r} and {other!r}"
+            yield at, f"{one!r} and {other!r}", abs(one - other)
     elif one != other:
-        yield at, f"{shown(one, other)} and {shown(other, one)}"
+        yield at, f"{shown(one, other)} and {shown(other, one)}", WHOLLY
 
 
 def shown(text: Any, other: Any) -> str:

@@ -42,6 +42,8 @@ def test_rounding_is_relative_to_the_largest_beside() -> None:
     assert found([4e3, 1e-15], [4e3, 5e-6]) != []
     assert found({"a": 1e-15, "b": 4e3}, {"a": 3e-15, "b": 4e3}) != []
     assert found({"seconds": 1.0}, {"seconds": 2.0}) == []
+    assert found({"a": {"rms_mm": 1e-12}}, {"a": {"rms_mm": -1e-12}}) == []
+    assert found({"a": {"rms_mm": 1e-12}}, {"a": {"rms_mm": 1e-8}}) != []
 
 
 def test_text_is_words_and_numbers() -> None:
