@@ -13,7 +13,7 @@ from scipy.special import fdtrc
 from minimax_cal.evidence.library import Aside, Candidate, Kind, Library, kinds
 from minimax_cal.evidence.limits import CREDIBLE, LINES
 from minimax_cal.evidence.noise import Noise, inflation, triangles
-from minimax_cal.evidence.products import LEAST, At, Products, within
+from minimax_cal.evidence.products import At, Products, regularised, within
 from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.bounded import bounded
 
@@ -375,7 +375,7 @@ def beside_priors(at: At, index: Array, ridge: Array) -> Array:
     """
     each = range(len(index))
     gram = at.lines[:, :, index].copy()
-    gram[:, each, each] = np.maximum(gram[:, each, each], LEAST * at.whole[:, index])
+    gram[:, each, each] = regularised(gram[:, each, each], at.whole[:, index])
     gram[:, each, each] += np.pad(ridge, (len(index) - len(ridge), 0))
     return gram
 

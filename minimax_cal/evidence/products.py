@@ -303,6 +303,15 @@ class At:
     among: Callable[[Array], Array]
 
 
+def regularised(square: Array, whole: Array) -> Array:
+    """Squares of what geometry leaves of columns, such that no sum of unit columns is rounding.
+
+    whole: squares of the columns as they are.  What is added is a share of what is left: a column
+    and the same column with more geometry in it are one.
+    """
+    return np.asarray((1.0 + LEAST) * np.maximum(square, LEAST * whole))
+
+
 class Products:
     """Products for any ratio, of all rows.  kept: (N,) whether a row counts.
 
@@ -405,13 +414,13 @@ class Products:
         """
         chosen = np.append(1 + index, 0)
         gram = np.empty((len(ratios), len(chosen), len(chosen)))
-        logs, least = np.empty(len(ratios)), np.empty((len(ratios), len(index)))
+        logs, whole = np.empty(len(ratios)), np.empty((len(ratios), len(index)))
         for here, beside, between in self.views(ratios):
             gram[here] = np.tensordot(between, beside.square(chosen), 1)
-            least[here] = LEAST * (between @ beside.sums.squares()[index].T)
+            whole[here] = between @ beside.sums.squares()[index].T
             logs[here] = between @ beside.logs
         each = range(len(index))
-        gram[:, each, each] = np.maximum(gram[:, each, each], least)
+        gram[:, each, each] = regularised(gram[:, each, each], whole)
         return gram, logs
 
     @property

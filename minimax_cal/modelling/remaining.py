@@ -248,5 +248,5 @@ def wound(move: Array) -> Array:
 def unit(x: Array, beside: Array | float = 0.0) -> Array:
     """Values scaled to a largest size of 1; zeros stay, and rounding beside larger ones is 0."""
     size = float(np.abs(x).max(initial=0.0))
-    told = size > MIN_SPAN * float(np.abs(beside).max(initial=0.0))
-    return np.asarray(x / max(size, 1e-300) * told)
+    is_real = size > MIN_SPAN * float(np.abs(beside).max(initial=0.0))
+    return np.asarray(x / max(size, 1e-300) * is_real)

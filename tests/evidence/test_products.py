@@ -104,6 +104,7 @@ def test_what_is_left_of_a_column_is_that_of_the_column_and_geometry(rough: Stud
     gram, _ = products.gram(np.zeros(1), np.array([3, again]))
     rest = columns.clear[columns.fixed + 3]
     assert_allclose(gram[0, :2, :2], rest @ rest, rtol=ROUNDING)
+    assert np.linalg.eigvalsh(gram[0, :2, :2])[0] > 0.5 * LEAST * rest @ rest  # the same, twice
     gram, _ = products.gram(np.zeros(1), np.array([alone]))
     assert gram[0, 0, 0] == pytest.approx(LEAST * more @ more, rel=ROUNDING)
 
