@@ -17,7 +17,7 @@ from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.set_aside import WithThem, aside_sentence
 from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.files import finite, number, plain
+from minimax_cal.ground.files import finite, number, plain, saved_content
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
@@ -29,7 +29,7 @@ from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.pose_rows import pose_rows
-from minimax_cal.modelling.cell import Cell, saved_content
+from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.words import name_effect, name_place, name_step
 from minimax_cal.modelling.frames import frames_of

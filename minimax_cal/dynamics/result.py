@@ -387,6 +387,6 @@ def load_motion(path: Path | str) -> MotionDiagnosis:
     --------
     >>> motion = mc.load_motion("motion.json")
     """
-    from minimax_cal.modelling.cell import saved_content  # only who reads a file waits for it
+    from minimax_cal.ground.files import saved_content  # only who reads a file waits for it
 
     return MotionDiagnosis.from_dict(saved_content(path), str(path))

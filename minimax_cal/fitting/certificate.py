@@ -8,14 +8,15 @@ much as the largest error at the start.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import starmap
+from typing import Annotated
 
 import numpy as np
 
 from minimax_cal.fitting.minimax_problem import MinimaxProblem
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import derived, fact
+from minimax_cal.ground.facts import Fact, derived
 from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.dual_bound import Rows, gap_of, lower_bound, of_squares
@@ -87,7 +88,7 @@ class DecidingPoint:
 
     target: str
     line: int
-    distance: float = field(metadata=fact(key="distance_mm", scale=1e3))
+    distance: Annotated[float, Fact(key="distance_mm", scale=1e3)]
     multiplier: float
 
 
@@ -104,8 +105,8 @@ class Certificate:
     points: that decide, the weightiest first; the multipliers sum to one over all points.
     """
 
-    value: float = field(metadata=fact(key="value_mm", scale=1e3))
-    bound: float = field(metadata=fact(key="bound_mm", scale=1e3))
+    value: Annotated[float, Fact(key="value_mm", scale=1e3)]
+    bound: Annotated[float, Fact(key="bound_mm", scale=1e3)]
     kkt: Kkt
     points: tuple[DecidingPoint, ...]
 

@@ -10,7 +10,7 @@ from functools import cache, cached_property
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, overload
+from typing import Annotated, Any, overload
 
 import numpy as np
 import scipy
@@ -27,8 +27,8 @@ from minimax_cal.fitting.set_aside import WithThem, aside_sentence
 from minimax_cal.fitting.suspects import Suspect, aside, table_of
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, quantile
 from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.facts import derived, fact, facts_in_words
-from minimax_cal.ground.files import finite, json_text, write_whole
+from minimax_cal.ground.facts import Fact, derived, facts_in_words
+from minimax_cal.ground.files import finite, json_text, saved_content, write_whole
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
@@ -40,7 +40,7 @@ from minimax_cal.measuring.grouping import clusters, grouped
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.spans import Span, spans_of
-from minimax_cal.modelling.cell import Cell, saved_content
+from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted
 from minimax_cal.modelling.effects.words import name_effect, name_parameter
@@ -308,8 +308,8 @@ class KeptDistance:
     """A distance between two targets that the minimax keeps [m]."""
 
     pair: tuple[str, str]
-    measured: float = field(metadata=fact(key="measured_mm", scale=1e3))
-    tolerance: float = field(metadata=fact(key="tolerance_mm", scale=1e3))
+    measured: Annotated[float, Fact(key="measured_mm", scale=1e3)]
+    tolerance: Annotated[float, Fact(key="tolerance_mm", scale=1e3)]
     multiplier: float
 
 
@@ -323,7 +323,7 @@ class WorstCase:
 
     functions: tuple[str, ...]
     size: Array
-    multiplier: Array = field(metadata=fact(key="multipliers"))
+    multiplier: Annotated[Array, Fact(key="multipliers")]
     active: tuple[str, ...]
     distances: tuple[KeptDistance, ...]
     kkt: Kkt
@@ -397,41 +397,41 @@ class Fit:
 
     cell: Cell
     nominal: Cell
-    objective: str = field(metadata=fact())
-    qp: str = field(metadata=fact())
-    status: Status = field(metadata=fact())
-    iterations: int = field(metadata=fact("{} iterations"))
-    seconds: float = field(metadata=fact("{:.2f} s"))
+    objective: str
+    qp: str
+    status: Status
+    iterations: Annotated[int, Fact("{} iterations")]
+    seconds: Annotated[float, Fact("{:.2f} s")]
     parameters: Parameters
     accuracy: Mapping[str, Accuracy]
     identification: Identification
     uncertainty: Uncertainty
-    minimax: WorstCase | None = field(metadata=fact())
-    certificate: Certificate | None = field(metadata=fact())
-    trace: tuple[float, ...] = field(metadata=fact(key="trace_mm2", scale=1e6))
+    minimax: WorstCase | None
+    certificate: Certificate | None
+    trace: Annotated[tuple[float, ...], Fact(key="trace_mm2", scale=1e6)]
     data: Measurements
     held: Array
     error_nominal: Array
     error: Array
-    notices: tuple[str, ...] = field(metadata=fact())
-    loss: str = field(metadata=fact())
-    suspects: tuple[Suspect, ...] = field(metadata=fact())
+    notices: tuple[str, ...]
+    loss: str
+    suspects: tuple[Suspect, ...]
     weights: Array
     share: Array
     prior: Array
-    widening: float = field(metadata=fact())
-    provenance: Provenance = field(metadata=fact())
+    widening: float
+    provenance: Provenance
     claim: Callable[[], Beyond]
     stated: Mapping[str, tuple[Interval, Interval]] | None = None
     error_crossed: Array = field(default_factory=NOT_CROSSED.copy)
-    set_aside: tuple[SetAside, ...] = field(default=(), metadata=fact())
+    set_aside: tuple[SetAside, ...] = ()
     with_them: WithThem | None = None
-    answered: Mapping[str, int] = field(default_factory=dict, metadata=fact())
-    work: Work = field(default=Work(), metadata=fact())
+    answered: Mapping[str, int] = field(default_factory=dict)
+    work: Work = Work()
     stated_geometric: Cell | None = None
     error_drawn_crossed: Array = field(default_factory=NOT_CROSSED.copy)
-    reason: str = field(default="", metadata=fact())
-    moved: tuple[Change, ...] = field(default=(), metadata=fact(key="between_sessions"))
+    reason: str = ""
+    moved: Annotated[tuple[Change, ...], Fact(key="between_sessions")] = ()
 
     def __repr__(self) -> str:
         after, known = self.within.after, sum(p.identifiable for p in self.parameters)

@@ -21,13 +21,14 @@ from minimax_cal.fitting.stations import MIN_FRAME_POINTS, moving
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
+from minimax_cal.ground.files import saved_content
 from minimax_cal.ground.records import AGAIN, checked, reading
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.spans import Span, spans_of
 from minimax_cal.measuring.stations import labels
-from minimax_cal.modelling.cell import Cell, cell_from_dict, saved_content
+from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import model_of

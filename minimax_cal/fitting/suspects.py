@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 from scipy.special import betaln, fdtr, fdtrc, fdtri
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import fact
+from minimax_cal.ground.facts import Fact
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import Model
@@ -250,9 +251,9 @@ class Suspect:
 
     line: int
     target: str
-    distance: float = field(metadata=fact(key="distance_mm", scale=1e3))
+    distance: Annotated[float, Fact(key="distance_mm", scale=1e3)]
     score: float
-    p_value: float = field(metadata=fact(key="chance"))
+    p_value: Annotated[float, Fact(key="chance")]
     together: bool
     held: bool = False
 

@@ -1,4 +1,4 @@
-"""Facts of a result: how a field, or a property, stands in its file, and what people read of it.
+"""Facts of a record: how a field, or a property, stands in its file, and what people read of it.
 
 Said once, where the field is declared.  From there read what writes and reads the file, its JSON
 schema, the terminal, the report and the page.
@@ -6,32 +6,42 @@ schema, the terminal, the report and the page.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sized
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
-from typing import Any, TypeVar
+from typing import Annotated, Any, Generic, TypeVar, get_type_hints
 
 Value = TypeVar("Value")
-METADATA = "fact"
 
 
 @dataclass(frozen=True)
 class Fact:
-    """A value in a file and in words.
+    """A value in a file and in words: the annotation of a field that is more than its name there.
 
     words: of the number in the file's unit, as "{:.2f} s"; what has none is not shown to people.
-    key: in the JSON, the field's own name unless given.  scale: what a number is multiplied by
-    there, as 1e3 for millimetres.
+    key: in the JSON, the field's own name with its unit unless given; dots where objects hold it.
+    scale: what a number is multiplied by there, as 1e3 for millimetres.  unit: there, for the key.
+    brief: left out where it is None or empty.  least: no number of it is smaller.
+    fewest: of its parts.  apart: told by `results.Result.beside`, not by itself.
     """
 
     words: str = ""
     key: str = ""
     scale: float = 1.0
+    unit: str = ""
+    brief: bool = False
+    least: float = float("-inf")
+    fewest: int = 0
+    apart: bool = False
+
+    def key_of(self, name: str) -> str:
+        """Its key where the field has a name."""
+        return self.key or (f"{name}_{self.unit}" if self.unit else name)
 
 
-def fact(words: str = "", key: str = "", scale: float = 1.0) -> Mapping[str, Fact]:
-    """Metadata of a field of a dataclass that is a fact of it: see `Fact`."""
-    return {METADATA: Fact(words, key, scale)}
+APART = Fact(apart=True)
+MILLI = Fact(scale=1e3, unit="mm")
+Mm = Annotated[float, MILLI]  # metres, in millimetres in files
 
 
 class Derived(cached_property[Value]):
@@ -40,64 +50,81 @@ class Derived(cached_property[Value]):
     fact: Fact
 
 
-def derived(
-    words: str = "", key: str = "", scale: float = 1.0
-) -> Callable[[Callable[[Any], Value]], Derived[Value]]:
+def derived(words: str = "", **told: Any) -> Callable[[Callable[[Any], Value]], Derived[Value]]:
     """Make a property a fact: see `Fact`."""
 
     def made(worked_out: Callable[[Any], Value]) -> Derived[Value]:
         found = Derived(worked_out)
-        found.fact = Fact(words, key, scale)
+        found.fact = Fact(words, **told)
         return found
 
     return made
 
 
-# ---- which there are ---------------------------------------------------------------------------
+class Later(Generic[Value]):
+    """A fact that is worked out when it is first asked for."""
 
-Facts = Mapping[str, Fact]  # by the name of the field
+    def __init__(self, made: Callable[[], Value]) -> None:
+        self.made = made
 
-
-@cache
-def stored_facts(kind: type) -> Facts:
-    """Fields of a dataclass that are facts."""
-    return {own.name: own.metadata[METADATA] for own in fields(kind) if METADATA in own.metadata}
-
-
-@cache
-def derived_facts(kind: type) -> Facts:
-    """Properties of a class that are facts."""
-    return {name: each.fact for name, each in vars(kind).items() if isinstance(each, Derived)}
+    @cached_property
+    def value(self) -> Value:
+        """The fact."""
+        return self.made()
 
 
 @cache
-def record_facts(kind: type) -> Facts:
-    """All fields of a dataclass that is in a file as a whole, each under its name unless said."""
-    return {own.name: own.metadata.get(METADATA, Fact()) for own in fields(kind)}
+def hints_of(kind: type) -> Mapping[str, Any]:
+    """Types of the fields of a class."""
+    return get_type_hints(kind, include_extras=True)
 
 
-# ---- what is done with them --------------------------------------------------------------------
+@cache
+def stored_facts(kind: type) -> Mapping[str, Fact]:
+    """Of every field of a dataclass that its file holds by itself, by the field's name."""
+    hints = hints_of(kind)
+    every = {own.name: fact_of(hints[own.name]) for own in fields(kind)}
+    return {name: known for name, known in every.items() if not known.apart}
 
 
-def in_file(record: Any, facts: Facts) -> dict[str, Any]:
+def fact_of(hint: Any) -> Fact:
+    """What the annotation of a field says."""
+    told = (one for one in getattr(hint, "__metadata__", ()) if isinstance(one, Fact))
+    return next(told, Fact())
+
+
+@cache
+def derived_facts(kind: type) -> Mapping[str, Fact]:
+    """Of the properties of a class that are facts, those of its bases first."""
+    every = [vars(base).items() for base in reversed(kind.__mro__)]
+    return {name: each.fact for own in every for name, each in own if isinstance(each, Derived)}
+
+
+def in_file(record: Any) -> dict[str, Any]:
     """Values of a record by their keys in the file, in its units."""
-    return {
-        known.key or name: scaled(getattr(record, name), known.scale)
-        for name, known in facts.items()
-    }
-
-
-def from_file(part: Any, facts: Facts) -> dict[str, Any]:
-    """The inverse of `in_file`: SI, by the names of the fields.  part: has these names already."""
-    return {name: scaled(getattr(part, name), 1.0 / known.scale) for name, known in facts.items()}
+    kind: type = type(record)
+    out: dict[str, Any] = {}
+    for name, known in {**stored_facts(kind), **derived_facts(kind)}.items():
+        value = getattr(record, name)
+        if known.brief and (value is None or (isinstance(value, Sized) and not len(value))):
+            continue
+        *inner, last = known.key_of(name).split(".")
+        at = out
+        for step in inner:
+            at = at.setdefault(step, {})
+        at[last] = scaled(value, known.scale)
+    return out
 
 
 def scaled(value: Any, factor: float) -> Any:
-    """A number, a tuple of some, or an array, times a factor; anything else where that is one."""
-    if factor == 1.0:
+    """Numbers times a factor: one, an array, or those of a tuple or mapping; None stays."""
+    if factor == 1.0 or value is None:
         return value
+    if isinstance(value, Mapping):
+        return {key: scaled(part, factor) for key, part in value.items()}
     if isinstance(value, tuple):
-        return tuple(scaled(part, factor) for part in value)
+        parts = (scaled(part, factor) for part in value)
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
     return value * factor
 
 

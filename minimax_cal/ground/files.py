@@ -19,7 +19,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.facts import derived_facts, in_file, record_facts
+from minimax_cal.ground.facts import Later, in_file
 
 LARGEST = 1 << 30  # bytes of a file that is read: a million poses take a quarter of this
 SHORT = 40  # letters of a name that stand in that of its temporary neighbour
@@ -202,8 +202,14 @@ def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def plain(content: Any) -> Any:
     """Data as JSON holds them: arrays are lists, records their fields, null no finite number."""
-    if is_dataclass(content) and not isinstance(content, type):
-        content = in_file(content, {**record_facts(type(content)), **derived_facts(type(content))})
+    if isinstance(content, Later):
+        content = content.value
+    if hasattr(content, "to_dict"):
+        content = content.to_dict()
+    elif is_dataclass(content) and not isinstance(content, type):
+        content = in_file(content)
+    elif hasattr(content, "_asdict"):
+        content = content._asdict()
     if isinstance(content, Mapping):
         return {key: plain(value) for key, value in content.items()}
     if isinstance(content, np.ndarray | np.generic):
@@ -239,6 +245,21 @@ def text_of(raw: bytes, path: Path | str, *, kind: type[CalibrationError]) -> st
         return text.replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
         raise kind(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
+
+
+class NotSaved(CalibrationError):
+    """A file that holds no saved result."""
+
+
+def saved_content(path: Path | str) -> Mapping[str, Any]:
+    """The JSON of a saved result.  Raises NotSaved."""
+    try:
+        content = json_of(read_text(path, kind=NotSaved))
+    except (ValueError, RecursionError) as error:
+        raise NotSaved(f"{path}: is not JSON ({error})") from error
+    if not isinstance(content, Mapping):
+        raise NotSaved(f"{path}: is not a saved calibration")
+    return content
 
 
 def check_table(raw: bytes, path: Path | str, *, kind: type[CalibrationError]) -> None:

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
-from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.facts import in_file
+from minimax_cal.ground.files import json_text, plain, saved_content, write_whole
+from minimax_cal.ground.records import AGAIN, check_schema, reading, stored
 from minimax_cal.ground.tables import Table
 
 
 class Result:
-    """A record that people and programs read: it has `headline`, `tables` and `to_dict`."""
+    """A record that people and programs read: a dataclass with `headline` and `tables`.
+
+    KIND: what its file says that it is.  COMMAND: what writes such a file.
+    """
+
+    SCHEMA: ClassVar[int] = 1
+    KIND: ClassVar[str]
+    COMMAND: ClassVar[str] = ""
 
     @abstractmethod
     def headline(self) -> str:
@@ -22,9 +33,40 @@ class Result:
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
 
-    @abstractmethod
+    def beside(self) -> dict[str, Any]:
+        """What of its file its fields do not tell by themselves."""
+        return {}
+
+    @classmethod
+    def told_beside(
+        cls, content: Mapping[str, Any], told: Mapping[str, Any], source: str
+    ) -> dict[str, Any]:
+        """The fields that are `apart`, and others put right, from a file.
+
+        told: what its other fields hold.  Raises CalibrationError, or one of `records.FAULTS`.
+        """
+        return {}
+
     def to_dict(self) -> dict[str, Any]:
-        """The JSON of the contract, and more."""
+        """The JSON of the contract, and more; `from_dict` reads it back."""
+        named = {"schema": self.SCHEMA, "kind": self.KIND}
+        return {**named, **plain(in_file(self)), **plain(self.beside())}
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], source: str = "") -> Self:
+        """From `to_dict`.  Raises CalibrationError."""
+        source = source or cls.KIND.replace("_", " ")
+        check_schema(content, source, cls.SCHEMA)
+        if content.get("kind") != cls.KIND:
+            raise CalibrationError(f"{source}: is no {cls.KIND}; {AGAIN} {cls.COMMAND}".rstrip())
+        with reading(source):
+            told = stored(cls, content)
+            return cls(**{**told, **cls.told_beside(content, told, source)})
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """From its file.  Raises CalibrationError."""
+        return cls.from_dict(saved_content(path), str(path))
 
     def json(self) -> str:
         """`to_dict` as text."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError, said
-from minimax_cal.ground.files import json_of, read_text
+from minimax_cal.ground.files import saved_content
 from minimax_cal.ground.units import in_mm
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.history import Clock, ordered
@@ -26,10 +26,6 @@ from minimax_cal.robots.robot import Robot, checked_poses, robot_from_dict, told
 from minimax_cal.robots.transforms import transform
 
 LATE = 0.1  # of a session: so far beyond its ends, effects of time are not extrapolated silently
-
-
-class NotSaved(CalibrationError):
-    """A file that holds no saved result."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,17 +268,6 @@ def load_cell(path: Path | str) -> Cell:
     >>> mc.load_cell("fit.json").predict([[0, 0.3, 0.2, 0, 0.5, 0]])
     """
     return cell_from_dict(saved_content(path), str(path))
-
-
-def saved_content(path: Path | str) -> Mapping[str, Any]:
-    """The JSON of a saved calibration.  Raises NotSaved."""
-    try:
-        content = json_of(read_text(path, kind=NotSaved))
-    except (ValueError, RecursionError) as error:
-        raise NotSaved(f"{path}: is not JSON ({error})") from error
-    if not isinstance(content, Mapping):
-        raise NotSaved(f"{path}: is not a saved calibration")
-    return content
 
 
 def strangers(cell: Cell, data: Measurements) -> tuple[str, ...]:

@@ -21,9 +21,9 @@ from minimax_cal.fitting.pixels.judge import everywhere
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import plain
+from minimax_cal.ground.files import plain, saved_content
 from minimax_cal.ground.stages import Progress, silent
-from minimax_cal.modelling.cell import Cell, pose_from_dict, saved_content
+from minimax_cal.modelling.cell import Cell, pose_from_dict
 from minimax_cal.planning.camera_options import PIXEL_NOISE, SIDES, CameraOptions, check_cameras
 from minimax_cal.planning.camera_prospect import CameraProspect, PixelNoise
 from minimax_cal.planning.camera_sight import CameraSight

@@ -9,8 +9,9 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.files import saved_content
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.cell import Cell, cell_from_dict, saved_content, still
+from minimax_cal.modelling.cell import Cell, cell_from_dict, still
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.testing import assert_array_equal
 
 import minimax_cal as mc
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import derived, fact, facts_in_words
+from minimax_cal.ground.facts import Fact, derived, facts_in_words
 from minimax_cal.ground.files import json_text, plain
 from minimax_cal.ground.records import Gaps, Part, Recorded, checked, json_schema
 from minimax_cal.solvers.minimax import Kkt, Step
@@ -29,8 +29,8 @@ class Wire:
     """A record with units, arrays and records of its own."""
 
     name: str
-    length: float = field(metadata=fact(key="length_mm", scale=1e3))
-    ends: tuple[float, ...] = field(metadata=fact(key="ends_mm", scale=1e3))
+    length: Annotated[float, Fact(key="length_mm", scale=1e3)]
+    ends: Annotated[tuple[float, ...], Fact(key="ends_mm", scale=1e3)]
     error: Array
     steps: tuple[Step, ...] = ()
     used: bool | None = None

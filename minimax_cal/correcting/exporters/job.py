@@ -11,8 +11,9 @@ import numpy as np
 
 from minimax_cal.fitting.opened import Opened, Result, open_result
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import NotSaved, saved_content
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.cell import Cell, NotSaved, saved_content, still
+from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.compliance import JOINT_COMPLIANCE, stiffens
 from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.robots.robot import Robot, load_robot
