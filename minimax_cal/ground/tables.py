@@ -109,6 +109,10 @@ class Table:
             f"{row(list(self.header), heads)}\n</thead>\n<tbody>\n{rows}\n</tbody></table>"
         )
 
+    def records(self, *keys: str) -> list[dict[str, Cell]]:
+        """The rows for JSON, by the header or other keys."""
+        return [dict(zip(keys or self.header, row, strict=True)) for row in self.rows]
+
     def csv(self) -> str:
         """Header and rows at full precision."""
         return csv_text((self.header, *self.rows))

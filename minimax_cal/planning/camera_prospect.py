@@ -8,6 +8,7 @@ the pixels per unit of each joint.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from minimax_cal.fitting.pixels.identify import identified
 from minimax_cal.fitting.pixels.judge import free_motion
 from minimax_cal.fitting.pixels.model import LENS, PixelModel, Scene, lens_of
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.facts import APART, Fact
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.parameters import zero_positions
 from minimax_cal.planning.camera_sight import CameraSight
@@ -33,11 +35,8 @@ RELATIVE = 6  # numbers of a board's pose in a camera: an image tells these, and
 class PixelNoise(Instrument):
     """Noise of u and v [px], whatever the range, and jitter of each joint [rad, m]."""
 
-    per_metre: float = 0.0
-
-    def to_dict(self) -> dict[str, float]:
-        """For JSON."""
-        return {"noise_px": self.noise, "jitter_urad": 1e6 * self.jitter}
+    noise: Annotated[float, Fact(unit="px")]
+    per_metre: Annotated[float, APART] = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.facts import APART, derived
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.planning.visibility import ARM, Condition, Room, Sight, View
@@ -28,23 +29,24 @@ class Poses:
     drawn: how many of q, the first, are of the sequence; the others were looked for near some.
     """
 
-    q: Array
-    seen: Array
+    q: Annotated[Array, APART]
+    seen: Annotated[Array, APART]
     tested: int
     rejected: Mapping[str, float]
-    drawn: int
+    drawn: Annotated[int, APART]
+
+    @derived()
+    def count(self) -> int:
+        """Of all."""
+        return len(self.q)
 
     def table(self) -> Table:
         """What each condition rejects."""
         rows = tuple((name, 100.0 * share) for name, share in self.rejected.items())
         title = f"{self.drawn} candidates of {self.tested} poses drawn"
-        if len(self.q) > self.drawn:
-            title += f", and {len(self.q) - self.drawn} near the best ones"
+        if self.count > self.drawn:
+            title += f", and {self.count - self.drawn} near the best ones"
         return Table(title, ("condition", "rejects alone %"), rows, ("", ".1f"))
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {"count": len(self.q), "tested": self.tested, "rejected": self.rejected}
 
     def join(self, q: Array, seen: Array) -> Poses:
         """With further candidates."""

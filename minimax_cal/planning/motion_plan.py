@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from minimax_cal.dynamics.regressor import (
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.facts import APART, Fact, in_file
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.options import option
 from minimax_cal.ground.results import Result
@@ -53,7 +54,6 @@ REST = 0.02  # of the largest speed: below it friction has no sign
 NOT_APART = 1e4  # relative sigma above which a parameter is not separable
 VAGUE_GAIN = 1.0  # sigma of a drive gain, of itself, that says nothing of it
 WAYPOINTS_HZ = 10.0
-SCHEMA = 1
 SHORTEST, LONGEST = 5.0, 300.0  # of a part [s]
 FASTEST_ROWS = 1000.0
 
@@ -91,8 +91,8 @@ class Part:
     """A part of the motion, recorded as a run of its own.  payload: [kg]."""
 
     name: str
-    series: Series
-    payload: float
+    series: Annotated[Series, APART]
+    payload: Annotated[float, Fact(unit="kg")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,11 +109,13 @@ class Told:
 class MotionPlan(Result):
     """parts: in the order of driving.  told: what they will tell, for a noise of `noise` (n,)."""
 
-    robot: Robot
-    parts: tuple[Part, ...]
-    told: tuple[Told, ...]
+    KIND = "motion_plan"
+
+    robot: Annotated[Robot, APART]
+    parts: Annotated[tuple[Part, ...], APART]
+    told: Annotated[tuple[Told, ...], Fact(key="tells")]
     noise: Array
-    base: int
+    base: Annotated[int, Fact(key="base_parameters")]
     settings: Mapping[str, object]
     notices: tuple[str, ...]
     seconds: float
@@ -189,36 +191,13 @@ class MotionPlan(Result):
         """What the motion will tell, and what moves."""
         return self.told_table(), self.motion_table()
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON: the series' coefficients in SI, and what they will tell."""
-        moved = self.motion_table()
-        whole = {
-            "schema": SCHEMA,
-            "kind": "motion_plan",
+    def beside(self) -> dict[str, Any]:
+        """The series' coefficients in SI, and how far and how fast they move each joint."""
+        return {
             "robot": self.robot.name,
-            "parts": [
-                {
-                    "name": part.name,
-                    "period_s": part.series.period,
-                    "payload_kg": part.payload,
-                    "centre": part.series.centre,
-                    "cos": part.series.a,
-                    "sin": part.series.b,
-                }
-                for part in self.parts
-            ],
-            "base_parameters": self.base,
-            "noise": self.noise,
-            "tells": [
-                {"parameter": t.parameter, "place": t.place, "sigma": t.sigma, "unit": t.unit}
-                for t in self.told
-            ],
-            "motion": [dict(zip(moved.header, row, strict=True)) for row in moved.rows],
-            "settings": self.settings,
-            "notices": self.notices,
-            "seconds": self.seconds,
+            "parts": [in_file(part) | in_file(part.series) for part in self.parts],
+            "motion": self.motion_table().records(),
         }
-        return dict(plain(whole))
 
 
 def shown(told: Told) -> str:

@@ -15,7 +15,7 @@ from minimax_cal.planning.designs.criteria import Criterion, inverse, sizes_of
 from minimax_cal.planning.designs.exchange import Menu
 from minimax_cal.planning.designs.search import DRAWS, Found, quick_design
 from minimax_cal.planning.observability import INDICES, observability
-from minimax_cal.planning.promise import Growth, Separation
+from minimax_cal.planning.promise import Both, Growth, Separation
 from minimax_cal.planning.prospect import Ahead
 from minimax_cal.planning.route import Visits
 from minimax_cal.planning.separating import Contest, Question
@@ -56,12 +56,12 @@ def grown(
         if not np.isfinite(both[0]).all() and count != poses:
             continue  # so few tell not everything
         columns = (*both.T, sizes)
-        pairs = [(float(column[0]), float(np.median(column[1:]))) for column in columns]
+        pairs = [Both(float(column[0]), float(np.median(column[1:]))) for column in columns]
         out.append(Growth(count, *pairs))
     return tuple(out)
 
 
-def indices(ahead: Ahead, found: Poses, chosen: Array, seed: int) -> dict[str, tuple[float, float]]:
+def indices(ahead: Ahead, found: Poses, chosen: Array, seed: int) -> dict[str, Both]:
     """Observability indices of the poses chosen, and the median of random ones."""
     rng = np.random.default_rng(seed)
 
@@ -74,7 +74,7 @@ def indices(ahead: Ahead, found: Poses, chosen: Array, seed: int) -> dict[str, t
 
     random = [of(rng.choice(found.drawn, len(chosen), replace=False)) for _ in range(SETS)]
     return {
-        name: (one, float(other))
+        name: Both(one, float(other))
         for name, one, other in zip(INDICES, of(chosen), np.median(random, axis=0), strict=True)
     }
 

@@ -20,7 +20,7 @@ from minimax_cal.planning.designs.exchange import Menu, exchange, highest, polar
 from minimax_cal.planning.designs.search import ROUGH, Found, best_design, first_design, worth
 from minimax_cal.planning.options import PlanOptions, check_options, settings_of
 from minimax_cal.planning.outlook import grown, indices, remarks, separated
-from minimax_cal.planning.result import POWER, Plan
+from minimax_cal.planning.result import POWER, Plan, Travel
 from minimax_cal.planning.route import shortest, travel, visits
 from minimax_cal.planning.setting import ground_of, surroundings
 from minimax_cal.planning.task import Task, task_of
@@ -183,9 +183,9 @@ def planned(
 def enough(room: Room, sight: Sight, options: PlanOptions, poses: int) -> Poses:
     """Candidates for so many poses.  Raises OptionError where there are fewer."""
     found = candidates(room, sight, options.candidates, options.seed)
-    if len(found.q) < poses:
+    if found.count < poses:
         raise OptionError(
-            f"only {len(found.q)} of {found.tested} poses can be taken and seen, but {poses} are "
+            f"only {found.count} of {found.tested} poses can be taken and seen, but {poses} are "
             f"asked for; {rarest(found.rejected)}"
         )
     return found
@@ -224,9 +224,9 @@ def refined(task: Task, found: Poses, poses: int, progress: Progress) -> tuple[P
         more, seen = near(task.room, task.sight, found.q[chosen], each, step, rng)
         menu, criterion = task.aim(found.join(more, seen))
         cov = inverse(menu.of(chosen))
-        fresh = menu.scores(polar(cov, criterion.mix(cov)))[len(found.q) :]
+        fresh = menu.scores(polar(cov, criterion.mix(cov)))[found.count :]
         kept = np.sort(highest(fresh, KEPT))
-        old = len(found.q)
+        old = found.count
         found = found.join(more[kept], seen[kept])
         menu = menu.take(np.concatenate([np.arange(old), old + kept]))
         among = np.union1d(np.arange(old, menu.count), chosen)
@@ -284,10 +284,7 @@ def assembled(
         candidates=found,
         instrument=task.ground.instrument,
         place=np.atleast_2d(task.sight.place)[0],
-        travel=(
-            travel(q, robot.prismatic),
-            travel(found.q[best.design.chosen], robot.prismatic),
-        ),
+        travel=Travel(*(travel(way, robot.prismatic) for way in (q, found.q[best.design.chosen]))),
         at_hand=sum(one.poses for one in task.ground.measured),
         settings=settings_of(options, poses),
         notices=notices,

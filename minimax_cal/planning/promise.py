@@ -3,32 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, NamedTuple
 
+from minimax_cal.ground.facts import APART, Fact
 from minimax_cal.modelling.effects.words import name_label
+
+MICRO = Fact(scale=1e6, unit="um")
+
+
+class Both(NamedTuple):
+    """Of the poses planned, and the median of random ones."""
+
+    planned: float
+    random: float
 
 
 @dataclass(frozen=True)
 class Growth:
-    """What so many poses tell, planned and random (median): sigma of a position [m].
+    """What so many poses tell: sigma of a position [m].
 
     mean: root of the mean variance over the workspace.  worst: the largest there.
     size: of the criterion, as `Plan.size`.
     """
 
     poses: int
-    mean: tuple[float, float]
-    worst: tuple[float, float]
-    size: tuple[float, float]
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON, in micrometres."""
-        sigmas = {"mean_um": self.mean, "worst_um": self.worst}
-        both = {
-            name: {"planned": 1e6 * planned, "random": 1e6 * random}
-            for name, (planned, random) in sigmas.items()
-        }
-        return {"poses": self.poses, **both}
+    mean: Annotated[Both, MICRO]
+    worst: Annotated[Both, MICRO]
+    size: Annotated[Both, APART]
 
 
 @dataclass(frozen=True)
@@ -40,14 +41,14 @@ class Separation:
     else_: what would, besides poses like these.
     """
 
-    one: str
-    other: str
-    now: float
-    planned: float
-    everything: float
-    needed: float
-    alike: bool
-    else_: str
+    one: Annotated[str, Fact(key="effect")]
+    other: Annotated[str, Fact(key="rival")]
+    now: Annotated[float, Fact(key="power.now")]
+    planned: Annotated[float, Fact(key="power.planned")]
+    everything: Annotated[float, Fact(key="power.all_candidates")]
+    needed: Annotated[float, Fact(key="power.needed")]
+    alike: Annotated[bool, Fact(key="alike_at_every_pose")]
+    else_: Annotated[str, Fact(key="separate_with")]
 
     def headline(self) -> str:
         """How far the poses get, in words."""
@@ -69,18 +70,3 @@ class Separation:
             f"{text} All candidates together reach {self.everything:.3g}: no poses like these "
             f"tell them apart. Otherwise: {self.else_}."
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {
-            "effect": self.one,
-            "rival": self.other,
-            "power": {
-                "now": self.now,
-                "planned": self.planned,
-                "all_candidates": self.everything,
-                "needed": self.needed,
-            },
-            "alike_at_every_pose": self.alike,
-            "separate_with": self.else_,
-        }

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import numpy as np
 
 from minimax_cal.fitting import identify
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.facts import Fact
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.scene import Scene
@@ -22,6 +23,7 @@ from minimax_cal.modelling.effects.table import Fitted
 from minimax_cal.modelling.effects.table import terms as terms_of
 from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import model_of
+from minimax_cal.planning.promise import MICRO
 from minimax_cal.robots.transforms import shift
 
 SAMPLE = 1000  # poses that tell which parameters are identifiable
@@ -35,17 +37,9 @@ class Instrument:
     The defaults are a laser tracker's data sheet, and an arm that stops to 0.01 mrad.
     """
 
-    noise: float = 10e-6
-    per_metre: float = 2.5e-6
-    jitter: float = 10e-6
-
-    def to_dict(self) -> dict[str, float]:
-        """For JSON."""
-        return {
-            "noise_um": 1e6 * self.noise,
-            "noise_um_per_m": 1e6 * self.per_metre,
-            "jitter_urad": 1e6 * self.jitter,
-        }
+    noise: Annotated[float, MICRO] = 10e-6
+    per_metre: Annotated[float, Fact(key="noise_um_per_m", scale=1e6)] = 2.5e-6
+    jitter: Annotated[float, Fact(scale=1e6, unit="urad")] = 10e-6
 
 
 class Ahead(Protocol):

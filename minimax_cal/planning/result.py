@@ -5,24 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import plain, write_whole
+from minimax_cal.ground.facts import APART, Fact, derived, in_file
+from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.planning.candidates import Poses
 from minimax_cal.planning.observability import INDICES
-from minimax_cal.planning.promise import Growth, Separation
+from minimax_cal.planning.promise import Both, Growth, Separation
 from minimax_cal.planning.prospect import Instrument
 from minimax_cal.planning.route import Visits
 from minimax_cal.planning.stops import rounded_csv, stops
 
-SCHEMA = 1
 POWER = "separate"  # the criterion that is a power: the larger the better
 MEANINGS = {
     "D": "geometric mean of the parameters' sigma, each as motion of a target",
@@ -32,6 +32,13 @@ MEANINGS = {
     "I": "mean sigma of a position in the workspace",
     POWER: "power to tell the effects apart",
 }
+
+
+class Travel(NamedTuple):
+    """Of the largest joint moves through all poses [rad]."""
+
+    ordered: float
+    as_chosen: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,46 +51,47 @@ class Plan(Result):
     size: of the criterion, a variance [m^2] (one over the power).  bound: no N candidates are
     below it.  random: median of random candidates.  equal: how many random ones tell as much.
     names, sigma: identifiable parameters and their predicted sigma [m, rad].
-    indices: observability, planned and random.  growth: with the number of poses.
+    indices: observability.  growth: with the number of poses.
     candidates: what was chosen from.  instrument: noise that was assumed, place: (3,) where it
-    stands in base axes [m].  travel: of the largest joint moves, as ordered and as chosen [rad].
-    at_hand: number of poses measured before, which count.  cameras:
+    stands in base axes [m].  at_hand: number of poses measured before, which count.  cameras:
     that are planned for, and seen (N, c) by which the board is seen; none for a tracker.
     still: what stands at `place`: the tracker, else the board or the camera.
     """
 
-    cell: Cell
+    KIND = "plan"
+
+    cell: Annotated[Cell, APART]
     criterion: str
     q: Array
     seen: Array
-    expected: Array
+    expected: Annotated[Array, APART]
     visits: Visits
-    size: float
-    bound: float
-    random: float
-    equal: float
-    names: tuple[str, ...]
-    sigma: Array
-    indices: Mapping[str, tuple[float, float]]
+    size: Annotated[float, APART]
+    bound: Annotated[float, APART]
+    random: Annotated[float, APART]
+    equal: Annotated[float, Fact(key="worth_random_poses")]
+    names: Annotated[tuple[str, ...], APART]
+    sigma: Annotated[Array, APART]
+    indices: Annotated[Mapping[str, Both], Fact(key="observability")]
     growth: tuple[Growth, ...]
     separation: tuple[Separation, ...]
     candidates: Poses
-    instrument: Instrument
-    place: Array
-    travel: tuple[float, float]
+    instrument: Annotated[Instrument, APART]
+    place: Annotated[Array, APART]
+    travel: Annotated[Travel, Fact(unit="rad")]
     at_hand: int
     settings: Mapping[str, object]
     notices: tuple[str, ...]
     seconds: float
-    cameras: tuple[str, ...] = ()
-    still: str = "tracker"
+    cameras: Annotated[tuple[str, ...], Fact(brief=True)] = ()
+    still: Annotated[str, APART] = "tracker"
 
-    @property
+    @derived()
     def poses(self) -> int:
         """N."""
         return len(self.q)
 
-    @property
+    @derived(key="efficiency_at_least")
     def efficiency(self) -> float:
         """Bound over size: so much of the best possible is sure."""
         return min(1.0, self.bound / self.size)
@@ -173,7 +181,7 @@ class Plan(Result):
         """Every stop, in order."""
         header, rows = stops(self.visits, self.cell, self.expected, unit)
         return Table(
-            f"stops in order, travel {self.travel[0]:.1f} rad",
+            f"stops in order, travel {self.travel.ordered:.1f} rad",
             tuple(header[: 2 + self.q.shape[1]]),
             tuple(tuple(row[: 2 + self.q.shape[1]]) for row in rows),
             ("d", "", *[".3f"] * self.q.shape[1]),
@@ -198,42 +206,16 @@ class Plan(Result):
         """Write the stops; never a half-written file."""
         write_whole(path, self.csv(unit))
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON: sigmas of positions in micrometres."""
+    def beside(self) -> dict[str, Any]:
+        """Names, units, sizes and sigmas."""
         unit = "power" if self.criterion == POWER else "sigma_um"
         sizes = {"planned": self.size, "random": self.random, "bound": self.bound}
-        slides = self.cell.robot.prismatic
-        whole = {
-            "schema": SCHEMA,
-            "kind": "plan",
+        named = zip(self.names, self.sigma, strict=True)
+        return {
             "robot": self.cell.robot.name,
-            "criterion": self.criterion,
-            "poses": self.poses,
-            "at_hand": self.at_hand,
             "targets": self.cell.target_names,
-            "q": self.q,
-            "q_units": ["m" if sliding else "rad" for sliding in slides],
-            "seen": self.seen,
-            **({"cameras": self.cameras} if self.cameras else {}),
-            "visits": self.visits.to_dict(),
+            "q_units": ["m" if sliding else "rad" for sliding in self.cell.robot.prismatic],
             "value": {f"{name}_{unit}": self.shown(size) for name, size in sizes.items()},
-            "efficiency_at_least": self.efficiency,
-            "worth_random_poses": self.equal,
-            "growth": [growth.to_dict() for growth in self.growth],
-            "observability": {
-                name: {"planned": planned, "random": random}
-                for name, (planned, random) in self.indices.items()
-            },
-            "parameters": [
-                {"name": name, "sigma": sigma}
-                for name, sigma in zip(self.names, self.sigma, strict=True)
-            ],
-            "separation": [separation.to_dict() for separation in self.separation],
-            "candidates": self.candidates.to_dict(),
-            "instrument": {"place_in_base_mm": 1e3 * self.place, **self.instrument.to_dict()},
-            "travel_rad": {"ordered": self.travel[0], "as_chosen": self.travel[1]},
-            "settings": self.settings,
-            "notices": self.notices,
-            "seconds": self.seconds,
+            "parameters": [{"name": name, "sigma": sigma} for name, sigma in named],
+            "instrument": {"place_in_base_mm": 1e3 * self.place, **in_file(self.instrument)},
         }
-        return dict(plain(whole))

@@ -7,11 +7,12 @@ slide's metre counts as a turn of two radians.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.facts import APART, derived
 
 SLIDE = 0.5  # metres of a slide that count as a radian
 STEP = np.radians(5.0)  # a pose is approached from its other side by a move of so much [rad]
@@ -77,15 +78,15 @@ class Visits:
     approach: (v, n) sign of each joint's last move, 0 before the first.
     """
 
-    pose: Array
+    pose: Annotated[Array, APART]
     q: Array
     via: Array
     approach: Array
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON; poses are counted from 1."""
-        approach = self.approach.astype(int)
-        return {"pose": self.pose + 1, "q": self.q, "via": self.via, "approach": approach}
+    @derived(key="pose")
+    def number(self) -> Array:
+        """(v,) the poses, counted from 1."""
+        return self.pose + 1
 
 
 def visits(
@@ -126,7 +127,7 @@ def visits(
 
 def last_signs(q: Array) -> Array:
     """(v, n) sign of each joint's last move along a way (v, n), 0 before its first."""
-    out = np.zeros_like(q)
+    out = np.zeros(q.shape, dtype=int)
     for row in range(1, len(q)):
         move = q[row] - q[row - 1]
         out[row] = np.where(np.abs(move) > 1e-9, np.sign(move), out[row - 1])

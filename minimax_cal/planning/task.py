@@ -61,7 +61,7 @@ class Task:
 
     def contests(self, found: Poses) -> tuple[Contest, ...]:
         """What the candidates tell about the effects asked for."""
-        nowhere = np.zeros(len(found.q), dtype=bool)
+        nowhere = np.zeros(found.count, dtype=bool)
         return tuple(
             separating.contest(one, found.q, found.seen[:, self.named(one)], nowhere)
             for one in self.asked
