@@ -26,7 +26,7 @@ from minimax_cal.cli.options import (
 from minimax_cal.dynamics.logs import LogFiles, are_logs, import_logs, runs_text
 from minimax_cal.dynamics.run import Run
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import json_text
+from minimax_cal.ground.files import json_text, plain
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.columns import rows_in
 from minimax_cal.measuring.faults import distance_faults
@@ -187,21 +187,17 @@ def readable(text: str, path: Path | None) -> str:
 
 def content(found: Imported, output: Path | None) -> dict[str, object]:
     """The JSON of the command."""
-    files = found.files()
-    columns = found.columns()
-    return {
+    whole = {
         "schema": 1,
         "output": str(output) if output else None,
         "poses": found.data.poses,
         "joints": found.data.q.shape[1],
-        "targets": list(found.data.target_names),
+        "targets": found.data.target_names,
         "files": [
-            {
-                **dict(zip(files.header, row, strict=True)),
-                "columns": [dict(zip(table.header, r, strict=True)) for r in table.rows],
-            }
-            for row, table in zip(files.rows, columns, strict=True)
+            {**file, "columns": table.records()}
+            for file, table in zip(found.files().records(), found.columns(), strict=True)
         ],
-        "set_aside": [point.to_dict() for point in found.data.set_aside],
-        "notices": list(found.data.notices),
+        "set_aside": found.data.set_aside,
+        "notices": found.data.notices,
     }
+    return dict(plain(whole))

@@ -41,6 +41,8 @@ class Fact:
 
 APART = Fact(apart=True)
 MILLI = Fact(scale=1e3, unit="mm")
+Apart = Annotated[Value, APART]
+Milli = Annotated[Value, MILLI]
 Mm = Annotated[float, MILLI]  # metres, in millimetres in files
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
+from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -139,6 +141,11 @@ class Table:
                 "",
             ]
         )
+
+
+def records_of(columns: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Columns of one length as objects for JSON, one a row."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def show(cell: Cell, spec: str) -> str:

@@ -1,6 +1,9 @@
 """In which units people and files read a value that is in SI here."""
 
 from math import pi
+from typing import Any
+
+from minimax_cal.ground.facts import in_file
 
 
 def for_people(unit: str) -> tuple[float, str]:
@@ -16,6 +19,13 @@ def turned_for_people(unit: str) -> tuple[float, str]:
 def in_mm(metres: float) -> float:
     """A length for a file, in 15 digits: read and written again it is the same text."""
     return float(f"{1e3 * float(metres):.15g}")
+
+
+def in_own_unit(record: Any, *sizes: str) -> dict[str, Any]:
+    """A record of a file, whose `sizes` are in SI, their `unit` told: see `in_files`."""
+    scale, unit = in_files(record.unit)
+    scaled = {name: scale * getattr(record, name) for name in sizes}
+    return in_file(record) | scaled | {"unit": unit}
 
 
 def in_files(unit: str) -> tuple[float, str]:

@@ -19,7 +19,7 @@ from minimax_cal.fitting.pixels.identify import identified
 from minimax_cal.fitting.pixels.judge import free_motion
 from minimax_cal.fitting.pixels.model import LENS, PixelModel, Scene, lens_of
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import APART, Fact
+from minimax_cal.ground.facts import Apart, Fact
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.parameters import zero_positions
 from minimax_cal.planning.camera_sight import CameraSight
@@ -36,7 +36,7 @@ class PixelNoise(Instrument):
     """Noise of u and v [px], whatever the range, and jitter of each joint [rad, m]."""
 
     noise: Annotated[float, Fact(unit="px")]
-    per_metre: Annotated[float, APART] = 0.0
+    per_metre: Apart[float] = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.facts import APART, derived
+from minimax_cal.ground.facts import Apart, derived
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.planning.visibility import ARM, Condition, Room, Sight, View
@@ -29,11 +28,11 @@ class Poses:
     drawn: how many of q, the first, are of the sequence; the others were looked for near some.
     """
 
-    q: Annotated[Array, APART]
-    seen: Annotated[Array, APART]
+    q: Apart[Array]
+    seen: Apart[Array]
     tested: int
     rejected: Mapping[str, float]
-    drawn: Annotated[int, APART]
+    drawn: Apart[int]
 
     @derived()
     def count(self) -> int:
@@ -109,8 +108,7 @@ def free_poses(room: Room, count: int, seed: int) -> Array:
     """
     nowhere = Sight(np.zeros(3), room.robot.up)
     conditions = {name: ARM[name] for name in ("floor", "self-collision")}
-    found = drawn(room, nowhere, count, seed, conditions, {})
-    return found.q
+    return drawn(room, nowhere, count, seed, conditions, {}).q
 
 
 def candidates(room: Room, sight: Sight, count: int, seed: int) -> Poses:
@@ -141,7 +139,7 @@ def drawn(
 ) -> Poses:
     """Poses of the sequence that meet the conditions.  Raises OptionError where there is none."""
     proposals = sight.proposals(room, seed)
-    kept_q, kept_seen, tested, found = [], [], 0, 0
+    kept, tested, found = [], 0, 0
     total = dict.fromkeys((*arm, *tracker), 0)
     while found < count and tested < sight.tries[found > 0]:
         q = next(proposals)
@@ -149,12 +147,11 @@ def drawn(
         total = {name: number + against[name] for name, number in total.items()}
         tested += len(q)
         found += int(good.sum())
-        kept_q.append(q[good])
-        kept_seen.append(seen[good])
+        kept.append((q[good], seen[good]))
     rejected = {name: number / tested for name, number in total.items()}
     if not found:
         raise OptionError(no_pose(room, tested, rejected))
-    q, seen = np.concatenate(kept_q)[:count], np.concatenate(kept_seen)[:count]
+    q, seen = (np.concatenate(part)[:count] for part in zip(*kept, strict=True))
     return Poses(q, seen, tested, rejected, len(q))
 
 

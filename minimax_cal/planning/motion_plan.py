@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from minimax_cal.dynamics.regressor import (
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.facts import APART, Fact, in_file
+from minimax_cal.ground.facts import Apart, Fact, in_file
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.options import option
 from minimax_cal.ground.results import Result
@@ -91,12 +91,11 @@ class Part:
     """A part of the motion, recorded as a run of its own.  payload: [kg]."""
 
     name: str
-    series: Annotated[Series, APART]
+    series: Apart[Series]
     payload: Annotated[float, Fact(unit="kg")]
 
 
-@dataclass(frozen=True, eq=False)
-class Told:
+class Told(NamedTuple):
     """What a parameter's sigma will be [unit], inf if not separable.  place: as J2."""
 
     parameter: str
@@ -111,8 +110,8 @@ class MotionPlan(Result):
 
     KIND = "motion_plan"
 
-    robot: Annotated[Robot, APART]
-    parts: Annotated[tuple[Part, ...], APART]
+    robot: Apart[Robot]
+    parts: Apart[tuple[Part, ...]]
     told: Annotated[tuple[Told, ...], Fact(key="tells")]
     noise: Array
     base: Annotated[int, Fact(key="base_parameters")]
@@ -135,24 +134,21 @@ class MotionPlan(Result):
         slides = self.robot.prismatic
         for part in self.parts:
             moved = part.series.at(part.series.grid(SURE_HZ))
-            for j in range(self.robot.joints):
-                scale = 1e3 if slides[j] else 180.0 / np.pi
+            top = [np.abs(values).max(axis=0) for values in (moved.qd, moved.qdd)]
+            sizes = np.stack([moved.q.min(axis=0), moved.q.max(axis=0), *top], axis=1)
+            for j, size in enumerate(np.where(slides, 1e3, ANGLES["deg"])[:, None] * sizes):
                 unit = "mm" if slides[j] else "deg"
-                low, high = moved.q[:, j].min(), moved.q[:, j].max()
-                top = [np.abs(values[:, j]).max() for values in (moved.qd, moved.qdd)]
-                sizes = [float(scale * value) for value in (low, high, *top)]
-                rows.append((part.name, f"J{j + 1}", *sizes, unit))
+                rows.append((part.name, f"J{j + 1}", *map(float, size), unit))
         header = ("part", "joint", "from", "to", "speed /s", "acceleration /s^2", "unit")
         return Table("motion", header, tuple(rows), ("", "", ".1f", ".1f", ".1f", ".1f", ""))
 
     def told_table(self) -> Table:
         """Predicted standard deviations, a row a joint."""
         kinds = dict.fromkeys(told.parameter for told in self.told)
-        by = {(told.parameter, told.place): told for told in self.told}
-        rows: list[tuple[TableCell, ...]] = []
-        for j in range(self.robot.joints):
-            mine = [by[kind, f"J{j + 1}"] for kind in kinds]
-            rows.append((f"J{j + 1}", float(self.noise[j]), *map(shown, mine)))
+        rows: list[tuple[TableCell, ...]] = [
+            (f"J{j + 1}", noise, *map(shown, self.told[j :: len(self.noise)]))
+            for j, noise in enumerate(self.noise.tolist())
+        ]
         header = ("joint", "noise", *(f"{kind} +-" for kind in kinds))
         formats = ("", ".3g", *("" for _ in kinds))
         return Table("standard deviations, predicted", header, tuple(rows), formats)
@@ -171,12 +167,13 @@ class MotionPlan(Result):
         rows: list[list[Any]] = []
         for part in self.parts:
             grid = part.series.grid(rate)
-            moved = part.series.at(grid)
-            blocks = [moved.q * scale, *([moved.qd * scale] if speeds else [])]
-            for at, t in enumerate(grid):
-                row = [float(value) for block in blocks for value in block[at]]
-                load = [f"{part.payload:g}"] if loaded else []
-                rows.append([part.name, f"{t:.6g}", *row, *load])
+            moved, load = part.series.at(grid), [f"{part.payload:g}"] if loaded else []
+            block = np.concatenate([moved.q, *([moved.qd] if speeds else [])], axis=1)
+            block = block * np.tile(scale, 1 + speeds)
+            rows += [
+                [part.name, f"{t:.6g}", *row, *load]
+                for t, row in zip(grid, block.tolist(), strict=True)
+            ]
         return rounded_csv(header, rows)
 
     def csv(self, unit: str = "deg") -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
-from minimax_cal.ground.facts import APART, Fact
+from minimax_cal.ground.facts import Apart, Fact
 from minimax_cal.modelling.effects.words import name_label
 
 MICRO = Fact(scale=1e6, unit="um")
@@ -29,7 +29,7 @@ class Growth:
     poses: int
     mean: Annotated[Both, MICRO]
     worst: Annotated[Both, MICRO]
-    size: Annotated[Both, APART]
+    size: Apart[Both]
 
 
 @dataclass(frozen=True)

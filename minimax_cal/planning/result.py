@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import APART, Fact, derived, in_file
+from minimax_cal.ground.facts import Apart, Fact, derived, in_file, scaled
 from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell as TableCell
@@ -60,31 +61,31 @@ class Plan(Result):
 
     KIND = "plan"
 
-    cell: Annotated[Cell, APART]
+    cell: Apart[Cell]
     criterion: str
     q: Array
     seen: Array
-    expected: Annotated[Array, APART]
+    expected: Apart[Array]
     visits: Visits
-    size: Annotated[float, APART]
-    bound: Annotated[float, APART]
-    random: Annotated[float, APART]
+    size: Apart[float]
+    bound: Apart[float]
+    random: Apart[float]
     equal: Annotated[float, Fact(key="worth_random_poses")]
-    names: Annotated[tuple[str, ...], APART]
-    sigma: Annotated[Array, APART]
+    names: Apart[tuple[str, ...]]
+    sigma: Apart[Array]
     indices: Annotated[Mapping[str, Both], Fact(key="observability")]
     growth: tuple[Growth, ...]
     separation: tuple[Separation, ...]
     candidates: Poses
-    instrument: Annotated[Instrument, APART]
-    place: Annotated[Array, APART]
+    instrument: Apart[Instrument]
+    place: Apart[Array]
     travel: Annotated[Travel, Fact(unit="rad")]
     at_hand: int
     settings: Mapping[str, object]
     notices: tuple[str, ...]
     seconds: float
     cameras: Annotated[tuple[str, ...], Fact(brief=True)] = ()
-    still: Annotated[str, APART] = "tracker"
+    still: Apart[str] = "tracker"
 
     @derived()
     def poses(self) -> int:
@@ -127,20 +128,14 @@ class Plan(Result):
 
     def criterion_table(self) -> Table:
         """The criterion: planned, random, and what no choice of candidates beats."""
-        power = self.criterion == POWER
-        here = self.here
-        rows: list[tuple[TableCell, ...]] = [
-            (
-                f"{self.criterion}: {MEANINGS[self.criterion]}",
-                "" if power else "um",
-                *(self.shown(value) for value in (self.size, self.random, self.bound)),
-            ),
-        ]
-        for name, both in (("I", here.mean), ("G", here.worst)):
-            if name != self.criterion:
-                rows.append((MEANINGS[name], "um", *(1e6 * sigma for sigma in both), float("nan")))
+        own, unit = self.criterion, "" if self.criterion == POWER else "um"
+        sizes = map(self.shown, (self.size, self.random, self.bound))
+        rows: list[tuple[TableCell, ...]] = [(f"{own}: {MEANINGS[own]}", unit, *sizes)]
+        for name, both in (("I", self.here.mean), ("G", self.here.worst)):
+            if name != own:
+                rows.append((MEANINGS[name], "um", *scaled(both, 1e6), math.nan))
         return Table(
-            f"{self.poses} poses by criterion {self.criterion}",
+            f"{self.poses} poses by criterion {own}",
             ("what", "unit", "planned", "random (median)", "no choice is better than"),
             tuple(rows),
             ("", "", ".4g", ".4g", ".4g"),
@@ -150,11 +145,7 @@ class Plan(Result):
         """How accuracy grows with the number of poses."""
         more = self.criterion not in ("G", "I")
         rows = tuple(
-            (
-                g.poses,
-                *(1e6 * sigma for sigma in (*g.mean, *g.worst)),
-                *(map(self.shown, g.size) if more else ()),
-            )
+            (g.poses, *scaled((*g.mean, *g.worst), 1e6), *(map(self.shown, g.size) if more else ()))
             for g in self.growth
         )
         name = "power" if self.criterion == POWER else f"{self.criterion} um"
@@ -180,12 +171,10 @@ class Plan(Result):
     def pose_table(self, unit: str = "deg") -> Table:
         """Every stop, in order."""
         header, rows = stops(self.visits, self.cell, self.expected, unit)
-        return Table(
-            f"stops in order, travel {self.travel.ordered:.1f} rad",
-            tuple(header[: 2 + self.q.shape[1]]),
-            tuple(tuple(row[: 2 + self.q.shape[1]]) for row in rows),
-            ("d", "", *[".3f"] * self.q.shape[1]),
-        )
+        formats = ("d", "", *[".3f"] * self.q.shape[1])
+        n = len(formats)
+        title = f"stops in order, travel {self.travel.ordered:.1f} rad"
+        return Table(title, tuple(header[:n]), tuple(tuple(row[:n]) for row in rows), formats)
 
     def tables(self) -> tuple[Table, ...]:
         """Every table but the poses themselves."""

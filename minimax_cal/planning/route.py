@@ -7,12 +7,11 @@ slide's metre counts as a turn of two radians.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import APART, derived
+from minimax_cal.ground.facts import Apart, derived
 
 SLIDE = 0.5  # metres of a slide that count as a radian
 STEP = np.radians(5.0)  # a pose is approached from its other side by a move of so much [rad]
@@ -78,7 +77,7 @@ class Visits:
     approach: (v, n) sign of each joint's last move, 0 before the first.
     """
 
-    pose: Annotated[Array, APART]
+    pose: Apart[Array]
     q: Array
     via: Array
     approach: Array
@@ -103,10 +102,9 @@ def visits(
     aside: come to them from the other side than the first time, by a short move of all joints from
     a stop on the way.  A joint at its limit, where there is no room for that, keeps its side.
     """
-    m, n = q.shape
-    stops, pose, via = list(q), list(range(m)), [False] * m
+    stops = [(one, there, False) for one, there in enumerate(q)]
     side = last_signs(q)
-    picked = np.linspace(0, m, again, endpoint=False).astype(int)  # the last few just were
+    picked = np.linspace(0, len(q), again, endpoint=False).astype(int)  # the last few just were
     if len(picked):
         picked = picked[shortest(q[picked], sliding, q[-1])]
     step = STEP * np.where(sliding, SLIDE, 1.0)
@@ -115,14 +113,10 @@ def visits(
             came = np.where(side[one] == 0.0, -1.0, side[one])
             there = q[one] + came * step
             room = (there >= lower) & (there <= upper)
-            stops.append(np.where(room, there, q[one] - came * step))
-            pose.append(int(one))
-            via.append(True)
-        stops.append(q[one])
-        pose.append(int(one))
-        via.append(False)
-    path = np.array(stops).reshape(-1, n)
-    return Visits(np.array(pose), path, np.array(via), last_signs(path))
+            stops.append((one, np.where(room, there, q[one] - came * step), True))
+        stops.append((one, q[one], False))
+    pose, path, via = (np.array(column) for column in zip(*stops, strict=True))
+    return Visits(pose, path, via, last_signs(path))
 
 
 def last_signs(q: Array) -> Array:
