@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -15,7 +16,7 @@ from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.fitting.set_aside import aside_sentence, errors_of, with_them
 from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.files import json_of, json_text, read_text
+from minimax_cal.ground.files import json_text, plain, saved_content
 from minimax_cal.judging.saved import training_poses
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
@@ -27,9 +28,8 @@ from minimax_cal.modelling.cell import strangers
 
 def kind_of_file(path: Path) -> str:
     """The kind that a result file says; empty where it says none."""
-    with suppress(CalibrationError, ValueError):
-        content = json_of(read_text(path))
-        return str(content.get("kind", "")) if isinstance(content, dict) else ""
+    with suppress(CalibrationError):
+        return str(saved_content(path).get("kind", ""))
     return ""
 
 
@@ -85,7 +85,7 @@ def evaluate_command(
             f"fit spanned ({spans_in_words(narrow(opened.spans))}): no claim was made for them"
         )
     to.notice(*measured.notices, *said, *strangers(cell, measured), *mixed, *doubts)
-    content = {
+    content: dict[str, Any] = {
         "schema": 1,
         "kind": "evaluation",
         "fit": str(fit),
@@ -94,17 +94,17 @@ def evaluate_command(
         "data_sha256": measured.digest,
         "training_poses": count,
         "outside_spans": {
-            "poses": int(away.sum()),
+            "poses": away.sum(),
             "joints": [span.joint for span in narrow(opened.spans)],
         },
-        "accuracy": found.to_dict(),
-        "set_aside": [point.to_dict() for point in measured.set_aside],
+        "accuracy": plain(found),
+        "set_aside": measured.set_aside,
     }
     if measured.set_aside:
         gone = with_them(error, groups(measured), errors_of(cell, measured))
-        content["accuracy"] = found.to_dict() | {"holdout_with_them": gone.to_dict()}
+        content["accuracy"]["holdout_with_them"] = gone
         to.notice(aside_sentence(measured.set_aside, gone))
-    if to.deliver(lambda: json_text(content)):
+    if to.deliver(lambda: json_text(plain(content))):
         name = cell.robot.name if rung is None else f"{cell.robot.name}, {content['rung']},"
         show(found.table(f"{name} on {data}", measured.target_names))
     return 0

@@ -20,7 +20,6 @@ from minimax_cal.cli.options import (
     show,
 )
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
 from minimax_cal.judging.standard import iso9283
 
@@ -63,6 +62,6 @@ def iso9283_command(fit: Path, data: Path | None, poses: bool, to: Output, **cho
     """
     found = iso9283(fit, data, **chosen)
     to.notice(*found.notices)
-    if to.deliver(lambda: json_text(found.to_dict())):
+    if to.deliver(found.json):
         show(*found.tables(poses=poses))
     return 0

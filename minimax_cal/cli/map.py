@@ -22,7 +22,6 @@ from minimax_cal.cli.options import (
     with_output,
 )
 from minimax_cal.fitting.uncertainty import FRAMES
-from minimax_cal.ground.files import json_text
 from minimax_cal.judging.maps import Grid, Predict, predictor, unknown, workspace_map
 from minimax_cal.judging.saved import AFTER, Saved, open_saved
 from minimax_cal.reporting.plots.map import save_map
@@ -72,7 +71,7 @@ def map_command(
     predict, measured, said = predicted(saved, frame, str(fit))
     found = workspace_map(saved, predict, Grid(**chosen), measured)
     to.notice(*saved.notices, *said, *found.notices)
-    if to.deliver(lambda: json_text(found.to_dict())):
+    if to.deliver(found.json):
         show(found.table())
     to.draw(save_map, found)
     return 0

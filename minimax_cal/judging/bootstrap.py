@@ -20,9 +20,10 @@ from minimax_cal.fitting.options import Progress, silent, solver_of
 from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.files import plain
 from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.stages import count_stage
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Cell, Table, records_of
 from minimax_cal.ground.units import for_people, in_files
 from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import Model, SumOfSquares, with_poses
@@ -112,21 +113,17 @@ class Bootstrap:
     def to_dict(self, level: float = 0.95) -> dict[str, Any]:
         """For JSON, lengths in millimetres."""
         scale = np.array([in_files(unit)[0] for unit in self.units])
+        unit, rms = [in_files(unit)[1] for unit in self.units], self.rms_interval(level)
         ends = self.interval(level) * scale[:, None]
-        rms = self.rms_interval(level)
-        known = np.isfinite(rms.low)
-        return {
+        columns = {"name": self.names, "unit": unit, "sigma": self.sigma * scale, "interval": ends}
+        whole = {
             "replicates": len(self.change),
             "lost": self.lost,
             "level": level,
-            "parameters": [
-                {"name": name, "unit": in_files(unit)[1], "sigma": float(sigma),
-                 "interval": ends[i].tolist()}
-                for i, (name, unit, sigma) in enumerate(
-                    zip(self.names, self.units, self.sigma * scale, strict=True))
-            ],
-            "out_of_bag_rms_mm": [1e3 * rms.low, 1e3 * rms.high] if known else None,
-        }  # fmt: skip
+            "parameters": records_of(columns),
+            "out_of_bag_rms_mm": None if np.isnan(rms.low) else [1e3 * rms.low, 1e3 * rms.high],
+        }
+        return dict(plain(whole))
 
 
 def percentiles(values: Array, level: float) -> Array:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import scipy
@@ -18,12 +18,13 @@ from scipy.spatial import cKDTree
 from minimax_cal.fitting.uncertainty import FRAMES, Uncertainty, holding_radius, position_factor
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import plain
+from minimax_cal.ground.facts import Apart, Fact, Milli, Mm
 from minimax_cal.ground.options import option
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
-from minimax_cal.judging.saved import AFTER, Saved
+from minimax_cal.judging.saved import AFTER, BEFORE, Saved
 from minimax_cal.measuring.spans import (
     Span,
     narrow,
@@ -101,7 +102,7 @@ class Grid:
 class Section:
     """Predictions binned over a section.
 
-    axes: labels of its coordinates.  x, y: (a + 1,), (b + 1,) edges of the bins [m].
+    axes: labels of its coordinates.  edges: of the bins along them, (a + 1,), (b + 1,) [m].
     count: (a, b) samples.  median, worst: (a, b) radius that holds 95 % [m].  reached: (a, b) share
     of the samples among the training poses.  outside: (a, b) share of them where a joint is outside
     its span, having gone too little for a claim.  The last four are NaN in an empty bin; median and
@@ -110,47 +111,26 @@ class Section:
 
     name: str
     axes: tuple[str, str]
-    x: Array
-    y: Array
-    count: Array
-    median: Array
-    worst: Array
+    edges: Milli[tuple[Array, Array]]
+    count: Annotated[Array, Fact(key="samples")]
+    median: Annotated[Array, Fact(key="radius95_median_mm", scale=1e3)]
+    worst: Annotated[Array, Fact(key="radius95_worst_mm", scale=1e3)]
     reached: Array
-    outside: Array
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON: mm, null in an empty bin; rows along the first coordinate."""
-        return {
-            "name": self.name,
-            "axes": list(self.axes),
-            "edges_mm": [(1e3 * self.x).tolist(), (1e3 * self.y).tolist()],
-            "samples": self.count.astype(int).tolist(),
-            "radius95_median_mm": plain(1e3 * self.median),
-            "radius95_worst_mm": plain(1e3 * self.worst),
-            "reached": plain(self.reached),
-            "outside_spans": plain(self.outside),
-        }
+    outside: Annotated[Array, Fact(key="outside_spans")]
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
     """Observed errors of the targets' centroid.
 
-    place: (m, 3) in the base frame [m].  error: (m,) by the name of the cell, NaN where no target
-    was measured [m].  held: (m,) True where the fit has not seen the pose.
+    place: (m, 3) in the base frame [m].  before, after: (m,), NaN where no target was measured [m].
+    held: (m,) True where the fit has not seen the pose.
     """
 
-    place: Array
-    error: dict[str, Array]
-    held: Array
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON, mm."""
-        return {
-            "place_mm": plain(1e3 * self.place),
-            "held_out": self.held.tolist(),
-            **{f"{name}_mm": plain(1e3 * error) for name, error in self.error.items()},
-        }
+    place: Milli[Array]
+    before: Milli[Array]
+    after: Milli[Array]
+    held: Annotated[Array, Fact(key="held_out")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,20 +153,22 @@ class Sampled:
 
 
 @dataclass(frozen=True, eq=False)
-class WorkspaceMap:
+class WorkspaceMap(Result):
     """Sections through the workspace, and what was observed.  height, slab: see `Grid`.
 
     inside: how many held-out poses lie within the radius predicted for a measurement there, and of
     how many.
     """
 
+    KIND = "map"
+
     robot: str
     sections: tuple[Section, ...]
-    sampled: Sampled
-    seen: Seen
-    height: float
-    slab: float
-    inside: tuple[int, int]
+    sampled: Apart[Sampled]
+    seen: Annotated[Seen, Fact(key="observed")]
+    height: Mm
+    slab: Mm
+    inside: Apart[tuple[int, int]]
     notices: tuple[str, ...]
 
     @property
@@ -207,7 +189,7 @@ class WorkspaceMap:
             what = f"predicted, {title} ({share:.0f} % of the samples)"
             rows.append((what, int(mask.sum()), *spread(self.sampled.radius[mask])))
         for title, mask in (("held-out", self.seen.held), ("training", ~self.seen.held)):
-            for name, error in self.seen.error.items():
+            for name, error in ((BEFORE, self.seen.before), (AFTER, self.seen.after)):
                 what = f"observed {name}, {title} poses"
                 rows.append((what, int(mask.sum()), *spread(error[mask])))
         return Table(
@@ -218,23 +200,20 @@ class WorkspaceMap:
             ("", "d", ".4f", ".4f", ".4f"),
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        keys = ("what", "count", "median_mm", "q95_mm", "worst_mm")
+    def headline(self) -> str:
+        """How many held-out poses miss by no more than is predicted."""
+        count, of = self.inside
+        return f"{self.robot}: {count} of {of} held-out poses are within the predicted radius."
+
+    def tables(self) -> tuple[Table, ...]:
+        """The table."""
+        return (self.table(),)
+
+    def beside(self) -> dict[str, Any]:
+        """The table, and how many poses lie within."""
         return {
-            "schema": 1,
-            "kind": "map",
-            "robot": self.robot,
-            "height_mm": 1e3 * self.height,
-            "slab_mm": 1e3 * self.slab,
-            "summary": [
-                dict(zip(keys, (what, count, *plain(sizes)), strict=True))
-                for what, count, *sizes in self.table().rows
-            ],
+            "summary": self.table().records("what", "count", "median_mm", "q95_mm", "worst_mm"),
             "held_out_inside": dict(zip(("count", "of"), self.inside, strict=True)),
-            "sections": [section.to_dict() for section in self.sections],
-            "observed": self.seen.to_dict(),
-            "notices": list(self.notices),
         }
 
 
@@ -323,13 +302,13 @@ def section(
         found = scipy.stats.binned_statistic_2d(x, y, values[mask], statistic=statistic, bins=edges)
         return np.asarray(found.statistic, dtype=float)
 
-    count = binned(some.radius, "count")
+    count = binned(some.radius, "count").astype(int)
     reached, away = (binned(mask.astype(float), "mean") for mask in (some.reached, some.outside))
-    median = worst = np.full_like(count, np.nan)
+    median = worst = np.full(count.shape, np.nan)
     known = np.isfinite(some.radius)
     if known.any():
         median, worst = binned(some.radius, "median", known), binned(some.radius, "max", known)
-    return Section(name, axes, edges[0], edges[1], count, median, worst, reached, away)
+    return Section(name, axes, (edges[0], edges[1]), count, median, worst, reached, away)
 
 
 def workspace_map(
@@ -347,7 +326,7 @@ def workspace_map(
     some = sample(cell, predict, train if len(train) else data.q, grid, saved.spans)
     sections, height, slab = sections_of(some, grid, cell.robot.reach())
     seen = seen_of(saved)
-    radius, error = measured(data.q[held]), seen.error[AFTER][held]
+    radius, error = measured(data.q[held]), seen.after[held]
     known = np.isfinite(radius) & np.isfinite(error)
     inside = int((error[known] <= radius[known]).sum()), int(known.sum())
     notices = tuple(remarks(cell.robot, train, inside))
@@ -388,11 +367,13 @@ def sections_of(
 def seen_of(saved: Saved) -> Seen:
     """What was observed at the poses that were measured."""
     data, there = saved.data, saved.data.seen.T[..., None]
-    errors = {}
-    for name, cell in saved.cells.items():
+
+    def off(cell: Cell) -> Array:
         total = np.where(there, cell.error(data), 0.0).sum(axis=0)
-        errors[name] = np.linalg.norm(total, axis=-1) / there.sum(axis=(0, 2))
-    return Seen(tcp_place(saved.cells[AFTER], data.q), errors, saved.held)
+        return np.asarray(np.linalg.norm(total, axis=-1) / there.sum(axis=(0, 2)))
+
+    before, after = (off(saved.cells[name]) for name in (BEFORE, AFTER))
+    return Seen(tcp_place(saved.cells[AFTER], data.q), before, after, saved.held)
 
 
 def check_grid(grid: Grid) -> None:

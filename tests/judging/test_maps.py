@@ -117,12 +117,10 @@ def test_bins_hold_the_median_and_the_worst(rng: np.random.Generator) -> None:
     some = Sampled(np.stack([x, y, 0 * x], axis=1), 2.0 + radius, reached, ~reached)
     found = section("flat", ("x", "y"), (x, y), some, 0.25)
     assert found.count.sum() == 500
-    for i in range(len(found.x) - 1):
-        for j in range(len(found.y) - 1):
-            inside = (
-                (found.x[i] <= x) & (x < found.x[i + 1])
-                & (found.y[j] <= y) & (y < found.y[j + 1])
-            )  # fmt: skip
+    left, low = found.edges
+    for i in range(len(left) - 1):
+        for j in range(len(low) - 1):
+            inside = (left[i] <= x) & (x < left[i + 1]) & (low[j] <= y) & (y < low[j + 1])
             assert found.count[i, j] == inside.sum()
             if inside.any():
                 assert_allclose(found.median[i, j], np.median(some.radius[inside]))
@@ -135,16 +133,17 @@ def test_bins_hold_the_median_and_the_worst(rng: np.random.Generator) -> None:
 def test_a_known_field_lies_between_the_edges_of_its_bin(saved: Saved) -> None:
     found = workspace_map(saved, height_of(saved.cells["after"]), SMALL)
     vertical, horizontal = found.sections
+    away, height = vertical.edges
     for values in (vertical.median, vertical.worst):
         i, j = np.nonzero(np.isfinite(values))
         assert len(i) > 50
-        assert np.all(values[i, j] >= 1e-3 * (3.0 + vertical.y[j]) - 1e-15)
-        assert np.all(values[i, j] <= 1e-3 * (3.0 + vertical.y[j + 1]) + 1e-15)
+        assert np.all(values[i, j] >= 1e-3 * (3.0 + height[j]) - 1e-15)
+        assert np.all(values[i, j] <= 1e-3 * (3.0 + height[j + 1]) + 1e-15)
     level = horizontal.median[np.isfinite(horizontal.median)]
     middle, half = 1e-3 * (3.0 + found.height), 0.5e-3 * found.slab
     assert np.abs(level - middle).max() <= half
     assert vertical.count.sum() == SMALL.samples + 48  # with the training poses
-    assert vertical.x[0] == 0.0
+    assert away[0] == 0.0
 
 
 def test_reached_is_within_the_ranges_and_near(rng: np.random.Generator) -> None:
@@ -204,18 +203,18 @@ def test_observed_errors_are_those_of_the_cells(saved: Saved) -> None:
     found = workspace_map(saved, unknown, SMALL)
     for name, cell in saved.cells.items():
         told = np.linalg.norm(cell.error(saved.data).mean(axis=0), axis=-1)
-        assert_allclose(found.seen.error[name], told, atol=1e-15)
-    assert found.seen.error["after"].mean() < found.seen.error["before"].mean()
+        assert_allclose(getattr(found.seen, name), told, atol=1e-15)
+    assert found.seen.after.mean() < found.seen.before.mean()
     assert_array_equal(found.seen.held, saved.held)
     gap = saved.data.y.copy()
     gap[3, 1] = np.nan
     part = workspace_map(replace(saved, data=saved.data.with_y(gap)), unknown, SMALL).seen
     one = saved.cells["after"].error(saved.data)[[0, 2], 3].mean(axis=0)
-    assert_allclose(part.error["after"][3], np.linalg.norm(one), atol=1e-15)
+    assert_allclose(part.after[3], np.linalg.norm(one), atol=1e-15)
 
 
 def test_a_prediction_that_held_out_poses_belie_is_doubted(saved: Saved) -> None:
-    error = workspace_map(saved, unknown, SMALL).seen.error["after"][saved.held]
+    error = workspace_map(saved, unknown, SMALL).seen.after[saved.held]
     few, more = np.sort(error)[[7, 8]]  # of 12 by chance: 8 in 0.2 %, 9 in 2 % of all cases
     for radius, count, doubted in ((few, 8, True), (more, 9, False), (1.0, 12, False)):
         found = workspace_map(saved, unknown, SMALL, lambda q, r=radius: np.full(len(q), r))
@@ -272,12 +271,13 @@ def test_the_line_parts_what_is_reached_from_what_is_not(saved: Saved) -> None:
     axes = Figure().subplots()
     outline(axes, part)
     (line,) = axes.collections
+    x, y = part.edges
     reached = {
-        ((part.x[i] + part.x[i + 1]) / 2, (part.y[j] + part.y[j + 1]) / 2)
+        ((x[i] + x[i + 1]) / 2, (y[j] + y[j + 1]) / 2)
         for i, j in np.argwhere(part.reached >= REACHED)
     }
     inner = np.array(sorted(reached))
-    step = np.diff(part.x).mean(), np.diff(part.y).mean()
+    step = np.diff(x).mean(), np.diff(y).mean()
     edges = np.array(line.get_segments())
     assert len(edges)
     for one, other in edges:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import starmap
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import DataError, OptionError
-from minimax_cal.ground.files import plain
+from minimax_cal.ground.facts import Apart, Fact, scaled
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell as TableCell
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, records_of
 from minimax_cal.judging.iso9283.formulas import mean_of
 from minimax_cal.judging.iso9283.visits import (
     MAX_PAIRED_POSES,
@@ -57,20 +59,29 @@ class Part:
         return {"AO_a, AO_c": f"{LOCKED}, at {self.locked} poses"} if self.locked else {}
 
 
+class Condition(NamedTuple):
+    """Of a test: the clause, what the standard asks there, what the data tell."""
+
+    clause: str
+    asked: str
+    told: str
+
+
 @dataclass(frozen=True, eq=False)
-class Iso9283:
+class Iso9283(Result):
     """Values by the formulas of ISO 9283 on held-out and on training poses, before and after.
 
     parts: by the keys of PARTS, those that hold poses.  targets: k names.  tcp: which point.
-    conditions: clause, what the standard asks, what the data tell.
     """
 
+    KIND = "iso9283"
+
     robot: str
-    source: str
-    target_names: tuple[str, ...]
+    source: Annotated[str, Fact(key="data")]
+    target_names: Annotated[tuple[str, ...], Fact(key="targets")]
     tcp: str
-    parts: Mapping[str, Part]
-    conditions: tuple[tuple[str, str, str], ...]
+    parts: Apart[Mapping[str, Part]]
+    conditions: tuple[Condition, ...]
     notices: tuple[str, ...] = ()
 
     def rows(self) -> list[tuple[str, str, Part, Values]]:
@@ -200,84 +211,54 @@ class Iso9283:
         )
         return tuple(table for table in shown if table.rows)
 
-    def summary(self, width: int = 110) -> str:
-        """The result as plain text."""
-        return "\n\n".join(table.text(width) for table in self.tables())
+    def headline(self) -> str:
+        """What is judged, and by what."""
+        return f"{self.robot}: {self.tcp} on {self.source}, by the formulas of ISO 9283."
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON: mm and mrad, null where not available."""
-        return {
-            "schema": 1,
-            "kind": "iso9283",
-            "robot": self.robot,
-            "data": self.source,
-            "targets": list(self.target_names),
-            "tcp": self.tcp,
-            "parts": {
-                key: part_to_dict(part, self.target_names) for key, part in self.parts.items()
-            },
-            "conditions": [
-                dict(zip(("clause", "asked", "told"), row, strict=True)) for row in self.conditions
-            ],
-            "notices": list(self.notices),
-        }
+    def beside(self) -> dict[str, Any]:
+        """The parts: mm and mrad, null where not available."""
+        parts = {key: part_to_dict(part, self.target_names) for key, part in self.parts.items()}
+        return {"parts": parts}
 
 
 def part_to_dict(part: Part, targets: Sequence[str]) -> dict[str, Any]:
     """One part for JSON."""
-    return {
-        "cells": {name: values_to_dict(values, targets) for name, values in part.values.items()},
-        "repeat": {
-            "RP_mm": figures(part.scatter.one_way),
-            "RP_all_mm": figures(part.scatter.all_ways),
-            "vAP_mm": figures(part.scatter.variation),
-            "RO_angle_mrad": figures(part.scatter.angle),
-            "RD_mm": figures(part.scatter.distance),
-        },
-        "not_available": part.reasons,
-        "poses": [pose_to_dict(part, i, targets) for i in range(len(part.names))],
-    }
-
-
-def values_to_dict(values: Values, targets: Sequence[str]) -> dict[str, Any]:
-    """What one cell makes of the poses of a part, for JSON."""
-    each = zip(targets, np.moveaxis(values.targets, 1, 0), strict=True)
-    return {
-        "AP_mm": figures(np.linalg.norm(values.position, axis=1)),
-        **{f"AP_{x}_mm": figures(values.position[:, i]) for i, x in enumerate("xyz")},
-        "AP_target_mm": {target: figures(np.linalg.norm(off, axis=1)) for target, off in each},
-        "AO_angle_mrad": figures(values.angle),
-        **{f"AO_{a}_mrad": figures(values.euler[:, i]) for i, a in enumerate("abc")},
-        "AD_mm": {
-            "all": figures(values.pairs),
-            "consecutive": figures(values.moves),
-            "repeated": figures(values.repeated),
-        },
-    }
-
-
-def pose_to_dict(part: Part, i: int, targets: Sequence[str]) -> dict[str, Any]:
-    """Pose i of a part for JSON."""
     s = part.scatter
-    return {
-        "pose": str(part.names[i]),
-        "visits": int(s.stops[i]),
-        "directions": int(s.ways[i]),
-        "RP_mm": plain(1e3 * s.one_way[i]),
-        "RP_all_mm": plain(1e3 * s.all_ways[i]),
-        "RP_target_mm": dict(zip(targets, plain(1e3 * s.targets[i]), strict=True)),
-        "vAP_mm": plain(1e3 * s.variation[i]),
-        "RO_mrad": plain(1e3 * s.euler[i]),
-        "RO_angle_mrad": plain(1e3 * s.angle[i]),
-        "cells": {
-            name: {
-                "AP_mm": plain(1e3 * values.position[i]),
-                "AO_mrad": plain(1e3 * values.euler[i]),
-                "AO_angle_mrad": plain(1e3 * values.angle[i]),
-            }
-            for name, values in part.values.items()
-        },
+    sizes = {"RP_mm": s.one_way, "RP_all_mm": s.all_ways, "vAP_mm": s.variation,
+             "RO_angle_mrad": s.angle}  # fmt: skip
+    poses = {
+        "pose": part.names,
+        "visits": s.stops,
+        "directions": s.ways,
+        **scaled({**sizes, "RO_mrad": s.euler}, 1e3),
+        "RP_target_mm": records_of(dict(zip(targets, 1e3 * s.targets.T, strict=True))),
+        "cells": records_of({name: poses_of(values) for name, values in part.values.items()}),
     }
+    return {
+        "cells": {name: figures_of(values, targets) for name, values in part.values.items()},
+        "repeat": figures({**sizes, "RD_mm": s.distance}),
+        "not_available": part.reasons,
+        "poses": records_of(poses),
+    }
+
+
+def poses_of(values: Values) -> list[dict[str, Any]]:
+    """What one cell makes of each pose, for JSON."""
+    sizes = {"AP_mm": values.position, "AO_mrad": values.euler, "AO_angle_mrad": values.angle}
+    return records_of(scaled(sizes, 1e3))
+
+
+def figures_of(values: Values, targets: Sequence[str]) -> dict[str, Any]:
+    """What one cell makes of all poses of a part, for JSON."""
+    each = np.linalg.norm(values.targets, axis=2).T
+    return figures({
+        "AP_mm": np.linalg.norm(values.position, axis=1),
+        **{f"AP_{x}_mm": off for x, off in zip("xyz", values.position.T, strict=True)},
+        "AP_target_mm": dict(zip(targets, each, strict=True)),
+        "AO_angle_mrad": values.angle,
+        **{f"AO_{a}_mrad": off for a, off in zip("abc", values.euler.T, strict=True)},
+        "AD_mm": {"all": values.pairs, "consecutive": values.moves, "repeated": values.repeated},
+    })  # fmt: skip
 
 
 def millimetres(off: Array) -> Array:
@@ -293,10 +274,11 @@ def summary(values: Array) -> tuple[int, float, float, float]:
     return len(known), float(known.mean()), rms(known), float(np.abs(known).max())
 
 
-def figures(values: Array) -> dict[str, float | None]:
-    """`summary` for JSON, in thousandths of the unit."""
-    count, *sizes = summary(1e3 * values)
-    return {"count": count, **dict(zip(("mean", "rms", "max"), plain(sizes), strict=True))}
+def figures(values: Array | Mapping[str, Any]) -> dict[str, Any]:
+    """`summary` of an array, or of each of several, for JSON, in thousandths of the unit."""
+    if isinstance(values, Mapping):
+        return {key: figures(part) for key, part in values.items()}
+    return dict(zip(("count", "mean", "rms", "max"), summary(1e3 * values), strict=True))
 
 
 def worst(names: Array, values: Array) -> str:
@@ -395,7 +377,7 @@ def remarks(data: Measurements, stops: Stops, parts: Mapping[str, Part]) -> list
     return out
 
 
-def conditions(data: Measurements, stops: Stops) -> tuple[tuple[str, str, str], ...]:
+def conditions(data: Measurements, stops: Stops) -> tuple[Condition, ...]:
     """Conditions of a test by the standard that matter here, and what the data tell of each."""
     often = np.unique(stops.pose, return_counts=True)[1]
     enough, poses = int((often >= CYCLES).sum()), len(often)
@@ -408,7 +390,7 @@ def conditions(data: Measurements, stops: Stops) -> tuple[tuple[str, str, str], 
         return f"{stem} {between(known)} {unit}"
 
     cycles = f"{between(often)} visits; {CYCLES} or more at {enough} of {poses} poses"
-    return (
+    rows = (
         ("6.3", "stated ambient temperature, 20 C for choice", told("temperature", 1.0, "C")),
         ("6.4", "base frame found on the robot, apart from the test",
          "best fit to the training poses: AP is smaller than with a measured base"),
@@ -419,6 +401,7 @@ def conditions(data: Measurements, stops: Stops) -> tuple[tuple[str, str, str], 
         ("6.8", "five poses on a plane in a cube of the workspace", f"{poses} poses, anywhere"),
         ("6.9", f"{CYCLES} cycles", cycles),
     )  # fmt: skip
+    return tuple(starmap(Condition, rows))
 
 
 def between(values: Array) -> str:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
-from minimax_cal.ground.files import plain
+from minimax_cal.ground.facts import Apart, Fact, derived
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
-from minimax_cal.ground.units import for_people, in_files
+from minimax_cal.ground.units import for_people, in_own_unit
 from minimax_cal.judging.watching.moved import Moved, moved_table
 from minimax_cal.measuring.accuracy import Accuracy
 
@@ -25,14 +25,14 @@ class Difference:
     a: float
     b: float
     sigma: float
-    reason: str = ""
+    reason: Annotated[str, Fact(brief=True)] = ""
 
-    @property
+    @derived()
     def by(self) -> float:
         """B minus A [SI]."""
         return self.b - self.a
 
-    @property
+    @derived()
     def sigmas(self) -> float:
         """The same in sigmas."""
         return self.by / self.sigma
@@ -44,10 +44,15 @@ class Difference:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: lengths in mm, angles in rad."""
-        scale, unit = in_files(self.unit)
-        told = {"parameter": self.parameter, "unit": unit, "a": scale * self.a, "b": scale * self.b}
-        told |= {"by": scale * self.by, "sigma": scale * self.sigma, "sigmas": self.sigmas}
-        return told | ({"reason": self.reason} if self.reason else {})
+        return in_own_unit(self, "a", "b", "by", "sigma")
+
+
+class OnPoses(NamedTuple):
+    """The accuracy of A and of B on some poses, base and reflectors placed anew for both."""
+
+    poses: str
+    a: Accuracy
+    b: Accuracy
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,16 +60,17 @@ class Comparison(Result):
     """Two calibrations side by side.
 
     differences: of every link parameter.  changed: those that explain them, the clearest first.
-    accuracy: of A and of B on the poses of A and of B, base and reflectors placed anew for both.
-    same: chance of such differences where nothing changed.
+    accuracy: on the poses of A and of B.  same: chance of such differences where nothing changed.
     """
 
-    names: tuple[str, str]
+    KIND = "comparison"
+
+    names: Apart[tuple[str, str]]
     robot: str
-    differences: tuple[Difference, ...]
+    differences: Annotated[tuple[Difference, ...], Fact(key="parameters")]
     changed: tuple[Moved, ...]
-    accuracy: tuple[tuple[str, Accuracy, Accuracy], ...]
-    same: float
+    accuracy: tuple[OnPoses, ...]
+    same: Annotated[float, Fact(key="p_value_nothing_changed")]
     notices: tuple[str, ...]
 
     @property
@@ -122,24 +128,6 @@ class Comparison(Result):
             table for table in (self.changed_table(), self.common_table(), each) if table.rows
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON: lengths in mm, angles in rad."""
-        return dict(
-            plain(
-                {
-                    "schema": 1,
-                    "kind": "comparison",
-                    "robot": self.robot,
-                    "a": self.names[0],
-                    "b": self.names[1],
-                    "changed": [c.to_dict() for c in self.changed],
-                    "p_value_nothing_changed": self.same,
-                    "parameters": [d.to_dict() for d in self.differences],
-                    "accuracy": [
-                        {"poses": where, "a": one.to_dict(), "b": other.to_dict()}
-                        for where, one, other in self.accuracy
-                    ],
-                    "notices": list(self.notices),
-                }
-            )
-        )
+    def beside(self) -> dict[str, Any]:
+        """The names."""
+        return dict(zip("ab", self.names, strict=True))

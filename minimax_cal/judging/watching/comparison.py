@@ -23,11 +23,12 @@ from minimax_cal.fitting.same_arm import wild
 from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.judging.watching.compared import Comparison, Difference
+from minimax_cal.judging.watching.compared import Comparison, Difference, OnPoses
 from minimax_cal.judging.watching.moved import Moved, search
 from minimax_cal.judging.watching.opening import in_names, watched_of
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import regions
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import links_of, zero_positions
@@ -190,20 +191,22 @@ def changed(one: Fit, other: Fit) -> tuple[tuple[Moved, ...], float]:
     return (), math.nan
 
 
-def on_common(one: Fit, other: Fit) -> Iterator[tuple[str, Accuracy, Accuracy]]:
+def on_common(one: Fit, other: Fit) -> Iterator[OnPoses]:
     """Both on the poses of each: on those that its own fit did not see, if there are any."""
     for name, fit in (("A", one), ("B", other)):
         if not fit.data.poses:
             continue
         held = fit.held if fit.held.any() else ~fit.held
         data = fit.data.take(held)
-        found = []
-        for arm in (one, other):
-            watched, _ = watched_of(arm, replace(data, frames={}), ())
-            model, state = watched.start
-            found.append(accuracy(model.error(state)))
+        found = (missed_by(arm, data) for arm in (one, other))
         which = "held-out" if fit.held.any() else "training"
-        yield f"{which} poses of {name}", found[0], found[1]
+        yield OnPoses(f"{which} poses of {name}", *found)
+
+
+def missed_by(arm: Fit, data: Measurements) -> Accuracy:
+    """The accuracy on some poses, base and reflectors placed anew."""
+    model, state = watched_of(arm, replace(data, frames={}), ())[0].start
+    return accuracy(model.error(state))
 
 
 def remarks(one: Fit, other: Fit) -> Iterator[str]:

@@ -195,7 +195,7 @@ def verdict(limit: Limit, error: Array, data: Measurements, used: float, seed: i
     ends = interval(2.0 * MIN_CONFIDENCE - 1.0)
     low, high = 1e3 * ends.low, max(1e3 * ends.high, value)
     poses = len(np.unique(group))
-    told = partial(Verdict, limit, value, low, high)
+    told = partial(Verdict, limit.kind, limit.size_mm, value, (low, high))
     seen = f"{KINDS[limit.kind]} {value:.3f} mm, at most {limit.size_mm:g} mm is required"
     if math.isnan(low):
         return told(None, CONFIDENCE_RANGE[0], f"{seen}, and {poses} poses are too few to say")

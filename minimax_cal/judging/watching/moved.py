@@ -9,15 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.facts import Fact, derived
 from minimax_cal.ground.tables import Table
-from minimax_cal.ground.units import for_people, in_files
+from minimax_cal.ground.units import for_people, in_own_unit
 from minimax_cal.judging.watching.both import KNOWN, Both, critical
 from minimax_cal.judging.watching.joined import free_columns, joined, lacking
 from minimax_cal.judging.watching.placing import Placing
@@ -46,21 +47,16 @@ class Moved:
     sigma: float
     unit: str
     p_value: float
-    others: tuple[str, ...] = ()
+    others: Annotated[tuple[str, ...], Fact(key="alternatives")] = ()
 
-    @property
+    @derived()
     def joint(self) -> str:
         """Its joint, as J3."""
         return joint_of(self.parameter)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: lengths in mm, angles in rad."""
-        scale, unit = in_files(self.unit)
-        return {
-            "parameter": self.parameter, "joint": self.joint, "by": scale * self.by,
-            "sigma": scale * self.sigma, "unit": unit, "p_value": self.p_value,
-            "alternatives": list(self.others),
-        }  # fmt: skip
+        return in_own_unit(self, "by", "sigma")
 
 
 def moved_table(title: str, moved: Sequence[Moved]) -> Table:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.set_aside import WithThem, aside_sentence
+from minimax_cal.ground.facts import Apart, Fact, derived
 from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
-from minimax_cal.judging.tolerance import KINDS, Limit
+from minimax_cal.ground.units import in_files
+from minimax_cal.judging.tolerance import KINDS
 from minimax_cal.judging.watching.moved import Moved, moved_table
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.aside import SetAside
@@ -27,17 +29,16 @@ SHIFT = 2e-4  # of a zero position, whose discovery is asked of the poses [rad]
 class Verdict:
     """One requirement.  valid: None where it is not decided; confidence: of that; why: a clause."""
 
-    limit: Limit
-    value_mm: float
-    low_mm: float
-    high_mm: float
+    kind: str
+    limit_mm: float
+    value_mm: Annotated[float, Fact(key="seen_mm")]
+    ends_mm: Annotated[tuple[float, float], Fact(key="ci95_mm")]
     valid: bool | None
     confidence: float
     why: str
 
 
-@dataclass(frozen=True)
-class Hidden:
+class Hidden(NamedTuple):
     """A zero position whose shift these data cannot tell.  like: what moves everything alike."""
 
     parameter: str
@@ -59,24 +60,26 @@ class Health(Result):
     they count, None without any.
     """
 
-    robot: str
-    verdicts: tuple[Verdict, ...]
-    moved: tuple[Moved, ...]
-    hidden: tuple[Hidden, ...]
-    accuracy: Accuracy
-    refitted: Accuracy
-    findable: Mapping[str, float]
-    sliding: frozenset[str]
-    enough: int | None
-    asked: int | None
-    noise: float
-    poses: int
-    fit: Fit
-    notices: tuple[str, ...] = field(default=())
-    set_aside: tuple[SetAside, ...] = ()
-    with_them: WithThem | None = None
+    KIND = "check"
 
-    @property
+    robot: Apart[str]
+    verdicts: Annotated[tuple[Verdict, ...], Fact(key="required")]
+    moved: tuple[Moved, ...]
+    hidden: Annotated[tuple[Hidden, ...], Fact(key="not_separable")]
+    accuracy: Apart[Accuracy]
+    refitted: Annotated[Accuracy, Fact(key="accuracy_refitted")]
+    findable: Apart[Mapping[str, float]]
+    sliding: Apart[frozenset[str]]
+    enough: Annotated[int | None, Fact(key="poses.enough")]
+    asked: Annotated[int | None, Fact(key="poses.needed")]
+    noise: Annotated[float, Fact(key="noise_ratio")]
+    poses: Annotated[int, Fact(key="poses.given")]
+    fit: Apart[Fit]
+    notices: tuple[str, ...] = ()
+    set_aside: tuple[SetAside, ...] = ()
+    with_them: Apart[WithThem | None] = None
+
+    @derived()
     def valid(self) -> bool | None:
         """Whether the calibration keeps all that is required; None where it is not decided."""
         found = [verdict.valid for verdict in self.verdicts]
@@ -87,11 +90,16 @@ class Health(Result):
         """The verdict in words."""
         return WORDS[self.valid]
 
-    @property
+    @derived()
     def confidence(self) -> float:
         """In the verdict."""
         every = [v.confidence for v in self.verdicts if v.valid == self.valid]
         return max(every) if self.valid is False else min(every)
+
+    @derived(key="poses.to_find_rad")
+    def to_find(self) -> float:
+        """The shift that enough poses find [rad]."""
+        return SHIFT
 
     @property
     def status(self) -> Status:
@@ -133,8 +141,8 @@ class Health(Result):
             f"required of {self.robot}; base and reflectors fitted to {self.poses} poses",
             ("error", "at most mm", "seen mm", "95 % from", "to", "verdict", "confidence %"),
             tuple(
-                (KINDS[v.limit.kind], v.limit.size_mm, v.value_mm, v.low_mm, v.high_mm,
-                 WORDS[v.valid], 100 * v.confidence)
+                (KINDS[v.kind], v.limit_mm, v.value_mm, *v.ends_mm, WORDS[v.valid],
+                 100 * v.confidence)
                 for v in self.verdicts
             ),
             ("", "g", ".4f", ".4f", ".4f", "", ".1f"),
@@ -155,45 +163,18 @@ class Health(Result):
         hidden = Table(
             "joints that these data cannot check",
             ("zero position", "looks like", "measure"),
-            tuple((h.parameter, h.like, h.needs) for h in self.hidden),
+            self.hidden,
         )
         return tuple(table for table in (self.required_table(), moved, found, hidden) if table.rows)
 
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON of the contract, and more: lengths in mm, angles in rad."""
-
-        def scaled(name: str, size: float) -> dict[str, Any]:
-            slides = name in self.sliding
-            unit = "mm" if slides else "rad"
-            return {"parameter": name, "size": 1e3 * size if slides else size, "unit": unit}
-
-        with_it = {"holdout_with_them": self.with_them.to_dict()} if self.with_them else {}
-        return dict(
-            plain(
-                {
-                    "schema": 1,
-                    "kind": "check",
-                    "valid": self.valid,
-                    "confidence": self.confidence,
-                    "moved": [m.to_dict() for m in self.moved],
-                    "required": [
-                        {"kind": v.limit.kind, "limit_mm": v.limit.size_mm, "seen_mm": v.value_mm,
-                         "ci95_mm": [v.low_mm, v.high_mm], "valid": v.valid,
-                         "confidence": v.confidence, "why": v.why}
-                        for v in self.verdicts
-                    ],
-                    "not_separable": [vars(h) for h in self.hidden],
-                    "accuracy": self.accuracy.to_dict() | with_it,
-                    "set_aside": [point.to_dict() for point in self.set_aside],
-                    "accuracy_refitted": self.refitted.to_dict(),
-                    "smallest_found": [scaled(n, s) for n, s in self.findable.items()],
-                    "poses": {"given": self.poses, "enough": self.enough, "needed": self.asked,
-                              "to_find_rad": SHIFT},
-                    "noise_ratio": self.noise,
-                    "notices": list(self.notices),
-                }
-            )
-        )  # fmt: skip
+    def beside(self) -> dict[str, Any]:
+        """Accuracy, and what could be found: lengths in mm, angles in rad."""
+        found = []
+        for name, size in self.findable.items():
+            scale, unit = in_files("m" if name in self.sliding else "rad")
+            found.append({"parameter": name, "size": scale * size, "unit": unit})
+        with_it = {"holdout_with_them": self.with_them} if self.with_them else {}
+        return {"accuracy": plain(self.accuracy) | with_it, "smallest_found": found}
 
     def fit_dict(self) -> dict[str, Any]:
         """The refitted calibration as its file, with this answer."""

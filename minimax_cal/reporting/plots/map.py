@@ -41,7 +41,8 @@ def save_map(found: WorkspaceMap, path: Path) -> None:
         draw_predicted(figure, grid[:, :1], found)
     draw_observed(figure, grid[:, -2:], found)
     for row, part in zip(grid, found.sections, strict=True):
-        row[0].set(ylabel=millimetres(part.axes[1]), xlim=part.x[[0, -1]], ylim=part.y[[0, -1]])
+        x, y = (edges[[0, -1]] for edges in part.edges)
+        row[0].set(ylabel=millimetres(part.axes[1]), xlim=x, ylim=y)
         for axes in row:
             axes.set(xlabel=millimetres(part.axes[0]), aspect="equal")
             in_millimetres(axes)
@@ -76,7 +77,7 @@ def draw_predicted(figure: Figure, grid: Array, found: WorkspaceMap) -> None:
     scale = logarithmic(np.concatenate(every), 0.02)
     for axes, part in zip(grid[:, 0], found.sections, strict=True):
         shown = axes.pcolormesh(
-            part.x, part.y, 1e3 * part.worst.T, norm=scale, cmap=MAP_COLOURS, rasterized=True
+            *part.edges, 1e3 * part.worst.T, norm=scale, cmap=MAP_COLOURS, rasterized=True
         )
         outline(axes, part)
         axes.set_title("predicted, the worst of each bin", fontsize="medium")
@@ -86,16 +87,17 @@ def draw_predicted(figure: Figure, grid: Array, found: WorkspaceMap) -> None:
 def draw_observed(figure: Figure, grid: Array, found: WorkspaceMap) -> None:
     """Errors of the poses that were measured, before and after on one colour scale."""
     seen = found.seen
-    scale = logarithmic(1e3 * np.concatenate(list(seen.error.values())), 0.02)
+    scale = logarithmic(1e3 * np.concatenate([seen.before, seen.after]), 0.02)
     x, y, z = seen.place.T
     flat = np.abs(z - found.height) <= 0.5 * found.slab
     views = ((np.hypot(x, y), z, np.ones(len(x), dtype=bool)), (x, y, flat))
     for row, part, (across, along, inside) in zip(grid, found.sections, views, strict=True):
-        for axes, name in zip(row, (BEFORE, AFTER), strict=True):
+        pairs = ((BEFORE, seen.before), (AFTER, seen.after))
+        for axes, (name, off) in zip(row, pairs, strict=True):
             ground = np.where(part.count > 0, 0.0, np.nan)
-            axes.pcolormesh(part.x, part.y, ground.T, cmap="Greys", vmin=0, vmax=1, rasterized=True)
+            axes.pcolormesh(*part.edges, ground.T, cmap="Greys", vmin=0, vmax=1, rasterized=True)
             outline(axes, part)
-            error = 1e3 * seen.error[name]
+            error = 1e3 * off
             for held, mark in MARKS.items():
                 for mask, alpha in ((~inside, 0.25), (inside, 1.0)):
                     rows = np.flatnonzero(mask & (seen.held == held) & np.isfinite(error))
@@ -115,10 +117,7 @@ def outline(axes: Axes, part: Section) -> None:
     inside = np.pad(part.reached >= REACHED, 1)  # NaN, where no joints come, is no more
     i, j = np.nonzero(inside[1:, :] != inside[:-1, :])  # across x, then across y
     a, b = np.nonzero(inside[:, 1:] != inside[:, :-1])
-    walls = [
-        ((part.x[u], part.y[v - 1]), (part.x[u], part.y[v])) for u, v in zip(i, j, strict=True)
-    ]
-    floors = [
-        ((part.x[u - 1], part.y[v]), (part.x[u], part.y[v])) for u, v in zip(a, b, strict=True)
-    ]
+    x, y = part.edges
+    walls = [((x[u], y[v - 1]), (x[u], y[v])) for u, v in zip(i, j, strict=True)]
+    floors = [((x[u - 1], y[v]), (x[u], y[v])) for u, v in zip(a, b, strict=True)]
     axes.add_collection(LineCollection([*walls, *floors], colors="black", linewidths=1.0))
