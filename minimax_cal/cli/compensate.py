@@ -27,7 +27,6 @@ from minimax_cal.correcting.programs.program import LANGUAGES, is_program, read_
 from minimax_cal.correcting.target_file import read_targets
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
 from minimax_cal.ground.words import visible
 from minimax_cal.robots.robot import Robot, load_robot
@@ -116,7 +115,7 @@ def compensate_command(
         found = compensate(fit, given.data, robot, **chosen)
         text = to.cells(given.corrected(found), safe_cells)
     to.notice(*found.notices)
-    if to.deliver(lambda: json_text(found.to_dict()), rows=lambda: text):
+    if to.deliver(found.json, rows=lambda: text):
         show_corrected(found, text, to)
     if found.failed.any():
         tell("error", found.complaint(), exit_code=FAILED)

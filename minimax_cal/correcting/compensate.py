@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -20,11 +20,14 @@ from minimax_cal.correcting.deliverable import (
     Figures,
     kept,
 )
-from minimax_cal.fitting.opened import Result, open_result
+from minimax_cal.fitting.opened import Result as Given
+from minimax_cal.fitting.opened import open_result
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
+from minimax_cal.ground.facts import Apart, Fact, derived
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell as TableCell
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, records_of
 from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.checks import check_joints, limit_notices
 from minimax_cal.measuring.history import ordered
@@ -44,7 +47,7 @@ SAMPLE = 200  # poses that place a nominal base where no calibration did
 
 
 @dataclass(frozen=True, eq=False)
-class Compensation:
+class Compensation(Result):
     """Corrected joint targets.
 
     q: (m, n) corrected, commanded: (m, n) as given [rad, m].  distance, angle: (m,) what remains
@@ -54,16 +57,18 @@ class Compensation:
     arm that was corrected for, and how well it does; None if not asked for.
     """
 
-    q: Array
-    commanded: Array
-    distance: Array
-    angle: Array
-    distance_before: Array
-    angle_before: Array
-    outcome: tuple[Outcome, ...]
-    sliding: Array
-    line: Array
-    name: str
+    KIND = "compensation"
+
+    q: Apart[Array]
+    commanded: Apart[Array]
+    distance: Apart[Array]
+    angle: Apart[Array]
+    distance_before: Apart[Array]
+    angle_before: Apart[Array]
+    outcome: Apart[tuple[Outcome, ...]]
+    sliding: Apart[Array]
+    line: Apart[Array]
+    name: Annotated[str, Fact(key="robot")]
     frame: str
     notices: tuple[str, ...]
     delivered: Delivered | None = None
@@ -78,22 +83,25 @@ class Compensation:
         """(m,) True where a target is missed."""
         return np.array([outcome.failed for outcome in self.outcome], dtype=bool)
 
+    @derived()
+    def missed(self) -> int:
+        """How many targets are."""
+        return int(self.failed.sum())
+
     def tables(self) -> tuple[Table, ...]:
         """What the correction does, how targets ended, and by how much each joint changes."""
         rows: list[tuple[TableCell, ...]] = []
         missed, expected = self.failed, self.expected
-        for title, which, distance, angle in (
-            ("as commanded", np.ones(len(self.q), dtype=bool), self.distance_before,
-             self.angle_before),
-            ("missed, by the model", missed, self.distance, self.angle),
-        ):  # fmt: skip
+        for title, which, off in (
+            ("as commanded", np.ones_like(missed), self.before),
+            ("missed, by the model", missed, (self.distance, self.angle)),
+        ):
             if which.any():
-                sizes = [f(1e3 * part[which]) for part in (distance, angle) for f in (rms, np.max)]
-                rows.append((title, int(which.sum()), *map(float, sizes)))
+                sizes = [float(f(1e3 * part[which])) for part in off for f in (rms, np.max)]
+                rows.append((title, int(which.sum()), *sizes))
         if not math.isnan(expected.rms):
-            count = int((~missed).sum())
-            mm = (expected.rms, expected.largest)
-            rows.append(("corrected, on the arm", count, *mm, math.nan, math.nan))
+            mm = (expected.rms, expected.largest, math.nan, math.nan)
+            rows.append(("corrected, on the arm", len(missed) - self.missed, *mm))
         header = ("joints", "targets", "RMS mm", "max mm", "RMS mrad", "max mrad")
         formats = ("", "d", *[".4f"] * 4)
         title = f"{self.name}: error of the flange ({self.frame})"
@@ -101,30 +109,27 @@ class Compensation:
         found = [(o, self.outcome.count(o)) for o in Outcome if o in self.outcome]
         ends = tuple((str(o), count, o.advice) for o, count in found)
         outcome = Table("targets", ("status", "targets", "meaning"), ends, ("", "d", ""))
-        change = 1e3 * (self.q - self.commanded)
         joints = tuple(
-            (f"J{j + 1}", "mm" if self.sliding[j] else "mrad", rms(change[:, j]),
-             float(np.abs(change[:, j]).max()))
-            for j in range(self.q.shape[1])
-        )  # fmt: skip
+            (f"J{j + 1}", "mm" if self.sliding[j] else "mrad", rms(by), float(np.abs(by).max()))
+            for j, by in enumerate(1e3 * (self.q - self.commanded).T)
+        )
         each = Table("change of the joints", ("joint", "unit", "RMS", "max"), joints,
                      ("", "", ".4f", ".4f"))  # fmt: skip
         return pose, outcome, each
 
     def headline(self) -> str:
         """The result in a sentence."""
-        missed, count, said = self.failed, len(self.q), list[str]()
+        missed, said = self.failed, list[str]()
         if not missed.all():
             far, turned = (1e3 * part[~missed].max() for part in self.before)
             said.append(
-                f"{count - int(missed.sum())} of {count} targets corrected, which are off by up to "
-                f"{far:.3f} mm, {turned:.3f} mrad as commanded"
+                f"{len(missed) - self.missed} of {len(missed)} targets corrected, which are off by "
+                f"up to {far:.3f} mm, {turned:.3f} mrad as commanded"
             )
         if missed.any():
             far, turned = (1e3 * part[missed].max() for part in (self.distance, self.angle))
             said.append(
-                f"{int(missed.sum())} missed, which stay off by up to {far:.3f} mm, "
-                f"{turned:.3f} mrad"
+                f"{self.missed} missed, which stay off by up to {far:.3f} mm, {turned:.3f} mrad"
             )
         return f"{'; '.join(said)}. Expect on the arm: {self.expected.sentence()}."
 
@@ -133,48 +138,32 @@ class Compensation:
         """Distance and angle of each target as commanded: (m,) [m] and (m,) [rad]."""
         return self.distance_before, self.angle_before
 
-    def summary(self, width: int = 110) -> str:
-        """The result as plain text."""
-        return "\n\n".join([*(table.text(width) for table in self.tables()), self.headline()])
-
     def complaint(self) -> str:
         """Which targets are missed and what to try; '' if none is."""
         parts = []
         for kind in Outcome:
-            lines = [int(n) for n, o in zip(self.line, self.outcome, strict=True) if o == kind]
+            lines = [str(n) for n, o in zip(self.line, self.outcome, strict=True) if o == kind]
             if lines and kind.failed:
-                where = name_first(list(map(str, lines)))
-                parts.append(f"{kind} at line {where}: {kind.advice}")
-        count = int(self.failed.sum())
-        return f"{count} of {len(self.q)} targets are missed: " + "; ".join(parts) if count else ""
+                parts.append(f"{kind} at line {name_first(lines)}: {kind.advice}")
+        said = f"{self.missed} of {len(self.q)} targets are missed: "
+        return said + "; ".join(parts) if self.missed else ""
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON, joints in SI."""
-        return {
-            "schema": 1,
-            "kind": "compensation",
-            "robot": self.name,
-            "frame": self.frame,
-            "missed": int(self.failed.sum()),
-            "delivered": self.delivered.to_dict() if self.delivered else None,
-            "targets": [
-                {
-                    "line": int(self.line[i]),
-                    "status": str(self.outcome[i]),
-                    "q": self.q[i].tolist(),
-                    "residual_mm": 1e3 * float(self.distance[i]),
-                    "residual_mrad": 1e3 * float(self.angle[i]),
-                    "before_mm": 1e3 * float(self.distance_before[i]),
-                    "before_mrad": 1e3 * float(self.angle_before[i]),
-                }
-                for i in range(len(self.q))
-            ],
-            "notices": list(self.notices),
+    def beside(self) -> dict[str, Any]:
+        """The targets, joints in SI."""
+        columns = {
+            "line": self.line,
+            "status": map(str, self.outcome),
+            "q": self.q,
+            "residual_mm": 1e3 * self.distance,
+            "residual_mrad": 1e3 * self.angle,
+            "before_mm": 1e3 * self.distance_before,
+            "before_mrad": 1e3 * self.angle_before,
         }
+        return {"targets": records_of(columns)}
 
 
 def compensate(
-    fit: Result,
+    fit: Given,
     targets: Measurements | Array | Sequence[Sequence[float]],
     nominal: Robot | str | Path | None = None,
     *,
@@ -251,28 +240,12 @@ def compensate(
     lever = lever_of(cell) if np.isnan(lever) else lever
     reach = Reach(arm, data, goal, lever, tolerance, most_change)
     q, outcome = reach.best()
-    distance, angle = reach.error(q)
-    before, turned = reach.error(data.q)
+    lacks = (made.sentence(),) if made.lacks else ()
+    said = (*data.notices, *said, *remarks(arm, data), *lacks)
     return Compensation(
-        q=q,
-        commanded=data.q,
-        distance=distance,
-        angle=angle,
-        distance_before=before,
-        angle_before=turned,
-        outcome=outcome,
-        sliding=cell.robot.prismatic,
-        line=data.line,
-        name=cell.robot.name,
-        frame=frame,
-        notices=(
-            *data.notices,
-            *said,
-            *remarks(arm, data),
-            *([made.sentence()] if made.lacks else ()),
-        ),
-        delivered=made,
-    )
+        q, data.q, *reach.error(q), *reach.error(data.q), outcome, cell.robot.prismatic, data.line,
+        cell.robot.name, frame, said, made,
+    )  # fmt: skip
 
 
 def check_choices(

@@ -8,16 +8,16 @@ import shlex
 import sys
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, cast
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-
 from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.files import json_of, json_text, write_whole
+from minimax_cal.ground.facts import Fact
+from minimax_cal.ground.files import json_of, json_text, plain, write_whole
+from minimax_cal.ground.records import read
 from minimax_cal.ground.stages import clock
 from minimax_cal.ground.words import one_line
 from minimax_cal.serving.sessions import LOG, SCRIPT, Session
@@ -29,25 +29,24 @@ MOST_LINES = 400
 MOST_LINE = 1 << 20  # bytes of a line on stderr
 
 
-class Record(BaseModel):
+@dataclass(frozen=True)
+class Record:
     """How a step ended.  inputs: SHA-256 of the files that its commands read.  told: its stdout."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
 
     commands: tuple[str, ...]
     code: int
-    seconds: Annotated[float, Field(ge=0.0)]
+    seconds: Annotated[float, Fact(least=0.0)]
     told: str = ""
     notices: tuple[str, ...] = ()
     error: str = ""
-    inputs: dict[str, str] = {}
+    inputs: Mapping[str, str] = field(default_factory=dict)
 
 
 def record_of(at: Session, step: str) -> Record | None:
     """How a step ended the last time, None where it never did."""
     try:
-        return Record.model_validate(json_of((at.folder / LOG / f"{step}.json").read_bytes()))
-    except (OSError, ValueError, ValidationError):
+        return read(Record, json_of((at.folder / LOG / f"{step}.json").read_bytes()))
+    except (OSError, ValueError):
         return None
 
 
@@ -215,16 +214,13 @@ def digests(at: Session, command: Command) -> dict[str, str]:
 def kept(job: Job, code: int, told: str, inputs: dict[str, str]) -> None:
     """Write how a step ended, and its commands into the session's script."""
     seconds = round(time.monotonic() - job.began, 1)
-    record = Record(
-        commands=tuple(command.line() for command in job.commands),
-        code=code, seconds=seconds, told=told, notices=tuple(job.notices), error=job.error,
-        inputs=inputs,
-    )  # fmt: skip
-    write_whole(job.at.folder / LOG / f"{job.step}.json", json_text(record.model_dump()))
+    commands = tuple(command.line() for command in job.commands)
+    record = Record(commands, code, seconds, told, tuple(job.notices), job.error, inputs)
+    write_whole(job.at.folder / LOG / f"{job.step}.json", json_text(plain(record)))
     script = job.at.folder / SCRIPT
     text = script.read_text("utf-8") if script.exists() else start_of(job.at.folder)
     when = time.strftime("%Y-%m-%d %H:%M:%S")
-    lines = "\n".join(record.commands)
+    lines = "\n".join(commands)
     write_whole(script, f"{text}\n# {when}, exit code {code}, {seconds:g} s\n{lines}\n")
 
 

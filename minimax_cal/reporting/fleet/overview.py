@@ -28,6 +28,8 @@ GOOD, BAD = (PASSED, VALID), (NOT_PASSED, NOT_VALID, FAILED)
 class Fleet(Result):
     """What became of all cells, in the order of the file."""
 
+    KIND = "fleet"
+
     rows: tuple[Row, ...]
     source: str
 
@@ -61,11 +63,9 @@ class Fleet(Result):
         """A row a cell."""
         return (self.table(),)
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        rows = [row.to_dict() for row in self.rows]
-        counts = {"cells": len(rows), "failed": len(self.failed)}
-        return {"schema": 1, "kind": "fleet", "source": self.source, **counts, "rows": rows}
+    def beside(self) -> dict[str, Any]:
+        """How many cells, and how many failed."""
+        return {"cells": len(self.rows), "failed": len(self.failed)}
 
     def html(self) -> str:
         """One page that needs nothing else.  Raises OptionError without jinja2."""

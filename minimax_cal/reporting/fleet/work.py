@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
-from minimax_cal.ground.files import plain
 from minimax_cal.ground.parallel import in_parallel
 from minimax_cal.judging.tolerance import REFUSED, judge, limits_of, overall, within
 from minimax_cal.judging.watching.comparison import compare
@@ -52,10 +50,6 @@ class Row:
     def failed(self) -> bool:
         """Whether there is no result."""
         return self.status == FAILED
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return dict(plain(asdict(self)))
 
 
 def done(job: Job) -> Row:
