@@ -20,7 +20,7 @@ from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.opened import GEOMETRIC, Opened, Result, open_result
 from minimax_cal.fitting.options import OFFSETS, Progress, silent
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import plain
+from minimax_cal.ground.files import finite
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
@@ -162,15 +162,14 @@ def block(
     figures: Figures = Figures(),
 ) -> dict[str, Any]:
     """`delivered` in JSON; of a bare robot nothing is known."""
-    whole = {
+    return {
         "format": to,
-        "carries": carries,
-        "not_carried": not_carried,
-        "holdout_rms_mm": figures.rms,
-        "outside_typical_mm": figures.typical,
-        "outside_worst_mm": figures.worst,
+        "carries": list(carries),
+        "not_carried": list(not_carried),
+        "holdout_rms_mm": finite(figures.rms),
+        "outside_typical_mm": finite(figures.typical),
+        "outside_worst_mm": finite(figures.worst),
     }
-    return dict(plain(whole))
 
 
 def deliver(

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated
 
 import numpy as np
 
 from minimax_cal.dynamics.regressor import Motion
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.facts import Fact
 from minimax_cal.planning.visibility import ARM, Room, Sight, View
 from minimax_cal.robots.kinematics import chain
 
@@ -33,9 +31,9 @@ class Series:
     """centre: (n,).  a, b: (K, n) of cos and sin [rad, m].  period: [s]."""
 
     centre: Array
-    a: Annotated[Array, Fact(key="cos")]
-    b: Annotated[Array, Fact(key="sin")]
-    period: Annotated[float, Fact(unit="s")]
+    a: Array
+    b: Array
+    period: float
 
     def at(self, time: Array) -> Motion:
         """The motion at times (m,) [s]."""

@@ -20,7 +20,7 @@ from minimax_cal.dynamics.regressor import (
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.facts import Apart, Fact, in_file
+from minimax_cal.ground.facts import Apart, Fact
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.options import option
 from minimax_cal.ground.results import Result
@@ -91,8 +91,8 @@ class Part:
     """A part of the motion, recorded as a run of its own.  payload: [kg]."""
 
     name: str
-    series: Apart[Series]
-    payload: Annotated[float, Fact(unit="kg")]
+    series: Series
+    payload: float
 
 
 class Told(NamedTuple):
@@ -192,9 +192,13 @@ class MotionPlan(Result):
         """The series' coefficients in SI, and how far and how fast they move each joint."""
         return {
             "robot": self.robot.name,
-            "parts": [in_file(part) | in_file(part.series) for part in self.parts],
+            "parts": [
+                {"name": part.name, "period_s": part.series.period, "payload_kg": part.payload,
+                 "centre": part.series.centre, "cos": part.series.a, "sin": part.series.b}
+                for part in self.parts
+            ],
             "motion": self.motion_table().records(),
-        }
+        }  # fmt: skip
 
 
 def shown(told: Told) -> str:

@@ -15,7 +15,7 @@ from minimax_cal.ground.facts import Apart, Fact, derived, in_file, scaled
 from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell as TableCell
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, records_of
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.planning.candidates import Poses
 from minimax_cal.planning.observability import INDICES
@@ -199,12 +199,11 @@ class Plan(Result):
         """Names, units, sizes and sigmas."""
         unit = "power" if self.criterion == POWER else "sigma_um"
         sizes = {"planned": self.size, "random": self.random, "bound": self.bound}
-        named = zip(self.names, self.sigma, strict=True)
         return {
             "robot": self.cell.robot.name,
             "targets": self.cell.target_names,
             "q_units": ["m" if sliding else "rad" for sliding in self.cell.robot.prismatic],
             "value": {f"{name}_{unit}": self.shown(size) for name, size in sizes.items()},
-            "parameters": [{"name": name, "sigma": sigma} for name, sigma in named],
+            "parameters": records_of({"name": self.names, "sigma": self.sigma}),
             "instrument": {"place_in_base_mm": 1e3 * self.place, **in_file(self.instrument)},
         }

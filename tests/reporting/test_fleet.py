@@ -65,6 +65,7 @@ def test_ten_cells(folder: Path, tmp_path: Path) -> None:
     assert told["cell 3"].rms_mm == alone.within.after.rms_mm
     kept = mc.load_fit(tmp_path / "fits" / "cell 3.json")
     np.testing.assert_allclose(kept.robot.mdh, alone.robot.mdh, rtol=0, atol=1e-14)
+    assert Fleet.from_dict(json.loads(found.json())).json() == found.json()
     page = (tmp_path / "page.html").read_text()
     for row in found.rows:
         assert f">{row.cell}<" in page

@@ -26,9 +26,8 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.judging.watching.compared import Comparison, Difference, OnPoses
 from minimax_cal.judging.watching.moved import Moved, search
 from minimax_cal.judging.watching.opening import in_names, watched_of
-from minimax_cal.measuring.accuracy import Accuracy, accuracy
+from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import regions
-from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import links_of, zero_positions
@@ -72,7 +71,7 @@ def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
     drawn = links_of(one.nominal.robot.mdh)
     value = [drawn + turn @ (links_of(fit.cell.robot.mdh) - drawn) for fit in fits]
     covariance = sum(turn @ links_covariance(fit) @ turn.T for fit in fits)
-    told = [told_by(fit, kept, n) for fit in fits]
+    told = [told_by(fit, n) for fit in fits]
     told_in = [in_convention(one.cell.robot, links) for links in value]
     each = tuple(differences(one, told_in, np.asarray(covariance), kept, told))
     found, same = changed(one, other)
@@ -152,7 +151,7 @@ def folds_covariance(fit: Fit) -> Array:
     return out
 
 
-def told_by(fit: Fit, kept: Array, joints: int) -> Array:
+def told_by(fit: Fit, joints: int) -> Array:
     """(5n,) True where a fit tells a parameter, or any other that moves the points alike."""
     names = fit.uncertainty.names.all[: 5 * joints]
     kinds = {p.name: p.because for p in fit.parameters}
@@ -198,15 +197,12 @@ def on_common(one: Fit, other: Fit) -> Iterator[OnPoses]:
             continue
         held = fit.held if fit.held.any() else ~fit.held
         data = fit.data.take(held)
-        found = (missed_by(arm, data) for arm in (one, other))
+        found = []
+        for arm in (one, other):
+            model, state = watched_of(arm, replace(data, frames={}), ())[0].start
+            found.append(accuracy(model.error(state)))
         which = "held-out" if fit.held.any() else "training"
         yield OnPoses(f"{which} poses of {name}", *found)
-
-
-def missed_by(arm: Fit, data: Measurements) -> Accuracy:
-    """The accuracy on some poses, base and reflectors placed anew."""
-    model, state = watched_of(arm, replace(data, frames={}), ())[0].start
-    return accuracy(model.error(state))
 
 
 def remarks(one: Fit, other: Fit) -> Iterator[str]:

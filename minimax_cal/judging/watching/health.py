@@ -193,17 +193,16 @@ def verdict(limit: Limit, error: Array, data: Measurements, used: float, seed: i
     found = accuracy(larger)
     value = found.rms_mm if rms else found.max_mm
     ends = interval(2.0 * MIN_CONFIDENCE - 1.0)
-    low, high = 1e3 * ends.low, max(1e3 * ends.high, value)
+    span = 1e3 * ends.low, max(1e3 * ends.high, value)
     poses = len(np.unique(group))
-    told = partial(Verdict, limit.kind, limit.size_mm, value, (low, high))
+    told = partial(Verdict, limit.kind, limit.size_mm, value, span)
     seen = f"{KINDS[limit.kind]} {value:.3f} mm, at most {limit.size_mm:g} mm is required"
-    if math.isnan(low):
+    if math.isnan(ends.low):
         return told(None, CONFIDENCE_RANGE[0], f"{seen}, and {poses} poses are too few to say")
-    if not rms and accuracy(error).max_mm > limit.size_mm:
+    if not rms and (most := accuracy(error).max_mm) > limit.size_mm:
         return told(
             False, CONFIDENCE_RANGE[1],
-            f"{KINDS[limit.kind]} {accuracy(error).max_mm:.3f} mm was seen, at most "
-            f"{limit.size_mm:g} mm is required",
+            f"{KINDS['max']} {most:.3f} mm was seen, at most {limit.size_mm:g} mm is required",
         )  # fmt: skip
     if not rms and chance_of_larger(poses) > MAX_EXCEED_CHANCE:
         said = f"{seen}, and a maximum needs at least {MIN_POSES} poses"
