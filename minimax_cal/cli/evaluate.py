@@ -15,7 +15,7 @@ from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.fitting.set_aside import aside_sentence, errors_of, with_them
 from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.files import json_of, json_text, read_text
+from minimax_cal.ground.files import json_of, json_text, plain, read_text
 from minimax_cal.judging.saved import training_poses
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
@@ -97,12 +97,12 @@ def evaluate_command(
             "poses": int(away.sum()),
             "joints": [span.joint for span in narrow(opened.spans)],
         },
-        "accuracy": found.to_dict(),
-        "set_aside": [point.to_dict() for point in measured.set_aside],
+        "accuracy": plain(found),
+        "set_aside": plain(measured.set_aside),
     }
     if measured.set_aside:
         gone = with_them(error, groups(measured), errors_of(cell, measured))
-        content["accuracy"] = found.to_dict() | {"holdout_with_them": gone.to_dict()}
+        content["accuracy"] = plain(found) | {"holdout_with_them": plain(gone)}
         to.notice(aside_sentence(measured.set_aside, gone))
     if to.deliver(lambda: json_text(content)):
         name = cell.robot.name if rung is None else f"{cell.robot.name}, {content['rung']},"

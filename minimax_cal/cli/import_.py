@@ -26,7 +26,7 @@ from minimax_cal.cli.options import (
 from minimax_cal.dynamics.logs import LogFiles, are_logs, import_logs, runs_text
 from minimax_cal.dynamics.run import Run
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import json_text
+from minimax_cal.ground.files import json_text, plain
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.columns import rows_in
 from minimax_cal.measuring.faults import distance_faults
@@ -202,6 +202,6 @@ def content(found: Imported, output: Path | None) -> dict[str, object]:
             }
             for row, table in zip(files.rows, columns, strict=True)
         ],
-        "set_aside": [point.to_dict() for point in found.data.set_aside],
+        "set_aside": plain(found.data.set_aside),
         "notices": list(found.data.notices),
     }

@@ -12,14 +12,18 @@ from minimax_cal.ground.files import json_text
 
 KINDS = {  # name: (module, class that reads such a file, title)
     "robot": ("robots.robot", "RobotSchema", "Robot file of minimax-cal"),
-    "calibration": ("fitting.fit_file", "FitPart", "Result of minimax-cal calibrate"),
-    "relative": ("fitting.instruments.result", "RelativePart", "Result of minimax-cal relative"),
+    "calibration": ("fitting.fit", "Fit", "Result of minimax-cal calibrate"),
+    "relative": (
+        "fitting.instruments.result",
+        "RelativeCalibration",
+        "Result of minimax-cal relative",
+    ),
     "pixels": (
         "fitting.instruments.pixel_result",
-        "PixelPart",
+        "PixelCalibration",
         "Result of minimax-cal calibrate by cameras",
     ),
-    "diagnosis": ("diagnosing.result_file", "DiagnosisPart", "Result of minimax-cal diagnose"),
+    "diagnosis": ("diagnosing.result", "Diagnosis", "Result of minimax-cal diagnose"),
     "simulator_gap": ("simulators.result", "GapPart", "Result of minimax-cal gap"),
     "motion_gap": (
         "simulators.motion.result",

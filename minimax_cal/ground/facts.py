@@ -22,7 +22,7 @@ class Fact:
     key: in the JSON, the field's own name with its unit unless given; dots where objects hold it.
     scale: what a number is multiplied by there, as 1e3 for millimetres.  unit: there, for the key.
     brief: left out where it is None or empty.  least: no number of it is smaller.
-    fewest: of its parts.  apart: told by `results.Result.beside`, not by itself.
+    fewest: of its parts.  among: which texts it may be.  apart: told by `results.Result.beside`.
     """
 
     words: str = ""
@@ -32,6 +32,7 @@ class Fact:
     brief: bool = False
     least: float = float("-inf")
     fewest: int = 0
+    among: tuple[str, ...] = ()
     apart: bool = False
 
     def key_of(self, name: str) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from minimax_cal.fitting.fit import Fit
-from minimax_cal.fitting.set_aside import WithThem, aside_sentence
+from minimax_cal.fitting.set_aside import aside_sentence
 from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
@@ -74,7 +74,7 @@ class Health(Result):
     fit: Fit
     notices: tuple[str, ...] = field(default=())
     set_aside: tuple[SetAside, ...] = ()
-    with_them: WithThem | None = None
+    with_them: Accuracy | None = None
 
     @property
     def valid(self) -> bool | None:
