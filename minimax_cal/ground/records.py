@@ -205,7 +205,11 @@ def check_schema(content: Mapping[str, Any], source: str, known: int) -> None:
 
 def json_schema(kind: Any, title: str) -> dict[str, Any]:
     """The JSON schema of a record's file, for editors and other programs."""
-    whole = record_schema(kind) if is_dataclass(kind) else plain(kind.model_json_schema())
+    whole = (
+        record_schema(kind)
+        if isinstance(kind, type) and is_dataclass(kind)
+        else plain(kind.model_json_schema())
+    )
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **whole, "title": title}
 
 

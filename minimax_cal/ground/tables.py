@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import re
+import textwrap
 from dataclasses import dataclass, replace
 from html import escape
 from typing import Literal
@@ -21,7 +22,9 @@ Cell = str | float | int
 EDGE, BETWEEN = 1, 3  # letters beside a table's columns, and between two
 MAX_ROWS = 6  # of a table on a first screen
 LONGEST_NAME = 28  # letters of a cell that is a name; what is longer is a sentence, and wraps
-UNIT = re.compile(r"(\d) (\S{1,5})(?!\S)")  # of a number in a sentence
+JOINT = "\N{WORD JOINER}"
+JOINED = rf"\1{JOINT}\2"
+UNIT = re.compile(r"(\d) (\S{1,9})(?!\S)")  # of a number in a sentence
 
 LATEX_ESCAPES = str.maketrans(
     {c: "\\" + c for c in "&%$#_{}"}
@@ -119,7 +122,7 @@ class Table:
             justify: Literal["left", "right"] = "right" if right else "left"
             table.add_column(Text(visible(name)), justify=justify, overflow="fold", width=width)
         for row in self.cells():
-            table.add_row(*(Text(visible(cell)) for cell in row))
+            table.add_row(*(Text(folded(visible(c), n)) for c, n in zip(row, widths, strict=True)))
         return table
 
     def markdown(self) -> str:
@@ -179,7 +182,15 @@ def unbroken(cell: str, *, right: bool) -> list[str]:
     """Parts of a cell that stand on one line: a number, a name, words of a sentence with units."""
     if right or len(cell) <= LONGEST_NAME:
         return [cell]
-    return UNIT.sub("\1_\2", cell).split()
+    return [cell[:LONGEST_NAME], *UNIT.sub(JOINED, cell).split()]
+
+
+def folded(cell: str, width: int) -> str:
+    """A cell in lines of at most so many letters, numbers with their units."""
+    if len(cell) <= width:
+        return cell
+    lines = textwrap.wrap(UNIT.sub(JOINED, cell), width, break_on_hyphens=False)
+    return "\n".join(lines).replace(JOINT, " ")
 
 
 def show(cell: Cell, spec: str) -> str:

@@ -7,7 +7,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.ground.files import plain
 from minimax_cal.fitting import beyond
 from minimax_cal.fitting.beyond import (
     RESOLUTION,
@@ -19,6 +18,7 @@ from minimax_cal.fitting.beyond import (
 )
 from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import plain
 from minimax_cal.measuring.grouping import parts
 from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.model import moved
