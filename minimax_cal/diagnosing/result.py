@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -57,6 +58,8 @@ PEOPLES = {  # how people read a unit of the file
 TOLD_AS = {"rad/(N m)": "mrad at most", "1/(N m^2)": "mm at most"}  # where masses are not told
 NONE_HELPS = "no measurement"  # how what is proposed begins where nothing helps
 VERDICTS = ("none", "named", "one_of", "unknown", "not_repeatable")
+NAMED = {"geometric": "calibrated geometry (least squares)"}  # `calibrate` may have another
+MAX_STEPS = 6  # rows of the budget on a first screen: nominal, geometry, effects, noise
 BELOW = math.nextafter(CONFIRMED, 0.0)  # what was tentative when it was written stays so
 
 
@@ -602,6 +605,34 @@ class Diagnosis(Explained, Result):
             tuple(rows),
             ("", ".4f", ".4f", ".4f", ".4f"),
         )
+
+    def first_tables(self) -> tuple[Table, ...]:
+        """What stands on the first screen: the budget in at most six steps.
+
+        What follows the main causes is one step where they are more.
+        """
+        if not self.ladder:
+            return ()
+        every = [(NAMED.get(s.name) or name_step(s.name), s.holdout) for s in self.ladder]
+        most = MAX_STEPS - 1  # the last row is the noise
+        if len(every) > most:
+            main = [f.term.step for f in self.main]
+            last = max((i for i, step in enumerate(self.ladder) if step.name in main), default=1)
+            kept = min(last + 1, most - 1)
+            every = [*every[:kept], (self.rest_of(kept), every[-1][1])]
+        rows: list[tuple[TableCell, ...]] = [(name, a.rms_mm, a.max_mm) for name, a in every]
+        known = "" if self.floor.certain else ", at most"
+        rows.append((f"measurement noise{known}", self.floor.value, ""))
+        title = "error budget, step by step, on held-out poses"
+        return (Table(title, ("model", "RMS mm", "max mm"), tuple(rows), ("", ".3f", ".3f")),)
+
+    def rest_of(self, kept: int) -> str:
+        """The steps after those kept, counted by kind, as + 16 minor and 2 possible effects."""
+        of_kind = (("main", self.main), ("minor", self.minor))
+        kinds = {f.term.step: kind for kind, some in of_kind for f in some}
+        counts = Counter(kinds.get(step.name, "possible") for step in self.ladder[kept:])
+        said = [f"{counts[kind]} {kind}" for kind in ("main", "minor", "possible") if counts[kind]]
+        return f"+ {' and '.join(said)} effect{'s' if counts.total() > 1 else ''}"
 
     def effects_table(self) -> Table:
         """The effects found, with what each does for held-out poses; possible ones last."""

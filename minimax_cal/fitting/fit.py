@@ -20,7 +20,14 @@ from minimax_cal.fitting.changed import Change
 from minimax_cal.fitting.crossed import NOT_CROSSED, Within, intervals_of
 from minimax_cal.fitting.found import Parameter, Parameters, parameter_table, table_of_effects
 from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval, told, with_ends
+from minimax_cal.fitting.intervals import (
+    UNKNOWN,
+    Interval,
+    max_interval,
+    rms_interval,
+    told,
+    with_ends,
+)
 from minimax_cal.fitting.minimax_problem import Distances, trusted_distances
 from minimax_cal.fitting.options import Options, read_options
 from minimax_cal.fitting.set_aside import aside_sentence
@@ -433,6 +440,37 @@ class Fit(Result):
             ("", "d", *[".4f"] * (3 + len(targets))),
         )
 
+    def first_tables(self) -> tuple[Table, ...]:
+        """What stands on the first screen: accuracy in at most six rows, and the frames."""
+        rows = tuple(row for row in self.accuracy_rows() if row[1] != 0)
+        first = Table(
+            f"position error, objective {self.objective}",
+            ("error at", "poses", "RMS mm", "95 % low", "95 % high", "max mm"),
+            rows,
+            ("", "d", *[".3f"] * 4),
+        )
+        frames = [(name, self.frames[name]) for name in ("base", "tool") if name in self.frames]
+        placed = Table(
+            "base in the instrument's frame, tool in the flange's; Rz(A) Ry(B) Rx(C)",
+            ("frame", "X mm", "Y mm", "Z mm", "A deg", "B deg", "C deg"),
+            tuple((name, *frame.xyz_mm, *frame.abc_deg) for name, frame in frames),
+            ("", *[".3f"] * 3, *[".4f"] * 3),
+        )
+        return first, placed
+
+    def accuracy_rows(self) -> Iterator[tuple[TableCell, ...]]:
+        """New poses, inside and outside the measured region, then those of the fit."""
+        inside = self.within
+        if self.error_crossed.size or self.accuracy["holdout"].poses:
+            drawn = UNKNOWN if self.error_crossed.size else self.intervals["nominal"][0]
+            yield row_of("new poses, nominal", inside.before, drawn)
+            yield row_of("new poses, calibrated", inside.after, inside.rms)
+        if self.beyond.worst:
+            most = max(fold.max_mm for fold in self.beyond.folds)
+            yield "outside, calibrated", "", self.beyond.typical_mm, math.nan, math.nan, most
+        for key, name in (("nominal_train", "nominal"), ("train", "calibrated")):
+            yield row_of(f"training poses, {name}", self.accuracy[key])
+
     def interval_table(self) -> Table:
         """95 % intervals of the held-out accuracy; empty where the poses are too few."""
         rows = tuple(
@@ -636,6 +674,11 @@ class Fit(Result):
             "error_drawn_crossed": arrays.get("drawn crossed", NOT_CROSSED),
             "stated_geometric": None if kept else cell_from_dict({**content, "cell": {}}, source),
         }
+
+
+def row_of(name: str, of: Accuracy, ends: Interval = UNKNOWN) -> tuple[TableCell, ...]:
+    """A row of the first table; ends: 95 % interval of the RMS [m]."""
+    return name, of.poses, of.rms_mm, 1e3 * ends.low, 1e3 * ends.high, of.max_mm
 
 
 def ends_of(seen: Accuracy) -> tuple[Interval, Interval] | None:

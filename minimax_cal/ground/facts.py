@@ -7,7 +7,7 @@ schema, the terminal, the report and the page.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sized
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, cached_property
 from typing import Annotated, Any, Generic, TypeVar, get_type_hints
 
@@ -101,11 +101,17 @@ def derived_facts(kind: type) -> Mapping[str, Fact]:
     return {name: each.fact for own in every for name, each in own if isinstance(each, Derived)}
 
 
+@cache
+def all_facts(kind: type) -> Mapping[str, Fact]:
+    """Of the fields and of the properties of a class, none where it is no dataclass."""
+    return {**stored_facts(kind), **derived_facts(kind)} if is_dataclass(kind) else {}
+
+
 def in_file(record: Any) -> dict[str, Any]:
     """Values of a record by their keys in the file, in its units."""
     kind: type = type(record)
     out: dict[str, Any] = {}
-    for name, known in {**stored_facts(kind), **derived_facts(kind)}.items():
+    for name, known in all_facts(kind).items():
         value = getattr(record, name)
         if known.brief and (value is None or (isinstance(value, Sized) and not len(value))):
             continue
@@ -134,6 +140,6 @@ def facts_in_words(record: object) -> str:
     kind: type = type(record)
     return ", ".join(
         known.words.format(scaled(getattr(record, name), known.scale))
-        for name, known in {**stored_facts(kind), **derived_facts(kind)}.items()
+        for name, known in all_facts(kind).items()
         if known.words
     )

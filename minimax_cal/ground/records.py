@@ -19,7 +19,7 @@ from minimax_cal.ground.errors import CalibrationError, said
 from minimax_cal.ground.facts import (
     Fact,
     Later,
-    derived_facts,
+    all_facts,
     hints_of,
     scaled,
     stored_facts,
@@ -219,7 +219,7 @@ def record_schema(kind: type) -> dict[str, Any]:
     out: dict[str, Any] = {"type": "object", "properties": {}, "required": []}
     if kind.__doc__ and not kind.__doc__.startswith(f"{kind.__name__}("):
         out["description"] = kind.__doc__.partition("\n")[0]
-    for name, known in {**stored_facts(kind), **derived_facts(kind)}.items():
+    for name, known in all_facts(kind).items():
         *inner, last = known.key_of(name).split(".")
         at = out
         fills = name not in own or known.brief

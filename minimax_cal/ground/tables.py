@@ -6,15 +6,17 @@ import io
 import math
 import re
 import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from html import escape
-from typing import Literal
+from typing import Any, Literal, cast
 
 from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from minimax_cal.ground.facts import all_facts, scaled
 from minimax_cal.ground.files import csv_text
 from minimax_cal.ground.words import visible
 
@@ -24,6 +26,7 @@ MAX_ROWS = 6  # of a table on a first screen
 LONGEST_NAME = 28  # letters of a cell that is a name; what is longer is a sentence, and wraps
 JOINT = "\N{WORD JOINER}"
 JOINED = rf"\1{JOINT}\2"
+COLUMN = re.compile(r"(\w+)(?:=(.*?))?(?: ([-+#]?\.?\d*[defg]))?")
 UNIT = re.compile(r"(\d) (\S{1,9})(?!\S)")  # of a number in a sentence
 
 LATEX_ESCAPES = str.maketrans(
@@ -40,6 +43,17 @@ class Table:
     header: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
     formats: tuple[str, ...] = ()
+
+    @staticmethod
+    def of(title: str, records: Sequence[object], *columns: str) -> Table:
+        """A row a record.  columns: attribute, header unless its name, format: "rms=RMS mm .4f".
+
+        Values are in the units of files, as `facts` has them.
+        """
+        told = [cast(re.Match[str], COLUMN.fullmatch(each)).groups("") for each in columns]
+        rows = tuple(tuple(cell_of(record, name) for name, _, _ in told) for record in records)
+        header = tuple(shown or name.replace("_", " ") for name, shown, _ in told)
+        return Table(title, header, rows, tuple(spec for _, _, spec in told))
 
     def brief(self, *header: str, rows: int = MAX_ROWS) -> Table:
         """Some of the columns, all unless named, and at most so many rows: the first and the last.
@@ -176,6 +190,20 @@ class Table:
                 "",
             ]
         )
+
+
+def cell_of(record: object, name: str) -> Cell:
+    """An attribute of a record for people."""
+    kind: Any = type(record)
+    known = all_facts(kind).get(name)
+    value = getattr(record, name)
+    if known and known.scale != 1.0:
+        value = scaled(value, known.scale)
+    if isinstance(value, bool):
+        return "yes" if value else ""
+    if isinstance(value, tuple):
+        return ", ".join(map(str, value))
+    return math.nan if value is None else cast(Cell, value)
 
 
 def unbroken(cell: str, *, right: bool) -> list[str]:
