@@ -42,6 +42,7 @@ from minimax_cal.dynamics.result import (
     MotionStep,
     NotTestable,
     Parameter,
+    Verdict,
     best_worth,
     changed_joints,
     worth_by_joint,
@@ -310,6 +311,7 @@ def examined(
     effects.sort(key=lambda one: (one.minor, -gain_of(one)))
     models, budget = steps(found, normal, judge, late, before)
     return MotionDiagnosis(
+        arm=arm,
         unit=logs.unit,
         verdict=verdict_of(effects, left, too_little),
         effects=tuple(effects),
@@ -396,7 +398,8 @@ def parameters_of(term: Term, value: Array, sigma: Array, scene: Scene) -> tuple
         Parameter(name, float(v), float(s), said.get(unit, unit.replace("t", scene.logs.unit, 1)))
         for name, unit, v, s in zip(law.names, law.units, value, sigma, strict=False)
     ]
-    tuned = [Parameter(name, v, float("nan"), TUNED_UNITS.get(name, "1")) for name, v in term.tuned]
+    tuned = [Parameter(name, v, float("nan"), TUNED_UNITS.get(name, "1"))
+             for name, v in term.tuned.items()]  # fmt: skip
     return (*fitted_ones, *tuned)
 
 
@@ -516,8 +519,8 @@ def steps(
 
 def verdict_of(
     effects: Sequence[MotionEffect], left: Sequence[Unexplained], too_little: Sequence[str]
-) -> str:
-    """none, named, one_of or unknown."""
+) -> Verdict:
+    """What may be said of the cause."""
     main = [e for e in effects if e.established and not e.minor]
     if too_little or any(one.share > MATTERS for one in left):
         return "unknown"
@@ -574,14 +577,14 @@ def held_run(judge: LeftOut, logs: Logs, parts: Sequence[str]) -> HeldRun:
     """A stretch of a run as a fit without it predicts it."""
     run = int(logs.run[np.argmax(judge.judged)])
     rows = np.flatnonzero((logs.run == run) & judge.judged)[:SHOWN_ROWS]
-    measured = judge.error.T[rows]
-    predicted = measured - judge.missed(parts)[rows]
+    measured = judge.error[:, rows]
+    predicted = measured - judge.missed(parts)[rows].T
 
-    def listed(values: Array) -> tuple[tuple[float, ...], ...]:
-        return tuple(tuple(float(f"{v:.5g}") for v in column) for column in values.T)
+    def brief(values: Array) -> Array:
+        return np.array([[float(f"{value:.5g}") for value in row] for row in values])
 
-    time_s = tuple(float(v) for v in np.round((rows - rows[0]) / ROW_HZ, 4))
-    return HeldRun(logs.names[run], time_s, listed(measured), listed(predicted))
+    time_s = tuple(np.round((rows - rows[0]) / ROW_HZ, 4).tolist())
+    return HeldRun(logs.names[run], time_s, brief(measured), brief(predicted))
 
 
 def form_of(term: Term, sense: Array, share: Array) -> Array:
@@ -589,11 +592,10 @@ def form_of(term: Term, sense: Array, share: Array) -> Array:
 
     sense, share: (v,) soft sign of the speed, and its size over the largest.
     """
-    tuned = dict(term.tuned)
     if term.effect == "degressive":
-        return np.asarray(sense * share ** tuned["power"])
+        return np.asarray(sense * share ** term.tuned["power"])
     if term.effect == "stribeck":
-        return np.asarray(sense * np.exp(-((share / tuned["speed"]) ** 2)))
+        return np.asarray(sense * np.exp(-((share / term.tuned["speed"]) ** 2)))
     return share if term.effect == "asymmetry" else np.zeros_like(share)
 
 
@@ -612,6 +614,5 @@ def curves(found: Found, normal: Normal, judge: LeftOut) -> tuple[FrictionCurve,
             drawn += np.outer(amount, form_of(term, sense, share))
         folds = drawn[1:]
         wide = np.sqrt((len(folds) - 1) * folds.var(axis=0))  # jackknife
-        listed = (tuple(map(float, part)) for part in (v, drawn[0], wide))
-        out.append(FrictionCurve(f"J{j + 1}", *listed))
+        out.append(FrictionCurve(f"J{j + 1}", v, drawn[0], wide))
     return tuple(out)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from minimax_cal.dynamics.scene import Scene
 from minimax_cal.dynamics.search import Columns
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.facts import Fact
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
 
 
@@ -31,28 +33,27 @@ class MotionStepError:
 
 
 @dataclass(frozen=True)
-class MotionEvaluation:
+class MotionEvaluation(Result):
     """How well each step of a motion diagnosis predicts torques of other logs [unit]."""
 
+    KIND = "motion_evaluation"
+    COMMAND = "evaluate"
     unit: str
-    steps: tuple[MotionStepError, ...]
+    steps: Annotated[tuple[MotionStepError, ...], Fact(key="rungs", fewest=1)]
     runs: tuple[str, ...]
     notices: tuple[str, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON of the contract, and more."""
-        last = self.steps[-1]
-        return {
-            "schema": 1,
-            "kind": "motion_evaluation",
-            "unit": self.unit,
-            "rms": list(last.rms),
-            "rms_moving": list(last.rms_moving),
-            "rungs": [{"name": one.name, "rms": list(one.rms), "rms_moving": list(one.rms_moving)}
-                      for one in self.steps],
-            "runs": list(self.runs),
-            "notices": list(self.notices),
-        }  # fmt: skip
+    def beside(self) -> dict[str, Any]:
+        """What the last step misses."""
+        return {"rms": self.steps[-1].rms, "rms_moving": self.steps[-1].rms_moving}
+
+    def headline(self) -> str:
+        """What the last step misses, in the middle of the joints."""
+        return f"RMS torque missed, median of the joints: {np.median(self.steps[-1].rms):.3g}."
+
+    def tables(self) -> tuple[Table, ...]:
+        """Step by step."""
+        return (self.table(),)
 
     def table(self) -> Table:
         """RMS of all rows by joint, step by step."""

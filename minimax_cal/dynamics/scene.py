@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from minimax_cal.dynamics.regressor import (
 )
 from minimax_cal.dynamics.rows import SLOWEST, Logs
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.facts import APART
 from minimax_cal.robots.robot import Robot
 
 KEPT = ("regressor", "base_rows", "known_torque", "sense", "bristles", "since_reversal")
@@ -63,7 +65,7 @@ class Arm:
     that say so, per kilogram.
     """
 
-    robot: Robot
+    robot: Annotated[Robot, APART]
     gain: Array
     ratio: Array
     soft: Array

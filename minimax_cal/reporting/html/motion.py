@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.dynamics.result import KIND, WORDS, MotionDiagnosis
+from minimax_cal.dynamics.result import WORDS, MotionDiagnosis
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.ground.words import visible
@@ -63,14 +63,15 @@ def motion_of(results: Sequence[Result]) -> MotionSource | None:
         content, path, digest = content_of(result)
         if len(results) > 1:
             raise CalibrationError(f"{path}: is a motion diagnosis; report it alone")
-        return MotionSource(MotionDiagnosis.from_dict(content, path), File(KIND, path, digest))
+        found = MotionDiagnosis.from_dict(content, path)
+        return MotionSource(found, File(found.KIND, path, digest))
     return None
 
 
 def is_motion(result: Result) -> bool:
     """Whether a result is a motion diagnosis.  Raises CalibrationError for a file without JSON."""
     if isinstance(result, Path | str):
-        return bool(content_of(result)[0].get("kind") == KIND)
+        return bool(content_of(result)[0].get("kind") == MotionDiagnosis.KIND)
     return isinstance(result, MotionDiagnosis)
 
 
@@ -170,8 +171,7 @@ def joint_figures(found: MotionDiagnosis) -> tuple[Block, ...]:
 def joint_figure(found: MotionDiagnosis, j: int) -> Figure:
     """Measured and predicted torque, and friction over speed with its band."""
     run, curve, unit = found.held_run, found.curves[j], found.unit
-    time, speed = np.array(run.time), np.array(curve.speed)
-    friction, wide = np.array(curve.torque), BAND * np.array(curve.sigma)
+    time, speed, friction, wide = np.array(run.time), curve.speed, curve.torque, BAND * curve.sigma
     colour, _, _, soft = LOOKS["after"]
     band = {
         "type": "scatter", "mode": "lines", "name": "two standard deviations",
@@ -181,8 +181,8 @@ def joint_figure(found: MotionDiagnosis, j: int) -> Figure:
         "hoverinfo": "skip", "showlegend": False, "xaxis": "x2", "yaxis": "y2",
     }  # fmt: skip
     traces = (
-        line("before", "measured", time, np.array(run.measured[j])),
-        line("after", "predicted without this run", time, np.array(run.predicted[j])),
+        line("before", "measured", time, run.measured[j]),
+        line("after", "predicted without this run", time, run.predicted[j]),
         band,
         line("after", "friction", speed, friction, panel=1, showlegend=False),
     )
