@@ -20,12 +20,9 @@ KINDS = {  # name: (module, class that reads such a file, title)
         "Result of minimax-cal calibrate by cameras",
     ),
     "diagnosis": ("diagnosing.result_file", "DiagnosisPart", "Result of minimax-cal diagnose"),
-    "simulator_gap": ("simulators.result", "GapPart", "Result of minimax-cal gap"),
-    "motion_gap": (
-        "simulators.motion.result",
-        "MotionGapPart",
-        "Result of minimax-cal gap, of logs",
-    ),
+    "simulator_gap": ("simulators.result", "SimulatorGap", "Result of minimax-cal gap"),
+    "motion_gap": ("simulators.motion.result", "MotionGap", "Result of minimax-cal gap, of logs"),
+    "motion_diagnosis": ("dynamics.result", "MotionDiagnosis", "Result of minimax-cal torques"),
 }
 
 

@@ -325,6 +325,7 @@ def examined(
         held_run=held_run(judge, logs, parts_of(found.terms)),
         curves=curves(found, normal, judge),
         notices=(*units, *body_notices(arm, given, change, logs)),
+        seconds=0.0,
     )
 
 

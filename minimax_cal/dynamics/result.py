@@ -145,7 +145,7 @@ class MotionDiagnosis(Result):
     held_run: HeldRun
     curves: tuple[FrictionCurve, ...]
     notices: tuple[str, ...]
-    seconds: float = 0.0
+    seconds: float
 
     def __repr__(self) -> str:
         return f"<MotionDiagnosis of {self.arm.robot.name}: {self.headline()}>"
@@ -273,7 +273,8 @@ def check_parts(found: MotionDiagnosis) -> None:
         for body in (model.body, model.context):
             count = 1 if len(body.rigid) == 1 else n
             sizes += [(body.usual, (n, 2)), (body.rigid, (count, PER_LINK * n))]
-    if any(np.shape(part) != size for part, size in sizes):
+    late = [model.delay for model in found.models]
+    if any(np.shape(part) != size for part, size in sizes) or not np.isfinite(late).all():
         raise ValueError(f"its numbers are not of one arm of {n} joints and one run")
     if not all(one.worth for one in found.effects):
         raise ValueError("effects: one has no worth")

@@ -14,7 +14,7 @@ from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.options import Progress, silent
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import check_writable, write_whole
+from minimax_cal.ground.files import check_writable, plain, write_whole
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.grouping import check_chance
@@ -129,7 +129,7 @@ def simulator_gap(
         train_poses=int((~causes.held).sum()),
         holdout_poses=int(run.held.sum()),
         status=best.fit.status,
-        beyond=best.fit.beyond.to_dict(),
+        beyond=plain(best.fit.beyond),
         left_out=made.left_out,
         notices=tuple(dict.fromkeys(notices)),
         written="" if path is None else str(path),
