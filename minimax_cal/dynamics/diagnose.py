@@ -323,7 +323,7 @@ def examined(
         runs=logs.names,
         held_out=held_words(logs, fold, whole),
         held_run=held_run(judge, logs, parts_of(found.terms)),
-        curves=curves(found, normal, judge),
+        curves=tuple(curves(found, normal, judge)),
         notices=(*units, *body_notices(arm, given, change, logs)),
         seconds=0.0,
     )
@@ -364,31 +364,27 @@ def is_minor(worth: dict[str, tuple[float, float]], before: Array) -> bool:
 
 def laws_found(
     found: Found, normal: Normal, judge: LeftOut, again: dict[tuple[str, str], float]
-) -> list[MotionEffect]:
+) -> Iterator[MotionEffect]:
     """The laws that were found, with what each is worth."""
     every = parts_of(found.terms)
     value = normal.solve(every)
     sigma, whole = normal.spread(every, value), judge.missed(every)
     moving = normal.columns.scene.logs.moving
     usual = judge.rms(judge.missed(parts_of(())), moving)
-    out = []
     for number, term in enumerate(found.terms):
         worth = worth_of(judge, whole, judge.missed([p for p in every if p != term.text]))
         place = normal.place[term.text]
-        out.append(
-            MotionEffect(
-                term.effect,
-                term.place,
-                parameters_of(term, value[place], sigma[place], normal.columns.scene),
-                worth,
-                others_of(found.choice, number),
-                again[term.key],
-                bool(again[term.key] >= FOUND_AGAIN),
-                is_minor(worth, usual),
-                term.law.family,
-            )
+        yield MotionEffect(
+            term.effect,
+            term.place,
+            parameters_of(term, value[place], sigma[place], normal.columns.scene),
+            worth,
+            others_of(found.choice, number),
+            again[term.key],
+            bool(again[term.key] >= FOUND_AGAIN),
+            is_minor(worth, usual),
+            term.law.family,
         )
-    return out
 
 
 def parameters_of(term: Term, value: Array, sigma: Array, scene: Scene) -> tuple[Parameter, ...]:
@@ -407,11 +403,8 @@ def parameters_of(term: Term, value: Array, sigma: Array, scene: Scene) -> tuple
 def others_of(choice: Choice, number: int) -> tuple[Alternative, ...]:
     """What else could be an effect that was found."""
     found = alternatives(*choice.beside_others(number))
-    out = []
-    for other, rho2, _ in found:
-        term = other.candidate.term
-        out.append(Alternative(term.effect, term.place, rho2, separating(term)))
-    return tuple(out)
+    terms = ((other.candidate.term, rho2) for other, rho2, _ in found)
+    return tuple(Alternative(t.effect, t.place, rho2, separating(t)) for t, rho2 in terms)
 
 
 def separating(term: Term) -> str:
@@ -423,7 +416,7 @@ def separating(term: Term) -> str:
     return "longer runs of another kind"
 
 
-def usual_found(normal: Normal, judge: LeftOut) -> list[MotionEffect]:
+def usual_found(normal: Normal, judge: LeftOut) -> Iterator[MotionEffect]:
     """Coulomb and viscous friction of each joint, where the rows show them."""
     terms = normal.terms
     every = parts_of(terms)
@@ -432,7 +425,6 @@ def usual_found(normal: Normal, judge: LeftOut) -> list[MotionEffect]:
     logs = normal.columns.scene.logs
     before = judge.rms(judge.missed([RIGID]), logs.moving)
     start = normal.place[FRICTION].start
-    out = []
     for number in range(2 * logs.joints):
         at, joint, kind = start + number, number // 2, USUAL[number % 2]
         z = value[at] / sigma[at] if sigma[at] > 0.0 else 0.0
@@ -441,11 +433,8 @@ def usual_found(normal: Normal, judge: LeftOut) -> list[MotionEffect]:
         worth = worth_of(judge, whole, judge.missed(every, without=(at,)))
         unit = logs.unit if kind == "coulomb" else f"{logs.unit} s/rad"
         parameter = Parameter("friction", float(value[at]), float(sigma[at]), unit)
-        out.append(
-            MotionEffect(kind, f"J{joint + 1}", (parameter,), worth,
-                         minor=is_minor(worth, before), family=CURVE)
-        )  # fmt: skip
-    return out
+        yield MotionEffect(kind, f"J{joint + 1}", (parameter,), worth,
+                           minor=is_minor(worth, before), family=CURVE)  # fmt: skip
 
 
 def with_delay(
@@ -600,11 +589,10 @@ def form_of(term: Term, sense: Array, share: Array) -> Array:
     return share if term.effect == "asymmetry" else np.zeros_like(share)
 
 
-def curves(found: Found, normal: Normal, judge: LeftOut) -> tuple[FrictionCurve, ...]:
+def curves(found: Found, normal: Normal, judge: LeftOut) -> Iterator[FrictionCurve]:
     """Friction over the speed of each joint, and its spread over fits without each fold."""
     arm, every = normal.columns.scene.arm, parts_of(found.terms)
     values = np.array([normal.solve(every), *judge.values(every)])
-    out = []
     for j in range(arm.robot.joints):
         v = np.linspace(-1.0, 1.0, CURVE_POINTS) * arm.fastest[j]
         sense, share = sense_of(v, arm.soft[j]), np.abs(v) / arm.fastest[j]
@@ -615,5 +603,4 @@ def curves(found: Found, normal: Normal, judge: LeftOut) -> tuple[FrictionCurve,
             drawn += np.outer(amount, form_of(term, sense, share))
         folds = drawn[1:]
         wide = np.sqrt((len(folds) - 1) * folds.var(axis=0))  # jackknife
-        out.append(FrictionCurve(f"J{j + 1}", v, drawn[0], wide))
-    return tuple(out)
+        yield FrictionCurve(f"J{j + 1}", v, drawn[0], wide)

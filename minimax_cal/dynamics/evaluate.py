@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -105,13 +106,11 @@ def evaluate_motion(
     if not arm.known.any():
         prepared = replace(prepared, payload=np.full_like(prepared.payload, np.nan))
     scene = Scene.of(arm, prepared)
-    columns: dict[int, Columns] = {}
+    columns = cache(lambda context: Columns(context.in_scene(scene)))
     steps = []
     for model in found.models:
-        if id(model.context) not in columns:
-            columns[id(model.context)] = Columns(model.context.in_scene(scene))
-        off = missed(model, prepared, columns[id(model.context)])
-        whole, moving = rms_by_joint(off), rms_by_joint(off, prepared.moving)
-        steps.append(MotionStepError(model.name, tuple(whole.tolist()), tuple(moving.tolist())))
+        off = missed(model, prepared, columns(model.context))
+        ends = rms_by_joint(off), rms_by_joint(off, prepared.moving)
+        steps.append(MotionStepError(model.name, *(tuple(end.tolist()) for end in ends)))
     said = tuple(text for run in runs for text in run.notices)
     return MotionEvaluation(found.unit, tuple(steps), prepared.names, said)

@@ -81,6 +81,14 @@ class MotionEffect:
         runs = ", ".join(p.name for p in self.parameters[PER_LINK:] if self.effect == "payload")
         return f"{WORDS[self.effect]} {name_place(self.place)}" + (f" ({runs})" if runs else "")
 
+    def row(self) -> tuple[str, ...]:
+        """Of a table: words, the surest number, the worth where it is most, and whether it is."""
+        p = max(self.parameters, key=lambda each: abs(each.value) / (each.sigma or 1.0))
+        joint, (before, after) = best_worth(self)
+        return (self.words, f"{p.value:.3g} ± {p.sigma:.1g} {p.unit}",
+                f"{joint}: {before:.3g} to {after:.3g}",
+                "yes" if self.established else "possible")  # fmt: skip
+
 
 @dataclass(frozen=True)
 class MotionStep:
@@ -194,15 +202,8 @@ class MotionDiagnosis(Result):
 
     def effects_table(self) -> Table:
         """The effects, the most valuable first."""
-        rows = []
-        for one in self.effects:
-            p = max(one.parameters, key=lambda each: abs(each.value) / (each.sigma or 1.0))
-            joint, (before, after) = best_worth(one)
-            sure = "yes" if one.established else "possible"
-            rows.append((one.words, f"{p.value:.3g} ± {p.sigma:.1g} {p.unit}",
-                         f"{joint}: {before:.3g} to {after:.3g}", sure))  # fmt: skip
         header = ("effect", "value", f"held-out RMS, moving [{self.unit}]", "confirmed")
-        return Table("Effects", header, tuple(rows))
+        return Table("Effects", header, tuple(one.row() for one in self.effects))
 
     def unexplained_table(self) -> Table:
         """What has no name, by joint."""

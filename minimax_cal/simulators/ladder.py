@@ -124,7 +124,7 @@ def simulator_gap(
         robot=chain.robot.name,
         rungs=tuple(rungs),
         commands=made.commands,
-        floor=causes.floor.value if causes.floor else float("nan"),
+        floor=causes.floor.value if causes.floor else np.nan,
         floor_from=causes.floor.source if causes.floor else "",
         train_poses=int((~causes.held).sum()),
         holdout_poses=int(run.held.sum()),
@@ -336,7 +336,7 @@ class Run:
     def predicted(self, fit: Fit | None, rows: Array) -> float:
         """RMS of some driven poses by the formulas of a fit, NaN where it has others."""
         if fit is None or not self.causes.same:
-            return float("nan")
+            return np.nan
         return accuracy(fit.cell.error(self.data)[:, rows]).rms_mm
 
     def tell(self, what: str, data: Measurements, rows: Array, judge: Array) -> None:

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.dynamics.result import WORDS, MotionDiagnosis
+from minimax_cal.dynamics.result import WORDS, MotionDiagnosis, table_by_joint
 from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import visible
 from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.reporting.html.charts import (
@@ -116,12 +116,9 @@ def verdict_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
 
 def budget_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
     """Tables of all rows and of moving ones, and how both fall."""
-    whole = found.budget_table()
-    moving: tuple[tuple[Cell, ...], ...] = tuple(
-        (step.name, *step.holdout_rms_moving) for step in found.budget
-    )
+    moving = [(step.name, step.holdout_rms_moving) for step in found.budget]
     title = f"Held-out RMS torque [{found.unit}], moving rows ({found.held_out})"
-    return (budget_figure(found), whole, Table(title, whole.header, moving, whole.formats))
+    return budget_figure(found), found.budget_table(), table_by_joint(title, "step", moving)
 
 
 def budget_figure(found: MotionDiagnosis) -> Figure:
@@ -146,20 +143,15 @@ def budget_figure(found: MotionDiagnosis) -> Figure:
 
 def effect_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
     """Effects with their values, and what else they could be."""
-    rows: list[tuple[Cell, ...]] = [
-        (
-            one.words,
-            f"{WORDS[other.effect]} {name_place(other.place)}",
-            other.rho2,
-            other.separate_with,
-        )
-        for one in found.effects
-        for other in one.alternatives
-    ]  # fmt: skip
     if not found.effects:
         return (text("No effect is shown by these logs."),)
+    rows = tuple(
+        (one.words, f"{WORDS[a.effect]} {name_place(a.place)}", a.rho2, a.separate_with)
+        for one in found.effects
+        for a in one.alternatives
+    )
     header = ("effect", "could be", "similarity", "what tells them apart")
-    others = [Table("Alternatives", header, tuple(rows), ("", "", ".2f", ""))] if rows else []
+    others = [Table("Alternatives", header, rows, ("", "", ".2f", ""))] if rows else []
     return (found.effects_table(), *others)
 
 
