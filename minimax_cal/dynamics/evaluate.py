@@ -50,7 +50,8 @@ class MotionEvaluation(Result):
 
     def headline(self) -> str:
         """What the last step misses, in the middle of the joints."""
-        return f"RMS torque missed, median of the joints: {np.median(self.steps[-1].rms):.3g}."
+        size = f"{np.median(self.steps[-1].rms):.3g} {self.unit}"
+        return f"RMS torque missed, median of the joints: {size}."
 
     def tables(self) -> tuple[Table, ...]:
         """Step by step."""

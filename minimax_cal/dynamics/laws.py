@@ -257,7 +257,7 @@ class Term:
 
     effect: str
     place: str
-    tuned: Choice = field(hash=False)
+    tuned: Choice = field(hash=False)  # a mapping has no hash
 
     @property
     def text(self) -> str:

@@ -61,6 +61,7 @@ class MotionGap(Result):
     rungs: as given, then with each element.  elements: what was corrected, with its worth.
     left_out: what is in neither file nor module, and what that costs.  drives: what moved the arm.
     held_out: runs that no fit saw, or quarters of one.  written, module: paths, empty if none.
+    along: tells its file from that of poses.
     """
 
     KIND = "simulator_gap"
