@@ -79,7 +79,7 @@ class Provenance:
     robot: str = ""
     data: str = ""
     data_sha256: str = ""
-    settings: Mapping[str, object] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
 
     @staticmethod

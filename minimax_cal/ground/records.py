@@ -203,13 +203,15 @@ def check_schema(content: Mapping[str, Any], source: str, known: int) -> None:
 # ---- for other programs ------------------------------------------------------------------------
 
 
-def json_schema(kind: Any, title: str) -> dict[str, Any]:
-    """The JSON schema of a record's file, for editors and other programs."""
-    whole = (
-        record_schema(kind)
-        if isinstance(kind, type) and is_dataclass(kind)
-        else plain(kind.model_json_schema())
-    )
+def json_schema(kind: Any) -> dict[str, Any]:
+    """The JSON schema of a file, for editors and other programs; of a result with what it says."""
+    known = isinstance(kind, type) and is_dataclass(kind)
+    whole = record_schema(kind) if known else plain(kind.model_json_schema())
+    title = f"Result of minimax-cal {kind.COMMAND}" if known else "Robot file of minimax-cal"
+    if known:
+        marks = {"schema": {"const": kind.SCHEMA}, "kind": {"const": kind.KIND}}
+        whole["properties"] = {**marks, **whole["properties"]}
+        whole["required"] = [*marks, *whole["required"]]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **whole, "title": title}
 
 

@@ -16,7 +16,7 @@ from numpy.testing import assert_array_equal
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import APART, Fact, Later, Mm, derived, facts_in_words
 from minimax_cal.ground.files import json_text, plain
-from minimax_cal.ground.records import json_schema, read
+from minimax_cal.ground.records import read, record_schema
 
 jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
 
@@ -117,7 +117,7 @@ def test_what_may_miss_is_filled_in() -> None:
 
 
 def test_the_schema_is_of_the_file() -> None:
-    made = json_schema(Wire, "Wires")
+    made = record_schema(Wire)
     jsonschema.Draft202012Validator.check_schema(made)
     assert not list(jsonschema.Draft202012Validator(made).iter_errors(FILE))
     assert {"length_mm", "where", "error"} <= set(made["required"])
@@ -151,5 +151,5 @@ def test_the_schema_is_of_the_file() -> None:
 def test_what_is_wrong_is_named_with_its_place(change: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=f"^{says}"):
         read(Wire, FILE | change)
-    errors = jsonschema.Draft202012Validator(json_schema(Wire, "")).iter_errors(FILE | change)
+    errors = jsonschema.Draft202012Validator(record_schema(Wire)).iter_errors(FILE | change)
     assert list(errors) or "e.101" in says or "rows" in says or "than numbers" in says
