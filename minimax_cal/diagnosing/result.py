@@ -245,7 +245,7 @@ class Finding:
         What was tentative when it was written stays so.
         """
         told = stored(Finding, content, at)
-        key = (content["effect"], content["place"])
+        key = as_kind(tuple[str, str], [content["effect"], content["place"]], Fact(), at)
         own = tuple(term for term in known if term.key == key) or (Term(*key),)
         every = as_kind(
             tuple[Parameter, ...],

@@ -6,7 +6,7 @@ import math
 import platform
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -41,7 +41,7 @@ from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import capitalise, list_counts
-from minimax_cal.measuring.accuracy import HELD, Accuracy, accuracy, before_and_after
+from minimax_cal.measuring.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.grouping import clusters, grouped
 from minimax_cal.measuring.history import with_history
@@ -360,8 +360,8 @@ class Fit(Result):
         As they are told to people: open above where the poses tell no upper end.
         """
         seen = {key: self.accuracy[key] for key in ("nominal", "holdout")}
-        if stated := {key: ends for key, one in seen.items() if (ends := ends_of(one))}:
-            return stated
+        if any(one.rms_ci95_mm for one in seen.values()):
+            return {key: ends_of(one) for key, one in seen.items()}
         rng = np.random.default_rng(self.options.seed)
         group = grouped(self.data, self.options.holdout_by)[self.held]
         return {
@@ -651,6 +651,7 @@ class Fit(Result):
         names = Names.of(cell.robot, cell.target_names, tuple(p.name for p in every if p.of_effect))
         if missing := set(names.all) - set(parameters.names):
             raise ValueError(f"parameters: {min(missing)} is missing, of {len(missing)}")
+        beyond = read(Beyond, content["accuracy"]["beyond"], "accuracy.beyond")
         arrays = {name: array(value, name) for name, value in content["arrays"].items()}
         check_shapes(arrays, names.count, data.take(~held), data)
         kept = told["status"] is Status.NO_BETTER or not cell.effects.causes
@@ -660,7 +661,7 @@ class Fit(Result):
             "nominal": nominal,
             "parameters": parameters,
             "accuracy": accuracies_of(content["accuracy"], len(cell.target_names)),
-            "claim": Later(partial(read, Beyond, content["accuracy"]["beyond"], "accuracy.beyond")),
+            "claim": Later(lambda: beyond),
             "identification": found,
             "uncertainty": known,
             "data": replace(data, digest=told["provenance"].data_sha256),
@@ -681,12 +682,10 @@ def row_of(name: str, of: Accuracy, ends: Interval = UNKNOWN) -> tuple[TableCell
     return name, of.poses, of.rms_mm, 1e3 * ends.low, 1e3 * ends.high, of.max_mm
 
 
-def ends_of(seen: Accuracy) -> tuple[Interval, Interval] | None:
-    """The intervals that a file tells [m]."""
-    if seen.rms_ci95_mm is None or seen.max_ci95_mm is None:
-        return None
-    low, high = (Interval(1e-3 * a, 1e-3 * b) for a, b in (seen.rms_ci95_mm, seen.max_ci95_mm))
-    return low, high
+def ends_of(seen: Accuracy) -> tuple[Interval, Interval]:
+    """The intervals of RMS and largest error that a file tells [m]."""
+    (a, b), (c, d) = seen.rms_ci95_mm or NO_ENDS, seen.max_ci95_mm or NO_ENDS
+    return Interval(1e-3 * a, 1e-3 * b), Interval(1e-3 * c, 1e-3 * d)
 
 
 def accuracies_of(content: Mapping[str, Any], targets: int) -> dict[str, Accuracy]:

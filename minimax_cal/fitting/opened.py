@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -263,10 +262,11 @@ def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
     settings = content["provenance"]["settings"]
     known = rungs[-1].cell.effects.causes
     firm = {term.text for term in confirmed(content, known)}
+    beyond = read(Beyond, content["gap"]["beyond"], "gap.beyond")
     return Opened(
         source, rungs, len(rungs) - 1, data, held, digest, status=status, spans=spans,
         options=read_options(settings, objective="sum") if data.poses else None,
-        outside=partial(read, Beyond, content["gap"]["beyond"], "gap.beyond"),
+        outside=lambda: beyond,
         possible=frozenset(term.text for term in known) - firm,
     )  # fmt: skip
 
