@@ -25,7 +25,6 @@ from minimax_cal.cli.options import (
 )
 from minimax_cal.cli.pixel_files import PIXEL_FILES, PixelFiles
 from minimax_cal.fitting.calibrate import calibrate
-from minimax_cal.fitting.first_screen import first_table, frames_table
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.pixels.options import PixelOptions
@@ -111,7 +110,7 @@ def calibrate_command(
     to.notice(*(notice for notice in fit.notices if notice != fit.reason))
     if to.deliver(lambda: text_of(fit, *more, poses=not without), fit.status):
         intervals = [found.table() for found in more]
-        first = (first_table(fit), frames_table(fit), *intervals)
+        first = (*fit.first_tables(), *intervals)
         said = (*fit.sentences(), *([fit.solution()] if details else ()))
         options.present(
             details, said, first, lambda: (*fit.tables(), *intervals),

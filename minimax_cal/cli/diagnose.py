@@ -25,7 +25,6 @@ from minimax_cal.cli.options import (
     workers,
 )
 from minimax_cal.diagnosing.diagnose import diagnose
-from minimax_cal.diagnosing.first_screen import budget_table
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.options import Options
@@ -69,9 +68,10 @@ def diagnose_command(
         found = diagnose(robot, options.measured(data, in_rows), progress=progress, **chosen)
     to.notice(*found.notices)
     if to.deliver(found.json, found.status):
-        first = [budget_table(found)] if found.ladder else []
         every = partial(every_table, found)
-        options.present(details, found.said, first, every, advice(found, robot, data, to.path))
+        options.present(
+            details, found.said, found.first_tables(), every, advice(found, robot, data, to.path)
+        )
     to.draw(save_diagnosis, found)
     return options.exit_code(found.status)
 

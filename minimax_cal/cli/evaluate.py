@@ -11,7 +11,7 @@ import numpy as np
 
 from minimax_cal.cli.options import DATA, FIT, PATH, RUNG, InGroups, Output, result_options, show
 from minimax_cal.dynamics.evaluate import evaluate_motion
-from minimax_cal.dynamics.result import KIND
+from minimax_cal.dynamics.result import MotionDiagnosis
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.fitting.set_aside import aside_sentence, errors_of, with_them
@@ -37,7 +37,7 @@ def evaluate_logs(motion: Path, logs: tuple[Path, ...], to: Output) -> int:
     """What a motion diagnosis misses on other logs."""
     found = evaluate_motion(motion, list(logs))
     to.notice(*found.notices)
-    if to.deliver(lambda: json_text(found.to_dict())):
+    if to.deliver(found.json):
         show(found.table())
     return 0
 
@@ -61,7 +61,7 @@ def evaluate_command(
     FIT is a calibration, a diagnosis or a relative calibration, as -o wrote it.  Of a motion
     diagnosis, DATA and MORE are logs, and its torques are judged.
     """
-    if kind_of_file(fit) == KIND:
+    if kind_of_file(fit) == MotionDiagnosis.KIND:
         return evaluate_logs(fit, (data, *more), to)
     if more:
         raise OptionError(f"{more[0]}: evaluate takes one file of measurements; join them first")

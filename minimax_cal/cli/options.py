@@ -405,7 +405,7 @@ def first_screen(sentences: Iterable[str], *tables: Table, advice: Advice) -> No
         console.print(Text(visible(sentence)))
     click.echo()
     for table in tables:
-        console.print(table.rich())
+        table.show(console)
     for purpose, command in advice:
         console.print(Text(visible(f"{purpose}:")))
         whole.print(Text(visible(f"  {command}")), soft_wrap=True)  # to be copied in one piece
@@ -429,7 +429,7 @@ def show(*tables: Table, headline: str = "") -> None:
         console.print(Text(visible(headline)), soft_wrap=not console.is_terminal)
         click.echo()
     for table in tables:
-        console.print(table.rich())
+        table.show(console)
 
 
 def writable(*paths: Path | None) -> None:

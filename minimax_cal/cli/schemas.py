@@ -10,22 +10,15 @@ import click
 
 from minimax_cal.ground.files import json_text
 
-KINDS = {  # name: (module, class that reads such a file, title)
-    "robot": ("robots.robot", "RobotSchema", "Robot file of minimax-cal"),
-    "calibration": ("fitting.fit_file", "FitPart", "Result of minimax-cal calibrate"),
-    "relative": ("fitting.instruments.result", "RelativePart", "Result of minimax-cal relative"),
-    "pixels": (
-        "fitting.instruments.pixel_result",
-        "PixelPart",
-        "Result of minimax-cal calibrate by cameras",
-    ),
-    "diagnosis": ("diagnosing.result_file", "DiagnosisPart", "Result of minimax-cal diagnose"),
-    "simulator_gap": ("simulators.result", "GapPart", "Result of minimax-cal gap"),
-    "motion_gap": (
-        "simulators.motion.result",
-        "MotionGapPart",
-        "Result of minimax-cal gap, of logs",
-    ),
+KINDS = {  # name: (module, class that reads such a file)
+    "robot": ("robots.robot", "RobotSchema"),
+    "calibration": ("fitting.fit", "Fit"),
+    "relative": ("fitting.instruments.result", "RelativeCalibration"),
+    "pixels": ("fitting.instruments.pixel_result", "PixelCalibration"),
+    "diagnosis": ("diagnosing.result", "Diagnosis"),
+    "simulator_gap": ("simulators.result", "SimulatorGap"),
+    "motion_gap": ("simulators.motion.result", "MotionGap"),
+    "motion_diagnosis": ("dynamics.result", "MotionDiagnosis"),
 }
 
 
@@ -33,8 +26,8 @@ def schema_of(name: str) -> dict[str, Any]:
     """The JSON schema of a kind of file, made from what reads it."""
     from minimax_cal.ground.records import json_schema
 
-    module, kind, title = KINDS[name]
-    return json_schema(getattr(import_module(f"minimax_cal.{module}"), kind), title)
+    module, kind = KINDS[name]
+    return json_schema(getattr(import_module(f"minimax_cal.{module}"), kind))
 
 
 def schema_option(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -148,7 +148,7 @@ class Compensation(Result):
         said = f"{self.missed} of {len(self.q)} targets are missed: "
         return said + "; ".join(parts) if self.missed else ""
 
-    def beside(self) -> dict[str, Any]:
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """The targets, joints in SI."""
         columns = {
             "line": self.line,

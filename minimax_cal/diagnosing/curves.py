@@ -11,6 +11,7 @@ import numpy as np
 from minimax_cal.diagnosing.where import joint_equivalent
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import plain
+from minimax_cal.ground.records import array
 from minimax_cal.measuring.history import numbered, visits, with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
@@ -38,14 +39,23 @@ class Curve:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON; null where not measured."""
+        views = zip(VIEWS, self.y, strict=False)
         return {
             "title": self.title,
             "x": {"label": self.xlabel, "values": plain(self.x)},
             "y": {"label": self.ylabel},
-            "views": [
-                {"name": name, "values": plain(y)} for name, y in zip(VIEWS, self.y, strict=False)
-            ],
+            "views": [{"name": name, "values": plain(y)} for name, y in views],
         }
+
+    @staticmethod
+    def from_dict(content: Any, at: str) -> Curve:
+        """From `to_dict`.  Raises ValueError."""
+        x = array(content["x"]["values"], f"{at}.x")
+        y = tuple(array(view["values"], f"{at}.views") for view in content["views"])
+        if not (x.size and y) or any(part.shape != x.shape for part in y):
+            raise ValueError(f"{at} has no values, or some that differ in length")
+        title, xlabel = str(content["title"]), str(content["x"].get("label", ""))
+        return Curve(title, xlabel, str(content["y"].get("label", "")), x, y)
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,7 +41,7 @@ from minimax_cal.diagnosing.last_question import answered, known_noise
 from minimax_cal.diagnosing.moved import session_notices
 from minimax_cal.diagnosing.remainder import remainder
 from minimax_cal.diagnosing.reseats import sized, with_targets
-from minimax_cal.diagnosing.result import Diagnosis, Finding, Step
+from minimax_cal.diagnosing.result import Diagnosis, Finding, Step, Untestable
 from minimax_cal.diagnosing.set_aside import judged_with
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.diagnosing.tails import are_wrong, unpulled, wrong_rows
@@ -263,7 +263,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         structure=structure_left[1],
         structure_in=unexplained,
         where=located(study).to_dict(),
-        not_testable=causes.untestable,
+        not_testable=tuple(Untestable(*each) for each in causes.untestable),
         notices=(
             *asked.data.notices,
             *notices,

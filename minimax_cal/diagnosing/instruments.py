@@ -23,7 +23,7 @@ from minimax_cal.diagnosing.established import judged_again, often
 from minimax_cal.diagnosing.gap import motions as motions_of
 from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis, RelativeStep
 from minimax_cal.diagnosing.last_question import Known, answered
-from minimax_cal.diagnosing.result import Finding
+from minimax_cal.diagnosing.result import Finding, Untestable
 from minimax_cal.diagnosing.verdict import judged
 from minimax_cal.diagnosing.what_remains import NOTHING, left_over, motions
 from minimax_cal.evidence.limits import HELPS, MAX_JOINT_JITTER, MINOR
@@ -135,7 +135,7 @@ def examined(
         meets_floor=known.meets_floor,
         floor_file=file,
         floor_mm=(known.remaining, known.highest),
-        not_testable=causes.untestable,
+        not_testable=tuple(Untestable(*each) for each in causes.untestable),
         seconds=time.perf_counter() - began,
     )
 

@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import Field
-
-from minimax_cal.diagnosing.result import Explained, Finding
-from minimax_cal.diagnosing.result_file import (
-    FindingPart,
-    NoisePart,
-    StructurePart,
-    UntestablePart,
-)
+from minimax_cal.diagnosing.result import VERDICTS, Explained, Finding, Untestable
 from minimax_cal.diagnosing.sentences import explained
 from minimax_cal.evidence.limits import LEVEL
-from minimax_cal.fitting.fit_file import ScoresPart
 from minimax_cal.fitting.instruments import RelativeCalibration
-from minimax_cal.ground.files import finite
-from minimax_cal.ground.records import Number, Part, checked, reading
-from minimax_cal.ground.results import Result
+from minimax_cal.fitting.opened import RELATIVE
+from minimax_cal.ground.facts import APART, Fact, derived, in_file
+from minimax_cal.ground.files import number, plain
+from minimax_cal.ground.records import reading, stored
+from minimax_cal.ground.results import Result, merged
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy
@@ -32,53 +24,11 @@ from minimax_cal.solvers.status import Status
 RIVALS = ("effect", "alternative", "similarity", "power", "fits worse by")
 
 
-class StepPart(Part):
-    """One step of the error budget."""
-
-    step: str
-    holdout: ScoresPart
-    files: dict[str, ScoresPart] = Field(default_factory=dict)
-
-    def step_of(self) -> RelativeStep:
-        """As the code has it."""
-        files = {name: one.accuracy() for name, one in self.files.items()}
-        return RelativeStep(self.step, self.holdout.accuracy(), files)
-
-
-class BudgetPart(Part):
-    """The error budget."""
-
-    ladder: Annotated[tuple[StepPart, ...], Field(min_length=2)]
-
-
-class FloorPart(Part):
-    """What is left, and the noise that was given [mm]."""
-
-    file: str = ""
-    remaining_mm: Number = math.nan
-    noise_floor_mm: Number = math.nan
-
-
-class RelativeDiagnosisPart(Part):
-    """The key diagnosis in the file of `minimax-cal relative --diagnose -o`."""
-
-    verdict: Literal["none", "named", "one_of", "unknown"]
-    status: Status
-    meets_floor: bool | None = None
-    floor: FloorPart = FloorPart()
-    effects: tuple[FindingPart, ...]
-    gap: BudgetPart
-    noise: NoisePart = NoisePart()
-    structure: StructurePart = StructurePart()
-    not_testable: tuple[UntestablePart, ...] = ()
-    seconds: Number = math.nan
-
-
 @dataclass(frozen=True)
 class RelativeStep:
     """One step of the error budget.  holdout: of all files; files: held out, of each by name."""
 
-    name: str
+    name: Annotated[str, Fact(key="step")]
     holdout: Accuracy
     files: Mapping[str, Accuracy]
 
@@ -101,18 +51,21 @@ class RelativeDiagnosis(Explained, Result):
     leave at least, and what noise and sound joints may add up to [mm].
     """
 
-    calibration: RelativeCalibration
+    KIND = RELATIVE
+    COMMAND = "relative"
+
+    calibration: Annotated[RelativeCalibration, APART]
     status: Status
-    verdict: str
-    effects: tuple[Finding, ...]
-    steps: tuple[RelativeStep, ...]
-    structure: float
-    structure_in: str
-    jitter: float
+    verdict: Annotated[str, Fact(among=VERDICTS)]
+    effects: Annotated[tuple[Finding, ...], APART]
+    steps: Annotated[tuple[RelativeStep, ...], Fact(key="gap.ladder", fewest=2)]
+    structure: Annotated[float, Fact(key="structure.p")]
+    structure_in: Annotated[str, Fact(key="structure.in")]
+    jitter: Annotated[float, Fact(key="noise.joint_jitter_mrad", scale=1e3)]
     meets_floor: bool | None
-    floor_file: str
-    floor_mm: tuple[float, float]
-    not_testable: tuple[tuple[str, str], ...]
+    floor_file: Annotated[str, Fact(key="floor.file")]
+    floor_mm: Annotated[tuple[float, float], APART]
+    not_testable: tuple[Untestable, ...]
     seconds: float
 
     def __repr__(self) -> str:
@@ -130,7 +83,7 @@ class RelativeDiagnosis(Explained, Result):
         """What the reader should know."""
         return self.calibration.notices
 
-    @property
+    @derived()
     def reasons(self) -> tuple[str, ...]:
         """The verdict and why, in sentences."""
         return explained(self)
@@ -186,68 +139,35 @@ class RelativeDiagnosis(Explained, Result):
         """Every table, those of the calibration last."""
         return (*self.own_tables(), *self.calibration.tables())
 
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON of the calibration, with the key diagnosis."""
-        return {**self.calibration.to_dict(), "diagnosis": self.own_dict()}
+    def to_dict(self, *, poses: bool = True) -> dict[str, Any]:
+        """The JSON of the calibration, with the key diagnosis, as `Diagnosis` where it means so."""
 
-    def own_dict(self) -> dict[str, Any]:
-        """The diagnosis alone, its keys as those of `Diagnosis` where they mean the same."""
-
-        def held(kind: str) -> dict[str, float | None]:
+        def held(kind: str) -> dict[str, float]:
             ends = {"nominal": 0, "geometric": 1, "final": -1}
-            return {
-                name: finite(getattr(self.steps[at].holdout, kind)) for name, at in ends.items()
-            }
+            return {name: getattr(self.steps[at].holdout, kind) for name, at in ends.items()}
 
-        return {
-            "verdict": self.verdict,
-            "status": str(self.status),
-            "reasons": list(self.reasons),
+        remaining, highest = self.floor_mm
+        more = {
             "floor_known": self.meets_floor is not None,
-            "meets_floor": self.meets_floor,
-            "floor": {
-                "file": self.floor_file,
-                "remaining_mm": finite(self.floor_mm[0]),
-                "noise_floor_mm": finite(self.floor_mm[1]),
-            },
-            "effects": [found.to_dict() for found in self.effects],
-            "gap": {
-                "holdout_rms_mm": held("rms_mm"),
-                "holdout_max_mm": held("max_mm"),
-                "ladder": [
-                    {
-                        "step": step.name,
-                        "holdout": step.holdout.to_dict(),
-                        "files": {name: one.to_dict() for name, one in step.files.items()},
-                    }
-                    for step in self.steps
-                ],
-            },
-            "noise": {"joint_jitter_mrad": finite(1e3 * self.jitter)},
-            "structure": {"p": finite(self.structure), "in": self.structure_in},
-            "not_testable": [{"effect": name, "needs": needs} for name, needs in self.not_testable],
-            "seconds": self.seconds,
+            "floor": {"remaining_mm": remaining, "noise_floor_mm": highest},
+            "effects": self.effects,
+            "gap": {"holdout_rms_mm": held("rms_mm"), "holdout_max_mm": held("max_mm")},
         }
+        own = merged(plain(in_file(self)), plain(more))
+        return {**self.calibration.to_dict(), "diagnosis": own}
 
-    @staticmethod
-    def from_dict(content: Mapping[str, Any], source: str = "diagnosis") -> RelativeDiagnosis:
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], source: str = "diagnosis") -> RelativeDiagnosis:
         """From `to_dict`.  Raises CalibrationError."""
         calibration = RelativeCalibration.from_dict(content, source)
-        with reading(source, "diagnosis"):
-            part = checked(RelativeDiagnosisPart, content["diagnosis"], f"{source}: diagnosis")
         terms = calibration.cell.effects.terms if calibration.cell else ()
-        return RelativeDiagnosis(
-            calibration=calibration,
-            status=part.status,
-            verdict=part.verdict,
-            effects=tuple(found.finding(terms) for found in part.effects),
-            steps=tuple(step.step_of() for step in part.gap.ladder),
-            structure=part.structure.p,
-            structure_in=part.structure.place,
-            jitter=1e-3 * part.noise.joint_jitter_mrad,
-            meets_floor=part.meets_floor,
-            floor_file=part.floor.file,
-            floor_mm=(part.floor.remaining_mm, part.floor.noise_floor_mm),
-            not_testable=tuple((each.effect, each.needs) for each in part.not_testable),
-            seconds=part.seconds,
-        )
+        with reading(source, "diagnosis"):
+            own = content["diagnosis"]
+            told, floor = stored(cls, own), own["floor"]
+            each = enumerate(own["effects"])
+            return cls(
+                **told,
+                calibration=calibration,
+                effects=tuple(Finding.told(one, f"effects[{i}]", terms) for i, one in each),
+                floor_mm=(number(floor["remaining_mm"]), number(floor["noise_floor_mm"])),
+            )

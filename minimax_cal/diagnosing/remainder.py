@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Any
 
 import numpy as np
 import scipy
@@ -22,6 +21,7 @@ from scipy.spatial.distance import cdist
 
 from minimax_cal.diagnosing.gap import folds
 from minimax_cal.diagnosing.joint import Joint
+from minimax_cal.diagnosing.result import Remainder, Share
 from minimax_cal.evidence.limits import FAR_OUT, FOLDS, GAIN_LEVEL, LEAST_SWEEP
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.floor import Floor
@@ -39,30 +39,6 @@ WIDTHS = (1.0, 2.0, 4.0, 8.0)  # of them, in typical distances between those pos
 SHIFTS = (3e-5, 1e-4, 3e-4)  # sizes of the shift [m]
 JITTER = 1e-8  # added to a correlation, so that it is one for any poses
 RIDGE = 1e-10  # of a parameter's own weight: what poses do not tell stays where it is
-
-
-@dataclass(frozen=True)
-class Remainder:
-    """What is left beneath the names, on groups of training poses left out in turn.
-
-    predictable_mm: RMS distance that free functions of the joints predict, 0 where they do not.
-    where: place and share of each, the largest first.  unpredictable_mm: RMS distance that stays.
-    floor_mm: ends of what noise alone leaves, None where nothing tells.
-    """
-
-    predictable_mm: float
-    where: tuple[tuple[str, float], ...]
-    unpredictable_mm: float
-    floor_mm: tuple[float, float] | None
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {
-            "predictable_mm": self.predictable_mm,
-            "where": [{"place": place, "share": share} for place, share in self.where],
-            "unpredictable_mm": self.unpredictable_mm,
-            "floor_mm": list(self.floor_mm) if self.floor_mm else None,
-        }
 
 
 def remainder(last: Joint, floor: Floor) -> Remainder:
@@ -88,7 +64,7 @@ def remainder(last: Joint, floor: Floor) -> Remainder:
     order = np.argsort(-gains)
     return Remainder(
         1e3 * float(np.sqrt(gains.sum() / points)),
-        tuple((places[i], float(gains[i] / gains.sum())) for i in order),
+        tuple(Share(places[i], float(gains[i] / gains.sum())) for i in order),
         1e3 * float(np.sqrt(squares[-1] / points)),
         floor.ends,
     )

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -15,9 +16,14 @@ from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual
 from minimax_cal.evidence.limits import BAND, CONFIRMED, ENOUGH, LEVEL
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.fitting.set_aside import WithThem, aside_sentence
+from minimax_cal.fitting.found import Parameter
+from minimax_cal.fitting.set_aside import aside_sentence
+from minimax_cal.fitting.told_poses import measured_poses
 from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.files import finite, number, plain, saved_content
+from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.facts import APART, Fact, derived, in_file
+from minimax_cal.ground.files import finite, number, plain
+from minimax_cal.ground.records import AGAIN, array, as_kind, stored
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
@@ -29,17 +35,13 @@ from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.pose_rows import pose_rows
-from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.words import name_effect, name_place, name_step
 from minimax_cal.modelling.frames import frames_of
 from minimax_cal.robots.frames import CONVENTION, Frame
 from minimax_cal.solvers.status import Status
 
-if TYPE_CHECKING:
-    from minimax_cal.diagnosing.remainder import Remainder
-
-SCHEMA = 1
 CURVE = ("q_rad", "turn_rad", "sigma_rad")
 SURE = 1e-15  # a smaller chance is as good as none
 SHOWN_LINES = 12  # lines of a fault that are told one by one
@@ -56,6 +58,9 @@ PEOPLES = {  # how people read a unit of the file
 TOLD_AS = {"rad/(N m)": "mrad at most", "1/(N m^2)": "mm at most"}  # where masses are not told
 NONE_HELPS = "no measurement"  # how what is proposed begins where nothing helps
 VERDICTS = ("none", "named", "one_of", "unknown", "not_repeatable")
+NAMED = {"geometric": "calibrated geometry (least squares)"}  # `calibrate` may have another
+MAX_STEPS = 6  # rows of the budget on a first screen: nominal, geometry, effects, noise
+BELOW = math.nextafter(CONFIRMED, 0.0)  # what was tentative when it was written stays so
 
 
 def as_motion(effect: str, unit: str) -> str:
@@ -96,10 +101,6 @@ class Alternative:
         """Whether a measurement was found that is worth its while."""
         return bool(self.separate_with) and not self.separate_with.startswith(NONE_HELPS)
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return dict(vars(self))
-
 
 @dataclass(frozen=True, eq=False)
 class Finding:
@@ -118,26 +119,26 @@ class Finding:
     shown: the terms that the data ask for, where `terms` are the whole law that these belong to.
     """
 
-    terms: tuple[Term, ...]
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    values: tuple[float, ...]
-    sigmas: tuple[float, ...]
-    size: float
-    p_value: float
+    terms: Annotated[tuple[Term, ...], APART]
+    names: Annotated[tuple[str, ...], APART]
+    units: Annotated[tuple[str, ...], APART]
+    values: Annotated[tuple[float, ...], APART]
+    sigmas: Annotated[tuple[float, ...], APART]
+    size: Annotated[float, Fact(key="lambda")] = math.nan
+    p_value: Annotated[float, Fact(key="chance")] = math.nan
     alternatives: tuple[Alternative, ...] = ()
-    share: float = float("nan")
-    before: float = float("nan")
-    after: float = float("nan")
+    share: float = math.nan
+    before: Annotated[float, Fact(key="holdout_rms_mm.before")] = math.nan
+    after: Annotated[float, Fact(key="holdout_rms_mm.after")] = math.nan
     fixed: Mapping[str, float] = field(default_factory=dict)
-    rows: tuple[int, ...] = ()
-    motion: tuple[float, ...] = ()
-    again: float = 1.0
+    rows: Annotated[tuple[int, ...], Fact(key="lines")] = ()
+    motion: Annotated[tuple[float, ...], APART] = ()
+    again: Annotated[float, Fact(key="frequency")] = 1.0
     minor: bool = False
-    curve: Array = field(default_factory=lambda: np.zeros((3, 0)))
-    shown: tuple[Term, ...] = ()
+    curve: Annotated[Array, APART] = field(default_factory=lambda: np.zeros((3, 0)))
+    shown: Annotated[tuple[Term, ...], APART] = ()
 
-    @property
+    @derived()
     def established(self) -> bool:
         """Whether it is found again in nearly all subsamples of the poses."""
         return not self.why_tentative
@@ -220,27 +221,49 @@ class Finding:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {
-            "effect": self.term.effect,
-            "place": self.term.place,
-            "established": self.established,
-            "minor": self.minor,
-            "frequency": finite(self.again),
-            "why_tentative": self.why_tentative or None,
-            "share": finite(self.share),
-            "lambda": finite(self.size),
-            "chance": finite(self.p_value),
-            "parameters": self.parameters(),
-            "fixed": {key: finite(value) for key, value in self.fixed.items()},
-            **(
-                {"curve": dict(zip(CURVE, plain(self.curve), strict=True))}
-                if self.curve.size
-                else {}
-            ),
-            "holdout_rms_mm": {"before": finite(self.before), "after": finite(self.after)},
-            "alternatives": [other.to_dict() for other in self.alternatives],
-            "lines": list(self.rows),
-        }
+        return dict(
+            plain(
+                {
+                    "effect": self.term.effect,
+                    "place": self.term.place,
+                    **in_file(self),
+                    "why_tentative": self.why_tentative or None,
+                    "parameters": self.parameters(),
+                    **(
+                        {"curve": dict(zip(CURVE, self.curve, strict=True))}
+                        if self.curve.size
+                        else {}
+                    ),
+                }
+            )
+        )
+
+    @staticmethod
+    def told(content: Any, at: str, known: Sequence[Term]) -> Finding:
+        """From `to_dict`.  known: terms that were fitted, with their choices.  Raises ValueError.
+
+        What was tentative when it was written stays so.
+        """
+        told = stored(Finding, content, at)
+        key = as_kind(tuple[str, str], [content["effect"], content["place"]], Fact(), at)
+        own = tuple(term for term in known if term.key == key) or (Term(*key),)
+        every = as_kind(
+            tuple[Parameter, ...],
+            [{"nominal": None} | each for each in content.get("parameters", [])],
+            Fact(), f"{at}.parameters",
+        )  # fmt: skip
+        again, curve = told.get("again", math.nan), content.get("curve", {})
+        if content.get("established", True) != (again >= CONFIRMED):
+            told["again"] = 1.0 if content.get("established", True) else BELOW
+        return Finding(
+            **told,
+            terms=own,
+            names=tuple(p.name for p in every),
+            units=tuple(p.unit for p in every),
+            values=tuple(p.value for p in every),
+            sigmas=tuple(p.sigma for p in every),
+            curve=array([curve.get(key, []) for key in CURVE], f"{at}.curve"),
+        )
 
 
 def of_curve(curve: Array) -> list[dict[str, Any]]:
@@ -254,6 +277,28 @@ def of_curve(curve: Array) -> list[dict[str, Any]]:
     ]
 
 
+class Share(NamedTuple):
+    """A share of what is predictable without a name, and its place."""
+
+    place: str
+    share: float
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """What is left beneath the names, on groups of training poses left out in turn.
+
+    predictable_mm: RMS distance that free functions of the joints predict, 0 where they do not.
+    where: place and share of each, the largest first.  unpredictable_mm: RMS distance that stays.
+    floor_mm: ends of what noise alone leaves, None where nothing tells.
+    """
+
+    predictable_mm: float
+    where: tuple[Share, ...]
+    unpredictable_mm: float
+    floor_mm: tuple[float, float] | None
+
+
 @dataclass(frozen=True)
 class Step:
     """One rung of the gap ladder: accuracy on the training and on the held-out poses.
@@ -261,10 +306,17 @@ class Step:
     trusted: on the held-out points that do not stand out.
     """
 
-    name: str
+    name: Annotated[str, Fact(key="step")]
     train: Accuracy
     holdout: Accuracy
     trusted: Accuracy
+
+
+class Untestable(NamedTuple):
+    """An effect that the data cannot test, and what they lack for it."""
+
+    effect: str
+    needs: str
 
 
 class Explained:
@@ -280,7 +332,7 @@ class Explained:
     effects: tuple[Finding, ...]
     structure: float
     structure_in: str
-    not_testable: tuple[tuple[str, str], ...]
+    not_testable: tuple[Untestable, ...]
 
     @property
     def excess(self) -> str:
@@ -364,46 +416,49 @@ class Diagnosis(Explained, Result):
     stated_errors, stated_curves: as they stand in the file that the diagnosis was read from.
     """
 
+    KIND = "diagnosis"
+    COMMAND = "diagnose"
+
     robot: str
     status: Status
-    verdict: str
-    effects: tuple[Finding, ...]
-    ladder: tuple[Step, ...]
-    floor: Floor
-    closed: float
-    closed_ci: tuple[float, float]
-    beyond: Beyond
-    noise: float
-    jitter: float
-    structure: float
-    structure_in: str
+    verdict: Annotated[str, Fact(among=VERDICTS)]
+    effects: Annotated[tuple[Finding, ...], APART]
+    ladder: Annotated[tuple[Step, ...], Fact(key="gap.ladder", fewest=2)]
+    floor: Annotated[Floor, APART]
+    closed: Annotated[float, Fact(key="gap.closed")]
+    closed_ci: Annotated[tuple[float, float], APART]
+    beyond: Annotated[Beyond, Fact(key="gap.beyond")]
+    noise: Annotated[float, Fact(key="noise.instrument_mm", scale=1e3)]
+    jitter: Annotated[float, Fact(key="noise.joint_jitter_mrad", scale=1e3)]
+    structure: Annotated[float, Fact(key="structure.p")]
+    structure_in: Annotated[str, Fact(key="structure.in")]
     where: Mapping[str, Any]
-    not_testable: tuple[tuple[str, str], ...]
+    not_testable: tuple[Untestable, ...]
     notices: tuple[str, ...]
     provenance: Provenance
     seconds: float
-    data: Measurements
-    held: Array
-    cells: tuple[Cell, ...]
-    stated_errors: tuple[Array, Array] | None = None
-    stated_curves: Mapping[str, Curve] | None = None
-    nominal: Cell | None = None
+    data: Annotated[Measurements, APART]
+    held: Annotated[Array, APART]
+    cells: Annotated[tuple[Cell, ...], APART]
+    stated_errors: Annotated[tuple[Array, Array] | None, APART] = None
+    stated_curves: Annotated[Mapping[str, Curve] | None, APART] = None
+    nominal: Annotated[Cell | None, APART] = None
     remainder: Remainder | None = None
     set_aside: tuple[SetAside, ...] = ()
-    with_them: WithThem | None = None
+    with_them: Annotated[Accuracy | None, Fact(key="accuracy.holdout_with_them", brief=True)] = None
     meets_floor: bool | None = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis of {self.robot}: {self.verdict}. {self.headline()}>"
 
-    @cached_property
+    @derived()
     def reasons(self) -> tuple[str, ...]:
         """The verdict and why, in sentences."""
         from minimax_cal.diagnosing.sentences import reasons
 
         return reasons(self)
 
-    @cached_property
+    @derived()
     def next(self) -> str | None:
         """The one measurement to make next, as a sentence; None where none is worth it."""
         from minimax_cal.diagnosing.sentences import proposal
@@ -440,7 +495,7 @@ class Diagnosis(Explained, Result):
         told = with_history(self.data)
         return self.cells[0].error(told), self.cells[-1].error(told)
 
-    @cached_property
+    @derived()
     def curves(self) -> Mapping[str, Curve]:
         """The errors against their cause (residual), and as the poses were visited (order)."""
         if self.stated_curves is not None:
@@ -448,79 +503,74 @@ class Diagnosis(Explained, Result):
         left = self.leftover()
         return {"residual": residual_curve(left), "order": order_curve(left)}
 
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON of the contract, and more; `from_dict` reads it back."""
-        return {
-            "schema": SCHEMA,
-            "kind": "diagnosis",
-            "robot": self.robot,
-            "status": str(self.status),
-            "verdict": self.verdict,
-            "floor_known": self.floor.certain,
-            "meets_floor": self.meets_floor,
-            "next": self.next,
-            "reasons": list(self.reasons),
-            "effects": [finding.to_dict() for finding in self.effects],
-            "set_aside": [point.to_dict() for point in self.set_aside],
-            **(
-                {"accuracy": {"holdout_with_them": self.with_them.to_dict()}}
-                if self.with_them
-                else {}
-            ),
-            "gap": self.gap_dict(),
-            "frames": {name: frame.to_dict() for name, frame in self.frames.items()},
-            "frames_convention": CONVENTION,
-            "remainder": self.remainder.to_dict() if self.remainder else None,
-            "noise": {
-                "instrument_mm": finite(1e3 * self.noise),
-                "joint_jitter_mrad": finite(1e3 * self.jitter),
-            },
-            "structure": {"p": finite(self.structure), "in": self.structure_in},
-            "where": dict(self.where),
-            "not_testable": [{"effect": name, "needs": needs} for name, needs in self.not_testable],
-            "curves": {name: curve.to_dict() for name, curve in self.curves.items()},
-            "cells": [cell.whole() for cell in (self.cells[0], self.cells[-1])],
-            "rungs": [{"name": name, **cell.whole()} for name, cell in self.rungs()],
-            "poses": pose_rows(
-                self.data, self.held, dict(zip(("geometric", "final"), self.errors, strict=True))
-            ),
-            "notices": list(self.notices),
-            "seconds": self.seconds,
-            "provenance": vars(self.provenance),
-        }
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
+        """The error budget in short, the arms, the poses."""
 
-    def gap_dict(self) -> dict[str, Any]:
-        """The error budget of `to_dict`."""
-
-        def held(kind: str, of: str = "holdout") -> dict[str, float | None]:
+        def held(kind: str, of: str = "holdout") -> dict[str, float]:
             chosen = {"nominal": self.ladder[0], "geometric": self.ladder[1],
                       "final": self.ladder[-1]}  # fmt: skip
-            return {k: finite(getattr(getattr(step, of), kind)) for k, step in chosen.items()}
+            return {k: getattr(getattr(step, of), kind) for k, step in chosen.items()}
 
+        explained, gain = self.minor_sizes
+        errors = dict(zip(("geometric", "final"), self.errors, strict=True))
         return {
-            "holdout_rms_mm": held("rms_mm"),
-            "holdout_max_mm": held("max_mm"),
-            "trusted_rms_mm": held("rms_mm", "trusted"),
-            "beyond": self.beyond.to_dict(),
-            "noise_floor_mm": finite(self.floor.value),
-            "noise_floor_range_mm": [finite(self.floor.low), finite(self.floor.high)],
-            "noise_floor_from": self.floor.source,
-            "minor_effects": {
-                "count": len(self.minor),
-                "explained_mm": self.minor_sizes[0],
-                "gain_mm": self.minor_sizes[1],
+            "floor_known": self.floor.certain,
+            "effects": self.effects,
+            "gap": {
+                "holdout_rms_mm": held("rms_mm"),
+                "holdout_max_mm": held("max_mm"),
+                "trusted_rms_mm": held("rms_mm", "trusted"),
+                "noise_floor_mm": self.floor.value,
+                "noise_floor_range_mm": [self.floor.low, self.floor.high],
+                "noise_floor_from": self.floor.source,
+                "minor_effects": {
+                    "count": len(self.minor),
+                    "explained_mm": explained,
+                    "gain_mm": gain,
+                },
+                "closed_ci95": self.closed_ci if self.has_interval else None,
             },
-            "closed": finite(self.closed),
-            "closed_ci95": list(self.closed_ci) if self.has_interval else None,
-            "ladder": [
-                {
-                    "step": step.name,
-                    "train": step.train.to_dict(),
-                    "holdout": step.holdout.to_dict(),
-                    "trusted": step.trusted.to_dict(),
-                }
-                for step in self.ladder
-            ],
+            "frames": self.frames,
+            "frames_convention": CONVENTION,
+            "cells": [cell.whole() for cell in (self.cells[0], self.cells[-1])],
+            "rungs": [{"name": name, **cell.whole()} for name, cell in self.rungs()],
+            "poses": pose_rows(self.data, self.held, errors),
+        }
+
+    @classmethod
+    def told_beside(
+        cls, content: Mapping[str, Any], told: Mapping[str, Any], source: str
+    ) -> dict[str, Any]:
+        """The arms, their effects and the poses, from a file."""
+        listed = enumerate(content.get("rungs", ()))
+        arms = [cell_from_dict(cell, f"{source}: rungs[{i}]") for i, cell in listed]
+        if not arms:
+            raise CalibrationError(f"{source}: holds no arm; {AGAIN} diagnose")
+        nominal, *cells = arms
+        if len({(cell.robot.joints, cell.target_names) for cell in arms}) > 1:
+            raise CalibrationError(f"{source}: its cells are not of one arm; {AGAIN} diagnose")
+        fitted, first = (cells[-1].effects.terms, cells[0]) if cells else ((), None)
+        data, held, errors = measured_poses(content, source, first, "geometric")
+        gap, pair = content["gap"], tuple[float, float]
+        (low, high), closed = (
+            as_kind(pair, gap.get(key), Fact(), f"gap.{key}")
+            for key in ("noise_floor_range_mm", "closed_ci95")
+        )
+        floor, known = number(gap.get("noise_floor_mm")), str(gap.get("noise_floor_from", ""))
+        effects = enumerate(content["effects"])
+        return {
+            "effects": tuple(Finding.told(each, f"effects[{i}]", fitted) for i, each in effects),
+            "floor": Floor(floor, low, high, known),
+            "closed_ci": closed,
+            "data": data,
+            "held": held,
+            "cells": tuple(cells),
+            "nominal": nominal,
+            "stated_errors": errors,
+            "stated_curves": {
+                name: Curve.from_dict(curve, f"curves.{name}")
+                for name, curve in content.get("curves", {}).items()
+            },
         }
 
     @property
@@ -540,15 +590,6 @@ class Diagnosis(Explained, Result):
         names = ("nominal", "geometric", *(c.effects.terms[-1].step for c in self.cells[1:]))
         return tuple(zip(names, (self.nominal, *self.cells), strict=True))
 
-    @staticmethod
-    def from_dict(content: Mapping[str, Any], source: str = "diagnosis") -> Diagnosis:
-        """From `to_dict`.  Raises CalibrationError."""
-        from minimax_cal.diagnosing.result_file import read
-        from minimax_cal.ground.records import reading
-
-        with reading(source):
-            return read(content, source)
-
     def ladder_table(self) -> Table:
         """The error budget, step by step."""
         rows: list[tuple[TableCell, ...]] = [
@@ -564,6 +605,34 @@ class Diagnosis(Explained, Result):
             tuple(rows),
             ("", ".4f", ".4f", ".4f", ".4f"),
         )
+
+    def first_tables(self) -> tuple[Table, ...]:
+        """What stands on the first screen: the budget in at most six steps.
+
+        What follows the main causes is one step where they are more.
+        """
+        if not self.ladder:
+            return ()
+        every = [(NAMED.get(s.name) or name_step(s.name), s.holdout) for s in self.ladder]
+        most = MAX_STEPS - 1  # the last row is the noise
+        if len(every) > most:
+            main = [f.term.step for f in self.main]
+            last = max((i for i, step in enumerate(self.ladder) if step.name in main), default=1)
+            kept = min(last + 1, most - 1)
+            every = [*every[:kept], (self.rest_of(kept), every[-1][1])]
+        rows: list[tuple[TableCell, ...]] = [(name, a.rms_mm, a.max_mm) for name, a in every]
+        known = "" if self.floor.certain else ", at most"
+        rows.append((f"measurement noise{known}", self.floor.value, ""))
+        title = "error budget, step by step, on held-out poses"
+        return (Table(title, ("model", "RMS mm", "max mm"), tuple(rows), ("", ".3f", ".3f")),)
+
+    def rest_of(self, kept: int) -> str:
+        """The steps after those kept, counted by kind, as + 16 minor and 2 possible effects."""
+        of_kind = (("main", self.main), ("minor", self.minor))
+        kinds = {f.term.step: kind for kind, some in of_kind for f in some}
+        counts = Counter(kinds.get(step.name, "possible") for step in self.ladder[kept:])
+        said = [f"{counts[kind]} {kind}" for kind in ("main", "minor", "possible") if counts[kind]]
+        return f"+ {' and '.join(said)} effect{'s' if counts.total() > 1 else ''}"
 
     def effects_table(self) -> Table:
         """The effects found, with what each does for held-out poses; possible ones last."""
@@ -605,4 +674,4 @@ def load_diagnosis(path: Path | str) -> Diagnosis:
 
     Raises CalibrationError.
     """
-    return Diagnosis.from_dict(saved_content(path), str(path))
+    return Diagnosis.load(path)

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from minimax_cal.diagnosing.gap import of_lines
-from minimax_cal.fitting.set_aside import WithThem, errors_of, with_them
+from minimax_cal.fitting.set_aside import errors_of, with_them
+from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.aside import TOOL, SetAside
 from minimax_cal.measuring.faults import Fault
 from minimax_cal.measuring.faults.nests import RESEAT
@@ -29,7 +30,7 @@ def judged_with(
     left: Sequence[Fault],
     held: Measurements,
     cell: Cell,
-) -> tuple[tuple[SetAside, ...], WithThem | None]:
+) -> tuple[tuple[SetAside, ...], Accuracy | None]:
     """The points that no fit counts, and the accuracy with them; None where there are none.
 
     data: as asked.  clean: what the fits count.  left: what was found, by lines of the file.  held:

@@ -158,7 +158,7 @@ def by_loads(fold: Array, logs: Logs, terms: Sequence[Term]) -> Array:
 
     fold: (R,) of whole runs.  terms: laws found, with the payloads of runs.
     """
-    carried = [tuple(t.text for t in terms if dict(t.tuned).get(name)) for name in logs.names]
+    carried = [tuple(t.text for t in terms if t.tuned.get(name)) for name in logs.names]
     out, parts = fold.copy(), int(fold.max()) + 1
     for load in set(carried):
         rows = np.isin(logs.run, [r for r, each in enumerate(carried) if each == load])

@@ -42,6 +42,7 @@ from minimax_cal.dynamics.result import (
     MotionStep,
     NotTestable,
     Parameter,
+    Verdict,
     best_worth,
     changed_joints,
     worth_by_joint,
@@ -310,6 +311,7 @@ def examined(
     effects.sort(key=lambda one: (one.minor, -gain_of(one)))
     models, budget = steps(found, normal, judge, late, before)
     return MotionDiagnosis(
+        arm=arm,
         unit=logs.unit,
         verdict=verdict_of(effects, left, too_little),
         effects=tuple(effects),
@@ -321,8 +323,9 @@ def examined(
         runs=logs.names,
         held_out=held_words(logs, fold, whole),
         held_run=held_run(judge, logs, parts_of(found.terms)),
-        curves=curves(found, normal, judge),
+        curves=tuple(curves(found, normal, judge)),
         notices=(*units, *body_notices(arm, given, change, logs)),
+        seconds=0.0,
     )
 
 
@@ -361,31 +364,27 @@ def is_minor(worth: dict[str, tuple[float, float]], before: Array) -> bool:
 
 def laws_found(
     found: Found, normal: Normal, judge: LeftOut, again: dict[tuple[str, str], float]
-) -> list[MotionEffect]:
+) -> Iterator[MotionEffect]:
     """The laws that were found, with what each is worth."""
     every = parts_of(found.terms)
     value = normal.solve(every)
     sigma, whole = normal.spread(every, value), judge.missed(every)
     moving = normal.columns.scene.logs.moving
     usual = judge.rms(judge.missed(parts_of(())), moving)
-    out = []
     for number, term in enumerate(found.terms):
         worth = worth_of(judge, whole, judge.missed([p for p in every if p != term.text]))
         place = normal.place[term.text]
-        out.append(
-            MotionEffect(
-                term.effect,
-                term.place,
-                parameters_of(term, value[place], sigma[place], normal.columns.scene),
-                worth,
-                others_of(found.choice, number),
-                again[term.key],
-                bool(again[term.key] >= FOUND_AGAIN),
-                is_minor(worth, usual),
-                term.law.family,
-            )
+        yield MotionEffect(
+            term.effect,
+            term.place,
+            parameters_of(term, value[place], sigma[place], normal.columns.scene),
+            worth,
+            others_of(found.choice, number),
+            again[term.key],
+            bool(again[term.key] >= FOUND_AGAIN),
+            is_minor(worth, usual),
+            term.law.family,
         )
-    return out
 
 
 def parameters_of(term: Term, value: Array, sigma: Array, scene: Scene) -> tuple[Parameter, ...]:
@@ -396,18 +395,16 @@ def parameters_of(term: Term, value: Array, sigma: Array, scene: Scene) -> tuple
         Parameter(name, float(v), float(s), said.get(unit, unit.replace("t", scene.logs.unit, 1)))
         for name, unit, v, s in zip(law.names, law.units, value, sigma, strict=False)
     ]
-    tuned = [Parameter(name, v, float("nan"), TUNED_UNITS.get(name, "1")) for name, v in term.tuned]
+    tuned = [Parameter(name, v, float("nan"), TUNED_UNITS.get(name, "1"))
+             for name, v in term.tuned.items()]  # fmt: skip
     return (*fitted_ones, *tuned)
 
 
 def others_of(choice: Choice, number: int) -> tuple[Alternative, ...]:
     """What else could be an effect that was found."""
     found = alternatives(*choice.beside_others(number))
-    out = []
-    for other, rho2, _ in found:
-        term = other.candidate.term
-        out.append(Alternative(term.effect, term.place, rho2, separating(term)))
-    return tuple(out)
+    terms = ((other.candidate.term, rho2) for other, rho2, _ in found)
+    return tuple(Alternative(t.effect, t.place, rho2, separating(t)) for t, rho2 in terms)
 
 
 def separating(term: Term) -> str:
@@ -419,7 +416,7 @@ def separating(term: Term) -> str:
     return "longer runs of another kind"
 
 
-def usual_found(normal: Normal, judge: LeftOut) -> list[MotionEffect]:
+def usual_found(normal: Normal, judge: LeftOut) -> Iterator[MotionEffect]:
     """Coulomb and viscous friction of each joint, where the rows show them."""
     terms = normal.terms
     every = parts_of(terms)
@@ -428,7 +425,6 @@ def usual_found(normal: Normal, judge: LeftOut) -> list[MotionEffect]:
     logs = normal.columns.scene.logs
     before = judge.rms(judge.missed([RIGID]), logs.moving)
     start = normal.place[FRICTION].start
-    out = []
     for number in range(2 * logs.joints):
         at, joint, kind = start + number, number // 2, USUAL[number % 2]
         z = value[at] / sigma[at] if sigma[at] > 0.0 else 0.0
@@ -437,11 +433,8 @@ def usual_found(normal: Normal, judge: LeftOut) -> list[MotionEffect]:
         worth = worth_of(judge, whole, judge.missed(every, without=(at,)))
         unit = logs.unit if kind == "coulomb" else f"{logs.unit} s/rad"
         parameter = Parameter("friction", float(value[at]), float(sigma[at]), unit)
-        out.append(
-            MotionEffect(kind, f"J{joint + 1}", (parameter,), worth,
-                         minor=is_minor(worth, before), family=CURVE)
-        )  # fmt: skip
-    return out
+        yield MotionEffect(kind, f"J{joint + 1}", (parameter,), worth,
+                           minor=is_minor(worth, before), family=CURVE)  # fmt: skip
 
 
 def with_delay(
@@ -516,8 +509,8 @@ def steps(
 
 def verdict_of(
     effects: Sequence[MotionEffect], left: Sequence[Unexplained], too_little: Sequence[str]
-) -> str:
-    """none, named, one_of or unknown."""
+) -> Verdict:
+    """What may be said of the cause."""
     main = [e for e in effects if e.established and not e.minor]
     if too_little or any(one.share > MATTERS for one in left):
         return "unknown"
@@ -574,14 +567,14 @@ def held_run(judge: LeftOut, logs: Logs, parts: Sequence[str]) -> HeldRun:
     """A stretch of a run as a fit without it predicts it."""
     run = int(logs.run[np.argmax(judge.judged)])
     rows = np.flatnonzero((logs.run == run) & judge.judged)[:SHOWN_ROWS]
-    measured = judge.error.T[rows]
-    predicted = measured - judge.missed(parts)[rows]
+    measured = judge.error[:, rows]
+    predicted = measured - judge.missed(parts)[rows].T
 
-    def listed(values: Array) -> tuple[tuple[float, ...], ...]:
-        return tuple(tuple(float(f"{v:.5g}") for v in column) for column in values.T)
+    def brief(values: Array) -> Array:
+        return np.array([[float(f"{value:.5g}") for value in row] for row in values])
 
-    time_s = tuple(float(v) for v in np.round((rows - rows[0]) / ROW_HZ, 4))
-    return HeldRun(logs.names[run], time_s, listed(measured), listed(predicted))
+    time_s = tuple(np.round((rows - rows[0]) / ROW_HZ, 4).tolist())
+    return HeldRun(logs.names[run], time_s, brief(measured), brief(predicted))
 
 
 def form_of(term: Term, sense: Array, share: Array) -> Array:
@@ -589,19 +582,17 @@ def form_of(term: Term, sense: Array, share: Array) -> Array:
 
     sense, share: (v,) soft sign of the speed, and its size over the largest.
     """
-    tuned = dict(term.tuned)
     if term.effect == "degressive":
-        return np.asarray(sense * share ** tuned["power"])
+        return np.asarray(sense * share ** term.tuned["power"])
     if term.effect == "stribeck":
-        return np.asarray(sense * np.exp(-((share / tuned["speed"]) ** 2)))
+        return np.asarray(sense * np.exp(-((share / term.tuned["speed"]) ** 2)))
     return share if term.effect == "asymmetry" else np.zeros_like(share)
 
 
-def curves(found: Found, normal: Normal, judge: LeftOut) -> tuple[FrictionCurve, ...]:
+def curves(found: Found, normal: Normal, judge: LeftOut) -> Iterator[FrictionCurve]:
     """Friction over the speed of each joint, and its spread over fits without each fold."""
     arm, every = normal.columns.scene.arm, parts_of(found.terms)
     values = np.array([normal.solve(every), *judge.values(every)])
-    out = []
     for j in range(arm.robot.joints):
         v = np.linspace(-1.0, 1.0, CURVE_POINTS) * arm.fastest[j]
         sense, share = sense_of(v, arm.soft[j]), np.abs(v) / arm.fastest[j]
@@ -612,6 +603,4 @@ def curves(found: Found, normal: Normal, judge: LeftOut) -> tuple[FrictionCurve,
             drawn += np.outer(amount, form_of(term, sense, share))
         folds = drawn[1:]
         wide = np.sqrt((len(folds) - 1) * folds.var(axis=0))  # jackknife
-        listed = (tuple(map(float, part)) for part in (v, drawn[0], wide))
-        out.append(FrictionCurve(f"J{j + 1}", *listed))
-    return tuple(out)
+        yield FrictionCurve(f"J{j + 1}", v, drawn[0], wide)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from minimax_cal.dynamics.scene import Scene
 from minimax_cal.dynamics.search import Columns
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.facts import Fact
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
 
 
@@ -31,28 +34,28 @@ class MotionStepError:
 
 
 @dataclass(frozen=True)
-class MotionEvaluation:
+class MotionEvaluation(Result):
     """How well each step of a motion diagnosis predicts torques of other logs [unit]."""
 
+    KIND = "motion_evaluation"
+    COMMAND = "evaluate"
     unit: str
-    steps: tuple[MotionStepError, ...]
+    steps: Annotated[tuple[MotionStepError, ...], Fact(key="rungs", fewest=1)]
     runs: tuple[str, ...]
     notices: tuple[str, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON of the contract, and more."""
-        last = self.steps[-1]
-        return {
-            "schema": 1,
-            "kind": "motion_evaluation",
-            "unit": self.unit,
-            "rms": list(last.rms),
-            "rms_moving": list(last.rms_moving),
-            "rungs": [{"name": one.name, "rms": list(one.rms), "rms_moving": list(one.rms_moving)}
-                      for one in self.steps],
-            "runs": list(self.runs),
-            "notices": list(self.notices),
-        }  # fmt: skip
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
+        """What the last step misses."""
+        return {"rms": self.steps[-1].rms, "rms_moving": self.steps[-1].rms_moving}
+
+    def headline(self) -> str:
+        """What the last step misses, in the middle of the joints."""
+        size = f"{np.median(self.steps[-1].rms):.3g} {self.unit}"
+        return f"RMS torque missed, median of the joints: {size}."
+
+    def tables(self) -> tuple[Table, ...]:
+        """Step by step."""
+        return (self.table(),)
 
     def table(self) -> Table:
         """RMS of all rows by joint, step by step."""
@@ -104,13 +107,11 @@ def evaluate_motion(
     if not arm.known.any():
         prepared = replace(prepared, payload=np.full_like(prepared.payload, np.nan))
     scene = Scene.of(arm, prepared)
-    columns: dict[int, Columns] = {}
+    columns = cache(lambda context: Columns(context.in_scene(scene)))
     steps = []
     for model in found.models:
-        if id(model.context) not in columns:
-            columns[id(model.context)] = Columns(model.context.in_scene(scene))
-        off = missed(model, prepared, columns[id(model.context)])
-        whole, moving = rms_by_joint(off), rms_by_joint(off, prepared.moving)
-        steps.append(MotionStepError(model.name, tuple(whole.tolist()), tuple(moving.tolist())))
+        off = missed(model, prepared, columns(model.context))
+        ends = rms_by_joint(off), rms_by_joint(off, prepared.moving)
+        steps.append(MotionStepError(model.name, *(tuple(end.tolist()) for end in ends)))
     said = tuple(text for run in runs for text in run.notices)
     return MotionEvaluation(found.unit, tuple(steps), prepared.names, said)

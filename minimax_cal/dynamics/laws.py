@@ -7,7 +7,7 @@ the end.  A law at one joint adds to that joint's rows only; one of the whole mo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -257,12 +257,12 @@ class Term:
 
     effect: str
     place: str
-    tuned: tuple[tuple[str, float], ...] = ()
+    tuned: Choice = field(hash=False)  # a mapping has no hash
 
     @property
     def text(self) -> str:
         """A unique name."""
-        said = ",".join(f"{name}={value:.6g}" for name, value in self.tuned)
+        said = ",".join(f"{name}={value:.6g}" for name, value in self.tuned.items())
         return f"{self.effect}:{self.place}" + (f"[{said}]" if said else "")
 
     @property
@@ -282,16 +282,16 @@ class Term:
 
     def columns(self, scene: Scene) -> Array:
         """(M, d), or (M, n, d) where the law is of the whole motion."""
-        return self.law.columns(scene, self.joint, dict(self.tuned))
+        return self.law.columns(scene, self.joint, self.tuned)
 
     def finer(self) -> list[Term]:
         """With its tuned number closer together."""
         if self.effect in ("torque_ripple", "cable", "payload") or not self.tuned:
             return []
-        (name, value), = self.tuned  # fmt: skip
+        ((name, value),) = self.tuned.items()
         near = [value * by for by in FINER]
         low, high = BOUNDS.get(name, (0.0, np.inf))
-        return [Term(self.effect, self.place, ((name, v),)) for v in near if low < v < high]
+        return [Term(self.effect, self.place, {name: v}) for v in near if low < v < high]
 
 
 def terms_of(scene: Scene, exclude: Sequence[str]) -> tuple[list[Term], list[tuple[str, str, str]]]:
@@ -306,5 +306,5 @@ def terms_of(scene: Scene, exclude: Sequence[str]) -> tuple[list[Term], list[tup
             if needs := law.needs(scene, j):
                 lacking.append((effect, place, needs))
                 continue
-            found += [Term(effect, place, tuple(c.items())) for c in law.choices(scene, j)]
+            found += [Term(effect, place, c) for c in law.choices(scene, j)]
     return found, lacking

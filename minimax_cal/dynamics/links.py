@@ -174,7 +174,7 @@ def carried(columns: Columns, terms: Sequence[Term]) -> list[Term]:
         label -= label > b
     lightest = int(np.argmin(value[::PER_LINK]))
     return [Term("payload", f"L{logs.joints}",
-                 tuple((logs.names[r], 1.0) for r in np.flatnonzero(label == k)))
+                 {logs.names[r]: 1.0 for r in np.flatnonzero(label == k)})
             for k in range(loads.shape[1]) if k != lightest]  # fmt: skip
 
 

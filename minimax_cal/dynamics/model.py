@@ -29,7 +29,7 @@ def solve_scaled(gram: Array, pull: Array) -> Array:
 class Body:
     """What fitted numbers say of the arm itself.
 
-    rigid: (n, 10 n) inertial parameters by joint, equal rows where joints share them.
+    rigid: (n, 10 n) inertial parameters by joint, or (1, 10 n) where joints share them.
     usual: (n, 2) Coulomb [unit of the log] and viscous friction [the same, s/rad].
     """
 
@@ -44,38 +44,43 @@ class Body:
         """A scene with this load and friction."""
         coulomb, viscous = self.usual.T
         friction = scene.sense * coulomb + scene.logs.motion.qd * viscous
-        return scene.with_body(self.rigid, friction)
+        return scene.with_body(np.broadcast_to(self.rigid, scene.rigid.shape), friction)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedTerm(Term):
+    """A law of a fit.  value: (d,) of its parameters."""
+
+    value: Array
 
 
 @dataclass(frozen=True, eq=False)
 class TorqueModel:
     """Torques of an arm, as fitted.
 
-    body: of the fit.  terms: its laws, value: (d,) of each.  context: the body by which the laws
-    know load and friction.  held: (n, k) friction of each joint's bristles [unit of the log].
+    body: of the fit.  terms: its laws.  context: the body by which the laws know load and friction.
+    held: (n, k) friction of each joint's bristles [unit of the log].
     delay: by which torques are logged after the motion [s].
     """
 
     name: str
-    arm: Arm
     body: Body
-    terms: tuple[Term, ...]
-    value: tuple[Array, ...]
+    terms: tuple[FittedTerm, ...]
     context: Body
     held: Array
     delay: float
 
     def predict(self, columns: Columns) -> Array:
         """(R, n) torques in the unit of the log.  columns: of a scene with this context."""
-        logs = columns.scene.logs
-        base = self.body.rigid @ self.arm.base
-        rigid = np.einsum("rjp,jp->jr", columns.scene.base_rows, base)
+        scene = columns.scene
+        base = np.broadcast_to(self.body.rigid, scene.rigid.shape) @ scene.arm.base
+        rigid = np.einsum("rjp,jp->jr", scene.base_rows, base)
         friction = columns.usual() @ self.body.usual.ravel()
-        out = rigid + friction + logs.filtered(columns.scene.known_torque).T
-        for term, value in zip(self.terms, self.value, strict=True):
+        out = rigid + friction + scene.logs.filtered(scene.known_torque).T
+        for term in self.terms:
             joints, rows = columns.rows_of(term)
-            out[joints] += rows @ value
-        return np.asarray(out.T + (self.held * columns.scene.bristles).sum(axis=-1))
+            out[joints] += rows @ term.value
+        return np.asarray(out.T + (self.held * scene.bristles).sum(axis=-1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,23 +169,20 @@ class Normal:
         each = value[self.place[RIGID]].reshape(-1, base.shape[1])
         rigid = drawn + (each - base.T @ drawn) @ base.T
         usual = value[self.place[FRICTION]].reshape(n, 2)
-        return Body(np.broadcast_to(rigid, (n, len(drawn))), usual)
+        return Body(rigid, usual)
 
     def model(self, name: str, terms: Sequence[Term], context: Body, delay: float) -> TorqueModel:
         """The fit of rigid body, usual friction and some laws."""
         value = self.solve([RIGID, FRICTION, *(t.text for t in terms)])
-        found = tuple(value[self.place[t.text]] for t in terms)
-        scene = self.columns.scene
-        held = held_friction(scene.bristles, (self.columns.error() - self.raw @ value).T)
-        body = self.body(value)
-        return TorqueModel(name, scene.arm, body, tuple(terms), found, context, held, delay)
+        found = tuple(FittedTerm(**vars(t), value=value[self.place[t.text]]) for t in terms)
+        bristles = self.columns.scene.bristles
+        held = held_friction(bristles, (self.columns.error() - self.raw @ value).T)
+        return TorqueModel(name, self.body(value), found, context, held, delay)
 
     def rigid_model(self, name: str, context: Body) -> TorqueModel:
         """The fit of the rigid body alone."""
         body = self.body(self.solve([RIGID]))
-        arm = self.columns.scene.arm
-        none = np.zeros((arm.robot.joints, len(YIELD)))
-        return TorqueModel(name, arm, body, (), (), context, none, 0.0)
+        return TorqueModel(name, body, (), context, np.zeros((len(body.usual), len(YIELD))), 0.0)
 
 
 def held_friction(bent: Array, off: Array) -> Array:
@@ -202,4 +204,4 @@ def first_body(columns: Columns) -> Body:
     arm, n = columns.scene.arm, columns.scene.logs.joints
     each = value[: rigid.shape[2]].reshape(-1, arm.base.shape[1])
     body = arm.drawn + (each - arm.base.T @ arm.drawn) @ arm.base.T
-    return Body(np.broadcast_to(body, (n, len(arm.drawn))), value[rigid.shape[2] :].reshape(n, 2))
+    return Body(body, value[rigid.shape[2] :].reshape(n, 2))

@@ -6,32 +6,29 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
 
-from minimax_cal.dynamics.laws import LAWS, USUAL, Term
-from minimax_cal.dynamics.model import Body, TorqueModel
+from minimax_cal.dynamics.laws import LAWS, USUAL
+from minimax_cal.dynamics.model import TorqueModel
 from minimax_cal.dynamics.probes import Unexplained
 from minimax_cal.dynamics.regressor import PER_LINK
 from minimax_cal.dynamics.scene import YIELD, Arm
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationError
-from minimax_cal.ground.files import plain
-from minimax_cal.ground.records import Number, Part, Recorded, checked, reading
+from minimax_cal.ground.facts import APART, Fact
+from minimax_cal.ground.records import stored
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.robots.robot import robot_from_dict
 
-KIND = "motion_diagnosis"
-SCHEMA = 1
+Verdict = Literal["named", "one_of", "unknown", "none"]
 WORDS = {"coulomb": "Coulomb friction", "viscous": "viscous friction",
          "link_inertia": "mass or inertia of a link"}  # fmt: skip
 WORDS |= {name: law.words for name, law in LAWS.items()}
 SHOWN = 1e-3  # relative change of a joint's RMS that is listed
-SENTENCES = {
+SENTENCES: dict[Verdict, str] = {
     "named": "Cause identified",
     "one_of": "Ambiguous cause",
     "unknown": "Unexplained",
@@ -70,9 +67,9 @@ class MotionEffect:
 
     effect: str
     place: str
-    parameters: tuple[Recorded[Parameter], ...]
+    parameters: Annotated[tuple[Parameter, ...], Fact(fewest=1)]
     worth: Mapping[str, tuple[float, float]]
-    alternatives: tuple[Recorded[Alternative], ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
     frequency: float = math.nan
     established: bool = True
     minor: bool = False
@@ -83,6 +80,14 @@ class MotionEffect:
         """For people, as `joint flexibility at J2`; of a payload with the runs that carry it."""
         runs = ", ".join(p.name for p in self.parameters[PER_LINK:] if self.effect == "payload")
         return f"{WORDS[self.effect]} {name_place(self.place)}" + (f" ({runs})" if runs else "")
+
+    def row(self) -> tuple[str, ...]:
+        """Of a table: words, the surest number, the worth where it is most, and whether it is."""
+        p = max(self.parameters, key=lambda each: abs(each.value) / (each.sigma or 1.0))
+        joint, (before, after) = best_worth(self)
+        return (self.words, f"{p.value:.3g} ± {p.sigma:.1g} {p.unit}",
+                f"{joint}: {before:.3g} to {after:.3g}",
+                "yes" if self.established else "possible")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -103,56 +108,55 @@ class NotTestable:
     needs: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HeldRun:
     """A stretch of a run, measured and predicted by a fit without it: times and (n, k) torques."""
 
     name: str
     time: tuple[float, ...]
-    measured: tuple[tuple[float, ...], ...]
-    predicted: tuple[tuple[float, ...], ...]
+    measured: Array
+    predicted: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FrictionCurve:
     """Friction of a joint over its speed, with a standard deviation over fits without each fold."""
 
     place: str
-    speed: tuple[float, ...]
-    torque: tuple[float, ...]
-    sigma: tuple[float, ...]
+    speed: Array
+    torque: Array
+    sigma: Array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MotionDiagnosis(Result):
     """Why the torques of an arm are not those of its model, and how far each effect closes the gap.
 
-    unit: "N m" or "A", of torques.  models: a fit of each step of the budget but the first.
+    arm: and how its torques are read.  unit: "N m" or "A", of torques.
+    models: a fit of each step of the budget but the first.
     too_little: why the motion is too little to name anything, empty where it is enough.
     """
 
+    KIND = "motion_diagnosis"
+    COMMAND = "torques"
+    arm: Annotated[Arm, APART]
     unit: str
-    verdict: str
+    verdict: Verdict
     effects: tuple[MotionEffect, ...]
-    budget: tuple[MotionStep, ...]
+    budget: Annotated[tuple[MotionStep, ...], Fact(fewest=1)]
     unexplained: tuple[Unexplained, ...]
     not_testable: tuple[NotTestable, ...]
-    too_little: tuple[str, ...]
-    models: tuple[TorqueModel, ...]
+    too_little: Annotated[tuple[str, ...], Fact(key="too_little_motion")]
+    models: Annotated[tuple[TorqueModel, ...], Fact(fewest=1)]
     runs: tuple[str, ...]
     held_out: str
     held_run: HeldRun
     curves: tuple[FrictionCurve, ...]
     notices: tuple[str, ...]
-    seconds: float = 0.0
+    seconds: float
 
     def __repr__(self) -> str:
         return f"<MotionDiagnosis of {self.arm.robot.name}: {self.headline()}>"
-
-    @property
-    def arm(self) -> Arm:
-        """The arm, and how its torques are read."""
-        return self.models[-1].arm
 
     @property
     def main(self) -> tuple[MotionEffect, ...]:
@@ -198,15 +202,8 @@ class MotionDiagnosis(Result):
 
     def effects_table(self) -> Table:
         """The effects, the most valuable first."""
-        rows = []
-        for one in self.effects:
-            p = max(one.parameters, key=lambda each: abs(each.value) / (each.sigma or 1.0))
-            joint, (before, after) = best_worth(one)
-            sure = "yes" if one.established else "possible"
-            rows.append((one.words, f"{p.value:.3g} ± {p.sigma:.1g} {p.unit}",
-                         f"{joint}: {before:.3g} to {after:.3g}", sure))  # fmt: skip
         header = ("effect", "value", f"held-out RMS, moving [{self.unit}]", "confirmed")
-        return Table("Effects", header, tuple(rows), ("", "", "", ""))
+        return Table("Effects", header, tuple(one.row() for one in self.effects))
 
     def unexplained_table(self) -> Table:
         """What has no name, by joint."""
@@ -214,41 +211,19 @@ class MotionDiagnosis(Result):
         header = ("joint", "follows", f"size [{self.unit}]", f"remaining error [{self.unit}]")
         return Table("Unexplained", header, rows, ("", "", ".3g", ".3g"))
 
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON of the contract, and more; `from_dict` reads it back."""
-        return {
-            "schema": SCHEMA,
-            "kind": KIND,
-            "robot": self.arm.robot.to_dict(),
-            "headline": self.headline(),
-            "too_little_motion": list(self.too_little),
-            "arm": plain({name: getattr(self.arm, name) for name in ARM}),
-            "models": [model_dict(model) for model in self.models],
-            **plain({name: getattr(self, name) for name in KEPT}),
-        }
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
+        """The headline, and the arm with its robot for itself."""
+        return {"headline": self.headline(), "robot": self.arm.robot, "arm": self.arm}
 
-    @staticmethod
-    def from_dict(content: Mapping[str, Any], source: str = "motion diagnosis") -> MotionDiagnosis:
-        """The diagnosis of a file.  Raises CalibrationError."""
-        if content.get("kind") != KIND or content.get("schema") != SCHEMA:
-            raise CalibrationError(
-                f"{source}: is no motion diagnosis of this version; write it with minimax-cal "
-                "torques"
-            )
-        part = checked(MotionPart, content, source)
-        with reading(source):
-            robot = robot_from_dict(part.robot, source)
-            arm = Arm(robot, *(np.array(part.arm[name]) for name in ARM))
-            found = MotionDiagnosis(
-                **{name: getattr(part, name) for name in KEPT},
-                too_little=part.too_little_motion,
-                models=tuple(model_of(one, arm) for one in part.models),
-            )
-            check_parts(found, robot.joints)
-            return found
-
-
-ARM = ("gain", "ratio", "soft", "fastest", "known")  # numbers of an arm beside its robot
+    @classmethod
+    def told_beside(
+        cls, content: Mapping[str, Any], told: Mapping[str, Any], source: str
+    ) -> dict[str, Any]:
+        """The arm.  Raises CalibrationError and ValueError, also for parts of another arm."""
+        robot = robot_from_dict(content["robot"], source)
+        arm = Arm(robot, **stored(Arm, content["arm"], "arm"))
+        check_parts(cls(**told, arm=arm))
+        return {"arm": arm}
 
 
 def grouped(effects: tuple[MotionEffect, ...]) -> str:
@@ -270,8 +245,8 @@ def table_by_joint(title: str, what: str, rows: Sequence[tuple[str, Sequence[flo
 
 def worth_by_joint(without: Array, with_it: Array) -> dict[str, tuple[float, float]]:
     """RMS without and with something (n,) each, by joint."""
-    pairs = zip(without, with_it, strict=True)
-    return {f"J{j + 1}": (float(a), float(b)) for j, (a, b) in enumerate(pairs)}
+    pairs = np.stack([without, with_it], axis=1).tolist()
+    return {f"J{j + 1}": (before, after) for j, (before, after) in enumerate(pairs)}
 
 
 def changed_joints(worth: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
@@ -284,85 +259,31 @@ def best_worth(one: MotionEffect) -> tuple[str, tuple[float, float]]:
     return max(one.worth.items(), key=lambda item: item[1][0] ** 2 - item[1][1] ** 2)
 
 
-def check_parts(found: MotionDiagnosis, joints: int) -> None:
+def check_parts(found: MotionDiagnosis) -> None:
     """Raise ValueError for parts that are not of one arm, and for effects that do not exist."""
-    run = found.held_run
-    rows = [row for step in found.budget for row in (step.holdout_rms, step.holdout_rms_moving)]
-    if {len(row) for row in (*rows, run.measured, run.predicted)} != {joints}:
-        raise ValueError(f"its numbers are not of {joints} joints")
-    for trace in (*run.measured, *run.predicted):
-        if len(trace) != len(run.time):
-            raise ValueError("held_run: torques are not of the same times")
-    for curve in found.curves:
-        if not len(curve.speed) == len(curve.torque) == len(curve.sigma):
-            raise ValueError("curves: numbers of one curve differ in their count")
-    if len(found.curves) > joints or not found.models:
-        raise ValueError("its curves or models are not of the arm")
-    if not all(one.parameters and one.worth for one in found.effects):
-        raise ValueError("effects: one has no parameters, or no worth")
-    others = [other.effect for one in found.effects for other in one.alternatives]
-    named = [*(one.effect for one in found.effects), *others]
-    named += [untested.effect for untested in found.not_testable]
+    n, arm, run = found.arm.robot.joints, found.arm, found.held_run
+    rows: list[Any] = [arm.ratio, arm.soft, arm.fastest, found.curves]
+    rows += [row for step in found.budget for row in (step.holdout_rms, step.holdout_rms_moving)]
+    sizes: list[tuple[Any, tuple[int, ...]]] = [(row, (n,)) for row in rows]
+    sizes += [(arm.gain, (n if arm.shared else 0,)), (arm.known, (PER_LINK,))]
+    sizes += [(part, (n, len(run.time))) for part in (run.measured, run.predicted)]
+    for one in found.curves:
+        sizes += [(part, (len(one.speed),)) for part in (one.speed, one.torque, one.sigma)]
+    for model in found.models:
+        sizes += [(model.held, (n, len(YIELD)))]
+        for body in (model.body, model.context):
+            count = 1 if len(body.rigid) == 1 else n
+            sizes += [(body.usual, (n, 2)), (body.rigid, (count, PER_LINK * n))]
+    late = [model.delay for model in found.models]
+    if any(np.shape(part) != size for part, size in sizes) or not np.isfinite(late).all():
+        raise ValueError(f"its numbers are not of one arm of {n} joints and one run")
+    if not all(one.worth for one in found.effects):
+        raise ValueError("effects: one has no worth")
+    named = [one.effect for one in found.effects]
+    named += [other.effect for one in found.effects for other in one.alternatives]
+    named += [one.effect for one in found.not_testable]
     if unknown := [name for name in named if name not in WORDS]:
         raise ValueError(f"no effect {unknown[0]!r:.40}")
-
-
-def model_dict(model: TorqueModel) -> dict[str, Any]:
-    """A model for JSON: parameters that joints share once."""
-
-    def body(one: Body) -> dict[str, Any]:
-        rows = one.rigid[:1] if model.arm.shared else one.rigid
-        return {"rigid": rows.tolist(), "usual": one.usual.tolist()}
-
-    terms = [
-        {"effect": t.effect, "place": t.place, "tuned": dict(t.tuned), "value": v.tolist()}
-        for t, v in zip(model.terms, model.value, strict=True)
-    ]
-    return {"name": model.name, "body": body(model.body), "context": body(model.context),
-            "terms": terms, "held": model.held.tolist(), "delay": model.delay}  # fmt: skip
-
-
-def model_of(content: Mapping[str, Any], arm: Arm) -> TorqueModel:
-    """A model of a file."""
-    n = arm.robot.joints
-
-    def body(part: Mapping[str, Any]) -> Body:
-        rigid = np.broadcast_to(np.array(part["rigid"], dtype=float), (n, 10 * n))
-        return Body(rigid, np.array(part["usual"], dtype=float).reshape(n, 2))
-
-    terms = tuple(
-        Term(t["effect"], t["place"], tuple((k, float(v)) for k, v in t["tuned"].items()))
-        for t in content["terms"]
-    )
-    value: tuple[Array, ...] = tuple(np.array(t["value"], dtype=float) for t in content["terms"])
-    held = np.array(content["held"], dtype=float).reshape(n, len(YIELD))
-    return TorqueModel(content["name"], arm, body(content["body"]), terms, value,
-                       body(content["context"]), held, float(content["delay"]))  # fmt: skip
-
-
-class MotionPart(Part):
-    """The file of `minimax-cal torques -o`."""
-
-    robot: dict[str, Any]
-    arm: dict[str, tuple[Number, ...]]
-    verdict: Literal["named", "one_of", "unknown", "none"]
-    unit: str
-    effects: tuple[Recorded[MotionEffect], ...]
-    budget: tuple[Recorded[MotionStep], ...] = Field(min_length=1)
-    unexplained: tuple[Recorded[Unexplained], ...]
-    not_testable: tuple[Recorded[NotTestable], ...]
-    too_little_motion: tuple[str, ...]
-    models: tuple[dict[str, Any], ...]
-    runs: tuple[str, ...]
-    held_out: str
-    held_run: Recorded[HeldRun]
-    curves: tuple[Recorded[FrictionCurve], ...]
-    notices: tuple[str, ...]
-    seconds: Number
-
-
-KEPT = ("unit", "verdict", "effects", "budget", "unexplained", "not_testable", "runs", "held_out",
-        "held_run", "curves", "notices", "seconds")  # fmt: skip
 
 
 def load_motion(path: Path | str) -> MotionDiagnosis:
@@ -387,6 +308,4 @@ def load_motion(path: Path | str) -> MotionDiagnosis:
     --------
     >>> motion = mc.load_motion("motion.json")
     """
-    from minimax_cal.ground.files import saved_content  # only who reads a file waits for it
-
-    return MotionDiagnosis.from_dict(saved_content(path), str(path))
+    return MotionDiagnosis.load(path)

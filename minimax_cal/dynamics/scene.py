@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from minimax_cal.dynamics.regressor import (
 )
 from minimax_cal.dynamics.rows import SLOWEST, Logs
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.facts import APART
 from minimax_cal.robots.robot import Robot
 
 KEPT = ("regressor", "base_rows", "known_torque", "sense", "bristles", "since_reversal")
@@ -63,7 +65,7 @@ class Arm:
     that say so, per kilogram.
     """
 
-    robot: Robot
+    robot: Annotated[Robot, APART]
     gain: Array
     ratio: Array
     soft: Array
@@ -169,29 +171,28 @@ class Scene:
             out[a:b] = np.abs(q - np.take_along_axis(q, last, axis=0))
         return out
 
+    def along(self, motion: Motion) -> Array:
+        """(M, n) torque of the body along another motion, by recursion."""
+        return inverse_dynamics(self.arm.robot, motion, self.rigid[0].reshape(-1, PER_LINK))
+
     @cached_property
     def as_moved(self) -> Array:
         """(M, n) torque of the body by the same recursion as where the motion is shifted."""
-        body = self.rigid[0].reshape(-1, PER_LINK)
-        return inverse_dynamics(self.arm.robot, self.logs.motion, body)
+        return self.along(self.logs.motion)
 
     def shifted(self, by: Array) -> Array:
         """(M, n) torque of the body per unit of a shift `by` (M, n) of the motion [rad, m]."""
         one = self.logs.motion
-        size = max(float(np.abs(by).max()), 1e-300)
-        step = 1e-6 / size
+        step = 1e-6 / max(float(np.abs(by).max()), 1e-300)
         rate = self.logs.slope(by)
         moved = Motion(
             one.q + step * by, one.qd + step * rate, one.qdd + step * self.logs.slope(rate)
         )
-        body = self.rigid[0].reshape(-1, PER_LINK)
-        there = inverse_dynamics(self.arm.robot, moved, body)
-        return np.asarray((there - self.as_moved) / step / self.divisor)
+        return np.asarray((self.along(moved) - self.as_moved) / step / self.divisor)
 
     def with_body(self, rigid: Array, friction: Array) -> Scene:
         """The scene with another body and friction, its regressor kept."""
         new = replace(self, rigid=rigid, friction=friction)
-        for name in KEPT:
-            if name in vars(self):
-                vars(new)[name] = vars(self)[name]
+        for name in vars(self).keys() & KEPT:
+            vars(new)[name] = vars(self)[name]
         return new

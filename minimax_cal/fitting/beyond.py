@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from minimax_cal.fitting.identify import RESOLUTION, redundant
 from minimax_cal.fitting.intervals import max_interval, rms_interval, told
 from minimax_cal.fitting.uncertainty import Estimator, Linearised, PartSums, Poses
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import finite
+from minimax_cal.ground.facts import Fact, derived
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import Region, groups
@@ -74,15 +74,15 @@ class Beyond:
 
     folds: tuple[Fold, ...] = ()
     typical_mm: float = math.nan
-    geometric_typical_mm: float = math.nan
-    reason: str = ""
-    rms_high_mm: float = math.nan
-    max_high_mm: float = math.nan
-    missed: tuple[str, ...] = ()
-    sought: bool | None = None
-    trusted: Trusted | None = None
+    geometric_typical_mm: Annotated[float, Fact(key="geometric.typical_mm")] = math.nan
+    reason: Annotated[str, Fact(brief=True)] = ""
+    rms_high_mm: Annotated[float, Fact(key="worst_high95_mm")] = math.nan
+    max_high_mm: Annotated[float, Fact(key="max_high95_mm")] = math.nan
+    missed: Annotated[tuple[str, ...], Fact(key="not_judged")] = ()
+    sought: Annotated[bool | None, Fact(key="effects_sought_anew")] = None
+    trusted: Annotated[Trusted | None, Fact(key="without_suspects")] = None
     spans: tuple[Span, ...] = ()
-    plan: str = ""
+    plan: str | None = None
 
     @property
     def narrow(self) -> tuple[Span, ...]:
@@ -105,12 +105,22 @@ class Beyond:
         """The part with the largest RMS."""
         return max(self.folds, key=lambda fold: fold.rms_mm, default=None)
 
-    @property
+    @derived()
     def worst_mm(self) -> float:
         """Its RMS."""
         return self.worst.rms_mm if self.worst else math.nan
 
-    @property
+    @derived()
+    def worst_where(self) -> str | None:
+        """Where it is."""
+        return self.worst.where if self.worst else None
+
+    @derived(key="narrow")
+    def narrow_joints(self) -> list[str]:
+        """Names of the joints that went too little for a claim."""
+        return [span.joint for span in self.narrow]
+
+    @derived(key="geometric.worst_mm")
     def geometric_worst_mm(self) -> float:
         """Largest RMS of geometry alone."""
         return max((fold.geometric_mm for fold in self.folds), default=math.nan)
@@ -158,28 +168,6 @@ class Beyond:
             tuple(rows),
             ("", "d", ".4f", ".4f", ".4f"),
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        out: dict[str, Any] = {
-            "typical_mm": finite(self.typical_mm),
-            "worst_mm": finite(self.worst_mm),
-            "worst_where": self.worst.where if self.worst else None,
-            "worst_high95_mm": finite(self.rms_high_mm),
-            "max_high95_mm": finite(self.max_high_mm),
-            "folds": [vars(fold) for fold in self.folds],
-            "not_judged": list(self.missed),
-            "effects_sought_anew": self.sought,
-            "without_suspects": vars(self.trusted) if self.trusted else None,
-            "spans": [vars(span) for span in self.spans],
-            "narrow": [span.joint for span in self.narrow],
-            "plan": self.plan or None,
-            "geometric": {
-                "typical_mm": finite(self.geometric_typical_mm),
-                "worst_mm": finite(self.geometric_worst_mm),
-            },
-        }
-        return out | ({"reason": self.reason} if self.reason else {})
 
 
 def not_claimed(robot: Robot, data: Measurements) -> Beyond:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from html import escape
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, overload
+from typing import Annotated, Any
 
 import numpy as np
 import scipy
@@ -19,40 +18,50 @@ from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.certificate import Certificate
 from minimax_cal.fitting.changed import Change
 from minimax_cal.fitting.crossed import NOT_CROSSED, Within, intervals_of
-from minimax_cal.fitting.identify import Because, Identification, Reason, name_reason
-from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval, told
+from minimax_cal.fitting.found import Parameter, Parameters, parameter_table, table_of_effects
+from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.intervals import (
+    UNKNOWN,
+    Interval,
+    max_interval,
+    rms_interval,
+    told,
+    with_ends,
+)
 from minimax_cal.fitting.minimax_problem import Distances, trusted_distances
 from minimax_cal.fitting.options import Options, read_options
-from minimax_cal.fitting.set_aside import WithThem, aside_sentence
+from minimax_cal.fitting.set_aside import aside_sentence
 from minimax_cal.fitting.suspects import Suspect, aside, table_of
-from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, quantile
+from minimax_cal.fitting.told_poses import errors_of, measured_poses
+from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, uncertainty_from_dict
 from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.facts import Fact, derived, facts_in_words
-from minimax_cal.ground.files import finite, json_text, saved_content, write_whole
-from minimax_cal.ground.optional import optional
+from minimax_cal.ground.facts import APART, Fact, Later, derived, facts_in_words, in_file
+from minimax_cal.ground.records import array, as_kind, read
+from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
-from minimax_cal.ground.units import for_people, in_files, turned_for_people
 from minimax_cal.ground.words import capitalise, list_counts
-from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
+from minimax_cal.measuring.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.grouping import clusters, grouped
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.pose_rows import pose_rows
 from minimax_cal.measuring.spans import Span, spans_of
-from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted
-from minimax_cal.modelling.effects.words import name_effect, name_parameter
+from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.frames import frames_of, tables_of, with_effects
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, model_of, pose_weights
-from minimax_cal.modelling.parameters import BASE_NAMES, Names
-from minimax_cal.robots.frames import Frame
+from minimax_cal.modelling.parameters import Names
+from minimax_cal.robots.frames import CONVENTION, Frame
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.minimax import Kkt, Step
 from minimax_cal.solvers.status import Status
 
+POSE_BY_POSE = ("weights", "share", "crossed", "drawn crossed")  # arrays of a file
 PACKAGES = ("minimax-cal", "numpy", "scipy", "qpsolvers")
 ACCURACIES = (  # where accuracy is told: title, key
     ("held out, nominal", "nominal"),
@@ -61,222 +70,6 @@ ACCURACIES = (  # where accuracy is told: title, key
     ("training, calibrated", "train"),
 )
 ROUGH = 1e-6  # a QP answered worse than this is told
-NOT_IDENTIFIED = "not identified because"
-CORRECTIONS = {  # parameters that are no values but corrections, and of what
-    **dict.fromkeys(BASE_NAMES, "the base of the drawn arm, along its axes"),
-    **dict.fromkeys(
-        ("tool_rx", "tool_ry", "tool_rz"), "the tool of the drawn arm, along the flange's axes"
-    ),
-}
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter in SI; sigma is NaN where it is not identified.
-
-    reason: why it is not; because: of which kind that is; like: the parameters that together move
-    the points as it does.
-    """
-
-    name: str
-    value: float
-    nominal: float
-    sigma: float
-    unit: str = ""
-    identifiable: bool = True
-    reason: str = ""
-    because: Because = Because.OTHER
-    like: tuple[str, ...] = ()
-
-    @property
-    def of_effect(self) -> bool:
-        """Whether it belongs to an effect beyond geometry."""
-        return ":" in self.name
-
-    @property
-    def corrects(self) -> str:
-        """What it is a correction of, empty where it is a value by itself."""
-        return CORRECTIONS.get(self.name.rpartition(".")[2], "")  # of several files: file.base_x
-
-    @property
-    def title(self) -> str:
-        """Its name for people, who must not take a correction for a value."""
-        return f"{self.name} (correction)" if self.corrects else self.name
-
-    @property
-    def scale(self) -> tuple[float, str]:
-        """Factor and unit in which people read its change: millimetres, milliradians."""
-        return for_people(self.unit)
-
-    @property
-    def written(self) -> tuple[float, str]:
-        """Factor and unit in files: only lengths are scaled, to millimetres."""
-        return in_files(self.unit)
-
-    @property
-    def why_not(self) -> str:
-        """Why it was not identified, empty where it was."""
-        return "" if self.identifiable else self.reason or "no reason was recorded"
-
-    @property
-    def why(self) -> Reason:
-        """Why it is not identified, in one."""
-        return Reason(self.reason, self.because, self.like)
-
-    @property
-    def why_in_words(self) -> str:
-        """`why_not`, with other parameters as people call them."""
-        if self.identifiable or not self.like:
-            return self.why_not
-        return name_reason(self.because, [name_parameter(name) for name in self.like])
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON, lengths in millimetres."""
-        scale, unit = self.written
-        out = {
-            "name": self.name,
-            "value": self.value * scale,
-            "nominal": self.nominal * scale,
-            "sigma": finite(self.sigma * scale),
-            "unit": unit,
-            "identifiable": self.identifiable,
-        }
-        if self.corrects:
-            out |= {"correction": (self.value - self.nominal) * scale, "corrects": self.corrects}
-        why = {"reason": self.reason, "because": self.because, "like": list(self.like)}
-        return out | (why if self.reason else {})
-
-
-@dataclass(frozen=True, repr=False)
-class Parameters(Sequence[Parameter]):
-    """All p parameters of a fit, link by link; by number or by name.
-
-    dof: degrees of freedom behind their sigmas.
-    """
-
-    every: tuple[Parameter, ...]
-    dof: float
-
-    def __len__(self) -> int:
-        return len(self.every)
-
-    def __iter__(self) -> Iterator[Parameter]:
-        return iter(self.every)
-
-    @overload
-    def __getitem__(self, key: int | str) -> Parameter: ...
-    @overload
-    def __getitem__(self, key: slice) -> Sequence[Parameter]: ...
-    def __getitem__(self, key: int | str | slice) -> Parameter | Sequence[Parameter]:
-        """A parameter by number or name, or some.  Raises IndexError, KeyError."""
-        if isinstance(key, str):
-            try:
-                return next(p for p in self.every if p.name == key)
-            except StopIteration:
-                raise KeyError(f"no parameter {key!r}; there are {', '.join(self.names)}") from None
-        return self.every[key]
-
-    def __repr__(self) -> str:
-        known = sum(p.identifiable for p in self.every)
-        return f"<{len(self)} parameters, {known} identified>"
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """(p,) as d1 or joint_compliance:J2.c2."""
-        return tuple(p.name for p in self.every)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """(p,) SI."""
-        return tuple(p.unit for p in self.every)
-
-    @property
-    def value(self) -> Array:
-        """(p,) [SI]."""
-        return np.array([p.value for p in self.every])
-
-    @property
-    def nominal(self) -> Array:
-        """(p,) [SI]."""
-        return np.array([p.nominal for p in self.every])
-
-    @property
-    def sigma(self) -> Array:
-        """(p,) standard deviations, NaN where not identified [SI]."""
-        return np.array([p.sigma for p in self.every])
-
-    @property
-    def ci95(self) -> Array:
-        """(p, 2) ends of the 95 % intervals by Student's law, NaN where not identified [SI]."""
-        half = quantile(0.95, self.dof) * self.sigma
-        return np.stack([self.value - half, self.value + half], axis=1)
-
-    def frame(self) -> Any:
-        """As a pandas data frame, a row a parameter, SI.  Raises OptionError without pandas."""
-        low, high = self.ci95.T
-        return optional("pandas", "a data frame", "pandas").DataFrame(
-            {
-                "name": self.names, "unit": self.units, "value": self.value,
-                "nominal": self.nominal, "sigma": self.sigma, "low95": low, "high95": high,
-                "identifiable": [p.identifiable for p in self.every],
-                "reason": [p.reason for p in self.every],
-            }
-        )  # fmt: skip
-
-
-def link_by_link(
-    names: Names,
-    units: Sequence[str],
-    before: Array,
-    after: Array,
-    sigma: Array,
-    known: Identification,
-) -> tuple[Parameter, ...]:
-    """Every parameter in the order in which people read them.
-
-    units: of each, SI.  before, after, sigma: (p,) as drawn, as found and how sure [SI].
-    """
-    order = names.link_by_link.tolist()
-    numbers = (part[order].tolist() for part in (after, before, sigma, known.active))
-    whys = [known.reasons.get(names.all[i], Reason("")) for i in order]
-    return tuple(
-        Parameter(names.all[i], value, nominal, own, units[i], told, why.text, why.kind, why.like)
-        for i, value, nominal, own, told, why in zip(order, *numbers, whys, strict=True)
-    )
-
-
-def parameter_table(parameters: Iterable[Parameter]) -> Table:
-    """Parameters of geometry: values in mm and degrees, changes and sigmas in mm and mrad.
-
-    Of a correction there is a change alone: where base and tool stand, their frames say.
-    """
-    rows: list[tuple[TableCell, ...]] = []
-    for p in parameters:
-        (size, unit), (scale, of_change) = turned_for_people(p.unit), p.scale
-        drawn, found = (math.nan if p.corrects else size * v for v in (p.nominal, p.value))
-        change = scale * (p.value - p.nominal)
-        unit = "" if p.corrects else unit
-        rows.append((p.title, drawn, found, unit, change, scale * p.sigma, of_change, p.why_not))
-    header = ("name", "nominal", "calibrated", "in", "change", "sigma", "in", NOT_IDENTIFIED)
-    formats = ("", ".4f", ".4f", "", "+.4f", ".2g", "", "")
-    return Table("parameters", header, tuple(rows), formats)
-
-
-def table_of_effects(parameters: Iterable[Parameter]) -> Table:
-    """Of parameters those of effects, as in the files."""
-    rows = tuple(
-        (
-            name_parameter(p.name),
-            p.written[1],
-            p.value * p.written[0],
-            p.sigma * p.written[0],
-            p.why_in_words,
-        )
-        for p in parameters
-        if p.of_effect
-    )
-    header = ("effect", "unit", "value", "sigma", NOT_IDENTIFIED)
-    return Table("effects beyond geometry", header, rows, ("", "", ".4g", ".2g", ""))
 
 
 @dataclass(frozen=True)
@@ -286,7 +79,7 @@ class Provenance:
     robot: str = ""
     data: str = ""
     data_sha256: str = ""
-    settings: Mapping[str, object] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
 
     @staticmethod
@@ -365,16 +158,16 @@ class Work:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fit:
+class Fit(Result):
     """A calibrated robot and everything that is known about its fit.
 
-    A field that is a `fact` is in the file by itself, as is a property that is `derived`; what has
-    words is shown in the terminal, the report and the page.
+    A field is in the file by itself unless it is `APART`, as is a property that is `derived`; what
+    has words is shown in the terminal, the report and the page.
 
     cell: the calibrated robot with base, targets and effects, all fitted together; it predicts.
     nominal: the nominal robot with its best base and targets.
     accuracy: nominal and holdout on the held-out poses, nominal_train and train on the training
-    poses.  claim: looks for `beyond`.
+    poses, holdout_with_them with the points set aside.  claim: looks for `beyond`.
     uncertainty: of all parameters, base in its own axes [SI].
     minimax: what the worst rests on, if it was the objective.  certificate: how far the worst point
     is from its optimum.  trace: cost at each iterate of the least squares [m^2].
@@ -389,47 +182,48 @@ class Fit:
     error_crossed: (k, m, 3) of every pose by a fit without it [m], empty unless cross-validated;
     error_drawn_crossed: the same of the drawn arm.
     reason: why it failed or is no better than the drawn arm, and what to do; empty where neither.
-    set_aside: points that take no part; with_them: how it does where they count, None without any.
+    set_aside: points that take no part.
     answered: quadratic programs by the backend that answered.  work: what the solvers did.
     moved: what changed between sessions.
     stated_geometric: `geometric` as the file of the fit holds it.
     """
 
-    cell: Cell
-    nominal: Cell
+    KIND = "calibration"
+    COMMAND = "calibrate"
+
+    cell: Annotated[Cell, APART]
+    nominal: Annotated[Cell, APART]
     objective: str
     qp: str
     status: Status
     iterations: Annotated[int, Fact("{} iterations")]
     seconds: Annotated[float, Fact("{:.2f} s")]
-    parameters: Parameters
-    accuracy: Mapping[str, Accuracy]
-    identification: Identification
-    uncertainty: Uncertainty
-    minimax: WorstCase | None
-    certificate: Certificate | None
+    parameters: Annotated[Parameters, APART]
+    accuracy: Annotated[Mapping[str, Accuracy], APART]
+    identification: Annotated[Identification, APART]
+    uncertainty: Annotated[Uncertainty, APART]
+    minimax: Annotated[WorstCase | None, Fact(brief=True)]
+    certificate: Annotated[Certificate | None, Fact(brief=True)]
     trace: Annotated[tuple[float, ...], Fact(key="trace_mm2", scale=1e6)]
-    data: Measurements
-    held: Array
-    error_nominal: Array
-    error: Array
+    data: Annotated[Measurements, APART]
+    held: Annotated[Array, APART]
+    error_nominal: Annotated[Array, APART]
+    error: Annotated[Array, APART]
     notices: tuple[str, ...]
     loss: str
     suspects: tuple[Suspect, ...]
-    weights: Array
-    share: Array
-    prior: Array
+    weights: Annotated[Array, APART]
+    share: Annotated[Array, APART]
+    prior: Annotated[Array, APART]
     widening: float
     provenance: Provenance
-    claim: Callable[[], Beyond]
-    stated: Mapping[str, tuple[Interval, Interval]] | None = None
-    error_crossed: Array = field(default_factory=NOT_CROSSED.copy)
+    claim: Annotated[Later[Beyond], APART]
+    error_crossed: Annotated[Array, APART] = field(default_factory=NOT_CROSSED.copy)
     set_aside: tuple[SetAside, ...] = ()
-    with_them: WithThem | None = None
     answered: Mapping[str, int] = field(default_factory=dict)
     work: Work = Work()
-    stated_geometric: Cell | None = None
-    error_drawn_crossed: Array = field(default_factory=NOT_CROSSED.copy)
+    stated_geometric: Annotated[Cell | None, APART] = None
+    error_drawn_crossed: Annotated[Array, APART] = field(default_factory=NOT_CROSSED.copy)
     reason: str = ""
     moved: Annotated[tuple[Change, ...], Fact(key="between_sessions")] = ()
 
@@ -439,11 +233,6 @@ class Fit:
             f"<Fit of {self.cell.robot.name}: {self.objective}, RMS {after.rms_mm:.3f} mm, largest "
             f"{after.max_mm:.3f} mm, {known} of {len(self.parameters)} parameters, {self.status}>"
         )
-
-    def _repr_html_(self) -> str:
-        """For a notebook."""
-        tables = "\n".join(table.html() for table in self.tables())
-        return f"<p>{escape(self.headline())}</p>\n{tables}"
 
     @property
     def robot(self) -> Robot:
@@ -486,7 +275,7 @@ class Fit:
     @cached_property
     def beyond(self) -> Beyond:
         """On whole parts that were left out; looked for when it is first asked for."""
-        return self.claim()
+        return self.claim.value
 
     @property
     def spans(self) -> tuple[Span, ...]:
@@ -508,6 +297,11 @@ class Fit:
     def trusted(self) -> Accuracy:
         """On the held-out points that do not stand out."""
         return accuracy(aside(self.error, self.data, self.suspects)[:, self.held])
+
+    @property
+    def with_them(self) -> Accuracy | None:
+        """How it does where the points that were set aside count; None without any."""
+        return self.accuracy.get("holdout_with_them")
 
     @property
     def covariance(self) -> Array:
@@ -565,17 +359,17 @@ class Fit:
 
         As they are told to people: open above where the poses tell no upper end.
         """
-        if self.stated is not None:
-            return self.stated
+        seen = {key: self.accuracy[key] for key in ("nominal", "holdout")}
+        if any(one.rms_ci95_mm for one in seen.values()):
+            return {key: ends_of(one) for key, one in seen.items()}
         rng = np.random.default_rng(self.options.seed)
         group = grouped(self.data, self.options.holdout_by)[self.held]
         return {
             key: (
-                told(rms_interval(self.errors[key], group, rng=rng), 1e-3 * seen.rms_mm),
-                told(max_interval(self.errors[key], group, rng=rng), 1e-3 * seen.max_mm),
+                told(rms_interval(self.errors[key], group, rng=rng), 1e-3 * one.rms_mm),
+                told(max_interval(self.errors[key], group, rng=rng), 1e-3 * one.max_mm),
             )
-            for key in ("nominal", "holdout")
-            for seen in [self.accuracy[key]]
+            for key, one in seen.items()
         }
 
     @property
@@ -630,7 +424,7 @@ class Fit:
             if key == "holdout" and any(one.held for one in self.suspects):
                 yield f"{title}, without suspects", self.trusted
             if key == "holdout" and self.with_them:
-                yield f"{title}, with {len(self.set_aside)} set aside", self.with_them.accuracy
+                yield f"{title}, with {len(self.set_aside)} set aside", self.with_them
 
     def accuracy_table(self) -> Table:
         """Accuracy before and after, on the held-out and on the training poses."""
@@ -645,6 +439,37 @@ class Fit:
             tuple(rows),
             ("", "d", *[".4f"] * (3 + len(targets))),
         )
+
+    def first_tables(self) -> tuple[Table, ...]:
+        """What stands on the first screen: accuracy in at most six rows, and the frames."""
+        rows = tuple(row for row in self.accuracy_rows() if row[1] != 0)
+        first = Table(
+            f"position error, objective {self.objective}",
+            ("error at", "poses", "RMS mm", "95 % low", "95 % high", "max mm"),
+            rows,
+            ("", "d", *[".3f"] * 4),
+        )
+        frames = [(name, self.frames[name]) for name in ("base", "tool") if name in self.frames]
+        placed = Table(
+            "base in the instrument's frame, tool in the flange's; Rz(A) Ry(B) Rx(C)",
+            ("frame", "X mm", "Y mm", "Z mm", "A deg", "B deg", "C deg"),
+            tuple((name, *frame.xyz_mm, *frame.abc_deg) for name, frame in frames),
+            ("", *[".3f"] * 3, *[".4f"] * 3),
+        )
+        return first, placed
+
+    def accuracy_rows(self) -> Iterator[tuple[TableCell, ...]]:
+        """New poses, inside and outside the measured region, then those of the fit."""
+        inside = self.within
+        if self.error_crossed.size or self.accuracy["holdout"].poses:
+            drawn = UNKNOWN if self.error_crossed.size else self.intervals["nominal"][0]
+            yield row_of("new poses, nominal", inside.before, drawn)
+            yield row_of("new poses, calibrated", inside.after, inside.rms)
+        if self.beyond.worst:
+            most = max(fold.max_mm for fold in self.beyond.folds)
+            yield "outside, calibrated", "", self.beyond.typical_mm, math.nan, math.nan, most
+        for key, name in (("nominal_train", "nominal"), ("train", "calibrated")):
+            yield row_of(f"training poses, {name}", self.accuracy[key])
 
     def interval_table(self) -> Table:
         """95 % intervals of the held-out accuracy; empty where the poses are too few."""
@@ -761,34 +586,144 @@ class Fit:
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
-        tables = (table.text(width) for table in self.tables())
-        return "\n\n".join([self.headline(), *tables, self.solution()])
+        return f"{super().summary(width)}\n\n{self.solution()}"
 
-    def to_dict(self, *, poses: bool = True) -> dict[str, Any]:
-        """The JSON of the contract, and more; `from_dict` reads it back, lengths to 15 digits.
+    # ---- its file ------------------------------------------------------------------------------
+
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
+        """The arms, the accuracies and, in SI, what later work rests on.
 
         poses: whether with the measurements, which of many poses are nearly all of it.
         """
-        from minimax_cal.fitting.fit_file import written
+        kept = self.kept.whole()
+        cell: dict[str, Any] = {"effects": kept.pop("effects")}
+        cell = cell if self.kept is self.cell else self.cell.whole()
+        crossed = self.error_crossed.size
+        arrays = {
+            "singular": self.identification.singular,
+            "sensitivity": self.identification.scale,
+            "prior": self.prior,
+            **({"share": self.share} if poses or self.share.ndim == 1 else {}),
+            **({"weights": self.weights} if poses else {}),
+            **({"crossed": self.error_crossed, "drawn crossed": self.error_drawn_crossed}
+               if poses and crossed else {}),
+        }  # fmt: skip
+        errors = {"nominal": self.error_nominal, "final": self.error}
+        told = poses and self.data.poses
+        return {
+            **kept,
+            "cell": cell,
+            "nominal_robot": self.nominal.robot,
+            "nominal_cell": self.nominal,
+            "frames": self.frames,
+            "frames_convention": CONVENTION,
+            "parameters": self.parameters.every,
+            "accuracy": {
+                **{key: with_ends(seen, *self.intervals[key]) if key in self.intervals else seen
+                   for key, seen in self.accuracy.items()},
+                "holdout_trusted": self.trusted,
+                "beyond": self.beyond,
+                **({"cv": self.crossed_accuracy()} if crossed else {}),
+            },
+            "covariance": self.uncertainty,
+            "arrays": arrays,
+            **({"poses": pose_rows(self.data, self.held, errors)} if told else {}),
+        }  # fmt: skip
 
-        return written(self, poses=poses)
+    def crossed_accuracy(self) -> dict[str, Any]:
+        """The cross-validated accuracy."""
+        judged = in_file(with_ends(self.within.after, self.within.rms, self.within.largest))
+        return judged | {"not_judged": self.unjudged, "nominal": self.within.before}
 
-    @staticmethod
-    def from_dict(content: Mapping[str, Any], source: str = "fit") -> Fit:
-        """From `to_dict`.  Raises CalibrationError."""
-        from minimax_cal.fitting.fit_file import read
-        from minimax_cal.ground.records import reading
+    @classmethod
+    def told_beside(
+        cls, content: Mapping[str, Any], told: Mapping[str, Any], source: str
+    ) -> dict[str, Any]:
+        """The arms, the poses and what later work rests on, from a file."""
+        read_options(told["provenance"].settings)  # what later work rests on
+        cell = cell_from_dict(content, source)
+        drawn = {"robot": content["nominal_robot"], **content["nominal_cell"]}
+        nominal = cell_from_dict(drawn, f"{source}: nominal_cell")
+        data, held, errors = measured_poses(content, source, cell, "nominal")
+        known = uncertainty_from_dict(content, cell, source)
+        every = as_kind(tuple[Parameter, ...], content["parameters"], Fact(), "parameters")
+        parameters = Parameters(every, known.dof)
+        names = Names.of(cell.robot, cell.target_names, tuple(p.name for p in every if p.of_effect))
+        if missing := set(names.all) - set(parameters.names):
+            raise ValueError(f"parameters: {min(missing)} is missing, of {len(missing)}")
+        beyond = read(Beyond, content["accuracy"]["beyond"], "accuracy.beyond")
+        arrays = {name: array(value, name) for name, value in content["arrays"].items()}
+        check_shapes(arrays, names.count, data.take(~held), data)
+        kept = told["status"] is Status.NO_BETTER or not cell.effects.causes
+        found = identified(parameters, names, arrays["singular"], arrays["sensitivity"])
+        return {
+            "cell": cell,
+            "nominal": nominal,
+            "parameters": parameters,
+            "accuracy": accuracies_of(content["accuracy"], len(cell.target_names)),
+            "claim": Later(lambda: beyond),
+            "identification": found,
+            "uncertainty": known,
+            "data": replace(data, digest=told["provenance"].data_sha256),
+            "held": held,
+            "error_nominal": errors_of(nominal, data, errors[0]),
+            "error": errors_of(cell, data, errors[1]),
+            "weights": arrays.get("weights", data.take(~held).seen.T.astype(float)),
+            "share": arrays.get("share", np.ones(len(cell.target_names))),
+            "prior": arrays["prior"],
+            "error_crossed": arrays.get("crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
+            "error_drawn_crossed": arrays.get("drawn crossed", NOT_CROSSED),
+            "stated_geometric": None if kept else cell_from_dict({**content, "cell": {}}, source),
+        }
 
-        with reading(source):
-            return read(content, source)
 
-    def json(self, *, poses: bool = True) -> str:
-        """`to_dict` as text."""
-        return json_text(self.to_dict(poses=poses))
+def row_of(name: str, of: Accuracy, ends: Interval = UNKNOWN) -> tuple[TableCell, ...]:
+    """A row of the first table; ends: 95 % interval of the RMS [m]."""
+    return name, of.poses, of.rms_mm, 1e3 * ends.low, 1e3 * ends.high, of.max_mm
 
-    def save(self, path: Path | str, *, poses: bool = True) -> None:
-        """Write the JSON; never a half-written file.  poses: as `to_dict`."""
-        write_whole(path, self.json(poses=poses))
+
+def ends_of(seen: Accuracy) -> tuple[Interval, Interval]:
+    """The intervals of RMS and largest error that a file tells [m]."""
+    (a, b), (c, d) = seen.rms_ci95_mm or NO_ENDS, seen.max_ci95_mm or NO_ENDS
+    return Interval(1e-3 * a, 1e-3 * b), Interval(1e-3 * c, 1e-3 * d)
+
+
+def accuracies_of(content: Mapping[str, Any], targets: int) -> dict[str, Accuracy]:
+    """Before and after, from a file.  Raises ValueError."""
+    keys = [*HELD, *(key for key in ("holdout_with_them",) if content.get(key))]
+    found = {key: read(Accuracy, content.get(key), f"accuracy.{key}") for key in keys}
+    for key, seen in found.items():
+        if not len(seen.sse_mm2) == len(seen.counts) == targets:
+            raise ValueError(f"accuracy.{key} is not of {targets} targets")
+    return found
+
+
+def check_shapes(
+    arrays: Mapping[str, Array], count: int, train: Measurements, data: Measurements
+) -> None:
+    """Raise ValueError for arrays that are not of these parameters and poses."""
+    k, m = len(data.target_names), train.poses
+    every = (k, data.poses, 3)
+    shapes: dict[str, tuple[tuple[int, ...], ...]] = {
+        "sensitivity": ((count,),), "prior": ((count,),), "weights": ((k, m),),
+        "share": ((k,), (k, m)), "crossed": (every,), "drawn crossed": (every,)
+    }  # fmt: skip
+    if arrays["singular"].ndim != 1 or not arrays["singular"].size:
+        raise ValueError("singular is not a row of numbers")
+    for name, values in arrays.items():
+        known = shapes.get(name, (values.shape,))
+        asked = data.poses or name not in POSE_BY_POSE
+        if values.shape not in known and asked:
+            raise ValueError(f"{name} is not of these parameters and poses")
+
+
+def identified(
+    parameters: Parameters, names: Names, singular: Array, scale: Array
+) -> Identification:
+    """What was identified, and why the rest was not."""
+    active = np.zeros(names.count, dtype=bool)
+    active[[names.index(name) for name in parameters.names]] = [p.identifiable for p in parameters]
+    return Identification(active, {p.name: p.why for p in parameters if p.reason}, singular, scale)
 
 
 def load_fit(path: Path | str) -> Fit:
@@ -813,4 +748,4 @@ def load_fit(path: Path | str) -> Fit:
     --------
     >>> print(mc.load_fit("fit.json").summary())
     """
-    return Fit.from_dict(saved_content(path), str(path))
+    return Fit.load(path)

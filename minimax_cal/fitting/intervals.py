@@ -8,12 +8,13 @@ one pose in a hundred misses by ten times as much, a few dozen poses without one
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import ndtri
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.accuracy import Accuracy
 
 MIN_POSES = 3  # poses; fewer say nothing about their spread
 DRAWS = 2000  # bootstrap samples: the ends are then sure to about 2 % of the width
@@ -44,6 +45,12 @@ def told(interval: Interval, seen: float) -> Interval:
     """
     high = max(interval.high, seen) if interval.high <= FARTHEST * seen else math.nan
     return Interval(interval.low, high)
+
+
+def with_ends(seen: Accuracy, rms: Interval, largest: Interval) -> Accuracy:
+    """An accuracy with intervals of its RMS and of its largest error [m]."""
+    ends = [(1e3 * interval.low, 1e3 * interval.high) for interval in (rms, largest)]
+    return replace(seen, rms_ci95_mm=ends[0], max_ci95_mm=ends[1])
 
 
 def rms_interval(

@@ -23,15 +23,8 @@ from minimax_cal.fitting.claims import (
 )
 from minimax_cal.fitting.common_scale import common_share, with_lack
 from minimax_cal.fitting.crossed import NOT_CROSSED, few_poses
-from minimax_cal.fitting.fit import (
-    Fit,
-    KeptDistance,
-    Parameters,
-    Provenance,
-    Work,
-    WorstCase,
-    link_by_link,
-)
+from minimax_cal.fitting.fit import Fit, KeptDistance, Provenance, Work, WorstCase
+from minimax_cal.fitting.found import Parameters, link_by_link
 from minimax_cal.fitting.improvement import Improvement, no_better, rms_of, said_without
 from minimax_cal.fitting.options import Options, qp_name
 from minimax_cal.fitting.outcome import (
@@ -49,6 +42,7 @@ from minimax_cal.fitting.start import EVERYWHERE
 from minimax_cal.fitting.stations import jumps
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.facts import Later
 from minimax_cal.measuring import checks, faults
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import Measurements
@@ -215,7 +209,7 @@ class Judged:
                 "train": accuracy(after[:, ~held]),
                 "holdout": accuracy(after[:, held]),
                 "nominal_train": accuracy(before[:, ~held]),
-                **({"holdout_with_them": counted.accuracy} if counted else {}),
+                **({"holdout_with_them": counted} if counted else {}),
             },
             identification=solved.identification,
             uncertainty=solved.uncertainty,
@@ -234,10 +228,9 @@ class Judged:
             prior=solved.estimator.model.prior.weight,
             widening=solved.widening,
             provenance=Provenance.of(self.robot, data, options.settings()),
-            claim=partial(beyond_of, *given),
+            claim=Later(partial(beyond_of, *given)),
             error_crossed=crossed,
             set_aside=gone,
-            with_them=counted,
             answered=solved.optimum.answered if solved.optimum else {},
             work=work_of(solved),
             error_drawn_crossed=drawn_crossed,

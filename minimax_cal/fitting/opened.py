@@ -18,11 +18,12 @@ from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options, read_options
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.stations import MIN_FRAME_POINTS, moving
+from minimax_cal.fitting.told_poses import measured_poses
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
 from minimax_cal.ground.files import saved_content
-from minimax_cal.ground.records import AGAIN, checked, reading
+from minimax_cal.ground.records import AGAIN, read, reading
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
@@ -250,8 +251,6 @@ def of_relative(content: Mapping[str, Any], source: str) -> Opened:
 
 def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
     """A diagnosis: nominal, geometric, then with each effect."""
-    from minimax_cal.fitting.fit_file import BeyondPart, measured_poses  # schemas: slow to build
-
     rungs = rungs_of(content, source)
     first = rungs[0].cell
     data, held, (geometric, final) = measured_poses(content, source, first, "geometric")
@@ -263,10 +262,11 @@ def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
     settings = content["provenance"]["settings"]
     known = rungs[-1].cell.effects.causes
     firm = {term.text for term in confirmed(content, known)}
+    beyond = read(Beyond, content["gap"]["beyond"], "gap.beyond")
     return Opened(
         source, rungs, len(rungs) - 1, data, held, digest, status=status, spans=spans,
         options=read_options(settings, objective="sum") if data.poses else None,
-        outside=checked(BeyondPart, content["gap"]["beyond"], source).beyond,
+        outside=lambda: beyond,
         possible=frozenset(term.text for term in known) - firm,
     )  # fmt: skip
 

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from minimax_cal.fitting.crossed import intervals_of
+from minimax_cal.fitting.intervals import with_ends
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import Solved
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import finite
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.aside import TOOL, SetAside, counted
 from minimax_cal.measuring.grouping import grouped
@@ -23,32 +22,14 @@ from minimax_cal.measuring.set_aside import merged, set_aside
 from minimax_cal.measuring.stations import seen_from
 from minimax_cal.modelling.cell import Cell
 
-NO_ENDS = (math.nan, math.nan)
-
-
-@dataclass(frozen=True)
-class WithThem:
-    """Accuracy on poses that no fit has seen, the points set aside among them.
-
-    No fit has seen these either.  Each weighs as the share of the other points that is held out, so
-    that they count as they would among all.  rms_ends, max_ends: 95 % intervals [mm].
-    """
-
-    accuracy: Accuracy
-    rms_ends: tuple[float, float] = NO_ENDS
-    max_ends: tuple[float, float] = NO_ENDS
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        ends = {"rms_ci95_mm": self.rms_ends, "max_ci95_mm": self.max_ends}
-        return self.accuracy.to_dict() | {key: list(map(finite, two)) for key, two in ends.items()}
-
 
 def with_them(
     error: Array, group: Array, aside: Array, share: float = 1.0, seed: int = 0
-) -> WithThem:
-    """Accuracy and intervals with the points set aside.
+) -> Accuracy:
+    """Accuracy, with its intervals, on poses that no fit has seen, the points set aside among them.
 
+    No fit has seen these either.  Each weighs as the share of the other points that is held out, so
+    that they count as they would among all.
     error: (k, h, 3) at poses that judge, group: (h,) of them.  aside: (k, a, 3) at the points set
     aside, NaN elsewhere [m].  share: of all other points that judge.
     """
@@ -72,13 +53,12 @@ def with_them(
         counts=counts,
     )
     if not sum(counts):
-        return WithThem(whole)
+        return whole
     last = int(group.max(initial=-1)) + 1
     every = np.concatenate([group, last + np.arange(aside.shape[1])])
     rms, _ = intervals_of(root[:, None] * both, every, seed)
     _, largest = intervals_of(both, every, seed)
-    ends = [(1e3 * interval.low, 1e3 * interval.high) for interval in (rms, largest)]
-    return WithThem(whole, *ends)
+    return with_ends(whole, rms, largest)
 
 
 def with_trimmed(data: Measurements, held: Array, solved: Solved, options: Options) -> Measurements:
@@ -101,7 +81,7 @@ def judged_with(
     crossed: Array,
     solved: Solved,
     options: Options,
-) -> tuple[tuple[SetAside, ...], WithThem | None]:
+) -> tuple[tuple[SetAside, ...], Accuracy | None]:
     """The points set aside for a fit, and the accuracy with them; None where there are none.
 
     data: all poses.  held: (m,).  error: (k, m, 3) of the fit; crossed: of every pose by a fit
@@ -133,10 +113,10 @@ def errors_of(cell: Cell, data: Measurements) -> Array:
     return np.where(aside.seen.T[..., None], error, np.nan)
 
 
-def aside_sentence(points: Sequence[SetAside], found: WithThem | None) -> str:
+def aside_sentence(points: Sequence[SetAside], found: Accuracy | None) -> str:
     """How many points were set aside, by whom, and the error with them."""
     them = "it" if len(points) == 1 else "them"
     if found is None:
         return f"{counted(points)}."
-    seen = found.accuracy
-    return f"{counted(points)}; with {them} RMS {seen.rms_mm:.3f} mm, largest {seen.max_mm:.3f} mm."
+    errors = f"RMS {found.rms_mm:.3f} mm, largest {found.max_mm:.3f} mm"
+    return f"{counted(points)}; with {them} {errors}."

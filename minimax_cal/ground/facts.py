@@ -7,7 +7,7 @@ schema, the terminal, the report and the page.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sized
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, cached_property
 from typing import Annotated, Any, Generic, TypeVar, get_type_hints
 
@@ -22,7 +22,7 @@ class Fact:
     key: in the JSON, the field's own name with its unit unless given; dots where objects hold it.
     scale: what a number is multiplied by there, as 1e3 for millimetres.  unit: there, for the key.
     brief: left out where it is None or empty.  least: no number of it is smaller.
-    fewest: of its parts.  apart: told by `results.Result.beside`, not by itself.
+    fewest: of its parts.  among: which texts it may be.  apart: told by `results.Result.beside`.
     """
 
     words: str = ""
@@ -32,6 +32,7 @@ class Fact:
     brief: bool = False
     least: float = float("-inf")
     fewest: int = 0
+    among: tuple[str, ...] = ()
     apart: bool = False
 
     def key_of(self, name: str) -> str:
@@ -102,11 +103,17 @@ def derived_facts(kind: type) -> Mapping[str, Fact]:
     return {name: each.fact for own in every for name, each in own if isinstance(each, Derived)}
 
 
+@cache
+def all_facts(kind: type) -> Mapping[str, Fact]:
+    """Of the fields and of the properties of a class, none where it is no dataclass."""
+    return {**stored_facts(kind), **derived_facts(kind)} if is_dataclass(kind) else {}
+
+
 def in_file(record: Any) -> dict[str, Any]:
     """Values of a record by their keys in the file, in its units."""
     kind: type = type(record)
     out: dict[str, Any] = {}
-    for name, known in {**stored_facts(kind), **derived_facts(kind)}.items():
+    for name, known in all_facts(kind).items():
         value = getattr(record, name)
         if known.brief and (value is None or (isinstance(value, Sized) and not len(value))):
             continue
@@ -135,6 +142,6 @@ def facts_in_words(record: object) -> str:
     kind: type = type(record)
     return ", ".join(
         known.words.format(scaled(getattr(record, name), known.scale))
-        for name, known in {**stored_facts(kind), **derived_facts(kind)}.items()
+        for name, known in all_facts(kind).items()
         if known.words
     )

@@ -19,7 +19,7 @@ from minimax_cal.ground.errors import CalibrationError, said
 from minimax_cal.ground.facts import (
     Fact,
     Later,
-    derived_facts,
+    all_facts,
     hints_of,
     scaled,
     stored_facts,
@@ -81,12 +81,12 @@ def found_at(content: Any, key: str) -> Any:
 def as_kind(hint: Any, value: Any, known: Fact, at: str) -> Any:
     """JSON as a type: null is NaN where a number may be none.  Raises ValueError."""
     origin, args = get_origin(hint), get_args(hint)
-    if hint is Any:
+    if hint in (Any, object):
         return value
     if origin is Annotated:
         return as_kind(args[0], value, known, at)
     if hint in WORDS:
-        return one_of(hint, value, known, at)
+        return among(value, known.among, at) if known.among else one_of(hint, value, known, at)
     if hint == Array:
         return array(value, at)
     if origin in (Union, UnionType):
@@ -103,7 +103,7 @@ def as_kind(hint: Any, value: Any, known: Fact, at: str) -> Any:
         return {key: as_kind(args[1], part, known, f"{at}.{key}") for key, part in each}
     if hasattr(hint, "from_dict"):
         return hint.from_dict(value, at)
-    if is_dataclass(hint):
+    if isinstance(hint, type) and is_dataclass(hint):
         return read(hint, value, at)
     if hasattr(hint, "_fields"):  # of two or three numbers with names
         part = value if isinstance(value, Mapping) else told(at, "an object")
@@ -129,7 +129,7 @@ def one_of(hint: type, value: Any, known: Fact, at: str) -> Any:
     right = (float, int) if hint is float else hint
     if not isinstance(value, right) or (isinstance(value, bool) and hint is not bool):
         raise ValueError(f"{at}: should be {WORDS[hint]}")
-    if hint in (float, int) and not known.least <= value <= MOST:
+    if isinstance(value, int | float) and not known.least <= value <= MOST:
         raise ValueError(f"{at}: cannot be {value:.6g}")
     return hint(value)
 
@@ -203,9 +203,15 @@ def check_schema(content: Mapping[str, Any], source: str, known: int) -> None:
 # ---- for other programs ------------------------------------------------------------------------
 
 
-def json_schema(kind: type, title: str) -> dict[str, Any]:
-    """The JSON schema of a record's file, for editors and other programs."""
-    whole = record_schema(kind)
+def json_schema(kind: Any) -> dict[str, Any]:
+    """The JSON schema of a file, for editors and other programs; of a result with what it says."""
+    known = isinstance(kind, type) and is_dataclass(kind)
+    whole = record_schema(kind) if known else plain(kind.model_json_schema())
+    title = f"Result of minimax-cal {kind.COMMAND}" if known else "Robot file of minimax-cal"
+    if known:
+        marks = {"schema": {"const": kind.SCHEMA}, "kind": {"const": kind.KIND}}
+        whole["properties"] = {**marks, **whole["properties"]}
+        whole["required"] = [*marks, *whole["required"]]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **whole, "title": title}
 
 
@@ -215,7 +221,7 @@ def record_schema(kind: type) -> dict[str, Any]:
     out: dict[str, Any] = {"type": "object", "properties": {}, "required": []}
     if kind.__doc__ and not kind.__doc__.startswith(f"{kind.__name__}("):
         out["description"] = kind.__doc__.partition("\n")[0]
-    for name, known in {**stored_facts(kind), **derived_facts(kind)}.items():
+    for name, known in all_facts(kind).items():
         *inner, last = known.key_of(name).split(".")
         at = out
         fills = name not in own or known.brief
@@ -236,6 +242,8 @@ def kind_schema(hint: Any, known: Fact) -> dict[str, Any]:
         return kind_schema(args[0], known)
     least = {"minimum": known.least} if math.isfinite(known.least) else {}
     simple = {float: ["number", "null"], int: "integer", str: "string", bool: "boolean"}
+    if known.among and hint is str:
+        return {"enum": list(known.among)}
     if hint in simple:
         return {"type": simple[hint], **(least if hint in (float, int) else {})}
     if origin in (Union, UnionType):
@@ -258,7 +266,7 @@ def kind_schema(hint: Any, known: Fact) -> dict[str, Any]:
         return {"type": "array"}
     if hasattr(hint, "from_dict"):
         return {}
-    if is_dataclass(hint):
+    if isinstance(hint, type) and is_dataclass(hint):
         return record_schema(hint)
     if hasattr(hint, "_fields"):
         parts = {name: kind_schema(one, known) for name, one in hints_of(hint).items()}

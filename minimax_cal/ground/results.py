@@ -33,8 +33,11 @@ class Result:
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
 
-    def beside(self) -> dict[str, Any]:
-        """What of its file its fields do not tell by themselves."""
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
+        """What of its file its fields do not tell by themselves.
+
+        poses: whether with what was measured, which of many poses is nearly all of it.
+        """
         return {}
 
     @classmethod
@@ -47,10 +50,10 @@ class Result:
         """
         return {}
 
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON of the contract, and more; `from_dict` reads it back."""
+    def to_dict(self, *, poses: bool = True) -> dict[str, Any]:
+        """The JSON of the contract, and more; `from_dict` reads it back.  poses: see `beside`."""
         named = {"schema": self.SCHEMA, "kind": self.KIND}
-        return {**named, **plain(in_file(self)), **plain(self.beside())}
+        return merged(merged(named, plain(in_file(self))), plain(self.beside(poses=poses)))
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], source: str = "") -> Self:
@@ -68,13 +71,13 @@ class Result:
         """From its file.  Raises CalibrationError."""
         return cls.from_dict(saved_content(path), str(path))
 
-    def json(self) -> str:
+    def json(self, *, poses: bool = True) -> str:
         """`to_dict` as text."""
-        return json_text(self.to_dict())
+        return json_text(self.to_dict(poses=poses))
 
-    def save(self, path: Path | str) -> None:
+    def save(self, path: Path | str, *, poses: bool = True) -> None:
         """Write the JSON; never a half-written file."""
-        write_whole(path, self.json())
+        write_whole(path, self.json(poses=poses))
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
@@ -84,3 +87,9 @@ class Result:
         """For a notebook."""
         tables = "\n".join(table.html() for table in self.tables())
         return f"<p>{escape(self.headline())}</p>\n{tables}"
+
+
+def merged(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+    """Two objects in one, those that both hold likewise."""
+    both = {k: merged(one[k], v) for k, v in other.items() if isinstance(one.get(k), Mapping)}
+    return {**one, **other, **both}

@@ -4,21 +4,30 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+import re
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from html import escape
-from typing import Any
+from typing import Any, Literal, cast
 
 from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from minimax_cal.ground.facts import all_facts, scaled
 from minimax_cal.ground.files import csv_text
 from minimax_cal.ground.words import visible
 
 Cell = str | float | int
+EDGE, BETWEEN = 1, 3  # letters beside a table's columns, and between two
 MAX_ROWS = 6  # of a table on a first screen
+LONGEST_NAME = 28  # letters of a cell that is a name; what is longer is a sentence, and wraps
+JOINT = "\N{WORD JOINER}"
+JOINED = rf"\1{JOINT}\2"
+COLUMN = re.compile(r"(\w+)(?:=(.*?))?(?: ([-+#]?\.?\d*[defg]))?")
+UNIT = re.compile(r"(\d) (\S{1,9})(?!\S)")  # of a number in a sentence
 
 LATEX_ESCAPES = str.maketrans(
     {c: "\\" + c for c in "&%$#_{}"}
@@ -35,20 +44,27 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
     formats: tuple[str, ...] = ()
 
+    @staticmethod
+    def of(title: str, records: Sequence[object], *columns: str) -> Table:
+        """A row a record.  columns: attribute, header unless its name, format: "rms=RMS mm .4f".
+
+        Values are in the units of files, as `facts` has them.
+        """
+        told = [cast(re.Match[str], COLUMN.fullmatch(each)).groups("") for each in columns]
+        rows = tuple(tuple(cell_of(record, name) for name, _, _ in told) for record in records)
+        header = tuple(shown or name.replace("_", " ") for name, shown, _ in told)
+        return Table(title, header, rows, tuple(spec for _, _, spec in told))
+
     def brief(self, *header: str, rows: int = MAX_ROWS) -> Table:
         """Some of the columns, all unless named, and at most so many rows: the first and the last.
 
         The title says how many rows are left out.
         """
-        kept = [self.header.index(name) for name in header] or list(range(len(self.header)))
         more = len(self.rows) - rows
         some = self.rows if more <= 0 else (*self.rows[: rows - 1], self.rows[-1])
-        return Table(
-            f"{self.title} ({more} rows left out)" if more > 0 else self.title,
-            tuple(self.header[i] for i in kept),
-            tuple(tuple(row[i] for i in kept) for row in some),
-            tuple(self.formats[i] for i in kept) if self.formats else (),
-        )
+        title = f"{self.title} ({more} rows left out)" if more > 0 else self.title
+        kept = [self.header.index(name) for name in header] or range(len(self.header))
+        return replace(self, title=title, rows=some).only(*kept)
 
     def cells(self) -> list[list[str]]:
         """Every cell as text; NaN is a dash."""
@@ -64,26 +80,63 @@ class Table:
             for i in range(len(self.header))
         ]
 
+    def only(self, *kept: int) -> Table:
+        """Some of the columns, by number."""
+        return replace(
+            self,
+            header=tuple(self.header[i] for i in kept),
+            rows=tuple(tuple(row[i] for i in kept) for row in self.rows),
+            formats=tuple(self.formats[i] for i in kept) if self.formats else (),
+        )
+
     def text(self, width: int = 100) -> str:
         """Plain text, without colour."""
         stream = io.StringIO()
-        Console(file=stream, width=width, color_system=None, highlight=False).print(self.rich())
+        self.show(Console(file=stream, width=width, color_system=None, highlight=False))
         return stream.getvalue().rstrip()
 
-    def rich(self) -> RichTable:
-        """For a terminal.  Cells are literal text, never markup."""
+    def show(self, console: Console) -> None:
+        """Print it on a terminal; what is too wide in parts, each with the first column.
+
+        No number, unit or name is broken: columns that have no room for theirs stand below.
+        """
+        here, room = [0], console.width - EDGE
+        least = [least + BETWEEN for least, _ in self.widths()]
+        for i in range(1, len(self.header)):
+            if len(here) > 1 and sum(least[j] for j in (*here, i)) > room:
+                console.print(self.only(*here).rich(room))
+                here = [0]
+            here.append(i)
+        console.print(self.only(*here).rich(room))
+
+    def widths(self) -> list[tuple[int, int]]:
+        """Of each column, the least that breaks no number, unit or name, and the usual one."""
+        out = []
+        for i, (name, right) in enumerate(zip(self.header, self.numeric(), strict=True)):
+            cells = [visible(row[i]) for row in self.cells()]
+            parts = [part for cell in cells for part in unbroken(cell, right=right)]
+            least = max(map(len, [*parts, *visible(name).split()]), default=1)
+            out.append((least, max(map(len, [*cells, visible(name)]))))
+        return out
+
+    def rich(self, room: int = 0) -> RichTable:
+        """For a terminal.  Cells are literal text, never markup.  room: letters a line, if few."""
         table = RichTable(
             title=Text(visible(self.title)),
             title_justify="left",
             header_style="bold",
             box=box.SIMPLE,
         )
-        for name, right in zip(self.header, self.numeric(), strict=True):
-            table.add_column(
-                Text(visible(name)), justify="right" if right else "left", overflow="fold"
-            )
+        least, widths = (list(column) for column in zip(*self.widths(), strict=True))
+        over = sum(widths) + BETWEEN * len(widths) - room if room else 0
+        for i in sorted(range(len(widths)), key=lambda i: least[i] - widths[i]):  # sentences first
+            usual, widths[i] = widths[i], max(least[i], widths[i] - max(over, 0))
+            over -= usual - widths[i]
+        for name, right, width in zip(self.header, self.numeric(), widths, strict=True):
+            justify: Literal["left", "right"] = "right" if right else "left"
+            table.add_column(Text(visible(name)), justify=justify, overflow="fold", width=width)
         for row in self.cells():
-            table.add_row(*(Text(visible(cell)) for cell in row))
+            table.add_row(*(Text(folded(visible(c), n)) for c, n in zip(row, widths, strict=True)))
         return table
 
     def markdown(self) -> str:
@@ -146,6 +199,35 @@ class Table:
 def records_of(columns: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Columns of one length as objects for JSON, one a row."""
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def cell_of(record: object, name: str) -> Cell:
+    """An attribute of a record for people."""
+    kind: Any = type(record)
+    known = all_facts(kind).get(name)
+    value = getattr(record, name)
+    if known and known.scale != 1.0:
+        value = scaled(value, known.scale)
+    if isinstance(value, bool):
+        return "yes" if value else ""
+    if isinstance(value, tuple):
+        return ", ".join(map(str, value))
+    return math.nan if value is None else cast(Cell, value)
+
+
+def unbroken(cell: str, *, right: bool) -> list[str]:
+    """Parts of a cell that stand on one line: a number, a name, words of a sentence with units."""
+    if right or len(cell) <= LONGEST_NAME:
+        return [cell]
+    return [cell[:LONGEST_NAME], *UNIT.sub(JOINED, cell).split()]
+
+
+def folded(cell: str, width: int) -> str:
+    """A cell in lines of at most so many letters, numbers with their units."""
+    if len(cell) <= width:
+        return cell
+    lines = textwrap.wrap(UNIT.sub(JOINED, cell), width, break_on_hyphens=False)
+    return "\n".join(lines).replace(JOINT, " ")
 
 
 def show(cell: Cell, spec: str) -> str:

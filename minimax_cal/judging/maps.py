@@ -209,7 +209,7 @@ class WorkspaceMap(Result):
         """The table."""
         return (self.table(),)
 
-    def beside(self) -> dict[str, Any]:
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """The table, and how many poses lie within."""
         return {
             "summary": self.table().records("what", "count", "median_mm", "q95_mm", "worst_mm"),

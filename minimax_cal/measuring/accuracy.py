@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import plain
+from minimax_cal.ground.facts import APART, Fact
 from minimax_cal.ground.tables import Cell, Table
 
 # the accuracies of a result, and whether they are of held-out poses
+Ends = tuple[float, float]
+NO_ENDS = (math.nan, math.nan)
 HELD = {"nominal": True, "train": False, "holdout": True, "nominal_train": False}
 
 
@@ -21,6 +24,7 @@ class Accuracy:
     """Distances between measured and predicted points, over all measured points.
 
     sse_mm2, counts: per target, the sum of squares F_i and at how many poses it was measured.
+    rms_ci95_mm, max_ci95_mm: 95 % intervals of RMS and largest, where they were worked out.
     worst: (pose, target) of the largest distance, (-1, -1) without points.
     means_mm, largest_mm: per target, empty where a file does not tell them.
     """
@@ -28,12 +32,14 @@ class Accuracy:
     rms_mm: float
     max_mm: float
     mean_mm: float
-    poses: int
-    sse_mm2: tuple[float, ...]
-    counts: tuple[int, ...]
-    worst: tuple[int, int] = (-1, -1)
-    means_mm: tuple[float, ...] = field(default=(), compare=False)
-    largest_mm: tuple[float, ...] = field(default=(), compare=False)
+    poses: Annotated[int, Fact(least=0)]
+    sse_mm2: Annotated[tuple[float, ...], Fact(least=0.0)]
+    counts: Annotated[tuple[int, ...], Fact(key="points", least=0)]
+    worst: Annotated[tuple[int, int], APART] = (-1, -1)
+    means_mm: Annotated[tuple[float, ...], APART] = field(default=(), compare=False)
+    largest_mm: Annotated[tuple[float, ...], APART] = field(default=(), compare=False)
+    rms_ci95_mm: Annotated[Ends | None, Fact(brief=True)] = field(default=None, compare=False)
+    max_ci95_mm: Annotated[Ends | None, Fact(brief=True)] = field(default=None, compare=False)
 
     def by_target(self) -> tuple[float, ...]:
         """RMS of each target, NaN where it was not measured [mm]."""
@@ -55,18 +61,6 @@ class Accuracy:
             (*rows, ("all", *total)),
             ("", "d", ".4f", ".4f", ".4f", ".4f"),
         )
-
-    def to_dict(self) -> dict[str, object]:
-        """For JSON: NaN, which JSON does not know, is null."""
-        whole = {
-            "rms_mm": self.rms_mm,
-            "max_mm": self.max_mm,
-            "mean_mm": self.mean_mm,
-            "poses": self.poses,
-            "sse_mm2": self.sse_mm2,
-            "points": self.counts,
-        }
-        return dict(plain(whole))
 
 
 def accuracy(error: Array) -> Accuracy:

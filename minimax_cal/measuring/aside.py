@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 USER, FILE, TOOL = "user", "file", "tool"
 WHO = {USER: "the user", FILE: "the measurement file", TOOL: "the program"}  # in sentences
@@ -24,10 +23,6 @@ class SetAside:
     target: str
     why: str
     by: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return dict(vars(self))
 
 
 def counted(points: Sequence[SetAside]) -> str:

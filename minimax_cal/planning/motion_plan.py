@@ -188,7 +188,7 @@ class MotionPlan(Result):
         """What the motion will tell, and what moves."""
         return self.told_table(), self.motion_table()
 
-    def beside(self) -> dict[str, Any]:
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """The series' coefficients in SI, and how far and how fast they move each joint."""
         return {
             "robot": self.robot.name,

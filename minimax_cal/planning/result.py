@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import Apart, Fact, derived, in_file, scaled
+from minimax_cal.ground.facts import Apart, Fact, derived, scaled
 from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell as TableCell
@@ -77,7 +77,7 @@ class Plan(Result):
     growth: tuple[Growth, ...]
     separation: tuple[Separation, ...]
     candidates: Poses
-    instrument: Apart[Instrument]
+    instrument: Instrument
     place: Apart[Array]
     travel: Annotated[Travel, Fact(unit="rad")]
     at_hand: int
@@ -195,7 +195,7 @@ class Plan(Result):
         """Write the stops; never a half-written file."""
         write_whole(path, self.csv(unit))
 
-    def beside(self) -> dict[str, Any]:
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """Names, units, sizes and sigmas."""
         unit = "power" if self.criterion == POWER else "sigma_um"
         sizes = {"planned": self.size, "random": self.random, "bound": self.bound}
@@ -205,5 +205,5 @@ class Plan(Result):
             "q_units": ["m" if sliding else "rad" for sliding in self.cell.robot.prismatic],
             "value": {f"{name}_{unit}": self.shown(size) for name, size in sizes.items()},
             "parameters": records_of({"name": self.names, "sigma": self.sigma}),
-            "instrument": {"place_in_base_mm": 1e3 * self.place, **in_file(self.instrument)},
+            "instrument": {"place_in_base_mm": 1e3 * self.place},
         }

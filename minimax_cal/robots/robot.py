@@ -257,6 +257,11 @@ class Robot:
         """Length of the stretched arm without its slides, at least 0.1: a scale for errors [m]."""
         return max(0.1, float(np.hypot(self.mdh[:, 0], self.mdh[:, 1]).sum()))
 
+    @staticmethod
+    def from_dict(content: Mapping[str, Any], source: str) -> Robot:
+        """As `robot_from_dict`."""
+        return robot_from_dict(content, source)
+
     def to_dict(self) -> dict[str, Any]:
         """The robot in the file schema and the convention of its file, in mm and radians."""
         rows, end = self.notation.written(self.mdh, self.prismatic)

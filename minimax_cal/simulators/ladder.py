@@ -14,7 +14,7 @@ from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.options import Progress, silent
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import check_writable, write_whole
+from minimax_cal.ground.files import check_writable, plain, write_whole
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.grouping import check_chance
@@ -124,12 +124,12 @@ def simulator_gap(
         robot=chain.robot.name,
         rungs=tuple(rungs),
         commands=made.commands,
-        floor=causes.floor.value if causes.floor else float("nan"),
+        floor=causes.floor.value if causes.floor else np.nan,
         floor_from=causes.floor.source if causes.floor else "",
         train_poses=int((~causes.held).sum()),
         holdout_poses=int(run.held.sum()),
         status=best.fit.status,
-        beyond=best.fit.beyond.to_dict(),
+        beyond=plain(best.fit.beyond),
         left_out=made.left_out,
         notices=tuple(dict.fromkeys(notices)),
         written="" if path is None else str(path),
@@ -336,7 +336,7 @@ class Run:
     def predicted(self, fit: Fit | None, rows: Array) -> float:
         """RMS of some driven poses by the formulas of a fit, NaN where it has others."""
         if fit is None or not self.causes.same:
-            return float("nan")
+            return np.nan
         return accuracy(fit.cell.error(self.data)[:, rows]).rms_mm
 
     def tell(self, what: str, data: Measurements, rows: Array, judge: Array) -> None:

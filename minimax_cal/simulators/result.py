@@ -6,19 +6,15 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
-
-from pydantic import Field
+from typing import Annotated, Any
 
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.ground.files import finite, plain
-from minimax_cal.ground.records import Number, Part, Recorded, checked
+from minimax_cal.ground.facts import Fact, derived
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.solvers.status import Status
 
-KIND = "simulator_gap"
 HOLDS, HOLDS_MM = 0.1, 0.02  # of an error: a simulator that holds what a fit claims [-, mm]
 
 
@@ -61,14 +57,16 @@ class SimulatorGap(Result):
     element for.  written: where the last step's model was written, empty where it was not.
     """
 
+    KIND = "simulator_gap"
+    COMMAND = "gap"
     model: str
     robot: str
-    rungs: tuple[Rung, ...]
-    commands: Rung | None
-    floor: float
-    floor_from: str
-    train_poses: int
-    holdout_poses: int
+    rungs: Annotated[tuple[Rung, ...], Fact(fewest=1)]
+    commands: Annotated[Rung | None, Fact(key="with_commands")]
+    floor: Annotated[float, Fact(key="noise_floor_mm")]
+    floor_from: Annotated[str, Fact(key="noise_floor_from")]
+    train_poses: Annotated[int, Fact(key="poses.train")]
+    holdout_poses: Annotated[int, Fact(key="poses.holdout")]
     status: Status
     beyond: Mapping[str, Any]
     left_out: tuple[str, ...]
@@ -81,50 +79,21 @@ class SimulatorGap(Result):
         return f"<SimulatorGap of {self.model}: {self.headline()}>"
 
     @property
+    def every(self) -> tuple[Rung, ...]:
+        """The rungs, and the one with the command map."""
+        return (*self.rungs, *([self.commands] if self.commands else []))
+
+    @derived()
     def holds(self) -> bool:
         """Whether what was corrected last, and its command map, do what the fit claims."""
         return self.rungs[-1].holds and (self.commands is None or self.commands.holds)
 
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON of the contract, and more; `from_dict` reads it back."""
-        return {
-            "schema": 1,
-            "kind": KIND,
-            "model": self.model,
-            "robot": self.robot,
-            "rungs": plain(self.rungs),
-            "with_commands": plain(self.commands),
-            "noise_floor_mm": finite(self.floor),
-            "noise_floor_from": self.floor_from,
-            "poses": {"train": self.train_poses, "holdout": self.holdout_poses},
-            "status": str(self.status),
-            "holds": self.holds,
-            "beyond": dict(self.beyond),
-            "left_out": list(self.left_out),
-            "notices": list(self.notices),
-            "written": self.written,
-            "seconds": self.seconds,
-            "provenance": vars(self.provenance),
-        }
-
-    @staticmethod
-    def from_dict(content: Mapping[str, Any], source: str = "gap") -> SimulatorGap:
-        """From `to_dict`.  Raises CalibrationError."""
-        part = checked(GapPart, content, source)
-        held, floor = part.poses, (part.noise_floor_mm, part.noise_floor_from)
-        return SimulatorGap(
-            part.model, part.robot, part.rungs, part.with_commands, *floor, held["train"],
-            held["holdout"], part.status, part.beyond, part.left_out, part.notices, part.written,
-            part.seconds, part.provenance,
-        )  # fmt: skip
-
     def table(self) -> Table:
         """The ladder."""
-        every = (*self.rungs, *([self.commands] if self.commands else []))
         rows = tuple(
             (name_step(r.name), r.holdout_rms_mm, r.holdout_max_mm, r.predicted_rms_mm,
              r.sag_mrad, r.why)
-            for r in every
+            for r in self.every
         )  # fmt: skip
         if math.isfinite(self.floor):
             noise = (math.nan, math.nan, math.nan, self.floor_from)
@@ -162,24 +131,3 @@ class SimulatorGap(Result):
         elif self.beyond.get("narrow"):
             text += f". Outside the measured region nothing is claimed: {self.beyond['reason']}"
         return text + "."
-
-
-class GapPart(Part):
-    """The file of `minimax-cal gap -o`."""
-
-    kind: Literal["simulator_gap"]
-    model: str
-    robot: str
-    rungs: tuple[Recorded[Rung], ...] = Field(min_length=1)
-    with_commands: Recorded[Rung] | None = None
-    noise_floor_mm: Number = math.nan
-    noise_floor_from: str = ""
-    poses: dict[str, int]
-    status: Status = Status.CONVERGED
-    holds: bool = True
-    beyond: dict[str, Any] = Field(default_factory=dict)
-    left_out: tuple[str, ...] = ()
-    notices: tuple[str, ...] = ()
-    written: str = ""
-    seconds: Number = math.nan
-    provenance: Provenance

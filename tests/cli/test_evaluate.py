@@ -24,4 +24,4 @@ def test_a_motion_diagnosis_says_when_it_is_none(
     motion = tmp_path / "motion.json"
     motion.write_text('{"kind": "motion_diagnosis", "schema": 1}')
     assert run("evaluate", motion, tmp_path / "a.csv") == 2
-    assert "motion.json: robot: Field required" in capsys.readouterr().err
+    assert "motion.json: cannot be read (unit: is missing)" in capsys.readouterr().err

@@ -82,10 +82,10 @@ def test_what_no_fit_counts_is_listed_and_counted() -> None:
     assert len(found.set_aside) == 1 + min(ROW, 60 - ROW)
     assert {p.why for p in found.set_aside if p.by == TOOL} == {WHY[RESEAT]}
     assert found.with_them is not None
-    assert_allclose(found.with_them.accuracy.max_mm, 5.0, rtol=0.05)
+    assert_allclose(found.with_them.max_mm, 5.0, rtol=0.05)
     content = found.to_dict()
     assert len(content["set_aside"]) == len(found.set_aside)
-    assert content["accuracy"]["holdout_with_them"]["max_mm"] == found.with_them.accuracy.max_mm
+    assert content["accuracy"]["holdout_with_them"]["max_mm"] == found.with_them.max_mm
     again = mc.Diagnosis.from_dict(content)
     assert again.set_aside == found.set_aside
     assert again.to_dict()["accuracy"] == content["accuracy"]

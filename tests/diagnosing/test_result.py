@@ -18,6 +18,7 @@ from minimax_cal.diagnosing.result import (
     Diagnosis,
     Finding,
     Step,
+    Untestable,
     of_curve,
 )
 from minimax_cal.diagnosing.sentences import closed_words
@@ -66,7 +67,8 @@ def made() -> Diagnosis:
     error = np.zeros((2, 30, 3))
     return Diagnosis(
         "arm", Status.CONVERGED, "named", FINDINGS, RUNGS, Floor(0.1, 0.05, 0.2, DECLARED), 0.9,
-        (0.8, 0.95), Beyond(), 2e-5, 4e-6, 0.25, "pose", {}, (("thermal", "temperatures"),),
+        (0.8, 0.95), Beyond(), 2e-5, 4e-6, 0.25, "pose", {},
+        (Untestable("thermal", "temperatures"),),
         ("a notice",), Provenance("arm"), 1.5, sim.data, np.arange(30) % 5 == 0, tuple(cells),
         stated_errors=(error + 1e-3, error + 5e-4), stated_curves={}, nominal=base,
     )  # fmt: skip

@@ -165,7 +165,7 @@ def test_two_payloads_are_two() -> None:
 def test_what_has_no_weight_is_no_payload(mass: float) -> None:
     logs = prepare(simulated(carried=(0.0, mass, 0.0), seed=3))
     arm = Arm.of(ARM, np.ones(3), ARM.ratio, np.zeros(10), logs)
-    columns, term = Columns(Scene.of(arm, logs)), Term("payload", "L3", (("run1", 1.0),))
+    columns, term = Columns(Scene.of(arm, logs)), Term("payload", "L3", {"run1": 1.0})
     assert weighing(columns, [], [term]) == ([term] if mass else [])
 
 
@@ -310,7 +310,7 @@ def test_a_file_holds_the_whole_diagnosis(tmp_path: Path) -> None:
     assert here.steps[-1].rms_moving[1] < 1.3 * found.budget[-1].holdout_rms_moving[1]
     assert found.held_run.time[1] == pytest.approx(1.0 / ROW_HZ)
     (tmp_path / "c.json").write_text(json.dumps({**one, "schema": 2}))
-    with pytest.raises(mc.CalibrationError, match="is no motion diagnosis of this version"):
+    with pytest.raises(mc.CalibrationError, match="is of schema 2, this version knows 1"):
         mc.load_motion(tmp_path / "c.json")
 
 

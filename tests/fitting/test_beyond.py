@@ -18,6 +18,7 @@ from minimax_cal.fitting.beyond import (
 )
 from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import plain
 from minimax_cal.measuring.grouping import parts
 from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.model import moved
@@ -62,7 +63,7 @@ def test_typical_is_pooled_and_worst_is_named(robot: mc.Robot, noisy: Simulation
 def test_no_part_can_be_spared_of_few_poses(robot: mc.Robot) -> None:
     few = simulate(robot, 12).data
     found = mc.calibrate(robot, few, "sum", holdout=0.0, fix="beta*").beyond
-    content = found.to_dict()
+    content = plain(found)
     assert content["typical_mm"] is None or found.folds
     if not found.folds:
         assert content["reason"]
@@ -152,8 +153,8 @@ def test_parts_that_none_can_judge_are_counted_and_named(robot: mc.Robot) -> Non
         in found.sentence()
     )
     assert found.table().rows[-1][0] == f"{len(found.folds)} of {made} parts"
-    assert found.to_dict()["not_judged"] == list(found.missed)
-    assert found.to_dict()["effects_sought_anew"] is None
+    assert plain(found)["not_judged"] == list(found.missed)
+    assert plain(found)["effects_sought_anew"] is None
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,7 +268,7 @@ def test_joints_that_moved_are_not_named(robot: mc.Robot, noisy: Simulation) -> 
     assert found.worst is not None
     assert not found.narrow
     assert len(found.spans) == 6
-    assert found.to_dict()["plan"] is None
+    assert plain(found)["plan"] is None
 
 
 def test_a_diagnosis_claims_nothing_outside_either(robot: mc.Robot) -> None:

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.fitting.fit import Parameter
+from minimax_cal.fitting.found import Parameter
 from minimax_cal.fitting.solve import AT_BOUND
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.bounds import settled

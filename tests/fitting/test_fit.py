@@ -157,7 +157,7 @@ def test_a_file_without_poses(fit: mc.Fit, tmp_path: Path) -> None:
     assert [p.name for p in back.parameters] == [p.name for p in fit.parameters]
     assert_same(back.parameters.value, fit.parameters.value)
     assert back.accuracy["train"].sse_mm2 == fit.accuracy["train"].sse_mm2
-    assert back.beyond.to_dict() == fit.beyond.to_dict()
+    assert plain(back.beyond) == plain(fit.beyond)
     assert not back.data.poses
     assert_same(back.predict(fit.data.q[:3]), fit.predict(fit.data.q[:3]))
 
@@ -175,19 +175,19 @@ def test_a_number_changed_by_hand_counts(fit: mc.Fit) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda c: c.pop("accuracy"), "accuracy: Field required"),
-        (lambda c: c.pop("covariance"), "covariance: Field required"),
-        (lambda c: c.pop("seconds"), "seconds: Field required"),
+        (lambda c: c.pop("accuracy"), "'accuracy' is missing"),
+        (lambda c: c.pop("covariance"), "does not hold a covariance"),
+        (lambda c: c.pop("seconds"), "seconds: is missing"),
         (lambda c: c["accuracy"]["train"].update(points=[1]), "accuracy.train is not of"),
         (lambda c: c.update(schema=2), "is of schema 2"),
         (lambda c: c.pop("schema"), "does not say of which schema it is"),
         (
             lambda c: c["arrays"].update(prior="?"),
-            "arrays.prior: Value error, holds something else",
+            "prior: holds something else",
         ),
         (lambda c: c["parameters"][0].update(name="nonsense"), "cannot be read"),
         (lambda c: c["poses"]["q"].pop(), "its list of poses cannot be read"),
-        (lambda c: c.update(status="fine"), "status: Input should be"),
+        (lambda c: c.update(status="fine"), "status: should be one of"),
         (
             lambda c: c["cell"].update(effects=[{"effect": "gremlin", "place": "J1"}]),
             "effect 'gremlin' is not known here; register it",

@@ -83,3 +83,17 @@ def test_a_pipe_is_written_into_not_replaced(tmp_path: Path) -> None:
     reader.join(timeout=10)
     assert received == ["through"]
     assert stat.S_ISFIFO(pipe.stat().st_mode)
+
+
+@pytest.mark.parametrize("width", [110, 80, 60, 40])
+def test_no_number_unit_or_name_is_broken(width: int) -> None:
+    said = "as 0.333 mrad/N and more words that go on for longer than any line has room for"
+    numbers = (0.1234, 12.3456, 1234.5678, 3.3, 0.0001, 22.5)
+    header = ("model", *(f"number{i} mrad" for i in range(len(numbers))), "why")
+    wide = Table("wide", header, (("joint compliance J2", *numbers, said),), ("", *[".4f"] * 6, ""))
+    lines = wide.text(width).splitlines()
+    assert max(len(line.rstrip()) for line in lines) <= width
+    for part in ("joint compliance J2", *(f"{x:.4f}" for x in numbers), "0.333 mrad/N"):
+        assert any(part in line for line in lines), part
+    for i in range(len(numbers)):
+        assert any(f"number{i}" in line for line in lines)

@@ -71,4 +71,4 @@ def test_what_is_of_positions_is_refused_and_it_stands_alone(
     other = saved.with_name("other.json")
     other.write_text(json.dumps({**json.loads(saved.read_text()), "schema": 2}))
     assert run("report", other, "-o", saved.with_name("a.html")) == 2
-    assert "no motion diagnosis of this version" in capsys.readouterr().err
+    assert "is of schema 2, this version knows 1" in capsys.readouterr().err

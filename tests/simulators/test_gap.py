@@ -92,7 +92,7 @@ def test_the_file_of_a_gap_reads_back(gap: SimulatorGap, tmp_path: Path) -> None
     assert (
         SimulatorGap.from_dict(json.loads((tmp_path / "gap.json").read_text())).json() == gap.json()
     )
-    with pytest.raises(mc.CalibrationError, match="kind"):
+    with pytest.raises(mc.CalibrationError, match="is no simulator_gap"):
         SimulatorGap.from_dict({**content, "kind": "diagnosis"})
 
 

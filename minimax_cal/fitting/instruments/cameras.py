@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from minimax_cal.fitting.fit import Parameter
+from minimax_cal.fitting.found import Parameter
 from minimax_cal.fitting.instruments.data import RelativeData, checked
 from minimax_cal.fitting.instruments.options import RelativeOptions
 from minimax_cal.fitting.instruments.record import Instrument, Words

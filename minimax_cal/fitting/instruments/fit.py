@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from minimax_cal.fitting.fit import Parameter, link_by_link
+from minimax_cal.fitting.found import Parameter, link_by_link
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.instruments.identify import (
     Alone,

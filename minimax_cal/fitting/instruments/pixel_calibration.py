@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.fitting.fit import Parameter, Provenance, link_by_link
+from minimax_cal.fitting.fit import Provenance
+from minimax_cal.fitting.found import Parameter, link_by_link
 from minimax_cal.fitting.identify import RESOLUTION
 from minimax_cal.fitting.instruments.pixel_result import PIXELS, PixelCalibration
 from minimax_cal.fitting.options import QpSolver, listed, qp_name

@@ -4,78 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any
 
-import numpy as np
-from pydantic import Field
-
-from minimax_cal.fitting.fit import ACCURACIES, parameter_table
-from minimax_cal.fitting.instruments.result import RelativeCalibration, RelativePart
+from minimax_cal.fitting.fit import ACCURACIES
+from minimax_cal.fitting.found import parameter_table
+from minimax_cal.fitting.instruments.result import RelativeCalibration
 from minimax_cal.fitting.pixels.judge import Claim
 from minimax_cal.fitting.pixels.options import SUM
 from minimax_cal.fitting.pixels.worst import WorstPixels
-from minimax_cal.ground.files import plain
-from minimax_cal.ground.records import Number, Part, Recorded, checked
+from minimax_cal.ground.facts import APART, Fact
+from minimax_cal.ground.records import as_kind
+from minimax_cal.ground.results import merged
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.ground.words import capitalise
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.robots.robot import Robot, robot_from_dict
-from minimax_cal.solvers.minimax import Kkt
 from minimax_cal.solvers.status import Status
 
 PIXELS = "pixels"  # what was measured
 NO_CLAIM = Claim(*[math.nan] * 4)
-
-
-class ArmPart(Part):
-    """What is known of positions of the arm, in a file [mm]."""
-
-    sigma_mm: Number = math.nan
-    drawn_sigma_mm: Number = math.nan
-    change_mm: Number = math.nan
-    drawn_shown_mm: Number = math.nan
-
-
-class AsidePart(Part):
-    """A pixel that was set aside, in a file."""
-
-    row: int
-    pose: int
-    target: str
-    why: str
-    by: str
-
-
-class WorstPart(Part):
-    """What a minimax rests on, in a file."""
-
-    functions: tuple[str, ...]
-    rms_px: tuple[Number, ...]
-    multipliers: tuple[Number, ...]
-    active: tuple[str, ...]
-    sum_largest_rms_px: Number
-    kkt: Recorded[Kkt]
-
-    def read(self, answered: Mapping[str, int]) -> WorstPixels:
-        """What it says."""
-        size, multiplier = np.array(self.rms_px), np.array(self.multipliers)
-        before = self.sum_largest_rms_px
-        return WorstPixels(self.functions, size, multiplier, before, self.kkt, answered)
-
-
-class PixelPart(RelativePart):
-    """The file of a calibration by cameras."""
-
-    calibrated_robot: dict[str, Any]
-    arm_position: ArmPart
-    objective: str = SUM
-    qp: str = ""
-    answered: dict[str, int] = Field(default_factory=dict)
-    minimax: WorstPart | None = None
-    set_aside: tuple[AsidePart, ...] = ()
-    reason: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,14 +37,14 @@ class PixelCalibration(RelativeCalibration):
     rests on, None where there was none.
     """
 
-    calibrated: Robot | None = None
+    calibrated: Annotated[Robot | None, APART] = None
     objective: str = SUM
     qp: str = ""
-    worst: WorstPixels | None = None
-    pixels: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    claim: Claim = NO_CLAIM
+    worst: Annotated[WorstPixels | None, Fact(key="minimax")] = None
+    pixels: Annotated[Mapping[str, tuple[float, float]], APART] = field(default_factory=dict)
+    claim: Annotated[Claim, Fact(key="arm_position")] = NO_CLAIM
     set_aside: tuple[SetAside, ...] = ()
-    with_them: Accuracy | None = None
+    with_them: Annotated[Accuracy | None, Fact(key="accuracy.holdout_with_them", brief=True)] = None
     reason: str = ""
 
     @property
@@ -157,49 +106,29 @@ class PixelCalibration(RelativeCalibration):
             return f"{capitalise(self.reason)}. {text}"
         return text + (f" {self.status.advice}." if self.status.advice else "")
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON: `robot` is the arm to use, whole, as `load_robot` reads it."""
-        content = super().to_dict()
-        for key, (rms_px, max_px) in self.pixels.items():
-            content["accuracy"][key] |= plain({"rms_px": rms_px, "max_px": max_px})
-        if self.with_them is not None:
-            content["accuracy"]["holdout_with_them"] = self.with_them.to_dict()
-        calibrated = self.calibrated or self.robot
-        more: dict[str, Any] = plain(
-            {
-                "objective": self.objective,
-                "qp": self.qp,
-                "answered": self.worst.answered if self.worst else {},
-                "minimax": self.worst.to_dict() if self.worst else None,
-                "calibrated_robot": calibrated.to_dict(),
-                "arm_position": {
-                    "sigma_mm": 1e3 * self.claim.sigma,
-                    "drawn_sigma_mm": 1e3 * self.claim.drawn,
-                    "change_mm": 1e3 * self.claim.change,
-                    "drawn_shown_mm": 1e3 * self.claim.shown,
-                    "better": self.claim.is_better,
-                },
-                "set_aside": [point.to_dict() for point in self.set_aside],
-                "reason": self.reason,
-            }
-        )
-        return content | more
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
+        """What pixels tell besides."""
+        more = {
+            "accuracy": {
+                key: dict(zip(("rms_px", "max_px"), sizes, strict=True))
+                for key, sizes in self.pixels.items()
+            },
+            "answered": self.worst.answered if self.worst else {},
+            "calibrated_robot": self.calibrated or self.robot,
+        }
+        return merged(super().beside(), more)
 
-    @staticmethod
-    def from_dict(content: Mapping[str, Any], source: str = "result") -> PixelCalibration:
-        """From `to_dict`, without the errors of single pixels.  Raises CalibrationError."""
-        part = checked(PixelPart, content, source)
-        told = RelativeCalibration.from_dict(content, source)
-        arm = part.arm_position
-        claimed = (arm.sigma_mm, arm.drawn_sigma_mm, arm.change_mm, arm.drawn_shown_mm)
-        return PixelCalibration(
-            **{each.name: getattr(told, each.name) for each in fields(told)},
-            calibrated=robot_from_dict(part.calibrated_robot, f"{source}: calibrated_robot"),
-            pixels={key: (each.rms_px, each.max_px) for key, each in part.accuracy.items()},
-            claim=Claim(*(1e-3 * value for value in claimed)),
-            set_aside=tuple(SetAside(**each.model_dump()) for each in part.set_aside),
-            reason=part.reason,
-            objective=part.objective,
-            qp=part.qp,
-            worst=part.minimax.read(part.answered) if part.minimax else None,
-        )
+    @classmethod
+    def told_beside(
+        cls, content: Mapping[str, Any], told: Mapping[str, Any], source: str
+    ) -> dict[str, Any]:
+        """As `RelativeCalibration`, and what pixels tell besides."""
+        own = super().told_beside(content, told, source)
+        worst, stated = told.get("worst"), own["stated"]
+        answered = as_kind(Mapping[str, int], content.get("answered", {}), Fact(), "answered")
+        calibrated = robot_from_dict(content["calibrated_robot"], f"{source}: calibrated_robot")
+        return own | {
+            "calibrated": calibrated,
+            "pixels": {key: (each.rms_px, each.max_px) for key, each in stated.items()},
+            "worst": replace(worst, answered=answered) if worst else None,
+        }

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting.checks import check_plausible
-from minimax_cal.fitting.fit import Parameter
+from minimax_cal.fitting.found import Parameter
 from minimax_cal.fitting.instruments.data import RelativeData, bare, checked, without_blind
 from minimax_cal.fitting.instruments.fit import InstrumentFit, allowed_of
 from minimax_cal.fitting.instruments.identify import identified

@@ -2,40 +2,33 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
 
-from minimax_cal.fitting.fit import (
-    ACCURACIES,
-    Parameter,
-    Provenance,
-    parameter_table,
-    table_of_effects,
-)
-from minimax_cal.fitting.fit_file import SCHEMA, ScoresPart, TableParameter, in_si
+from minimax_cal.fitting.fit import ACCURACIES, Provenance
+from minimax_cal.fitting.found import Parameter, parameter_table, table_of_effects
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.instruments.record import Words
 from minimax_cal.fitting.instruments.table import INSTRUMENTS, instrument
 from minimax_cal.fitting.intervals import Interval
 from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.files import json_text, plain, write_whole
-from minimax_cal.ground.records import Number, Part, checked, reading
+from minimax_cal.ground.facts import APART, Fact, Mm, derived, in_file
+from minimax_cal.ground.files import plain
+from minimax_cal.ground.records import as_kind, read, reading, stored
+from minimax_cal.ground.results import Result, merged
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import name_first
-from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
+from minimax_cal.measuring.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
 from minimax_cal.modelling.cell import Cell, cell_from_dict, pose_from_dict
 from minimax_cal.modelling.frames import paired, tables_of
 from minimax_cal.robots.frames import CONVENTION, Frame
-from minimax_cal.robots.robot import Robot, robot_from_dict
+from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.status import Status
 
 SEVERAL = "several"  # kind of a calibration from several files
@@ -43,74 +36,17 @@ ALL = Words(
     quantity="what every file measured",
     caution="Lengths, misclosures and positions are one number here; each file has its own. ",
 )
-if TYPE_CHECKING:
-    Kind = str
-else:  # of the table, which no type checker sees
-    Kind = Literal[(*INSTRUMENTS, SEVERAL)]
 
 
-class ErrorsPart(ScoresPart):
-    """Accuracy of lengths, closures or poses, in a file."""
+@dataclass(frozen=True)
+class Scores(Accuracy):
+    """Accuracy of lengths, closures or poses, with what else is told of the errors."""
 
     numbers: int = 0
-    rms_mrad: Number = math.nan
-    max_mrad: Number = math.nan
-    rms_px: Number = math.nan
-    max_px: Number = math.nan
-
-
-class MeasuredPart(Part):
-    """What an instrument measured, and how well it is fitted, in a file."""
-
-    measured: Kind
-    parts: tuple[str, ...]
-    instrument: dict[str, Any] = Field(default_factory=dict)
-    accuracy: dict[Literal["nominal", "holdout", "nominal_train", "train"], ErrorsPart]
-
-    def fields(self) -> dict[str, Any]:
-        """As `Measured` has them, without the errors of single rows."""
-        turns = {
-            key: (1e-3 * each.rms_mrad, 1e-3 * each.max_mrad)
-            for key, each in self.accuracy.items()
-            if not math.isnan(each.rms_mrad)
-        }
-        return {
-            "kind": self.measured,
-            "parts": self.parts,
-            "errors": {},
-            "numbers": {key: each.numbers for key, each in self.accuracy.items()},
-            "turns": turns,
-            "instrument": self.instrument,
-            "stated": {key: each.accuracy() for key, each in self.accuracy.items()},
-        }
-
-
-class InstrumentPart(MeasuredPart):
-    """One of several instruments, in a file."""
-
-    name: str
-    noise_mm: Number = math.nan
-    alone: tuple[str, ...] = ()
-    directions_alone: int = 0
-
-
-class RelativePart(MeasuredPart):
-    """The file of `minimax-cal relative -o`."""
-
-    robot: dict[str, Any]
-    nominal_robot: dict[str, Any]
-    instruments: tuple[InstrumentPart, ...] = ()
-    cell: dict[str, Any] = Field(default_factory=dict)
-    status: Status
-    iterations: int = 0
-    seconds: Number = math.nan
-    parameters: tuple[TableParameter, ...]
-    beyond_one_reflector: tuple[str, ...] = ()
-    condition: Number = math.nan
-    position_sigma_mm: Number = math.nan
-    positions_open: tuple[str, ...] = ()
-    notices: tuple[str, ...] = ()
-    provenance: Provenance
+    rms_mrad: Annotated[float | None, Fact(brief=True)] = None
+    max_mrad: Annotated[float | None, Fact(brief=True)] = None
+    rms_px: Annotated[float | None, Fact(brief=True)] = None
+    max_px: Annotated[float | None, Fact(brief=True)] = None
 
 
 @dataclass(frozen=True)
@@ -136,13 +72,13 @@ class Measured:
     but for poses.  instrument: what was fitted besides the robot, for JSON.
     """
 
-    kind: str
+    kind: Annotated[str, Fact(key="measured")]
     parts: tuple[str, ...]
-    errors: Mapping[str, Array]
-    numbers: Mapping[str, int]
-    turns: Mapping[str, tuple[float, float]]
+    errors: Annotated[Mapping[str, Array], APART]
+    numbers: Annotated[Mapping[str, int], APART]
+    turns: Annotated[Mapping[str, tuple[float, float]], APART]
     instrument: Mapping[str, Any]
-    stated: Mapping[str, Accuracy] | None = None
+    stated: Annotated[Mapping[str, Scores] | None, APART] = None
 
     @property
     def words(self) -> Words:
@@ -200,21 +136,33 @@ class Measured:
         base = paired("base", places["base"], places["nominal_base"])
         return base | paired("tool", places["tool"], places["nominal_tool"])
 
-    def measured_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        accuracies = {}
-        for key, value in self.accuracy.items():
-            turns = [1e3 * turn for turn in self.turns.get(key, ())]
-            angles = dict(zip(("rms_mrad", "max_mrad"), turns, strict=False))
-            accuracies[key] = {**value.to_dict(), "numbers": self.numbers[key], **angles}
-        frames = {name: frame.to_dict() for name, frame in self.frames.items()}
+    def scored(self, key: str) -> Scores:
+        """An accuracy with all that is told beside it."""
+        turned = dict(zip(("rms_mrad", "max_mrad"), self.turns.get(key, ()), strict=False))
+        angles = {name: 1e3 * turn for name, turn in turned.items()}
+        return Scores(**{**vars(self.accuracy[key]), "numbers": self.numbers[key], **angles})
+
+    def measured_beside(self) -> dict[str, Any]:
+        """What of a file its fields do not tell."""
+        frames = {"frames": self.frames, "frames_convention": CONVENTION}
         return {
-            "measured": self.kind,
-            "parts": list(self.parts),
-            **({"frames": frames, "frames_convention": CONVENTION} if frames else {}),
-            "instrument": dict(self.instrument),
-            "accuracy": accuracies,
+            **(frames if self.frames else {}),
+            "accuracy": {key: in_file(self.scored(key)) for key in self.accuracy},
         }
+
+    @staticmethod
+    def fields_of(content: Mapping[str, Any], at: str) -> dict[str, Any]:
+        """Fields that are `APART`, without the errors of single rows.  Raises ValueError."""
+        if content["measured"] not in (*INSTRUMENTS, SEVERAL):
+            raise ValueError(f"{at}measured: should be one of {', '.join((*INSTRUMENTS, SEVERAL))}")
+        told = {key: read(Scores, content["accuracy"][key], f"{at}accuracy.{key}") for key in HELD}
+        turns = {
+            key: (1e-3 * each.rms_mrad, 1e-3 * each.max_mrad)
+            for key, each in told.items()
+            if each.rms_mrad is not None and each.max_mrad is not None
+        }
+        numbers = {key: each.numbers for key, each in told.items()}
+        return {"errors": {}, "numbers": numbers, "turns": turns, "stated": told}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -227,41 +175,28 @@ class InstrumentResult(Measured):
     """
 
     name: str
-    interval: Interval
-    noise: float
+    interval: Annotated[Interval, APART]
+    noise: Mm
     alone: tuple[str, ...]
     directions_alone: int
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        measured = self.measured_dict()
-        measured["accuracy"]["holdout"]["rms_ci95_mm"] = [
-            1e3 * self.interval.low,
-            1e3 * self.interval.high,
-        ]
-        return {
-            "name": self.name,
-            **measured,
-            "noise_mm": 1e3 * self.noise,
-            "alone": list(self.alone),
-            "directions_alone": self.directions_alone,
-        }
+        told = merged(in_file(self), self.measured_beside())
+        ends = [1e3 * self.interval.low, 1e3 * self.interval.high]
+        told["accuracy"]["holdout"]["rms_ci95_mm"] = ends
+        return dict(plain(told))
 
     @staticmethod
-    def of(part: InstrumentPart) -> InstrumentResult:
-        """From a file's part."""
-        return InstrumentResult(
-            **part.fields(),
-            name=part.name,
-            interval=Interval(*(1e-3 * end for end in part.accuracy["holdout"].rms_ci95_mm)),
-            noise=1e-3 * part.noise_mm,
-            alone=part.alone,
-            directions_alone=part.directions_alone,
-        )
+    def from_dict(content: Any, at: str) -> InstrumentResult:
+        """From `to_dict`.  Raises ValueError."""
+        told, apart = stored(InstrumentResult, content, at), Measured.fields_of(content, f"{at}.")
+        low, high = apart["stated"]["holdout"].rms_ci95_mm or NO_ENDS
+        return InstrumentResult(**told, **apart, interval=Interval(1e-3 * low, 1e-3 * high))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RelativeCalibration(Measured):
+class RelativeCalibration(Measured, Result):
     """A robot calibrated from lengths, closures or poses, or from several files together.
 
     robot: calibrated; nominal: as drawn.  position_sigma: expected error of a position over the
@@ -272,22 +207,35 @@ class RelativeCalibration(Measured):
     then of a fit without them.
     """
 
+    KIND = RELATIVE
+    COMMAND = "relative"
+
     robot: Robot
-    nominal: Robot
+    nominal: Annotated[Robot, Fact(key="nominal_robot")]
     status: Status
     iterations: int
     seconds: float
     parameters: tuple[Parameter, ...]
-    identification: Identification
-    position_sigma: float
-    beyond: tuple[str, ...]
+    identification: Annotated[Identification, APART]
+    position_sigma: Mm
+    beyond: Annotated[tuple[str, ...], Fact(key="beyond_one_reflector")]
     notices: tuple[str, ...]
     provenance: Provenance
-    instruments: tuple[InstrumentResult, ...] = ()
+    instruments: Annotated[tuple[InstrumentResult, ...], Fact(brief=True)] = ()
     positions_open: tuple[str, ...] = ()
-    cell: Cell | None = None
+    cell: Annotated[Cell | None, APART] = None
 
-    @property
+    @derived()
+    def advice(self) -> str:
+        """What its status advises."""
+        return self.status.advice
+
+    @derived()
+    def condition(self) -> float:
+        """Condition number of what was identified."""
+        return self.identification.condition
+
+    @derived()
     def identified(self) -> int:
         """Number of identified parameters."""
         return sum(p.identifiable for p in self.parameters)
@@ -371,63 +319,25 @@ class RelativeCalibration(Measured):
         """The result as plain text."""
         return "\n\n".join([*(table.text(width) for table in self.tables()), self.headline()])
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON: `robot` is the calibrated robot, whole, as `load_robot` reads it."""
-        content = {
-            "schema": SCHEMA,
-            "kind": RELATIVE,
-            "robot": self.robot.to_dict(),
-            "nominal_robot": self.nominal.to_dict(),
-            **self.measured_dict(),
-            "status": str(self.status),
-            "advice": self.status.advice,
-            "iterations": self.iterations,
-            "seconds": self.seconds,
-            "parameters": [p.to_dict() for p in self.parameters],
-            "identified": self.identified,
-            "beyond_one_reflector": list(self.beyond),
-            "condition": self.identification.condition,
-            "position_sigma_mm": 1e3 * self.position_sigma,
-            "positions_open": list(self.positions_open),
-            "notices": list(self.notices),
-            "provenance": vars(self.provenance),
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
+        """The accuracies, and the arm with its effects."""
+        return self.measured_beside() | ({"cell": self.cell.whole()} if self.cell else {})
+
+    @classmethod
+    def told_beside(
+        cls, content: Mapping[str, Any], told: Mapping[str, Any], source: str
+    ) -> dict[str, Any]:
+        """The accuracies without the errors of single rows, and the arm with its effects."""
+        own = {**told, **cls.fields_of(content, "")}
+        for each in (Measured(**{f.name: own[f.name] for f in fields(Measured)}),
+                     *told.get("instruments", ())):  # fmt: skip
+            with reading(source, "instrument"):  # poses that are none are refused before shown
+                _ = each.frames
+        known = np.array([p.identifiable for p in told["parameters"]])
+        condition = as_kind(float, content.get("condition"), Fact(), "condition")
+        whole = content.get("cell")
+        return {
+            **cls.fields_of(content, ""),
+            "identification": Stated(known, {}, np.zeros(0), np.zeros(0), condition),
+            "cell": cell_from_dict(whole, f"{source}: cell") if whole else None,
         }
-        if self.instruments:
-            content["instruments"] = [one.to_dict() for one in self.instruments]
-        if self.cell:
-            content["cell"] = self.cell.whole()
-        return dict(plain(content))
-
-    @staticmethod
-    def from_dict(content: Mapping[str, Any], source: str = "result") -> RelativeCalibration:
-        """From `to_dict`, without the errors of single rows.  Raises CalibrationError."""
-        part = checked(RelativePart, content, source)
-        known = np.array([p.identifiable for p in part.parameters])
-        found = RelativeCalibration(
-            **part.fields(),
-            robot=robot_from_dict(content["robot"], f"{source}: robot"),
-            nominal=robot_from_dict(content["nominal_robot"], f"{source}: nominal_robot"),
-            status=part.status,
-            iterations=part.iterations,
-            seconds=part.seconds,
-            parameters=tuple(in_si(p) for p in part.parameters),
-            identification=Stated(known, {}, np.zeros(0), np.zeros(0), part.condition),
-            position_sigma=1e-3 * part.position_sigma_mm,
-            positions_open=part.positions_open,
-            beyond=part.beyond_one_reflector,
-            notices=part.notices,
-            provenance=part.provenance,
-            instruments=tuple(InstrumentResult.of(each) for each in part.instruments),
-            cell=cell_from_dict(part.cell, f"{source}: cell") if part.cell else None,
-        )
-        with reading(source, "instrument"):  # poses that are none are refused here, not when shown
-            _ = [each.frames for each in (found, *found.instruments)]
-        return found
-
-    def json(self) -> str:
-        """`to_dict` as text."""
-        return json_text(self.to_dict())
-
-    def save(self, path: Path | str) -> None:
-        """Write the JSON; never a half-written file."""
-        write_whole(path, self.json())

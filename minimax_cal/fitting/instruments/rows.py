@@ -12,7 +12,7 @@ from typing import Any, Protocol, Self, TypeVar, cast
 
 import numpy as np
 
-from minimax_cal.fitting.fit import Parameter
+from minimax_cal.fitting.found import Parameter
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import TARGET, Model, arm_at

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.fitting.checks import MAX_TRIAL_POSES
-from minimax_cal.fitting.fit import Parameter
+from minimax_cal.fitting.found import Parameter
 from minimax_cal.fitting.identify import plenty_of_poses
 from minimax_cal.fitting.instruments.data import (
     RelativeData,

@@ -5,13 +5,15 @@ An error of the arm is what no base and no tool takes away: both are fitted wher
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Annotated
 
 import numpy as np
 
 from minimax_cal.fitting.pixels.uncertainty import Lack, Uncertainty
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.facts import Fact, Mm, derived
 from minimax_cal.measuring.measurements import measurements
 from minimax_cal.modelling.lack import by_pose
 from minimax_cal.modelling.model import arm_at, model_of
@@ -113,19 +115,19 @@ class Claim:
     two.  shown: of the drawing, by how far the pixels show it to be off; 0 where they do not.
     """
 
-    sigma: float
-    drawn: float
-    change: float
-    shown: float
+    sigma: Mm
+    drawn: Annotated[float, Fact(key="drawn_sigma_mm", scale=1e3)]
+    change: Mm
+    shown: Annotated[float, Fact(key="drawn_shown_mm", scale=1e3)]
 
-    @property
+    @derived(key="better")
     def is_better(self) -> bool:
         """Whether the calibrated arm is known clearly better than the drawn one."""
         return self.sigma < MARGIN * self.shown
 
     def texts(self) -> dict[str, str]:
         """Each number for people."""
-        return {name: f"{1e3 * value:#.3g} mm" for name, value in vars(self).items()}
+        return {f.name: f"{1e3 * getattr(self, f.name):#.3g} mm" for f in fields(self)}
 
     def sentence(self) -> str:
         """For people."""

@@ -8,7 +8,8 @@ squares, from which the search starts, and parameters scaled to unit curvature.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from minimax_cal.fitting.pixels.model import PixelModel, Scene
 from minimax_cal.fitting.pixels.options import SUM, WORST_CAMERA, WORST_TARGET, PixelOptions
 from minimax_cal.fitting.solve import MIN_TARGET_WEIGHT, QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.facts import APART, Fact, derived
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import list_counts
 from minimax_cal.solvers import minimax
@@ -128,13 +130,13 @@ class WorstPixels:
     """
 
     functions: tuple[str, ...]
-    size: Array
-    multiplier: Array
-    before: float
+    size: Annotated[Array, Fact(key="rms_px")]
+    multiplier: Annotated[Array, Fact(key="multipliers")]
+    before: Annotated[float, Fact(key="sum_largest_rms_px")]
     kkt: Kkt
-    answered: Mapping[str, int]
+    answered: Annotated[Mapping[str, int], APART] = field(default_factory=dict)
 
-    @property
+    @derived()
     def active(self) -> tuple[str, ...]:
         """The functions that decide."""
         near = self.size**2 >= self.size.max() ** 2 * (1.0 - ACTIVE)
@@ -155,17 +157,6 @@ class WorstPixels:
         return Table(
             "what decides the minimax", ("target", "RMS px", "multiplier"), rows, ("", ".4f", ".3f")
         )
-
-    def to_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return {
-            "functions": self.functions,
-            "rms_px": self.size,
-            "multipliers": self.multiplier,
-            "active": self.active,
-            "sum_largest_rms_px": self.before,
-            "kkt": vars(self.kkt),
-        }
 
 
 def fit_worst(

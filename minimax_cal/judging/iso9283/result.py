@@ -215,7 +215,7 @@ class Iso9283(Result):
         """What is judged, and by what."""
         return f"{self.robot}: {self.tcp} on {self.source}, by the formulas of ISO 9283."
 
-    def beside(self) -> dict[str, Any]:
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """The parts: mm and mrad, null where not available."""
         parts = {key: part_to_dict(part, self.target_names) for key, part in self.parts.items()}
         return {"parts": parts}

@@ -128,6 +128,6 @@ class Comparison(Result):
             table for table in (self.changed_table(), self.common_table(), each) if table.rows
         )
 
-    def beside(self) -> dict[str, Any]:
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """The names."""
         return dict(zip("ab", self.names, strict=True))

@@ -16,7 +16,7 @@ from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.fitting.intervals import Interval, chance_of_larger, max_interval, rms_interval
 from minimax_cal.fitting.options import listed
 from minimax_cal.fitting.same_arm import check_arm
-from minimax_cal.fitting.set_aside import WithThem, errors_of, with_them
+from minimax_cal.fitting.set_aside import errors_of, with_them
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.seeds import check_seed
@@ -35,7 +35,7 @@ from minimax_cal.judging.watching.prospects import hidden, prospects
 from minimax_cal.judging.watching.refit import refit
 from minimax_cal.judging.watching.result import Health, Verdict
 from minimax_cal.judging.watching.watched import Watched
-from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements, read_measurements
@@ -168,7 +168,7 @@ def left(watched: Watched, placed: Placing) -> Array:
     return model.error(state) @ state.rotation.T
 
 
-def counting_all(watched: Watched, placed: Placing, seed: int) -> WithThem:
+def counting_all(watched: Watched, placed: Placing, seed: int) -> Accuracy:
     """The accuracy as placed, where the points that were set aside count too."""
     cell, error = watched.cell, grown(left(watched, placed), placed.used)
     now = Cell.of(cell.robot, placed.state, cell.target_names, cell.effects, cell.sessions)

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.fitting.beyond import Beyond
-from minimax_cal.fitting.fit import Fit, Parameters, Provenance, link_by_link
+from minimax_cal.fitting.fit import Fit, Provenance
+from minimax_cal.fitting.found import Parameters, link_by_link
 from minimax_cal.fitting.identify import Identification, Reason
 from minimax_cal.fitting.opened import place
 from minimax_cal.fitting.uncertainty import Uncertainty
+from minimax_cal.ground.facts import Later
 from minimax_cal.judging.watching.moved import Search
 from minimax_cal.judging.watching.opening import in_names
 from minimax_cal.judging.watching.rows import Rows
@@ -69,14 +71,12 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
         prior=np.zeros(names.count),
         widening=1.0,
         provenance=Provenance.of(fit.nominal.robot, data, settings_of(fit, rows, sure)),
-        claim=partial(Beyond, reason="few poses after a check: nothing is left out"),
-        stated=None,
+        claim=Later(partial(Beyond, reason="few poses after a check: nothing is left out")),
         error_crossed=np.zeros((0, 0, 3)),
         error_drawn_crossed=np.zeros((0, 0, 3)),
         reason="",
         stated_geometric=geometric_of(fit, cell, data) if cell.effects.causes else None,
         set_aside=data.set_aside,
-        with_them=None,
     )
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 from minimax_cal.fitting.fit import Fit
-from minimax_cal.fitting.set_aside import WithThem, aside_sentence
+from minimax_cal.fitting.set_aside import aside_sentence
 from minimax_cal.ground.facts import Apart, Fact, derived
-from minimax_cal.ground.files import json_text, plain, write_whole
+from minimax_cal.ground.files import json_text, write_whole
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import in_files
@@ -66,7 +66,7 @@ class Health(Result):
     verdicts: Annotated[tuple[Verdict, ...], Fact(key="required")]
     moved: tuple[Moved, ...]
     hidden: Annotated[tuple[Hidden, ...], Fact(key="not_separable")]
-    accuracy: Apart[Accuracy]
+    accuracy: Accuracy
     refitted: Annotated[Accuracy, Fact(key="accuracy_refitted")]
     findable: Apart[Mapping[str, float]]
     sliding: Apart[frozenset[str]]
@@ -77,7 +77,7 @@ class Health(Result):
     fit: Apart[Fit]
     notices: tuple[str, ...] = ()
     set_aside: tuple[SetAside, ...] = ()
-    with_them: Apart[WithThem | None] = None
+    with_them: Apart[Accuracy | None] = None
 
     @derived()
     def valid(self) -> bool | None:
@@ -95,11 +95,6 @@ class Health(Result):
         """In the verdict."""
         every = [v.confidence for v in self.verdicts if v.valid == self.valid]
         return max(every) if self.valid is False else min(every)
-
-    @derived(key="poses.to_find_rad")
-    def to_find(self) -> float:
-        """The shift that enough poses find [rad]."""
-        return SHIFT
 
     @property
     def status(self) -> Status:
@@ -167,21 +162,22 @@ class Health(Result):
         )
         return tuple(table for table in (self.required_table(), moved, found, hidden) if table.rows)
 
-    def beside(self) -> dict[str, Any]:
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """Accuracy, and what could be found: lengths in mm, angles in rad."""
         found = []
         for name, size in self.findable.items():
             scale, unit = in_files("m" if name in self.sliding else "rad")
             found.append({"parameter": name, "size": scale * size, "unit": unit})
         with_it = {"holdout_with_them": self.with_them} if self.with_them else {}
-        return {"accuracy": plain(self.accuracy) | with_it, "smallest_found": found}
+        shift = {"to_find_rad": SHIFT}
+        return {"accuracy": with_it, "smallest_found": found, "poses": shift}
 
-    def fit_dict(self) -> dict[str, Any]:
+    def fit_dict(self, *, poses: bool = True) -> dict[str, Any]:
         """The refitted calibration as its file, with this answer."""
         told = self.to_dict()
         first = {key: told[key] for key in ("valid", "confidence", "moved")}
-        return {**self.fit.to_dict(), **first, "check": told}
+        return {**self.fit.to_dict(poses=poses), **first, "check": told}
 
-    def save(self, path: Path | str) -> None:
+    def save(self, path: Path | str, *, poses: bool = True) -> None:
         """Write the refitted calibration, with this answer; never a half-written file."""
-        write_whole(path, json_text(self.fit_dict()))
+        write_whole(path, json_text(self.fit_dict(poses=poses)))

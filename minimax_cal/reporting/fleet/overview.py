@@ -63,7 +63,7 @@ class Fleet(Result):
         """A row a cell."""
         return (self.table(),)
 
-    def beside(self) -> dict[str, Any]:
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """How many cells, and how many failed."""
         return {"cells": len(self.rows), "failed": len(self.failed)}
 

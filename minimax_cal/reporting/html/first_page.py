@@ -15,7 +15,6 @@ from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.crossed import intervals_of
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.same_arm import wild
-from minimax_cal.fitting.set_aside import WithThem
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.ground.words import capitalise
@@ -34,6 +33,7 @@ from minimax_cal.judging.tolerance import (
     overall,
     within,
 )
+from minimax_cal.measuring.accuracy import NO_ENDS, Accuracy
 from minimax_cal.measuring.aside import SetAside, counted
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.history import with_history
@@ -177,16 +177,12 @@ def counting_all(found: Signed, sources: Sources, limits: tuple[Limit, ...], whi
     return replace(found, set_aside=result.set_aside, with_them=inside, judged_with=with_all)
 
 
-def counting(claim: Claim, found: WithThem | None) -> Claim:
+def counting(claim: Claim, found: Accuracy | None) -> Claim:
     """A claim inside, where the points that were set aside count."""
     if found is None:
         return claim
-    seen = found.accuracy
-    return replace(
-        claim,
-        rms=Bound(seen.rms_mm, found.rms_ends[1]),
-        largest=Bound(seen.max_mm, found.max_ends[1]),
-    )
+    (_, rms), (_, largest) = found.rms_ci95_mm or NO_ENDS, found.max_ci95_mm or NO_ENDS
+    return replace(claim, rms=Bound(found.rms_mm, rms), largest=Bound(found.max_mm, largest))
 
 
 def aside_of(found: Signed) -> str:

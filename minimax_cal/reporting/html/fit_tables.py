@@ -78,23 +78,16 @@ def correlation_table(known: Uncertainty) -> Table:
 
 def distance_table(worst: WorstCase) -> Table:
     """Distances between targets that the minimax keeps."""
-    rows = tuple(
-        (" - ".join(d.pair), 1e3 * d.measured, 1e3 * d.tolerance, d.multiplier)
-        for d in worst.distances
-    )
-    return Table("Distances between targets, kept as measured",
-                 ("pair", "measured mm", "tolerance mm", "multiplier"), rows,
-                 ("", ".4f", ".4f", ".4g"))  # fmt: skip
+    title = "Distances between targets, kept as measured"
+    return Table.of(title, worst.distances, "pair", "measured=measured mm .4f",
+                    "tolerance=tolerance mm .4f", "multiplier .4g")  # fmt: skip
 
 
 def iteration_table(worst: WorstCase) -> Table:
     """Every step of the minimax, with the QP solver that answered."""
-    rows = tuple(
-        (s.iteration, s.value, s.violation, s.kkt, s.length, s.backend) for s in worst.trace
-    )
-    header = ("iteration", "worst, of the start's", "violation", "KKT residual", "step length",
-              "QP backend")  # fmt: skip
-    return Table("Steps of the minimax", header, rows, ("d", ".8f", ".1e", ".1e", ".3g", ""))
+    return Table.of("Steps of the minimax", worst.trace, "iteration d",
+                    "value=worst, of the start's .8f", "violation .1e", "kkt=KKT residual .1e",
+                    "length=step length .3g", "backend=QP backend")  # fmt: skip
 
 
 def cost_table(fit: Fit) -> Table:

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.dynamics.result import KIND, WORDS, MotionDiagnosis
+from minimax_cal.dynamics.result import WORDS, MotionDiagnosis, table_by_joint
 from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import visible
 from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.reporting.html.charts import (
@@ -63,14 +63,15 @@ def motion_of(results: Sequence[Result]) -> MotionSource | None:
         content, path, digest = content_of(result)
         if len(results) > 1:
             raise CalibrationError(f"{path}: is a motion diagnosis; report it alone")
-        return MotionSource(MotionDiagnosis.from_dict(content, path), File(KIND, path, digest))
+        found = MotionDiagnosis.from_dict(content, path)
+        return MotionSource(found, File(found.KIND, path, digest))
     return None
 
 
 def is_motion(result: Result) -> bool:
     """Whether a result is a motion diagnosis.  Raises CalibrationError for a file without JSON."""
     if isinstance(result, Path | str):
-        return bool(content_of(result)[0].get("kind") == KIND)
+        return bool(content_of(result)[0].get("kind") == MotionDiagnosis.KIND)
     return isinstance(result, MotionDiagnosis)
 
 
@@ -115,12 +116,9 @@ def verdict_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
 
 def budget_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
     """Tables of all rows and of moving ones, and how both fall."""
-    whole = found.budget_table()
-    moving: tuple[tuple[Cell, ...], ...] = tuple(
-        (step.name, *step.holdout_rms_moving) for step in found.budget
-    )
+    moving = [(step.name, step.holdout_rms_moving) for step in found.budget]
     title = f"Held-out RMS torque [{found.unit}], moving rows ({found.held_out})"
-    return (budget_figure(found), whole, Table(title, whole.header, moving, whole.formats))
+    return budget_figure(found), found.budget_table(), table_by_joint(title, "step", moving)
 
 
 def budget_figure(found: MotionDiagnosis) -> Figure:
@@ -145,20 +143,15 @@ def budget_figure(found: MotionDiagnosis) -> Figure:
 
 def effect_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
     """Effects with their values, and what else they could be."""
-    rows: list[tuple[Cell, ...]] = [
-        (
-            one.words,
-            f"{WORDS[other.effect]} {name_place(other.place)}",
-            other.rho2,
-            other.separate_with,
-        )
-        for one in found.effects
-        for other in one.alternatives
-    ]  # fmt: skip
     if not found.effects:
         return (text("No effect is shown by these logs."),)
+    rows = tuple(
+        (one.words, f"{WORDS[a.effect]} {name_place(a.place)}", a.rho2, a.separate_with)
+        for one in found.effects
+        for a in one.alternatives
+    )
     header = ("effect", "could be", "similarity", "what tells them apart")
-    others = [Table("Alternatives", header, tuple(rows), ("", "", ".2f", ""))] if rows else []
+    others = [Table("Alternatives", header, rows, ("", "", ".2f", ""))] if rows else []
     return (found.effects_table(), *others)
 
 
@@ -170,8 +163,7 @@ def joint_figures(found: MotionDiagnosis) -> tuple[Block, ...]:
 def joint_figure(found: MotionDiagnosis, j: int) -> Figure:
     """Measured and predicted torque, and friction over speed with its band."""
     run, curve, unit = found.held_run, found.curves[j], found.unit
-    time, speed = np.array(run.time), np.array(curve.speed)
-    friction, wide = np.array(curve.torque), BAND * np.array(curve.sigma)
+    time, speed, friction, wide = np.array(run.time), curve.speed, curve.torque, BAND * curve.sigma
     colour, _, _, soft = LOOKS["after"]
     band = {
         "type": "scatter", "mode": "lines", "name": "two standard deviations",
@@ -181,8 +173,8 @@ def joint_figure(found: MotionDiagnosis, j: int) -> Figure:
         "hoverinfo": "skip", "showlegend": False, "xaxis": "x2", "yaxis": "y2",
     }  # fmt: skip
     traces = (
-        line("before", "measured", time, np.array(run.measured[j])),
-        line("after", "predicted without this run", time, np.array(run.predicted[j])),
+        line("before", "measured", time, run.measured[j]),
+        line("after", "predicted without this run", time, run.predicted[j]),
         band,
         line("after", "friction", speed, friction, panel=1, showlegend=False),
     )

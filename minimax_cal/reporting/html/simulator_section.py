@@ -40,7 +40,7 @@ def motion_blocks(gap: MotionGap) -> Blocks:
 
 def ladder_chart(gap: SimulatorGap) -> Figure:
     """The ladder in the simulator."""
-    rungs = (*gap.rungs, *([gap.commands] if gap.commands else []))
+    rungs = gap.every
     held = np.array([rung.holdout_rms_mm for rung in rungs])
     worst = np.array([rung.holdout_max_mm for rung in rungs])
     said = np.array([rung.predicted_rms_mm for rung in rungs])

@@ -27,7 +27,7 @@ from minimax_cal.measuring.history import numbered, visits
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.simulators.motion.result import MotionGap
-from minimax_cal.simulators.result import KIND, SimulatorGap
+from minimax_cal.simulators.result import SimulatorGap
 
 Result = (
     Fit
@@ -155,9 +155,9 @@ def read_sources(results: Sequence[Result]) -> Sources:
             fits.append(Fit.from_dict(content, path))
         elif kind == "diagnosis":
             gaps.append(Diagnosis.from_dict(content, path))
-        elif kind == KIND and "along" in content:
+        elif kind == MotionGap.KIND and "along" in content:
             moving.append(MotionGap.from_dict(content, path))
-        elif kind == KIND:
+        elif kind == SimulatorGap.KIND:
             arms.append(SimulatorGap.from_dict(content, path))
         else:
             raise CalibrationError(

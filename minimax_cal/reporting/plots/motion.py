@@ -59,8 +59,8 @@ def draw_torques(axes: Axes, found: MotionDiagnosis, j: int) -> None:
 def draw_curve(axes: Axes, found: MotionDiagnosis, j: int) -> None:
     """Friction of a joint with a band of two standard deviations."""
     curve = found.curves[j]
-    speed, torque, sigma = (np.array(part) for part in (curve.speed, curve.torque, curve.sigma))
-    axes.fill_between(speed, torque - 2.0 * sigma, torque + 2.0 * sigma, color=AFTER, alpha=0.25)
+    speed, torque, wide = curve.speed, curve.torque, 2.0 * curve.sigma
+    axes.fill_between(speed, torque - wide, torque + wide, color=AFTER, alpha=0.25)
     axes.plot(speed, torque, color=AFTER, lw=1.2)
     axes.axhline(0.0, color="grey", lw=0.6)
     axes.grid(visible=True, alpha=0.3)

@@ -24,7 +24,7 @@ def save_simulator_gap(gap: SimulatorGap, path: Path | str) -> None:
 
 def simulator_figure(gap: SimulatorGap) -> Figure:
     """The ladder in the simulator, from the model as given down to the noise."""
-    rungs = (*gap.rungs, *([gap.commands] if gap.commands else []))
+    rungs = gap.every
     held = np.array([rung.holdout_rms_mm for rung in rungs])
     worst = np.array([rung.holdout_max_mm for rung in rungs])
     said = np.array([rung.predicted_rms_mm for rung in rungs])

@@ -196,9 +196,8 @@ def asked_of(found: MotionDiagnosis, bench: Bench) -> tuple[Asked, tuple[Term, .
     terms, model = found.models[-1].terms, bench.opened.chain.model
     link = next((int(e.place[1:]) - 1 for e in found.effects
                  if e.effect in ("payload", "link_inertia") and e.worth), -1)  # fmt: skip
-    late = found.models[-1].delay + sum(
-        float(v[0]) for t, v in zip(terms, found.models[-1].value, strict=True)
-        if t.effect == "delay")  # fmt: skip
+    late = found.models[-1].delay
+    late += sum(float(term.value[0]) for term in terms if term.effect == "delay")
     if abs(late) < SHORTEST * float(model.opt.timestep):
         late = 0.0
     chain = bench.opened.chain

@@ -44,7 +44,7 @@ def law_of(
     term: Term, torque: Array, share: Array, numbers: Numbers, ratio: float
 ) -> tuple[str, dict[str, float]]:
     """A law with its numbers at the joint.  torque: (d,) [N m]; share: the same without a unit."""
-    tuned, fastest = dict(term.tuned), float(numbers.fastest[term.joint])
+    tuned, fastest = term.tuned, float(numbers.fastest[term.joint])
     amount = float(torque[0])
     match term.effect:
         case "load_friction":

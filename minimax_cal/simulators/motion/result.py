@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
 
 from minimax_cal.dynamics.result import table_by_joint
+from minimax_cal.ground.facts import Fact
 from minimax_cal.ground.files import plain
-from minimax_cal.ground.records import Number, Part, Recorded, checked
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
-from minimax_cal.simulators.result import KIND
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,7 @@ class WrittenElement:
     """
 
     name: str
-    held_by: str
+    held_by: Literal["file", "module"]
     attributes: str
     worth: Mapping[str, tuple[float, float]]
 
@@ -63,12 +61,15 @@ class MotionGap(Result):
     rungs: as given, then with each element.  elements: what was corrected, with its worth.
     left_out: what is in neither file nor module, and what that costs.  drives: what moved the arm.
     held_out: runs that no fit saw, or quarters of one.  written, module: paths, empty if none.
+    along: tells its file from that of poses.
     """
 
+    KIND = "simulator_gap"
+    COMMAND = "gap"
     model: str
     robot: str
     unit: str
-    rungs: tuple[MotionRung, ...]
+    rungs: Annotated[tuple[MotionRung, ...], Fact(fewest=1)]
     elements: tuple[WrittenElement, ...]
     left_out: tuple[str, ...]
     drives: str
@@ -77,20 +78,10 @@ class MotionGap(Result):
     written: str
     module: str
     seconds: float
+    along: Literal["trajectories"] = "trajectories"
 
     def __repr__(self) -> str:
         return f"<MotionGap of {self.model}: {self.headline()}>"
-
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON of the contract, and more; `from_dict` reads it back."""
-        return {"schema": 1, "kind": KIND, "along": "trajectories", **plain(self)}
-
-    @staticmethod
-    def from_dict(content: Mapping[str, Any], source: str = "gap") -> MotionGap:
-        """From `to_dict`.  Raises CalibrationError."""
-        part = checked(MotionGapPart, content, source)
-        names = MotionGap.__dataclass_fields__
-        return MotionGap(**{name: getattr(part, name) for name in names})
 
     def headline(self) -> str:
         """The result in a sentence or two."""
@@ -117,8 +108,8 @@ class MotionGap(Result):
 
     def short(self) -> dict[str, Any]:
         """What another result says of the file that was written."""
-        full = self.to_dict()
-        return {name: full[name] for name in ("written", "module", "elements", "left_out")}
+        names = ("written", "module", "elements", "left_out")
+        return {name: plain(getattr(self, name)) for name in names}
 
     def table(self) -> Table:
         """RMS torque of each joint, rung by rung."""
@@ -135,22 +126,3 @@ class MotionGap(Result):
         title = f"RMS joint error [mrad] under {self.drives}"
         rows = [(rung.name, rung.tracking_rms_mrad) for rung in self.rungs]
         return table_by_joint(title, "model", rows)
-
-
-class MotionGapPart(Part):
-    """The file of `minimax-cal gap MODEL LOG... -o`."""
-
-    kind: Literal["simulator_gap"]
-    along: Literal["trajectories"]
-    model: str
-    robot: str
-    unit: str
-    rungs: tuple[Recorded[MotionRung], ...] = Field(min_length=1)
-    elements: tuple[Recorded[WrittenElement], ...] = ()
-    left_out: tuple[str, ...] = ()
-    drives: str = ""
-    held_out: tuple[str, ...] = ()
-    notices: tuple[str, ...] = ()
-    written: str = ""
-    module: str = ""
-    seconds: Number = 0.0
