@@ -155,11 +155,8 @@ class Health(Result):
             ),
             ("", "", ".3f"),
         )
-        hidden = Table(
-            "joints that these data cannot check",
-            ("zero position", "looks like", "measure"),
-            self.hidden,
-        )
+        header = ("zero position", "looks like", "measure")
+        hidden = Table("joints that these data cannot check", header, self.hidden)
         return tuple(table for table in (self.required_table(), moved, found, hidden) if table.rows)
 
     def beside(self, *, poses: bool = True) -> dict[str, Any]:

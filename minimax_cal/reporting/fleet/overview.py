@@ -49,15 +49,9 @@ class Fleet(Result):
 
     def table(self) -> Table:
         """A row a cell."""
-        header = ("cell", "robot", "work", "verdict", "before RMS mm", "RMS mm", "max mm",
-                  "changed", "why")  # fmt: skip
-        rows = tuple(
-            (row.cell, row.robot, row.work, FAILED if row.failed else row.verdict, row.before_mm,
-             row.rms_mm, row.max_mm, ", ".join(row.changed), row.why)
-            for row in self.rows
-        )  # fmt: skip
-        formats = ("", "", "", "", ".3f", ".3f", ".3f", "", "")
-        return Table(f"cells of {self.source}", header, rows, formats)
+        return Table.of(f"cells of {self.source}", self.rows, "cell", "robot", "work",
+                        "end=verdict", "before_mm=before RMS mm .3f", "rms_mm=RMS mm .3f",
+                        "max_mm=max mm .3f", "changed", "why")  # fmt: skip
 
     def tables(self) -> tuple[Table, ...]:
         """A row a cell."""

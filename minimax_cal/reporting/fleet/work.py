@@ -51,6 +51,11 @@ class Row:
         """Whether there is no result."""
         return self.status == FAILED
 
+    @property
+    def end(self) -> str:
+        """The verdict, or that there is none."""
+        return FAILED if self.failed else self.verdict
+
 
 def done(job: Job) -> Row:
     """One cell; what goes wrong with it is its row."""
