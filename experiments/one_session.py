@@ -256,7 +256,7 @@ def place(term: str) -> str:
 def in_one_fit(robot: object, both: Measurements) -> Names:
     """What one fit of two sessions says has moved of arm and reflectors."""
     try:
-        fit = calibrate(robot, both, "sum")  # type: ignore[arg-type]
+        fit = calibrate(robot, both, "sum")
     except CalibrationError:
         return None
     labels = [f"{one.effect}:{one.place}" for one in fit.moved if one.text]
@@ -284,7 +284,7 @@ def of_halves(job: Job, robot: object, data: Measurements, first: Array) -> dict
         return {}
     out: dict[str, Names] = {}
     with suppress(CalibrationError):  # half a session may not calibrate the arm
-        a, b = (calibrate(robot, data.take(half), "sum") for half in (first, ~first))  # type: ignore[arg-type]
+        a, b = (calibrate(robot, data.take(half), "sum") for half in (first, ~first))
         out["compared"] = tuple(dict.fromkeys(m.joint for m in compare(a, b).changed))
         moved = check(a, data.take(~first), "rms 0.5").moved
         out["checked"] = tuple(dict.fromkeys(m.joint for m in moved))

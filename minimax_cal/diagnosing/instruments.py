@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -30,14 +29,14 @@ from minimax_cal.evidence.limits import HELPS, MAX_JOINT_JITTER, MINOR
 from minimax_cal.evidence.remains import Remains
 from minimax_cal.evidence.selection import Choice, select
 from minimax_cal.fitting.instruments.fit import InstrumentFit, remaining
-from minimax_cal.fitting.instruments.kinds import Asked, Given, asked_of, chosen_of, result_of
+from minimax_cal.fitting.instruments.kinds import READ, Asked, Given, asked_of, result_of
 from minimax_cal.fitting.instruments.laws import is_shared
 from minimax_cal.fitting.instruments.linear import StackRows, rows_of_all, scene_of_all
-from minimax_cal.fitting.instruments.options import Progress, silent
+from minimax_cal.fitting.instruments.options import Progress, RelativeOptions, silent
 from minimax_cal.fitting.instruments.result import RelativeCalibration
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
-from minimax_cal.ground.options import check_left_out
+from minimax_cal.ground.options import check_left_out, takes
 from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
@@ -49,13 +48,14 @@ CLOCKS = "a temperature; the times of several files have no common zero"
 NOT_KNOWN = Known(np.nan, 0.0, np.nan, np.nan)
 
 
+@takes(chosen=RelativeOptions, read=READ)
 def diagnose_relative(
     robot: Robot | str | Path,
     data: Given | Sequence[Given],
     *,
     exclude: Sequence[str] = (),
+    chosen: RelativeOptions,
     progress: Progress = silent,
-    **options: Any,
 ) -> RelativeDiagnosis:
     """Say what geometry leaves of one or several instruments' measurements, and why.
 
@@ -68,10 +68,10 @@ def diagnose_relative(
         As `relative` takes them.
     exclude
         Effects that are not to be considered.
+    chosen
+        See `RelativeOptions`.
     progress
         Called with a word on each stage.
-    options
-        Those of `relative`, but for effects: these are looked for.
 
     Returns
     -------
@@ -89,7 +89,6 @@ def diagnose_relative(
     """
     began = time.perf_counter()
     check_left_out(exclude, EFFECTS)
-    chosen = chosen_of(**options)
     if chosen.effects:
         raise OptionError("effects: a diagnosis looks for them; leave them out")
     asked = asked_of(robot, data, chosen)

@@ -4,35 +4,33 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from minimax_cal.fitting import identify
 from minimax_cal.fitting.checks import check_plausible, coarse_joints
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.judged import Judged, Parts
-from minimax_cal.fitting.opened import Writes, listed_effects
+from minimax_cal.fitting.opened import listed_effects
 from minimax_cal.fitting.options import (
     Options,
     Progress,
-    QpFunction,
     check_options,
     listed,
     objective_of,
-    sigmas_of,
+    priors_of,
     silent,
     usable,
 )
-from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import LEAST_POSES, fit_cell
 from minimax_cal.fitting.start import EVERYWHERE
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning
+from minimax_cal.ground.options import takes
 from minimax_cal.measuring import campaigns, checks, faults
 from minimax_cal.measuring.aside import TOOL
 from minimax_cal.measuring.faults.declared import noise
@@ -45,39 +43,19 @@ from minimax_cal.measuring.stations import seen_from
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.time import SESSION_JUMP
 from minimax_cal.robots.robot import Robot, load_robot
-from minimax_cal.solvers.least_squares import AUTO
 
 JUMP = (SESSION_JUMP.name, f"{SESSION_JUMP.name}:frame")  # without its moment
 Given = Measurements | str | Path | Sequence[str | Path] | tuple[ArrayLike, ArrayLike]
 
 
+@takes(
+    "objective",
+    "qp",
+    options=Options,
+    read={"fix": listed, "free": listed, "priors": priors_of, "effects": listed_effects},
+)
 def calibrate(
-    robot: Robot | str | Path,
-    data: Measurements | str | Path | Sequence[str | Path] | tuple[ArrayLike, ArrayLike],
-    objective: str = "minimax",
-    qp: str | QpFunction = "daqp",
-    *,
-    holdout: float = 0.2,
-    seed: int = 0,
-    holdout_by: str | None = None,
-    cv: bool = False,
-    instrument: str | None = None,
-    fix: str | Sequence[str] = (),
-    free: str | Sequence[str] = (),
-    only: str = "",
-    priors: Mapping[str, float | str] | None = None,
-    method: str = AUTO,
-    lever: float | None = None,
-    hessian: str = "gauss-newton",
-    distance: str = "two-sided",
-    distance_tolerance: float | None = None,
-    resolution: float = identify.RESOLUTION,
-    effects: str | Path | Writes | Sequence[str | Path | Term] = (),
-    loss: str = SQUARE,
-    trim: float = 0.0,
-    allow_large_changes: bool = False,
-    simulated: bool = False,
-    progress: Progress = silent,
+    robot: Robot | str | Path, data: Given, *, options: Options, progress: Progress = silent
 ) -> Fit:
     """Calibrate a robot from measurements.
 
@@ -86,51 +64,8 @@ def calibrate(
     robot, data
         Loaded, or a name or path; data also as joints (m, n) and points (m, 3) or (m, k,
         3), or a list of paths: the campaigns of one arm, each a session.
-    objective
-        sum, minimax (the worst target), point (the worst point), pose, or smr:K.
-    qp
-        Backend of the minimax QPs, or a function from Problem to a verified Solution.
-    holdout
-        Share of the poses kept out of the fit.
-    seed
-        Of that choice.
-    holdout_by
-        A column (session, group ...) or region, whose poses are held out together.
-    instrument
-        u95 of a coordinate, as 10um+2.5um/m, where the data do not say.
-    cv
-        Judge every pose by a fit without it, which is done anyway where fewer than 20 poses
-        are held out.
-    fix, free
-        Parameters as ``beta*``, a list or a text with commas.
-    only
-        offsets, for the joints' zero positions alone.
-    priors
-        Sigma of a parameter's deviation from nominal, by name [m, rad], or a text as 0.5mm.
-    method
-        Of the least squares.
-    lever
-        What a radian counts as in the pose objective [m], the targets' own unless given.
-    hessian
-        gauss-newton or bfgs.
-    distance
-        Form of the distance constraints, two-sided, squared or off.
-    distance_tolerance
-        Theirs [m], as measured unless given.
-    resolution
-        Relative singular value that counts as not measured.
-    effects
-        Beyond geometry, as joint_compliance:J2, or a diagnosis (or its file), whose
-        confirmed effects are taken.
-    loss
-        square, huber, cauchy or tukey.
-    trim
-        Share of the points that may be set aside.
-    allow_large_changes
-        Accept links that differ from the drawing by more than 5 % of the reach, 5 degrees
-        (alpha, beta) or 30 degrees (theta).
-    simulated
-        The points may be exact.
+    options
+        See `Options`.
     progress
         Called with a word on each stage.
 
@@ -148,30 +83,6 @@ def calibrate(
     --------
     >>> print(mc.calibrate("irb2600", "poses.csv", objective="sum", holdout=0.3).summary())
     """
-    options = Options(
-        objective=objective,
-        qp=qp,
-        holdout=holdout,
-        seed=seed,
-        holdout_by=holdout_by,
-        cv=cv,
-        instrument=instrument,
-        fix=listed(fix),
-        free=listed(free),
-        only=only,
-        priors=sigmas_of(priors or {}),
-        method=method,
-        lever=lever,
-        hessian=hessian,
-        distance=distance,
-        distance_tolerance=distance_tolerance,
-        resolution=resolution,
-        effects=listed_effects(effects),
-        loss=loss,
-        trim=trim,
-        allow_large_changes=allow_large_changes,
-        simulated=simulated,
-    )
     return calibrate_with(robot, data, options, progress)
 
 
@@ -188,7 +99,7 @@ def calibrate_with(
     solved = fit_cell(robot, poses.train, options, progress, poses.near)
     result = Judged(robot, options, poses, solved)
     for doubt in result.alarming:
-        warnings.warn(doubt, CalibrationWarning, stacklevel=3)
+        warnings.warn(doubt, CalibrationWarning, stacklevel=4)
     return result.fit(began)
 
 

@@ -47,10 +47,10 @@ T = TypeVar("T")
 LEAST_SIGMA, MOST_SIGMA = 1e-12, 1e6  # of a prior that says something [m, rad]
 
 
-def sigmas_of(priors: Mapping[str, float | str]) -> dict[str, float]:
+def priors_of(given: Mapping[str, float | str] | None) -> dict[str, float]:
     """Sigmas of priors in SI, from numbers or texts with a unit.  Raises OptionError."""
-    read = [prior_of(f"{k}={v}") if isinstance(v, str) else (k, v) for k, v in priors.items()]
-    return dict(read)
+    pairs = (given or {}).items()
+    return dict(prior_of(f"{k}={v}") if isinstance(v, str) else (k, v) for k, v in pairs)
 
 
 def prior_of(text: str) -> tuple[str, float]:
@@ -74,22 +74,25 @@ class Options:
     """How to calibrate.
 
     objective: sum, minimax (the worst target), point (the worst point), pose, or smr:K.
-    lever: metres that a radian counts as in the pose objective, None for the targets' own.
-    qp: backend of the minimax QPs.  holdout: share of the poses kept out of the fit.
-    seed: of that choice.  holdout_by: what is held out together, a column as session or group, or
-    region; None for poses that repeat each other or stand in a cluster.
-    cv: judge every pose by a fit without it, however many are held out.
-    instrument: u95 of a coordinate as 10um+2.5um/m, where the data do not say.
-    fix, free: names or patterns as ``beta*``.  only: offsets, for the joints' zero positions alone.
-    priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
-    method: of the least squares.  hessian: gauss-newton or bfgs.  distance: form of the
-    distance constraints, two-sided, squared or off.  distance_tolerance: [m], None for the
-    instrument's own accuracy.  resolution: relative singular value that counts as not measured.
-    effects: beyond geometry, fitted jointly, as joint_compliance:J2 or backlash:all.
-    loss: of the distances in the least squares: square, huber, cauchy or tukey.
-    trim: at most this fraction of the points, the largest outliers, is set aside.
-    allow_large_changes: whether the arm may be another than the one drawn.  simulated: whether
-    points may be exact, as no instrument measures them.
+    qp: backend of the minimax QPs, or a function from Problem to a verified Solution.
+    holdout: share of the poses kept out of the fit.  seed: of that choice.
+    holdout_by: a column (session, group ...) or region, whose poses are held out together; poses
+    that repeat each other or stand in a cluster unless given.
+    cv: judge every pose by a fit without it, which is done anyway where fewer than 20 poses are
+    held out.  instrument: u95 of a coordinate, as 10um+2.5um/m, where the data do not say.
+    fix, free: parameters as ``beta*``, a list or a text with commas.
+    only: offsets, for the joints' zero positions alone.
+    priors: sigma of a parameter's deviation from nominal, by name [m, rad], or a text as 0.5mm.
+    method: of the least squares.  lever: what a radian counts as in the pose objective [m], the
+    targets' own unless given.  hessian: gauss-newton or bfgs.
+    distance: form of the distance constraints, two-sided, squared or off.
+    distance_tolerance: theirs [m], as measured unless given.
+    resolution: relative singular value that counts as not measured.
+    effects: beyond geometry, as joint_compliance:J2, or a diagnosis (or its file), whose confirmed
+    effects are taken.  loss: square, huber, cauchy or tukey.
+    trim: share of the points that may be set aside.
+    allow_large_changes: accept links that differ from the drawing by more than 5 % of the reach, 5
+    degrees (alpha, beta) or 30 degrees (theta).  simulated: the points may be exact.
     """
 
     objective: str = option(

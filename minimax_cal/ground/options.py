@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass, field
-from typing import Any
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields
+from functools import wraps
+from inspect import Parameter, signature
+from typing import Any, TypeVar
 
 from minimax_cal.ground.errors import OptionError
 
+Value = TypeVar("Value")
 SI = {  # what a unit of the command line is
     "": 1.0,
     "m": 1.0,
@@ -50,6 +54,71 @@ def option(default: Any, help: str = "", unit: str = "", **more: Any) -> Any:
     if default is dict:
         return field(default_factory=dict, metadata=told)
     return field(default=default, metadata=told)
+
+
+# ---- as keywords of a function -----------------------------------------------------------------
+
+
+def takes(
+    *positional: str, read: Mapping[str, Callable[[Any], Any]] | None = None, **records: Any
+) -> Callable[[Callable[..., Value]], Callable[..., Value]]:
+    """Make a function take the fields of records of options as keywords of its own.
+
+    records: by the argument that gets it, a dataclass, or a pair of it and some fields' names.
+    positional: fields that need no keyword.  read: what makes a field's value of what is given.
+    Signature and docstring say the fields as the dataclass has them.
+    """
+    kinds = {at: one if isinstance(one, tuple) else (one, None) for at, one in records.items()}
+    chosen = {
+        at: [one for one in fields(kind) if names is None or one.name in names]
+        for at, (kind, names) in kinds.items()
+    }
+
+    def made(verb: Callable[..., Value]) -> Callable[..., Value]:
+        own = signature(verb)
+        fixed = [one for name, one in own.parameters.items() if name not in kinds]
+        more = [as_parameter(one, one.name in positional) for at in chosen for one in chosen[at]]
+        known = own.replace(parameters=sorted([*fixed, *more], key=lambda each: each.kind))
+
+        @wraps(verb)
+        def asked(*given: Any, **named: Any) -> Value:
+            try:
+                bound = known.bind(*given, **named).arguments
+            except TypeError as error:
+                raise TypeError(f"{verb.__name__}() {error}") from None
+            for at, (kind, _) in kinds.items():
+                own = {one.name: bound.pop(one.name) for one in chosen[at] if one.name in bound}
+                for name, reader in (read or {}).items():
+                    if name in own:
+                        own[name] = reader(own[name])
+                bound[at] = kind(**own)
+            return verb(**bound)
+
+        asked.__signature__ = known  # type: ignore[attr-defined]
+        asked.__doc__ = verb.__doc__ or ""
+        for at, (kind, _) in kinds.items():
+            asked.__doc__ = documented(asked.__doc__, at, kind, [one.name for one in chosen[at]])
+        return asked
+
+    return made
+
+
+def as_parameter(one: Any, positional: bool) -> Parameter:
+    """A field as an argument; a mapping that is empty unless given as None."""
+    kind = Parameter.POSITIONAL_OR_KEYWORD if positional else Parameter.KEYWORD_ONLY
+    default = None if one.default is MISSING else one.default
+    return Parameter(one.name, kind, default=default, annotation=one.type)
+
+
+def documented(text: str, at: str, kind: type, names: Sequence[str]) -> str:
+    """A docstring with what a record says of its fields in the place of an argument's entry."""
+    known, said = "|".join(names), " ".join((kind.__doc__ or "").split())
+    parts = re.split(rf"(?:^|(?<=\. ))((?:{known})(?:, (?:{known}))*): ", said)
+    entries = "".join(
+        f"    {some}\n        {words.strip()[:1].upper()}{words.strip()[1:]}\n"
+        for some, words in zip(parts[1::2], parts[2::2], strict=True)
+    )
+    return re.sub(rf"    {at}\n        .*\n", lambda _: entries, text)
 
 
 def names_of(texts: Iterable[str]) -> tuple[str, ...]:

@@ -34,11 +34,13 @@ def frame(text: str, name: str) -> Array:
 class CameraOptions:
     """Where cameras and board are, and what an image must show.
 
-    camera_on: flange or ground.  camera_at: (4, 4) of each camera in the flange or base, board_at:
-    of the board in the other, approximately [m].  print_looks: along which axis of the board its
-    print is seen.  distance: of the cameras from the board's middle [m].  incidence: largest angle
-    to its normal [rad].  share: of the corners in an image.  pixel_noise: of u and v [px].
-    camera_prior: as in `PixelOptions`.
+    camera_on: flange or ground.  camera_at: (4, 4) about where each camera is in the flange or base
+    [m].  board_at: (4, 4) about where the board is in the base or flange [m].
+    print_looks: z or -z of the board's frame: the side of its print.
+    distance: from how near to how far a camera is sharp [m].
+    incidence: largest angle to the board's normal [rad].
+    share: of the corners that an image must show.  pixel_noise: of u and v [px].
+    camera_prior: how well the files know the lenses, as ``f 0.1%, c 2px``.
     """
 
     camera_on: str = option(

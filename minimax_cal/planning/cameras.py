@@ -22,9 +22,10 @@ from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import plain, saved_content
+from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.modelling.cell import Cell, pose_from_dict
-from minimax_cal.planning.camera_options import PIXEL_NOISE, SIDES, CameraOptions, check_cameras
+from minimax_cal.planning.camera_options import SIDES, CameraOptions, check_cameras
 from minimax_cal.planning.camera_prospect import CameraProspect, PixelNoise
 from minimax_cal.planning.camera_sight import CameraSight
 from minimax_cal.planning.options import USUAL, PlanOptions, check_options
@@ -34,7 +35,13 @@ from minimax_cal.planning.setting import Ground, check_same, surroundings
 from minimax_cal.planning.task import Task
 from minimax_cal.robots.robot import Robot, load_robot
 
+FOR_CAMERAS = (  # options of a plan that are about cameras too
+    "criterion", "joints", "volume", "floor", "body", "jitter", "revisit", "approach", "candidates",
+    "seed",
+)  # fmt: skip
 
+
+@takes(sees=CameraOptions, options=(PlanOptions, FOR_CAMERAS), read={"joints": lambda g: g or {}})
 def plan_cameras(
     robot: Robot | str | Path,
     poses: int,
@@ -42,25 +49,8 @@ def plan_cameras(
     board: Path | str,
     *,
     fit: Mapping[str, Any] | Path | str | None = None,
-    camera_on: str = FLANGE,
-    camera_at: Sequence[Array] = (),
-    board_at: Array | None = None,
-    print_looks: str = "-z",
-    distance: tuple[float, float] = (0.3, 1.0),
-    incidence: float = np.radians(60.0),
-    share: float = 0.8,
-    pixel_noise: float = PIXEL_NOISE,
-    camera_prior: str = "",
-    criterion: str = "I",
-    joints: Mapping[int, tuple[float, float]] | None = None,
-    volume: Sequence[Sequence[float]] = (),
-    floor: float = 0.0,
-    body: float | None = None,
-    jitter: float | None = None,
-    revisit: int = 0,
-    approach: str = "none",
-    candidates: int = 2000,
-    seed: int = 0,
+    sees: CameraOptions,
+    options: PlanOptions,
     progress: Progress = silent,
 ) -> Plan:
     """Which images of a board to take with cameras, and how well they will tell the arm.
@@ -77,26 +67,12 @@ def plan_cameras(
         Places of the board's corners (target, x_mm, y_mm, z_mm).
     fit
         A calibration by cameras: arm, cameras and board are where it has them.
-    camera_on
-        flange or ground.
-    camera_at
-        (4, 4) about where each camera is in the flange or base [m].
-    board_at
-        (4, 4) about where the board is in the base or flange [m].
-    print_looks
-        z or -z of the board's frame: the side of its print.
-    distance
-        From how near to how far a camera is sharp [m].
-    incidence
-        Largest angle to the board's normal [rad].
-    share
-        Of the corners that an image must show.
-    pixel_noise
-        Of u and v [px].
-    camera_prior
-        How well the files know the lenses, as ``f 0.1%, c 2px``.
-    criterion, joints, volume, floor, body, jitter, revisit, approach, candidates, seed, progress
-        As in `plan`.
+    sees
+        See `CameraOptions`.
+    options
+        See `PlanOptions`.
+    progress
+        Called with a word on each stage.
 
     Returns
     -------
@@ -112,15 +88,7 @@ def plan_cameras(
     --------
     >>> found = mc.plan_cameras("ur5", 30, {"cam": "camera.yaml"}, "board.csv", fit="fit.json")
     """
-    options = PlanOptions(
-        criterion=criterion, joints=joints or {}, volume=volume, floor=floor, body=body,
-        jitter=jitter, revisit=revisit, approach=approach, candidates=candidates, seed=seed,
-        whole=len(camera) == 1,
-    )  # fmt: skip
-    sees = CameraOptions(
-        camera_on, camera_at, board_at, print_looks, distance, incidence, share, pixel_noise,
-        camera_prior,
-    )  # fmt: skip
+    options = replace(options, whole=len(camera) == 1)
     began = time.perf_counter()
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     check_options(options, poses, robot)

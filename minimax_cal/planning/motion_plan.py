@@ -22,7 +22,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.facts import Apart, Fact
 from minimax_cal.ground.files import plain
-from minimax_cal.ground.options import option
+from minimax_cal.ground.options import option, takes
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.stages import Progress, silent
@@ -62,9 +62,10 @@ FASTEST_ROWS = 1000.0
 class MotionOptions:
     """What a motion is to be like.
 
-    duration: of a part [s].  speed, acceleration: of every joint at most [rad/s, rad/s^2], of
-    slides a metre a second where joints have a thousand degrees.  payload: known mass at the
-    flange in a part of its own [kg], None for none.  rows: of the file, a second.
+    duration: of a part of the motion [s].  speed, acceleration: of every joint at most [rad/s,
+    rad/s^2]; a slide has 1 mm where others have 1 degree.
+    payload: known mass at the flange [kg], for a part that tells masses and drive gains apart.
+    rows: of the file, a second.
     """
 
     duration: float = option(20.0, "How long a part of the motion takes, s.", group=GROUP)
@@ -206,19 +207,16 @@ def shown(told: Told) -> str:
     return f"{told.sigma:.2g} {told.unit}" if np.isfinite(told.sigma) else "not separable"
 
 
+@takes(options=MotionOptions)
 def plan_motion(
     robot: Robot | str | Path,
     *,
-    duration: float = 20.0,
-    speed: float = float(np.radians(60.0)),
-    acceleration: float = float(np.radians(120.0)),
-    payload: float | None = None,
-    rows: float = 100.0,
     joints: Mapping[int, tuple[float, float]] | None = None,
     volume: Sequence[Sequence[float]] = (),
     floor: float = 0.0,
     body: float | None = None,
     seed: int = 0,
+    options: MotionOptions,
     progress: Progress = silent,
 ) -> MotionPlan:
     """A motion whose torques tell masses and friction, within limits, and what it will tell.
@@ -227,14 +225,6 @@ def plan_motion(
     ----------
     robot
         A robot, its file, or a built-in name.
-    duration
-        Of a part of the motion [s].
-    speed, acceleration
-        Of every joint at most [rad/s, rad/s^2]; a slide has 1 mm where others have 1 degree.
-    payload
-        Known mass at the flange [kg], for a part that tells masses and drive gains apart.
-    rows
-        Of the file, a second.
     joints
         Limits by joint index that narrow the robot's [rad, m].
     volume
@@ -243,6 +233,8 @@ def plan_motion(
         Height of the floor, and radius of the arm's links [m].
     seed
         Of all that is random.
+    options
+        See `MotionOptions`.
     progress
         Called with a sentence at each stage.
 
@@ -262,13 +254,12 @@ def plan_motion(
     """
     began = time.perf_counter()
     arm = robot if isinstance(robot, Robot) else load_robot(robot)
-    options = MotionOptions(duration, speed, acceleration, payload, rows)
     check_motion(options)
     check_seed(seed)
     bounds, notices = bounds_of(arm, options, joints or {}, volume, floor, body)
     rng = np.random.default_rng(seed)
     progress("drawing motions")
-    draw = partial(free_series, bounds, HARMONICS, duration)
+    draw = partial(free_series, bounds, HARMONICS, options.duration)
     drawn = [draw(rng) for _ in range(DRAWN)]
     model = model_of(arm, drawn)
     worth = partial(information, model)
@@ -277,8 +268,8 @@ def plan_motion(
     best = improved(best, bounds, worth, ROUNDS, rng)
     slow = slow_part(best, bounds, worth, rng)
     parts = [Part("fast", sure(best, bounds), 0.0), Part("slow", sure(slow, bounds), 0.0)]
-    if payload:
-        parts.append(Part("loaded", parts[0].series, payload))
+    if options.payload:
+        parts.append(Part("loaded", parts[0].series, options.payload))
     else:
         notices = (*notices, UNLOADED)
     if not weighed(arm).all():

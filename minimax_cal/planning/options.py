@@ -37,16 +37,21 @@ def box(text: str) -> tuple[tuple[float, ...], ...]:
 class PlanOptions:
     """What a plan is to be like.
 
-    criterion: of `planning.CRITERIA`.  candidates: how many to draw.  seed: of all that is random.
-    tracker: (3,) in base axes [m], empty for 3 m before the arm.  targets: number on a circle of
-    100 mm; spots: (k, 3) instead [m].  normals: of `visibility.NORMALS`.  acceptance: [rad].
-    reach, elevation: limits of the instrument [m, rad].  joints: limits by joint index that
-    narrow the robot's.  volume: (2, 3) box for the flange [m], empty for none.  floor: its height
-    [m].  body: radius of the arm [m], None for a share of its reach.  whole: every target seen.
-    noise, per_metre, jitter: as `Instrument`, None for what data show or its defaults.
-    effects: to be fitted along with the geometry, beside those of a fit, as joint_compliance:all.
-    separate: two effects that the poses are to tell apart, or none.
-    approach: both for revisits from the other side.  revisit: how many.
+    criterion: D, A, E, G or I.  candidates: how many poses to choose from.
+    seed: of all that is random.
+    tracker: (3,) in base axes [m], 3 m before the arm unless given.
+    targets: number on a circle of 100 mm.  spots: (k, 3) in the flange instead [m].
+    normals: where reflectors look, of `visibility.NORMALS`.
+    acceptance: half angle of a reflector's cone [rad].  whole: every target seen at each pose.
+    reach, elevation: limits of the instrument [m, rad].
+    joints: limits by joint index that narrow the robot's [rad, m].
+    volume: (2, 3) corners of a box for the flange in base axes [m].  floor: its height [m].
+    body: radius of the arm [m], a share of its reach unless given.
+    noise, per_metre: of a coordinate and its growth with range [m, -].
+    jitter: of a joint [rad]; as the data show them, else typical ones, unless given.
+    effects: fitted along with the geometry, beside those of a fit, as joint_compliance:all.
+    separate: two effects that the poses are to tell apart instead.
+    approach: both for revisits from the other side.  revisit: poses to go back to.
     """
 
     criterion: str = option(

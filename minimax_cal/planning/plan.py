@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from minimax_cal.fitting.opened import Result
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.planning.candidates import Poses, candidates, near, rarest
@@ -31,34 +31,14 @@ STEPS = (0.2, 0.1, 0.05, 0.02)  # around the best so far, as a share of the join
 AROUND, KEPT = 2400, 400  # poses tried around all of them, and those kept, each time
 
 
+@takes(options=PlanOptions, read={"joints": lambda given: given or {}})
 def plan(
     robot: Robot | str | Path,
     poses: int,
     *,
     fit: Result | None = None,
     data: Measurements | str | Path | None = None,
-    criterion: str = "I",
-    effects: Sequence[str] = (),
-    separate: Sequence[str] = (),
-    tracker: Sequence[float] = (),
-    targets: int = 3,
-    spots: Sequence[Sequence[float]] = (),
-    normals: str = "flange",
-    acceptance: float = math.radians(30.0),
-    whole: bool = False,
-    reach: tuple[float, float] = (0.5, 50.0),
-    elevation: tuple[float, float] = (math.radians(-50.0), math.radians(75.0)),
-    joints: Mapping[int, tuple[float, float]] | None = None,
-    volume: Sequence[Sequence[float]] = (),
-    floor: float = 0.0,
-    body: float | None = None,
-    noise: float | None = None,
-    per_metre: float | None = None,
-    jitter: float | None = None,
-    revisit: int = 0,
-    approach: str = "none",
-    candidates: int = 2000,
-    seed: int = 0,
+    options: PlanOptions,
     progress: Progress = silent,
 ) -> Plan:
     """Which poses of a robot to measure next, in which order, and how accurate they will make it.
@@ -73,46 +53,8 @@ def plan(
         A calibration whose robot, base, targets and poses are the start.
     data
         Poses measured already; without a fit they are calibrated first.
-    criterion
-        D, A, E, G or I.
-    effects
-        Fitted along with the geometry, as joint_compliance:all.
-    separate
-        Two effects that the poses are to tell apart instead.
-    tracker
-        (3,) in base axes [m], 3 m before the arm unless given.
-    targets
-        Number on a circle of 100 mm.
-    spots
-        (k, 3) in the flange instead [m].
-    normals
-        Where reflectors look.
-    acceptance
-        Half angle of a reflector's cone [rad].
-    whole
-        Every target seen at each pose.
-    reach, elevation
-        Limits of the instrument [m, rad].
-    joints
-        Limits by joint index that narrow the robot's [rad, m].
-    volume
-        (2, 3) corners of a box for the flange in base axes [m].
-    floor
-        Its height [m].
-    body
-        Radius of the arm [m], a share of its reach unless given.
-    noise, per_metre
-        Of a coordinate and its growth with range [m, -].
-    jitter
-        Of a joint [rad]; as the data show them, else typical ones, unless given.
-    revisit
-        Poses to go back to.
-    approach
-        Both for revisits from the other side.
-    candidates
-        How many poses to choose from.
-    seed
-        Of all that is random.
+    options
+        See `PlanOptions`.
     progress
         Called with a word on each stage.
 
@@ -130,30 +72,6 @@ def plan(
     --------
     >>> print(mc.plan("irb2600", 40, tracker=(3.0, 0.0, 0.5)).headline())
     """
-    options = PlanOptions(
-        criterion=criterion,
-        candidates=candidates,
-        seed=seed,
-        tracker=tracker,
-        targets=targets,
-        spots=spots,
-        normals=normals,
-        acceptance=acceptance,
-        reach=reach,
-        elevation=elevation,
-        joints=joints or {},
-        volume=volume,
-        floor=floor,
-        body=body,
-        whole=whole,
-        noise=noise,
-        per_metre=per_metre,
-        jitter=jitter,
-        effects=effects,
-        separate=separate,
-        approach=approach,
-        revisit=revisit,
-    )
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     return planned(
         robot, poses, options, "" if fit is None else fit, "" if data is None else data, progress

@@ -13,6 +13,7 @@ from pathlib import Path
 from minimax_cal.fitting.options import listed
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
+from minimax_cal.ground.options import takes
 from minimax_cal.judging.tolerance import claim_called, limits_of
 from minimax_cal.reporting.html import (
     Report,
@@ -33,77 +34,20 @@ from minimax_cal.reporting.html.sources import Result
 PAGES, PAPERS, PICTURES = (".html", ".htm"), (".pdf",), (".png",)
 
 
-def report(
-    results: Result | Sequence[Result],
-    path: Path | str = "report.html",
-    *,
-    title: str = "",
-    customer: str = "",
-    author: str = "",
-    date: str = "",
-    tolerance: str = "",
-    tolerance_for: str = "inside",
-    facts: Path | str | None = None,
-    rung: int | None = None,
-    deliver: str | Sequence[str] = (),
-    pdf: Path | str | None = None,
-    notify: Callable[[str], object] = warnings.warn,
-) -> Path:
-    """A page to sign of a calibration, a diagnosis, or both of the same measurements.
-
-    Parameters
-    ----------
-    results
-        Each itself or the file that it was saved to; a gap in a simulator may come with
-        them, a relative calibration and a motion diagnosis stand alone.
-    path
-        Of the HTML, which needs no network, or of a PDF, or of a PNG of the first page.
-    title
-        That of the robot unless given.
-    customer, author
-        Who accepts, who measured.
-    date
-        YYYY-MM-DD; SOURCE_DATE_EPOCH or today unless given.
-    tolerance
-        What is required in mm, as ``rms 0.2, max 0.5``.
-    tolerance_for
-        inside or outside the measured region.
-    facts
-        A TOML file with serial_number, controller, tool ...
-    rung
-        Of a diagnosis, the last unless given.
-    deliver
-        Formats of `export`, or compensate: the requirement is judged by what each reaches,
-        fitted for exactly what it carries; where a result holds effects and nothing is
-        named, by corrected targets.
-    pdf
-        Printed to this file as well, by an installed Chromium, Chrome or Edge.
-    notify
-        Called with what the reader should know of both together, which the page says too.
-
-    Returns
-    -------
-    Path
-        The path of the page. Lengths on the page are in mm, angles in mrad.
-
-    Raises
-    ------
-    CalibrationError
-        For wrong input.
-
-    Examples
-    --------
-    >>> mc.report([fit, diagnosis], "report.html", author="A. Turing")
-    """
-    chosen = Chosen(title, customer, author, date, tolerance, tolerance_for, facts, rung,
-                    tuple(listed(deliver)))  # fmt: skip
-    signed(results, path, chosen, pdf, notify)
-    return Path(path)
-
-
 @dataclass(frozen=True)
 class Chosen:
-    """What people say of a report: see `report`."""
+    """What people say of a report.
+
+    title: that of the robot unless given.  customer, author: who accepts, who measured.
+    date: YYYY-MM-DD; SOURCE_DATE_EPOCH or today unless given.
+    tolerance: what is required in mm, as ``rms 0.2, max 0.5``.
+    tolerance_for: inside or outside the measured region.
+    facts: a TOML file with serial_number, controller, tool ...
+    rung: of a diagnosis, the last unless given.
+    deliver: formats of `export`, or compensate: the requirement is judged by what each reaches,
+    fitted for exactly what it carries; where a result holds effects and nothing is named, by
+    corrected targets.
+    """
 
     title: str = ""
     customer: str = ""
@@ -123,6 +67,49 @@ class Chosen:
         )
         return Wording(date_of(date), title, customer, author, told, limits_of(self.tolerance),
                        claim_called(self.tolerance_for), self.rung, self.deliver)  # fmt: skip
+
+
+@takes(chosen=Chosen, read={"deliver": lambda given: tuple(listed(given))})
+def report(
+    results: Result | Sequence[Result],
+    path: Path | str = "report.html",
+    *,
+    chosen: Chosen,
+    pdf: Path | str | None = None,
+    notify: Callable[[str], object] = warnings.warn,
+) -> Path:
+    """A page to sign of a calibration, a diagnosis, or both of the same measurements.
+
+    Parameters
+    ----------
+    results
+        Each itself or the file that it was saved to; a gap in a simulator may come with
+        them, a relative calibration and a motion diagnosis stand alone.
+    path
+        Of the HTML, which needs no network, or of a PDF, or of a PNG of the first page.
+    chosen
+        See `Chosen`.
+    pdf
+        Printed to this file as well, by an installed Chromium, Chrome or Edge.
+    notify
+        Called with what the reader should know of both together, which the page says too.
+
+    Returns
+    -------
+    Path
+        The path of the page. Lengths on the page are in mm, angles in mrad.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
+    >>> mc.report([fit, diagnosis], "report.html", author="A. Turing")
+    """
+    signed(results, path, chosen, pdf, notify)
+    return Path(path)
 
 
 def signed(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.fitting.identify import RESOLUTION, Because
+from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.instruments import fit, plausible, remarks
 from minimax_cal.fitting.instruments.checks import check_given, check_noises, check_options
 from minimax_cal.fitting.instruments.data import RelativeData
@@ -20,7 +20,6 @@ from minimax_cal.fitting.instruments.file import read_relative
 from minimax_cal.fitting.instruments.fit import InstrumentFit, Train
 from minimax_cal.fitting.instruments.identify import left_open, position_sigma, positions_by
 from minimax_cal.fitting.instruments.options import (
-    Known,
     Progress,
     RelativeOptions,
     read_noises,
@@ -35,9 +34,10 @@ from minimax_cal.fitting.instruments.result import (
 )
 from minimax_cal.fitting.instruments.table import instrument_of
 from minimax_cal.fitting.intervals import rms_interval, told
-from minimax_cal.fitting.opened import Writes, listed_effects
-from minimax_cal.fitting.options import listed, sigmas_of
+from minimax_cal.fitting.opened import listed_effects
+from minimax_cal.fitting.options import listed, priors_of
 from minimax_cal.ground.arrays import Array, rms
+from minimax_cal.ground.options import takes
 from minimax_cal.measuring.accuracy import HELD
 from minimax_cal.measuring.campaigns import session_names
 from minimax_cal.measuring.checks import check_joints, limit_notices
@@ -50,32 +50,28 @@ from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.joint_fit import fitted
 from minimax_cal.modelling.model import TARGET
 from minimax_cal.robots.robot import Robot, load_robot
-from minimax_cal.solvers.least_squares import AUTO
 from minimax_cal.solvers.status import Status
 
 Given = RelativeData | Measurements | str | Path
 
 
+READ: Mapping[str, Callable[[Any], Any]] = {  # what people give of an option, as its record has it
+    "fix": listed,
+    "free": listed,
+    "known_distances": tuple,
+    "noises": lambda given: read_noises(given or {}),
+    "priors": priors_of,
+    "effects": listed_effects,
+}
+
+
+@takes(options=RelativeOptions, read=READ)
 def relative(
     robot: Robot | str | Path,
     data: Given | Sequence[Given],
     progress: Progress = silent,
     *,
-    holdout: float = 0.2,
-    seed: int = 0,
-    fix: str | Sequence[str] = (),
-    free: str | Sequence[str] = (),
-    offset: bool = False,
-    known_distances: Sequence[Known] = (),
-    lever: float | None = None,
-    noises: Mapping[str, float | str] | None = None,
-    priors: Mapping[str, float | str] | None = None,
-    effects: str | Path | Writes | Sequence[str | Path | Term] = (),
-    camera_on: str = "",
-    fix_camera: bool = False,
-    camera_prior: str = "",
-    method: str = AUTO,
-    resolution: float = RESOLUTION,
+    options: RelativeOptions,
 ) -> RelativeCalibration:
     """Calibrate a robot from lengths, closures or poses, or from several files together.
 
@@ -86,33 +82,10 @@ def relative(
     ----------
     robot, data
         Loaded, or a name or path; several data in a list.
+    options
+        See `RelativeOptions`.
     progress
         Called with a word on each stage.
-    holdout
-        Share kept out of the fit.
-    seed
-        Of that choice.
-    fix, free
-        Names or patterns as ``beta*``.
-    offset
-        Of lengths, fit a constant one of each wire.
-    known_distances
-        Of closures, sockets A, B and the distance of their centres [m].
-    lever
-        Of poses, what a radian counts as [m]; the file's own unless given.
-    noises
-        Sigma of a number of a file by its name [m], or a text as 0.2mm; of others residuals say it.
-    priors
-        Sigma of a parameter's deviation from nominal, by name [m, rad], or a text as 5mm.
-    effects
-        Of the arm beyond geometry, fitted with it, as joint_compliance:all; or a diagnosis, of
-        which the confirmed effects are taken.
-    camera_on, fix_camera, camera_prior
-        Of pixels, as `calibrate_pixels` takes them.
-    method
-        Of the least squares.
-    resolution
-        Relative singular value that counts as not measured.
 
     Returns
     -------
@@ -128,40 +101,7 @@ def relative(
     --------
     >>> print(mc.relative("irb2600", "wires.csv", holdout=0.1).headline())
     """
-    chosen = chosen_of(
-        holdout=holdout,
-        seed=seed,
-        fix=fix,
-        free=free,
-        offset=offset,
-        known_distances=known_distances,
-        lever=lever,
-        noises=noises,
-        priors=priors,
-        effects=effects,
-        camera_on=camera_on,
-        fix_camera=fix_camera,
-        camera_prior=camera_prior,
-        method=method,
-        resolution=resolution,
-    )
-    return asked_of(robot, data, chosen).calibrated(progress)
-
-
-READ: Mapping[str, Callable[[Any], Any]] = {  # what people write of an option, as `RelativeOptions`
-    "fix": listed,
-    "free": listed,
-    "known_distances": tuple,
-    "noises": lambda given: read_noises(given or {}),
-    "priors": lambda given: sigmas_of(given or {}),
-    "effects": listed_effects,
-}
-
-
-def chosen_of(**given: Any) -> RelativeOptions:
-    """The options of `relative` by name.  Raises CalibrationError."""
-    read = {name: READ[name](value) if name in READ else value for name, value in given.items()}
-    return RelativeOptions(**read)
+    return asked_of(robot, data, options).calibrated(progress)
 
 
 @dataclass(frozen=True, eq=False)

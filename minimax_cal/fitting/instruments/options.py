@@ -55,13 +55,15 @@ class RelativeOptions:
     """How to calibrate.
 
     holdout: share kept out of the fit.  seed: of that choice.  fix, free: names or patterns as
-    ``beta*``.  offset: fit a constant offset of each wire.  known_distances: sockets A, B and the
-    distance of their centres [m].  lever: of poses, metres that a radian counts as; None for the
-    file's own.  priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
-    noises: sigma of a number of a file, by its name [m]; of others their residuals say it.
-    effects: beyond geometry, of the arm, fitted jointly, as `Options` has them.
-    method: of the least squares.  resolution: relative singular value that counts as
-    not measured.
+    ``beta*``.  offset: of lengths, fit a constant one of each wire.
+    known_distances: of closures, sockets A, B and the distance of their centres [m].
+    lever: of poses, what a radian counts as [m]; the file's own unless given.
+    noises: sigma of a number of a file by its name [m], or a text as 0.2mm; of others residuals
+    say it.  priors: sigma of a parameter's deviation from nominal, by name [m, rad], or a text as
+    5mm.  effects: of the arm beyond geometry, fitted with it, as joint_compliance:all; or a
+    diagnosis, of which the confirmed effects are taken.
+    camera_on, fix_camera, camera_prior: of pixels, as `calibrate_pixels` takes them.
+    method: of the least squares.  resolution: relative singular value that counts as not measured.
     """
 
     holdout: float = Options.holdout

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,19 +11,19 @@ import numpy as np
 
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.found import Parameter, link_by_link
-from minimax_cal.fitting.identify import RESOLUTION
 from minimax_cal.fitting.instruments.pixel_result import PIXELS, PixelCalibration
-from minimax_cal.fitting.options import QpSolver, listed, qp_name
+from minimax_cal.fitting.options import listed, qp_name
 from minimax_cal.fitting.pixels.camera import FLANGE, read_camera
 from minimax_cal.fitting.pixels.data import PixelData, read_pixels
 from minimax_cal.fitting.pixels.determined import Determined, determined, judged_pixels, placed
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.pixels.judge import Claim, arms_apart, drawn_sigma, position_sigma
 from minimax_cal.fitting.pixels.model import Scene, units_of
-from minimax_cal.fitting.pixels.options import SUM, PixelOptions, check_options
+from minimax_cal.fitting.pixels.options import PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import contradiction, file_notices, outlier_notices
 from minimax_cal.fitting.pixels.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.aside import TOOL, SetAside
@@ -32,6 +32,7 @@ from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.status import Status
 
 
+@takes(options=PixelOptions, read={"fix": listed, "free": listed})
 def calibrate_pixels(
     robot: Robot | str | Path,
     pixels: Path | str,
@@ -40,18 +41,7 @@ def calibrate_pixels(
     board: Path | str | None = None,
     progress: Progress = silent,
     *,
-    objective: str = SUM,
-    qp: QpSolver = PixelOptions.qp,
-    camera_on: str = "",
-    fix_camera: bool = False,
-    camera_prior: str = "",
-    drawn_prior: bool = False,
-    holdout: float = 0.2,
-    seed: int = 0,
-    fix: str | Sequence[str] = (),
-    free: str | Sequence[str] = (),
-    resolution: float = RESOLUTION,
-    allow_large_changes: bool = False,
+    options: PixelOptions,
 ) -> PixelCalibration:
     """Calibrate a robot from what cameras saw.
 
@@ -68,30 +58,10 @@ def calibrate_pixels(
     board
         Places of the targets (target, x_mm, y_mm, z_mm); without it they are fitted, and
         the drawing alone tells the scale.
+    options
+        See `PixelOptions`.
     progress
         Called with a word on each stage.
-    objective
-        sum, minimax (the worst target) or camera (the worst camera).
-    qp
-        Backend of the minimax QPs.
-    camera_on
-        flange or ground; what fits better unless given.
-    fix_camera
-        Hold the lenses as their files say.
-    camera_prior
-        How well these know them, as ``f 0.1%, c 2px``.
-    drawn_prior
-        Take the drawing as a prior, as well as the robot's `drawn_within` says or better.
-    holdout
-        Share of the poses kept out of the fit.
-    seed
-        Of that choice.
-    fix, free
-        Names or patterns as ``beta*``.
-    resolution
-        Relative singular value that counts as not measured.
-    allow_large_changes
-        Accept an arm that is another than the one drawn.
 
     Returns
     -------
@@ -109,20 +79,6 @@ def calibrate_pixels(
     >>> fit = mc.calibrate_pixels("ur5", "detections.csv", "joints.csv", {"cam": "camera.yaml"})
     """
     began = time.perf_counter()
-    options = PixelOptions(
-        objective=objective,
-        qp=qp,
-        camera_on=camera_on,
-        fix_camera=fix_camera,
-        camera_prior=camera_prior,
-        drawn_prior=drawn_prior,
-        holdout=holdout,
-        seed=seed,
-        fix=listed(fix),
-        free=listed(free),
-        resolution=resolution,
-        allow_large_changes=allow_large_changes,
-    )
     check_options(options)
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     cameras = [read_camera(name, path) for name, path in camera.items()]

@@ -61,13 +61,15 @@ def cameras_of(texts: Sequence[str]) -> dict[str, str]:
 class PixelOptions:
     """How to calibrate.
 
-    objective: sum, minimax (the worst target) or camera (the worst camera).  qp: backend of the
-    minimax QPs.  camera_on: flange or ground; "" for what fits better.  fix_camera: hold the
-    lenses as their files say.  camera_prior: how well these know them, as ``f 0.1%, c 2px``.
-    drawn_prior: whether the drawing is a prior.  holdout: share of the poses kept out of the fit;
-    seed: of that choice.  fix, free: names or patterns as ``beta*``.  resolution: relative singular
-    value that counts as not measured.  allow_large_changes: accept an arm that is another than the
-    one drawn.
+    objective: sum, minimax (the worst target) or camera (the worst camera).
+    qp: backend of the minimax QPs.  camera_on: flange or ground; what fits better unless given.
+    fix_camera: hold the lenses as their files say.
+    camera_prior: how well these know them, as ``f 0.1%, c 2px``.
+    drawn_prior: take the drawing as a prior, as well as the robot's `drawn_within` says or better.
+    holdout: share of the poses kept out of the fit.  seed: of that choice.
+    fix, free: names or patterns as ``beta*``.
+    resolution: relative singular value that counts as not measured.
+    allow_large_changes: accept an arm that is another than the one drawn.
     """
 
     objective: str = SUM
