@@ -14,7 +14,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.cli.commands import COMMANDS, ENTRIES
+from minimax_cal.cli.commands import ENTRIES, said_of
 from minimax_cal.cli.running import cli
 from minimax_cal.fitting.instruments import RelativeOptions
 from minimax_cal.modelling.simulate import Simulation
@@ -201,13 +201,12 @@ def test_no_command_waits_for_what_its_help_does_not_need() -> None:
 def test_the_list_says_what_the_commands_say() -> None:
     context = click.Context(cli)
     assert cli.list_commands(context) == list(cli.commands) == list(ENTRIES)
-    for entries in COMMANDS.values():
-        for name, (module, said) in entries.items():
-            command = cli.get_command(context, name)
-            assert command is not None
-            assert command.name == name
-            first = " ".join((command.help or "").partition("\n\n")[0].split())
-            assert first == said, f"minimax_cal.cli.{module}"
+    for name in ENTRIES:
+        command = cli.get_command(context, name)
+        assert command is not None
+        assert command.name == name
+        first = " ".join((command.help or "").partition("\n\n")[0].split())
+        assert first == said_of(name) != ""
     assert cli.get_command(context, "callibrate") is None
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections import UserDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from importlib import import_module
 from importlib.util import LazyLoader, find_spec, module_from_spec
@@ -17,165 +18,59 @@ import click
 
 from minimax_cal.ground.errors import OptionError
 
-Entry = tuple[str, str]  # module in this folder, the first sentence of the command's help
-
-COMMANDS: dict[str, dict[str, Entry]] = {
-    "Calibrate": {
-        "import": (
-            "import_",
-            "Read FILEs of a tracker or controller as they are, show what was understood, write "
-            "CSV.",
-        ),
-        "calibrate": (
-            "calibrate",
-            "Calibrate ROBOT (a file or a built-in name) from the measurements in DATA.",
-        ),
-        "identify": (
-            "identify",
-            "Make a robot file where nothing is drawn, from the measurements in DATA.",
-        ),
-        "relative": (
-            "relative",
-            "Calibrate ROBOT without coordinates, by lengths, closures, contacts or poses in DATA.",
-        ),
-    },
-    "Judge": {
-        "evaluate": (
-            "evaluate",
-            "Accuracy of a saved calibration FIT on the measurements in DATA; nothing is fitted.",
-        ),
-        "check": (
-            "check",
-            "Check with a few poses in DATA whether the calibration FIT is still valid, and what "
-            "moved.",
-        ),
-        "compare": (
-            "compare",
-            "What differs between two calibrations A and B: before and after a repair, say.",
-        ),
-    },
-    "Diagnose": {
-        "diagnose": (
-            "diagnose",
-            "Say why ROBOT still misses once calibrated, as far as the measurements in DATA can "
-            "tell.",
-        ),
-        "torques": (
-            "torques",
-            "Say why joint torques (or currents) in LOGs differ from those of MODEL, and by how "
-            "much.",
-        ),
-    },
-    "Plan": {
-        "plan": (
-            "plan",
-            "Which poses of ROBOT to measure next, in which order, and how accurate they will make "
-            "it.",
-        ),
-        "simulate": (
-            "simulate",
-            "Measurements of an imperfect copy of ROBOT, from a tracker at a random place.",
-        ),
-    },
-    "Correct": {
-        "compensate": (
-            "compensate",
-            "Correct the joint TARGETS (CSV) so that the robot of FIT goes where it is drawn to "
-            "go.",
-        ),
-        "export": (
-            "export",
-            "Write the robot of FIT (a saved result or a robot) as a file others can load.",
-        ),
-    },
-    "Simulate": {
-        "gap": (
-            "gap",
-            "How far the simulated arm of MODEL (MJCF or URDF) misses the real one in DATA, and "
-            "why.",
-        ),
-    },
-    "Report": {
-        "report": (
-            "report",
-            "A page to sign of RESULTS: a calibration, a diagnosis, or both of the same "
-            "measurements.",
-        ),
-    },
-    "Work on a page": {
-        "serve": (
-            "serve",
-            "A page to work in, in the browser of this machine: drop files, fit, diagnose, judge, "
-            "plan.",
-        ),
-    },
-    "Look up": {
-        "robots": ("robots", "The robots that come with the package."),
-        "effects": (
-            "diagnose",
-            "The library of effects; with ROBOT and DATA, where these measurements can test them.",
-        ),
-        "backends": ("backends", "The QP backends that are installed, with their versions."),
-    },
-    "More": {
-        "fleet": (
-            "fleet",
-            "Calibrate or check every cell of CELLS (TOML) in one go, with one overview of all.",
-        ),
-        "iso9283": (
-            "iso9283",
-            "Pose and distance accuracy of FIT by the formulas of ISO 9283, before and after.",
-        ),
-        "map": (
-            "map",
-            "Where FIT is sure of a position, and where the arm missed, over the workspace.",
-        ),
-    },
+COMMANDS = {  # in the order of the work
+    "Calibrate": ("import", "calibrate", "identify", "relative"),
+    "Judge": ("evaluate", "check", "compare"),
+    "Diagnose": ("diagnose", "torques"),
+    "Plan": ("plan", "simulate"),
+    "Correct": ("compensate", "export"),
+    "Simulate": ("gap",),
+    "Report": ("report",),
+    "Work on a page": ("serve",),
+    "Look up": ("robots", "effects", "backends"),
+    "More": ("fleet", "iso9283", "map"),
 }
 # parameters that name outputs
 WRITTEN = ("output", "figure", "path", "pdf", "truth", "write", "out")
 SPARED = ("numpy.f2py", "numpy.testing")  # which SciPy would load and no command uses
 LONG = ("relative", "diagnose", "plan", "gap")  # worth compiled kernels
-ENTRIES = {name: entry for part in COMMANDS.values() for name, entry in part.items()}
+ELSEWHERE = {"import": "import_", "effects": "diagnose"}  # not in a module of their name
+ENTRIES = {name: ELSEWHERE.get(name, name) for part in COMMANDS.values() for name in part}
+HELP = r'def {}_command\(.*?"""(.*?)(?:"""|\n\n)'
 
 
-def keeping_inputs(command: Callable[..., Any] | None) -> Callable[..., Any]:
-    """The command, refusing an output that is an input or another output, or a file called -."""
+def guarded(command: Callable[..., Any], *, brief: bool) -> Callable[..., Any]:
+    """The command with the kernels that suit its work, once its outputs are known to be its own."""
 
-    @wraps(command)  # type: ignore[arg-type]
-    def kept(*given: Any, **named: Any) -> Any:
-        outputs = [named[name] for name in WRITTEN if named.get(name) is not None]
-        inputs = [
-            part
-            for name, value in named.items()
-            if name not in WRITTEN
-            for part in (value if isinstance(value, list | tuple) else [value])
-            if isinstance(part, str | Path) and str(part)
-        ]
-        inputs += [part.rpartition("#")[0] for part in map(str, inputs) if "#" in part]  # a link
-        for i, path in enumerate(map(Path, outputs)):
-            if str(path) == "-":
-                raise OptionError("-o -: name a file; --json prints to stdout")
-            if any(is_same(path, Path(part)) for part in inputs):
-                raise OptionError(f"{path}: is an input of this command; name another file")
-            if any(leads_with(path, Path(other)) for other in outputs[:i]):
-                raise OptionError(f"{path}: is to hold two results; name another file for one")
-        return command(*given, **named)  # type: ignore[misc]
-
-    return kept
-
-
-def paced(command: Callable[..., Any] | None, *, brief: bool) -> Callable[..., Any]:
-    """The command, with the kernels that suit its work."""
-
-    @wraps(command)  # type: ignore[arg-type]
-    def at_pace(*given: Any, **named: Any) -> Any:
+    @wraps(command)
+    def at_work(*given: Any, **named: Any) -> Any:
+        check_outputs(named)
         from minimax_cal.robots.kernels.choice import work  # NumPy comes with it
 
         with work(brief=brief):
-            return command(*given, **named)  # type: ignore[misc]
+            return command(*given, **named)
 
-    return at_pace
+    return at_work
+
+
+def check_outputs(named: Mapping[str, Any]) -> None:
+    """Raise OptionError for an output that is an input or another output, or a file called -."""
+    outputs = [named[name] for name in WRITTEN if named.get(name) is not None]
+    inputs = [
+        part
+        for name, value in named.items()
+        if name not in WRITTEN
+        for part in (value if isinstance(value, list | tuple) else [value])
+        if isinstance(part, str | Path) and str(part)
+    ]
+    inputs += [part.rpartition("#")[0] for part in map(str, inputs) if "#" in part]  # a link
+    for i, path in enumerate(map(Path, outputs)):
+        if str(path) == "-":
+            raise OptionError("-o -: name a file; --json prints to stdout")
+        if any(is_same(path, Path(part)) for part in inputs):
+            raise OptionError(f"{path}: is an input of this command; name another file")
+        if any(leads_with(path, Path(other)) for other in outputs[:i]):
+            raise OptionError(f"{path}: is to hold two results; name another file for one")
 
 
 def is_same(one: Path, other: Path) -> bool:
@@ -222,9 +117,10 @@ class Commands(UserDict[str, Any]):
         found = self.data[name]
         if isinstance(found, click.Command):
             return found
-        module = quickly(f"minimax_cal.cli.{found[0]}")
+        module = quickly(f"{__package__}.{found}")
         command: click.Command = getattr(module, f"{name}_command")
-        command.callback = keeping_inputs(paced(command.callback, brief=name not in LONG))
+        assert command.callback is not None
+        command.callback = guarded(command.callback, brief=name not in LONG)
         self.data[name] = command
         return command
 
@@ -238,6 +134,13 @@ class Workflow(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The list of commands, part by part."""
-        for part, entries in COMMANDS.items():
+        for part, names in COMMANDS.items():
             with formatter.section(part):
-                formatter.write_dl([(name, said) for name, (_, said) in entries.items()])
+                formatter.write_dl([(name, said_of(name)) for name in names])
+
+
+def said_of(name: str) -> str:
+    """The first sentence of a command's help, from its source: to import all takes seconds."""
+    spec: Any = find_spec(f"{__package__}.{ENTRIES[name]}")
+    found = re.search(HELP.format(name), spec.loader.get_source(spec.name) or "", re.S)
+    return " ".join(found[1].split()) if found else ""
