@@ -3,37 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-import click
-
-from minimax_cal.cli import FAILED
 from minimax_cal.cli.options import (
     DATA,
-    DETAILS,
     FIT,
-    InGroups,
     Output,
-    keep,
+    command,
+    failed,
     options_of,
-    plain_option,
-    present,
     result_options,
 )
-from minimax_cal.cli.stderr import tell
+from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
 from minimax_cal.judging.watching.health import check
 
 ASKED = "What is asked"
 
 
-@click.command(name="check", cls=InGroups)
+@command
 @FIT
 @DATA
-@plain_option(
-    ASKED, "--tolerance", required=True, help='What is required in mm, as "rms 0.2, max 0.5".'
-)
 @options_of(
     check,
+    tolerance=Option('What is required in mm, as "rms 0.2, max 0.5".', group=ASKED),
     known=Option(
         "What is where it was at the calibration: frame (the instrument), targets (the "
         "reflectors).",
@@ -48,32 +41,12 @@ ASKED = "What is asked"
         group=ASKED,
     ),
 )
-@DETAILS
-@result_options("the calibration with what moved refitted (JSON)")
-def check_command(
-    fit: Path,
-    data: Path,
-    tolerance: str,
-    known: tuple[str, ...],
-    seed: int,
-    simulated: bool,
-    details: bool,
-    to: Output,
-) -> int:
+@result_options("the calibration with what moved refitted (JSON)", keep="checked.json")
+def check_command(fit: Path, data: Path, to: Output, **chosen: Any) -> int:
     """Check with a few poses in DATA whether the calibration FIT is still valid, and what moved.
 
     Instrument and reflectors may have moved.  The exit code is 0 if it is valid, else 1.
     """
-    found = check(fit, data, tolerance, known=known, seed=seed, simulated=simulated)
-    to.notice(*found.notices)
-    if to.path:
-        found.save(to.path)
-        to.wrote(to.path)
-    if to.as_json:
-        click.echo(found.json(), nl=False)
-    else:
-        present(details, [found.headline()], [found.first_table()], found.tables,
-                keep(to.path, "checked.json"))  # fmt: skip
-    if not found.valid:
-        tell("error", found.headline(), exit_code=FAILED)
-    return 0 if found.valid else FAILED
+    found = check(fit, data, **chosen)
+    to.finish(found, file=lambda: json_text(found.fit_dict()))
+    return 0 if found.valid else failed(found.headline())

@@ -8,33 +8,30 @@ from typing import Any
 
 import click
 
-from minimax_cal.cli import FAILED
 from minimax_cal.cli.options import (
     FIT,
     PATH,
     RUNG,
     SAFE_CELLS,
     WIDTH,
-    InGroups,
     Output,
-    options_of,
+    command,
+    failed,
+    options_from,
     plain_option,
     result_options,
 )
 from minimax_cal.cli.stderr import AS_JSON, tell
-from minimax_cal.correcting.compensate import Compensation, compensate
-from minimax_cal.correcting.programs.program import LANGUAGES, is_program, read_program
-from minimax_cal.correcting.target_file import read_targets
+from minimax_cal.correcting.compensate import HOW, CompensateOptions, Compensation, compensate
+from minimax_cal.correcting.programs.program import LANGUAGES, Program, is_program, read_program
+from minimax_cal.correcting.target_file import TargetFile, read_targets
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.options import Option
 from minimax_cal.ground.words import visible
 from minimax_cal.robots.robot import Robot, load_robot
 
-HOW = "How targets are corrected"
 
-
-@click.command(name="compensate", cls=InGroups)
+@command
 @FIT
 @click.argument("targets", type=PATH)
 @plain_option(
@@ -43,31 +40,7 @@ HOW = "How targets are corrected"
     "nominal",
     help="The nominal robot of the controller, file or name [default: that of the fit].",
 )
-@options_of(
-    compensate,
-    frame=Option(
-        "Where the nominal arm stands: best-fit (base and reflectors as the calibration placed "
-        "them), flange (the base so, the flange as drawn), own (on the calibrated base).",
-        group=HOW,
-    ),
-    tolerance=Option("What may remain of a target that counts as reached.", "mm", group=HOW),
-    most_change=Option(
-        "The most that a joint may change (a slide 8.7 mm per degree).",
-        "deg",
-        flag="--max-change",
-        group=HOW,
-    ),
-    lever=Option("What a radian counts as [default: the targets' own].", "mm", group=HOW),
-    clock=Option(
-        "Correct what follows the session's time too, as at this moment of it, 0 to 1 [default: "
-        "not at all].",
-        group=HOW,
-    ),
-)
-@options_of(
-    compensate,
-    keep_anyway=Option("Also where the calibrated arm is no better than the drawn one.", group=HOW),
-)
+@options_from(CompensateOptions)
 @plain_option(
     HOW,
     "--tool",
@@ -103,24 +76,18 @@ def compensate_command(
     """
     check_alike(targets, to.path)
     robot = None if nominal is None else load_robot(nominal)
+    given: Program | TargetFile
     if is_program(targets):
-        drawn = robot or nominal_of(fit, chosen["rung"])
-        program = read_program(targets, drawn, tool, wobj)
-        found = compensate(fit, program.data, robot, **chosen)
-        text: str | bytes = program.corrected(found)
+        given = read_program(targets, robot or nominal_of(fit, chosen["rung"]), tool, wobj)
+    elif tool or wobj:
+        raise OptionError("--tool and --wobj go with a program (.mod, .src, .dat)")
     else:
-        if tool or wobj:
-            raise OptionError("--tool and --wobj go with a program (.mod, .src, .dat)")
         given = read_targets(targets)
-        found = compensate(fit, given.data, robot, **chosen)
-        text = to.cells(given.corrected(found), safe_cells)
-    to.notice(*found.notices)
-    if to.deliver(found.json, rows=lambda: text):
-        show_corrected(found, text, to)
-    if found.failed.any():
-        tell("error", found.complaint(), exit_code=FAILED)
-        return FAILED
-    return 0
+    found = compensate(fit, given.data, robot, **chosen)
+    text = given.corrected(found)
+    text = to.cells(text, safe_cells) if isinstance(text, str) else text
+    to.finish(found, rows=lambda: text, show=lambda: show_corrected(found, text, to))
+    return failed(found.complaint()) if found.missed else 0
 
 
 def show_corrected(found: Compensation, text: str | bytes, to: Output) -> None:

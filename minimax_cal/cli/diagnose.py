@@ -9,28 +9,25 @@ from typing import Any
 
 import click
 
-from minimax_cal.cli import options
 from minimax_cal.cli.options import (
     CAMPAIGNS,
-    DETAILS,
     JSON,
     ROBOT,
     ROWS,
     SOME_DATA,
-    InGroups,
     Output,
+    command,
+    looked_up,
+    measured,
     options_from,
-    options_of,
     result_options,
     workers,
 )
-from minimax_cal.diagnosing.diagnose import diagnose
+from minimax_cal.diagnosing.diagnose import DiagnosisOptions, diagnose
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.options import Options
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import json_text
-from minimax_cal.ground.options import Option
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.history import with_history
 from minimax_cal.reporting.plots.diagnosis import save_diagnosis
@@ -38,42 +35,27 @@ from minimax_cal.reporting.tables import effects_list, effects_table, remainder_
 from minimax_cal.solvers.status import Status
 
 
-@click.command(name="diagnose", cls=InGroups)
+@command
 @ROBOT
 @CAMPAIGNS
 @options_from(Options, "holdout", "seed", "holdout_by", "instrument")
-@options_of(
-    diagnose,
-    exclude=Option(
-        "Do not consider this effect; `minimax-cal effects` lists them.",
-        metavar="EFFECT",
-        flag="--without",
-        many=tuple,
-        group="What is sought",
-    ),
-    quick=Option(
-        "Hold out no parts of the poses in turn: no claim outside the measured region.",
-        group="What is sought",
-    ),
-)
+@options_from(DiagnosisOptions)
 @workers(1, "1")
 @ROWS
-@DETAILS
-@result_options("the diagnosis (JSON)", figure="the gap and where it lies")
+@result_options("the diagnosis (JSON)", keep="diagnosis.json", figure="the gap and where it lies")
 def diagnose_command(
-    robot: str, data: tuple[Path, ...], in_rows: bool, details: bool, to: Output, **chosen: Any
+    robot: str, data: tuple[Path, ...], in_rows: bool, to: Output, **chosen: Any
 ) -> int:
     """Say why ROBOT still misses once calibrated, as far as the measurements in DATA can tell."""
-    with to.stages() as progress:
-        found = diagnose(robot, options.measured(data, in_rows), progress=progress, **chosen)
-    to.notice(*found.notices)
-    if to.deliver(found.json, found.status):
-        every = partial(every_table, found)
-        options.present(
-            details, found.said, found.first_tables(), every, advice(found, robot, data, to.path)
-        )
-    to.draw(save_diagnosis, found)
-    return options.exit_code(found.status)
+    found = to.work(diagnose, robot, measured(data, in_rows), **chosen)
+    return to.finish(
+        found,
+        status=found.status,
+        sentences=found.said,
+        tables=partial(every_table, found),
+        advice=advice(found, robot, data, to.path),
+        draw=save_diagnosis,
+    )
 
 
 def every_table(found: Diagnosis) -> Iterator[Table]:
@@ -100,7 +82,7 @@ def advice(
     yield f"{what} every effect, parameter and table", f"add {keep}--details"
 
 
-@click.command(name="effects", cls=InGroups)
+@command
 @click.argument("robot", required=False)
 @SOME_DATA
 @ROWS
@@ -111,12 +93,8 @@ def effects_command(robot: str | None, data: Path | None, in_rows: bool, as_json
     if robot is not None:
         if data is None:
             raise OptionError("effects needs both ROBOT and DATA, or neither")
-        measured = with_history(options.measured([data], in_rows))
-        fit = calibrate(robot, measured, objective="sum", holdout=0.0)
-        scene = fit.cell.scene(measured)
+        given = with_history(measured([data], in_rows))
+        fit = calibrate(robot, given, objective="sum", holdout=0.0)
+        scene = fit.cell.scene(given)
     entries = effects_list(scene)
-    if as_json:
-        click.echo(json_text({"schema": 1, "effects": entries}), nl=False)
-    else:
-        options.show(effects_table(entries))
-    return 0
+    return looked_up(as_json, {"schema": 1, "effects": entries}, effects_table(entries))

@@ -2,48 +2,54 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import click
 
-from minimax_cal.cli import options
-from minimax_cal.cli.motion_options import motion_options, paired, read
 from minimax_cal.cli.options import (
-    DETAILS,
     PATH,
-    InGroups,
     Output,
+    command,
+    exit_code,
     options_from,
     options_of,
-    plain_option,
     result_options,
 )
+from minimax_cal.dynamics.given import ARM, MotionKnown
 from minimax_cal.dynamics.logs import are_logs
 from minimax_cal.fitting.options import Options
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import Option
+from minimax_cal.ground.options import Option, number
 from minimax_cal.reporting.plots.motion import save_motion_gap
 from minimax_cal.reporting.plots.simulator import save_simulator_gap
 from minimax_cal.simulators.ladder import simulator_gap
 from minimax_cal.simulators.motion.ladder import motion_gap
 
-ARM, LOGS = "The arm", "Logs of motion"
+LOGS = "Logs of motion"
 OF_LOGS = ("holdout_run", "payload", "drive_gain", "ratio", "gains", "friction")
 
 
-@click.command(name="gap", cls=InGroups)
+def paired(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """KP:KD of each joint, separated by commas, or one for all.  Raises OptionError."""
+    pairs = [part.partition(":") for part in text.split(",")]
+    both = tuple(tuple(number(pair[k]) for pair in pairs) for k in (0, 2))
+    if not all(value >= 0.0 and math.isfinite(value) for side in both for value in side):
+        raise OptionError(
+            f"gains={text!r}: give KP:KD of each joint in N m/rad and N m s/rad, as 2000:200"
+        )
+    return both[0], both[1]
+
+
+@command
 @click.argument("model", type=PATH)
 @click.argument("data", type=PATH, nargs=-1, required=True)
-@plain_option(
-    ARM, "--fit", type=PATH, metavar="FIT", help="Correct by this calibration of the arm."
-)
-@plain_option(
-    ARM, "--diagnosis", type=PATH, metavar="D", help="Correct by this diagnosis of the arm."
-)
-@click.option("--write", type=PATH, metavar="XML", help="Write the corrected model to this MJCF.")
 @options_of(
     motion_gap,
+    fit=Option("Correct by this calibration of the arm.", metavar="FIT", read=Path, group=ARM),
+    diagnosis=Option("Correct by this diagnosis of the arm.", metavar="D", read=Path, group=ARM),
+    write=Option("Write the corrected model to this MJCF.", metavar="XML", read=Path),
     tip=Option("The last body of the arm, where there are several.", metavar="BODY", group=ARM),
     holdout_run=Option(
         "Judge on this run alone, which no fit sees.", metavar="NAME", many=tuple, group=LOGS
@@ -54,20 +60,19 @@ OF_LOGS = ("holdout_run", "payload", "drive_gain", "ratio", "gains", "friction")
         group=LOGS,
     ),
 )
-@motion_options(LOGS)
-@plain_option(
-    LOGS,
-    "--gains",
-    metavar="KP:KD,...",
-    callback=read(paired),
-    help="Gains of the drives that move the model, of all joints or of each.",
+@options_from(MotionKnown, "payload", "drive_gain", "ratio", group=LOGS)
+@options_of(
+    motion_gap,
+    gains=Option(
+        "Gains of the drives that move the model, of all joints or of each.",
+        metavar="KP:KD,...",
+        read=paired,
+        group=LOGS,
+    ),
 )
 @options_from(Options, "holdout", "seed")
-@DETAILS
-@result_options("the gap (JSON)", figure="the ladder")
-def gap_command(
-    model: Path, data: tuple[Path, ...], details: bool, to: Output, **chosen: Any
-) -> int:
+@result_options("the gap (JSON)", keep="gap.json", figure="the ladder")
+def gap_command(model: Path, data: tuple[Path, ...], to: Output, **chosen: Any) -> int:
     """How far the simulated arm of MODEL (MJCF or URDF) misses the real one in DATA, and why.
 
     DATA of poses: the model is driven with the measured commands in MuJoCo, as given and then
@@ -76,35 +81,17 @@ def gap_command(
     saw, and friction, masses, rotor inertias and what else makes a difference is corrected.
     """
     if are_logs(data):
-        return gap_of_logs(model, data, to, chosen, details=details)
+        del chosen["seed"]
+        moved = to.work(motion_gap, model, data, **chosen)
+        to.wrote(chosen["write"], moved.module)
+        said = (*moved.notices, *moved.sentences())
+        return to.finish(moved, notices=said, draw=save_motion_gap)
     if len(data) > 1:
         raise OptionError(f"{data[1]}: poses come in one file; logs need t_s, q1_rad, ..., tau1_Nm")
     for name in OF_LOGS:
         if chosen.pop(name):
             raise OptionError(f"{name}: is for logs of motion, {data[0]} holds poses; leave it")
-    with to.stages() as progress:
-        found = simulator_gap(model, data[0], progress=progress, **chosen)
+    found = to.work(simulator_gap, model, data[0], **chosen)
     to.wrote(chosen["write"])
-    to.notice(*found.notices)
-    if to.deliver(found.json):
-        first = found.table().brief("model", "RMS mm", "max mm", "fit says mm")
-        advice = options.keep(to.path, "gap.json")
-        options.present(details, [found.headline()], [first], found.tables, advice)
-    to.draw(save_simulator_gap, found)
-    return options.exit_code(found.status) or int(not found.holds)
-
-
-def gap_of_logs(
-    model: Path, data: tuple[Path, ...], to: Output, chosen: dict[str, Any], *, details: bool
-) -> int:
-    """The same along trajectories."""
-    del chosen["seed"]
-    with to.stages() as progress:
-        found = motion_gap(model, list(data), progress=progress, **chosen)
-    to.wrote(chosen["write"], Path(found.module) if found.module else None)
-    to.notice(*found.notices, *found.sentences())
-    if to.deliver(found.json):
-        advice = options.keep(to.path, "gap.json")
-        options.present(details, [found.headline()], [found.table().brief()], found.tables, advice)
-    to.draw(save_motion_gap, found)
-    return 0
+    to.finish(found, draw=save_simulator_gap)
+    return exit_code(found.status) or int(not found.holds)

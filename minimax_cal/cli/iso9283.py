@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import click
-
 from minimax_cal.cli.options import (
     FIT,
     RUNG,
     SOME_DATA,
-    InGroups,
     Output,
+    command,
     options_of,
     plain_option,
     result_options,
@@ -36,7 +34,7 @@ def point_of(text: str) -> str | Sequence[float]:
         raise OptionError(f"tcp={text!r}: give centroid, a target, or X,Y,Z in mm") from None
 
 
-@click.command(name="iso9283", cls=InGroups)
+@command
 @FIT
 @SOME_DATA
 @options_of(
@@ -61,7 +59,4 @@ def iso9283_command(fit: Path, data: Path | None, poses: bool, to: Output, **cho
     again give repeatability.
     """
     found = iso9283(fit, data, **chosen)
-    to.notice(*found.notices)
-    if to.deliver(found.json):
-        show(*found.tables(poses=poses))
-    return 0
+    return to.finish(found, show=lambda: show(*found.tables(poses=poses)))

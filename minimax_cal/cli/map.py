@@ -14,8 +14,8 @@ from minimax_cal.cli.options import (
     QUIET,
     RUNG,
     SOME_DATA,
-    InGroups,
     Output,
+    command,
     options_from,
     plain_option,
     show,
@@ -38,7 +38,7 @@ def predicted(saved: Saved, frame: str, source: str) -> tuple[Predict, Predict, 
     return predictor(cell, known, frame), predictor(cell, known, measured=True), ()
 
 
-@click.command(name="map", cls=InGroups)
+@command
 @FIT
 @SOME_DATA
 @options_from(Grid, "height", "slab")
@@ -58,7 +58,7 @@ def predicted(saved: Saved, frame: str, source: str) -> tuple[Predict, Predict, 
     help="Draw to this PNG, SVG or PDF, or write the numbers to a .json.",
 )  # fmt: skip
 @QUIET
-@with_output
+@with_output()
 def map_command(
     fit: Path, data: Path | None, frame: str, rung: int | None, to: Output, **chosen: Any
 ) -> int:
@@ -70,8 +70,5 @@ def map_command(
     saved = open_saved(fit, data or "", rung=rung)
     predict, measured, said = predicted(saved, frame, str(fit))
     found = workspace_map(saved, predict, Grid(**chosen), measured)
-    to.notice(*saved.notices, *said, *found.notices)
-    if to.deliver(found.json):
-        show(found.table())
-    to.draw(save_map, found)
-    return 0
+    notices = (*saved.notices, *said, *found.notices)
+    return to.finish(found, notices=notices, show=lambda: show(found.table()), draw=save_map)

@@ -5,15 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields
-from functools import cache, reduce, wraps
+from dataclasses import dataclass, fields, replace
+from functools import cache, partial, reduce, wraps
 from importlib.util import find_spec
-from inspect import signature
+from inspect import Parameter, signature
 from math import inf, isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.core import ParameterSource
 from rich.console import Console
 from rich.text import Text
 
@@ -21,7 +22,7 @@ from minimax_cal.cli import FAILED
 from minimax_cal.cli.progress import stages
 from minimax_cal.cli.stderr import PROGRESS, tell
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import check_writable, write_whole
+from minimax_cal.ground.files import check_writable, json_text, plain, write_whole
 from minimax_cal.ground.options import SI, Option, names_of, pair
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import visible, without_formulas
@@ -36,6 +37,8 @@ MOST_NOTICES = 50
 MOST = 1e12  # of any number: squares of what is larger overflow somewhere
 RESULT = "Measurements and result"
 DRAWN = (".png", ".svg", ".pdf")
+Advice = Iterable[tuple[str, str]]  # what for, and the command
+Made = TypeVar("Made")
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
 
@@ -80,6 +83,9 @@ JSON = click.option(
 NO_NOTICES = click.option(
     "--quiet", "-q", is_flag=True, help="Print no notices and no progress on stderr."
 )
+DETAILS = click.option(
+    "--details", is_flag=True, help="Print every table, not the first screen alone."
+)
 SAFE_CELLS = click.option(
     "--safe-cells",
     is_flag=True,
@@ -90,18 +96,32 @@ SAFE_CELLS = click.option(
 # ---- options from fields and arguments ---------------------------------------------------------
 
 
-def options_from(kind: Any, *names: str) -> Decorator:
+def options_from(kind: Any, *names: str, **other: Any) -> Decorator:
     """Options of a command from the fields of a dataclass that are made by `ground.options.option`.
 
     The command gets their values as keywords of the fields' names, in SI.  names: which fields.
+    other: what is not as there, as their group.
     """
     return stacked(
         *(
-            option_of(field.name, field.default, field.metadata["option"])
+            option_of(field.name, field.default, replace(field.metadata["option"], **other))
             for field in fields(kind)
             if "option" in field.metadata and (not names or field.name in names)
         )
     )
+
+
+def record_of(kind: Callable[..., Made], chosen: dict[str, Any]) -> Made:
+    """A record of options, from what a command got; they are taken from there."""
+    told: Any = kind
+    return kind(**{one.name: chosen.pop(one.name) for one in fields(told) if one.name in chosen})
+
+
+def on_command_line() -> set[str]:
+    """Names of the options that the command line gives."""
+    at = click.get_current_context()
+    given = ParameterSource.COMMANDLINE
+    return {name for name in at.params if at.get_parameter_source(name) is given}
 
 
 def options_of(verb: Callable[..., object], **told: Option) -> Decorator:
@@ -153,13 +173,14 @@ def option_of(name: str, default: Any, told: Option) -> Decorator:
         group=told.group,
         type=kind,
         is_flag=kind is bool,
-        default=shown,
+        **({"required": True} if default is Parameter.empty else {"default": shown}),
         show_default=shown is not None and kind is not bool,
         metavar=told.metavar or metavar or None,
         nargs=told.values,
         multiple=told.many is not None,
         callback=in_si,
         help=told.help or None,
+        hidden=told.hidden,
     )
 
 
@@ -188,9 +209,11 @@ class InGroups(click.Command):
                     formatter.write_dl(records)
 
 
-def kind_of(default: Any, told: Option, name: str) -> tuple[type, Any, str, Callable[[Any], Any]]:
+def kind_of(default: Any, told: Option, name: str) -> tuple[Any, Any, str, Callable[[Any], Any]]:
     """Type of what people give, its default and metavar, and what it is in SI."""
     scale = SI[told.unit]
+    if told.read is Path:
+        return PATH, None, "", Path
     if isinstance(default, tuple) and default:
         low, high = (f"{end / scale:g}" for end in default)
         return str, f"{low}:{high}", "LOW:HIGH", lambda text: pair(text, name, scale)
@@ -202,6 +225,11 @@ def kind_of(default: Any, told: Option, name: str) -> tuple[type, Any, str, Call
     return str, None, "", told.read or (tuple if told.values > 1 else str)
 
 
+def command(made: Command) -> click.Command:
+    """A command of the name that its function has before _command."""
+    return click.command(name=made.__name__.removesuffix("_command"), cls=InGroups)(made)
+
+
 NAMED = re.compile(r"(?<![\w-])(\w+)=(?:True\b|'([^']*)')?(?=(\S?))")
 
 
@@ -209,13 +237,19 @@ def in_flags(text: str, command: click.Command) -> str:
     """A message of Python, which calls an argument name=, with the command's --name."""
     flags = {p.name: max(p.opts, key=len) for p in command.params if isinstance(p, click.Option)}
 
-    def flagged(found: re.Match[str]) -> str:
+    def in_flag(found: re.Match[str]) -> str:
         flag, value = flags.get(found[1]), found[2]
         if flag is None:
             return found[0]
         return flag if value is None and found[3] in ",.;:)" else f"{flag} {value or ''}"
 
-    return NAMED.sub(flagged, text)
+    return NAMED.sub(in_flag, text)
+
+
+def flagged(text: str) -> str:
+    """A message of Python as the command says it that is at work."""
+    at = click.get_current_context(silent=True)
+    return in_flags(text, at.command) if at else text
 
 
 # ---- results -----------------------------------------------------------------------------------
@@ -223,24 +257,32 @@ def in_flags(text: str, command: click.Command) -> str:
 
 @dataclass(frozen=True)
 class Output:
-    """Where a result goes, as --json, --output, --figure and --quiet say."""
+    """Where a result goes, as --json, --output, --figure, --quiet and --details say.
+
+    keep: what its file is called in advice; empty for a command without a first screen.
+    """
 
     path: Path | None
     as_json: bool
     figure: Path | None
     quiet: bool
+    details: bool = False
+    keep: str = ""
 
     def stages(self) -> AbstractContextManager[Callable[[str], None]]:
         """A callback for each stage of long work, which stderr shows."""
         return stages(self.quiet)
 
+    def work(self, verb: Callable[..., Made], *given: Any, **chosen: Any) -> Made:
+        """What a function makes that takes long, its progress on stderr."""
+        with self.stages() as progress:
+            return verb(*given, progress=progress, **chosen)
+
     def notice(self, *texts: str) -> None:
         """Print notices on stderr, one a line."""
         shown = () if self.quiet else texts[:MOST_NOTICES]
         for text in shown:
-            at = click.get_current_context(silent=True)
-            said = in_flags(text, at.command) if at else text
-            tell("notice", said)
+            tell("notice", flagged(text))
         if shown and len(texts) > MOST_NOTICES:
             tell("notice", f"and {len(texts) - MOST_NOTICES} more, in the JSON")
 
@@ -254,58 +296,117 @@ class Output:
             )
         return quoted if safe else text
 
-    def wrote(self, *paths: Path | None) -> None:
-        """Say on stderr which files were written."""
+    def wrote(self, *paths: Path | str | None) -> None:
+        """Say on stderr which files were written, whatever their names."""
         for path in paths:
             if path and not self.quiet:
-                say_written(path)
-
-    def draw(self, save: Callable[[Any, Path], object], result: Any) -> None:
-        """Save the picture of a result where it was asked for."""
-        if self.figure:
-            save(result, self.figure)
-            self.wrote(self.figure)
+                tell("written", str(path))
 
     def deliver(
         self,
         json: Callable[[], str],
         status: Status = Status.CONVERGED,
         *,
+        file: Callable[[], str] | None = None,
         rows: Callable[[], str | bytes] | None = None,
     ) -> bool:
         """Write a result where it was asked for; whether people want to read it too.
 
-        rows: its CSV, which a file gets unless its ending asks for JSON.  A result that failed is
-        not written to a file.
+        file: the JSON of its file, where it is another.  rows: its CSV, which a file gets unless
+        its ending asks for JSON.  A result that failed is not written to a file.
         """
         once = cache(json)
         if self.path and status is not Status.FAILED:
-            made = rows if rows and self.path.suffix.lower() != ".json" else once
+            made = rows if rows and self.path.suffix.lower() != ".json" else file or once
             write_whole(self.path, made())
             self.wrote(self.path)
         if self.as_json:
             click.echo(once(), nl=False)
         return not self.as_json
 
+    def finish(
+        self,
+        found: Any,
+        *,
+        status: Status = Status.CONVERGED,
+        reason: str = "",
+        notices: Iterable[str] | None = None,
+        json: Callable[[], str] | None = None,
+        file: Callable[[], str] | None = None,
+        rows: Callable[[], str | bytes] | None = None,
+        show: Callable[[], object] | None = None,
+        draw: Callable[[Any, Path], object] | None = None,
+        **screen: Any,
+    ) -> int:
+        """Say, write, show and draw a `Result` as it was asked for; the exit code.
 
-def with_output(command: Command) -> Command:
-    """Hand a command its `Output` as `to`, once its files are known to be writable."""
+        status, reason: how it ended and why.  notices, json, show: its own unless given.
+        file, rows: as of `deliver`.  draw: saves its picture.  screen: as of `present`.
+        """
+        said = found.notices if notices is None else notices
+        self.notice(*(text for text in said if text != reason))
+        if self.deliver(json or found.json, status, file=file, rows=rows):
+            (show or partial(self.present, found, **screen))()
+        if self.figure and draw:
+            draw(found, self.figure)
+            self.wrote(self.figure)
+        return exit_code(status, reason)
 
-    @wraps(command)
-    def handed(
-        *given: Any,
-        quiet: bool,
-        as_json: bool = False,
-        output: Path | None = None,
-        figure: Path | None = None,
-        **more: Any,
-    ) -> Any:
-        output, figure = by_ending(command, output, figure)
-        writable(output)
-        drawable(figure)
-        return command(*given, to=Output(output, as_json, figure, quiet), **more)
+    def present(
+        self,
+        found: Any,
+        *,
+        sentences: Sequence[str] = (),
+        more: Sequence[Table] = (),
+        tables: Callable[[], Iterable[Table]] | None = None,
+        advice: Advice | None = None,
+    ) -> None:
+        """Print the first screen of a result, or with --details its sentences and every table.
 
-    return handed
+        sentences, tables, advice: other than its own, and how to keep it.  more: tables beside it.
+        """
+        sentences = sentences or [found.headline()]
+        if self.details:
+            terminal().print(Text(visible(" ".join(sentences))))
+            click.echo()
+            show(*(tables or found.tables)(), *more)
+        else:
+            advice = self.kept() if advice is None else advice
+            first_screen(sentences, *found.first_tables(), *more, advice=advice)
+
+    def kept(self) -> Advice:
+        """How to see every table, and to keep a result that was not written."""
+        if self.path:
+            return [("To see every table", "add --details")]
+        return [("To keep the result, and to see every table", f"add -o {self.keep} --details")]
+
+
+def with_output(*, rows: bool = False, draws: bool = False, keep: str = "") -> Decorator:
+    """Hand a command its `Output` as `to`, once its files are known to be writable.
+
+    rows: its result may be a CSV.  draws: or a picture.  keep: as of `Output`.
+    """
+
+    def made(command: Command) -> Command:
+        @wraps(command)
+        def handed(
+            *given: Any,
+            quiet: bool,
+            as_json: bool = False,
+            output: Path | None = None,
+            figure: Path | None = None,
+            details: bool = False,
+            **more: Any,
+        ) -> Any:
+            output, figure = by_ending(output, figure, rows=rows, draws=draws)
+            writable(output)
+            drawable(figure)
+            to = Output(output, as_json, figure, quiet, details, keep)
+            return command(*given, to=to, **more)
+
+        return handed
+
+    return made
 
 
 def measured(paths: Sequence[Path], in_rows: bool) -> Measurements:
@@ -321,79 +422,42 @@ def measured(paths: Sequence[Path], in_rows: bool) -> Measurements:
 
 
 def by_ending(
-    command: Command, output: Path | None, figure: Path | None
+    output: Path | None, figure: Path | None, *, rows: bool, draws: bool
 ) -> tuple[Path | None, Path | None]:
     """Where the result and where its picture go: by the ending of a file, as .json or .svg.
 
     Raises OptionError for a picture of a command that draws none, or for two of a kind.
     """
     if output and output.suffix.lower() in DRAWN:
-        if not getattr(command, "draws", False):
+        if not draws:
             raise OptionError(f"{output}: this command draws no picture; write a .json")
         if figure:
             raise OptionError(f"{output}: the picture goes to {figure} already")
         return None, output
-    if output and output.suffix.lower() == ".csv" and not getattr(command, "rows", False):
+    if output and output.suffix.lower() == ".csv" and not rows:
         raise OptionError(f"{output}: this command writes no CSV; write a .json")
     if figure and figure.suffix.lower() == ".json" and not output:
         return figure, None
     return output, figure
 
 
-def can(what: str) -> Decorator:
-    """Mark a command that draws its result (draws), or whose result is rows of a CSV (rows)."""
+def result_options(what: str, *, keep: str = "", figure: str = "") -> Decorator:
+    """The options of a result.
 
-    def marked(command: Command) -> Command:
-        setattr(command, what, True)
-        return command
-
-    return marked
-
-
-def result_options(what: str, *, figure: str = "") -> Decorator:
-    """The options of a result.  what: what -o writes.  figure: what --figure draws, if anything."""
+    what: what -o writes.  keep: what its file is called in advice, where --details shows more than
+    a first screen.  figure: what --figure draws, if anything.
+    """
+    rows, draws = "CSV" in what, bool(figure)
+    ends = f"{'.csv or ' * rows}.json{', or the picture to a .png, .svg or .pdf' * draws},"
     drawn = click.option("--figure", type=PATH, help=f"Draw {figure} to this PNG, SVG or PDF.")
-    endings = [".csv or .json"] if "CSV" in what else [".json"]
-    endings += ["or the picture to a .png, .svg or .pdf"] if figure else []
-    told = (JSON, output(f"{what}, {', '.join(endings)},"), QUIET, with_output)
-    marks = (*((can("draws"),) if figure else ()), *((can("rows"),) if "CSV" in what else ()))
-    return stacked(*((drawn,) if figure else ()), *told, *marks)
+    told = (JSON, output(f"{what}, {ends}"), QUIET)
+    more = (*[DETAILS] * bool(keep), *[drawn] * draws)
+    return stacked(*more, *told, with_output(rows=rows, draws=draws, keep=keep))
 
 
 def output(what: str) -> Decorator:
     """The option -o."""
     return click.option("-o", "--output", type=PATH, help=f"Write {what} to this file.")
-
-
-DETAILS = click.option(
-    "--details", is_flag=True, help="Print every table, not the first screen alone."
-)
-
-
-Advice = Iterable[tuple[str, str]]  # what for, and the command
-
-
-def present(
-    details: bool,
-    sentences: Sequence[str],
-    first: Sequence[Table],
-    every: Callable[[], Iterable[Table]],
-    advice: Advice,
-) -> None:
-    """Print the first screen of a result, or with --details its sentences and every table."""
-    if details:
-        terminal().print(Text(visible(" ".join(sentences))))
-        click.echo()
-        show(*every())
-    else:
-        first_screen(sentences, *first, advice=advice)
-
-
-def keep(written: Path | None, name: str) -> Advice:
-    """How to see every table, and to keep a result that was not written."""
-    if written:
-        return [("To see every table", "add --details")]
-    return [("To keep the result, and to see every table", f"add -o {name} --details")]
 
 
 def first_screen(sentences: Iterable[str], *tables: Table, advice: Advice) -> None:
@@ -415,11 +479,6 @@ def terminal() -> Console:
     """Stdout, as wide as the terminal, or 110 columns elsewhere."""
     console = Console(highlight=False)
     return console if console.is_terminal else Console(highlight=False, width=WIDTH)
-
-
-def say_written(path: Path) -> None:
-    """Say on stderr that a file was written, whatever its name."""
-    tell("written", str(path))
 
 
 def show(*tables: Table, headline: str = "") -> None:
@@ -456,7 +515,19 @@ def exit_code(status: Status, reason: str = "") -> int:
     """
     if status is Status.CONVERGED:
         return 0
-    at = click.get_current_context(silent=True)
-    said = in_flags(reason, at.command) if at and reason else reason or status.advice
-    tell("error", f"{status}: {said}", exit_code=FAILED)
+    return failed(f"{status}: {flagged(reason) or status.advice}")
+
+
+def failed(text: str) -> int:
+    """A line of error; the exit code."""
+    tell("error", text, exit_code=FAILED)
     return FAILED
+
+
+def looked_up(as_json: bool, content: object, *tables: Table) -> int:
+    """Print JSON, or tables; the exit code."""
+    if as_json:
+        click.echo(json_text(plain(content)), nl=False)
+    else:
+        show(*tables)
+    return 0

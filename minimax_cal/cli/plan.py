@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import click
-from click.core import ParameterSource
 
-from minimax_cal.cli import options
 from minimax_cal.cli.options import (
-    DETAILS,
     PATH,
     ROBOT,
-    InGroups,
     Output,
-    keep,
+    command,
+    on_command_line,
     options_from,
+    options_of,
     plain_option,
     result_options,
     writable,
@@ -25,9 +24,9 @@ from minimax_cal.cli.options import (
 from minimax_cal.fitting.pixels.options import cameras_of
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import write_whole
-from minimax_cal.ground.stages import Progress
+from minimax_cal.ground.options import Option
+from minimax_cal.planning.camera_options import FOR_CAMERAS, CameraOptions
 from minimax_cal.planning.camera_options import GROUP as CAMERAS
-from minimax_cal.planning.camera_options import CameraOptions
 from minimax_cal.planning.motion_plan import GROUP, MotionOptions, plan_motion
 from minimax_cal.planning.options import PlanOptions, limits_of
 from minimax_cal.planning.plan import plan
@@ -36,37 +35,29 @@ from minimax_cal.planning.stops import ANGLES
 from minimax_cal.reporting.plots.plan import save_plan
 from minimax_cal.robots.robot import Robot, load_robot
 
-MOTION = tuple(field.name for field in fields(MotionOptions))  # options of motions alone
-SHARED = ("joints", "volume", "floor", "body", "seed")  # of poses and motions
-IMAGES = ("criterion", "jitter", "revisit", "approach", "candidates", *SHARED)  # of poses too
 SEES = ("camera", "board", *(field.name for field in fields(CameraOptions)))
 ALLOWED = {  # what is planned, and the options that are about it
-    "motion": {*MOTION, "waypoints", *SHARED},
-    "poses": {*(one.name for one in fields(PlanOptions)), "poses", "fit", "data", "figure"},
-    "cameras": {*SEES, *IMAGES, "poses", "fit", "figure"},
+    "motion": {*signature(plan_motion).parameters, "waypoints"},
+    "poses": {*signature(plan).parameters, "figure"},
+    "cameras": {*SEES, *FOR_CAMERAS, "robot", "poses", "fit", "figure"},
 }
 OTHERWISE = {  # what an option is about that is not about what is planned
     "motion": "a motion; add motion=", "cameras": "cameras; add camera= and board=",
     "poses": "poses, not about",
 }  # fmt: skip
+KNOWN = "What is known"
 NAMED = {"motion": "a motion", "cameras": "cameras"}
 
 
-@click.command(name="plan", cls=InGroups)
+@command
 @ROBOT
 @plain_option(
-    "What the poses are for",
-    "--poses",
-    type=int,
-    metavar="N",
-    help="How many poses to measure.",
+    "What the poses are for", "--poses", type=int, metavar="N", help="How many poses to measure."
 )
 @plain_option(
-    GROUP,
-    "--motion",
-    is_flag=True,
+    GROUP, "--motion", is_flag=True,
     help="Plan a motion instead, whose torques tell masses and friction.",
-)
+)  # fmt: skip
 @options_from(MotionOptions)
 @plain_option(
     GROUP, "--waypoints", type=PATH, help="Write points and speeds at 10 Hz to this CSV file too."
@@ -86,14 +77,12 @@ NAMED = {"motion": "a motion", "cameras": "cameras"}
     help="The places of the board's corners (CSV): target, x_mm, y_mm, z_mm.",
 )
 @options_from(CameraOptions)
-@plain_option(
-    "What is known",
-    "--fit",
-    type=PATH,
-    help="A calibration (JSON): robot, base, targets, and its poses.",
-)
-@plain_option(
-    "What is known", "--data", type=PATH, help="Existing measurements (CSV); the plan adds to them."
+@options_of(
+    plan,
+    fit=Option(
+        "A calibration (JSON): robot, base, targets, and its poses.", read=Path, group=KNOWN
+    ),
+    data=Option("Existing measurements (CSV); the plan adds to them.", read=Path, group=KNOWN),
 )
 @options_from(PlanOptions)
 @click.option(
@@ -102,8 +91,9 @@ NAMED = {"motion": "a motion", "cameras": "cameras"}
     show_default=True,
     help=f"The unit of joints in the file: {' or '.join(ANGLES)}.",
 )
-@DETAILS
-@result_options("the poses (CSV)", figure="the poses and how accuracy grows with their number")
+@result_options(
+    "the poses (CSV)", keep="poses.csv", figure="the poses and how accuracy grows with their number"
+)
 def plan_command(
     robot: str,
     unit: str,
@@ -112,7 +102,6 @@ def plan_command(
     poses: int | None,
     motion: bool,
     waypoints: Path | None,
-    details: bool,
     **chosen: Any,
 ) -> int:
     """Which poses of ROBOT to measure next, in which order, and how accurate they will make it.
@@ -126,67 +115,42 @@ def plan_command(
     check_given(kind)
     arm = load_robot(robot)
     chosen["joints"] = limits_of(chosen["joints"], arm)
+    asked = {name: value for name, value in chosen.items() if name in ALLOWED[kind]}
     if motion:
         writable(waypoints)
-        return show_motion(arm, unit, to, waypoints, chosen, details=details)
+        moved = to.work(plan_motion, arm, **asked)
+        code = replace(to, keep="motion.csv").finish(moved, rows=lambda: moved.csv(unit))
+        if waypoints:
+            write_whole(waypoints, moved.waypoints(unit))
+            to.wrote(waypoints)
+        return code
     if poses is None:
         raise OptionError("give the number of poses=, or motion= for a motion")
-    with to.stages() as progress:
-        found = poses_of(arm, poses, kind, chosen, progress)
-    to.notice(*found.notices)
-    if to.deliver(found.json, rows=lambda: found.csv(unit)):
-        options.present(
-            details, [found.headline()], [found.criterion_table().brief()],
-            lambda: (*found.tables(), *(() if to.path else (found.pose_table(unit),))),
-            keep(to.path, "poses.csv"),
-        )  # fmt: skip
-    to.draw(save_plan, found)
-    return 0
+    found = poses_of(arm, poses, kind, asked, to)
+    return to.finish(
+        found,
+        rows=lambda: found.csv(unit),
+        tables=lambda: (*found.tables(), *[found.pose_table(unit)] * (to.path is None)),
+        draw=save_plan,
+    )
 
 
-def poses_of(arm: Robot, poses: int, kind: str, chosen: dict[str, Any], progress: Progress) -> Plan:
+def poses_of(arm: Robot, poses: int, kind: str, asked: dict[str, Any], to: Output) -> Plan:
     """The poses for a tracker, or for cameras.  Raises OptionError."""
-    cameras = cameras_of(chosen["camera"])
-    own = {name: value for name, value in chosen.items() if name in ALLOWED[kind]}
     if kind == "poses":
-        return plan(arm, poses, progress=progress, **own)
-    if not cameras or chosen["board"] is None:
+        return to.work(plan, arm, poses, **asked)
+    cameras = cameras_of(asked.pop("camera"))
+    if not cameras or asked["board"] is None:
         raise OptionError("images need both camera='NAME=FILE' and board=")
     from minimax_cal.planning.cameras import plan_cameras
 
-    return plan_cameras(arm, poses, progress=progress, **{**own, "camera": cameras})
+    return to.work(plan_cameras, arm, poses, cameras, **asked)
 
 
 def check_given(kind: str) -> None:
     """Raise OptionError for options that are not about what is planned.  kind: of ALLOWED."""
-    at = click.get_current_context()
-    for name in sorted(set().union(*ALLOWED.values()) - ALLOWED[kind]):
-        if at.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            about = next(each for each, names in ALLOWED.items() if name in names)
-            what = OTHERWISE[about] + (f" {NAMED[kind]}" if about == "poses" else "")
-            raise OptionError(f"{name}= is about {what}")
-
-
-def show_motion(
-    arm: Robot,
-    unit: str,
-    to: Output,
-    waypoints: Path | None,
-    chosen: dict[str, Any],
-    *,
-    details: bool,
-) -> int:
-    """Plan a motion, write and show it."""
-    wanted = {name: chosen[name] for name in (*MOTION, *SHARED)}
-    with to.stages() as progress:
-        found = plan_motion(arm, progress=progress, **wanted)
-    to.notice(*found.notices)
-    if to.deliver(found.json, rows=lambda: found.csv(unit)):
-        options.present(
-            details, [found.headline()], [found.told_table().brief()],
-            found.tables, keep(to.path, "motion.csv"),
-        )  # fmt: skip
-    if waypoints:
-        write_whole(waypoints, found.waypoints(unit))
-        to.wrote(waypoints)
-    return 0
+    known = set().union(*ALLOWED.values()) - ALLOWED[kind]
+    for name in sorted(on_command_line() & known):
+        about = next(each for each, names in ALLOWED.items() if name in names)
+        what = OTHERWISE[about] + (f" {NAMED[kind]}" if about == "poses" else "")
+        raise OptionError(f"{name}= is about {what}")

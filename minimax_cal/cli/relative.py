@@ -2,42 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import click
-
-from minimax_cal.cli import options
 from minimax_cal.cli.options import (
     CAMPAIGNS,
-    DETAILS,
     ROBOT,
-    InGroups,
     Output,
+    command,
     options_from,
     plain_option,
+    record_of,
     result_options,
 )
-from minimax_cal.cli.pixel_files import PIXEL_FILES, PixelFiles
 from minimax_cal.fitting.instruments import RelativeOptions, relative
 from minimax_cal.fitting.instruments.kinds import Given
-from minimax_cal.fitting.instruments.result import RelativeCalibration
 from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.pixels.options import PixelFiles, PixelOptions
 from minimax_cal.ground.errors import OptionError
-
-if TYPE_CHECKING:
-    from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
 
 SOUGHT = "What is sought"
 
 
-@click.command(name="relative", cls=InGroups)
+@command
 @ROBOT
 @CAMPAIGNS
 @options_from(Options, "holdout", "seed", "fix", "free", "priors", "effects")
 @options_from(RelativeOptions)
-@PIXEL_FILES
+@options_from(PixelFiles)
+@options_from(PixelOptions, "camera_on", "fix_camera", "camera_prior")
 @options_from(Options, "method")
 @plain_option(
     SOUGHT,
@@ -53,19 +48,13 @@ SOUGHT = "What is sought"
     metavar="EFFECT",
     help="With --diagnose: do not consider this effect; `minimax-cal effects` lists them.",
 )
-@DETAILS
-@result_options("the result (JSON)")
+@result_options("the result (JSON)", keep="relative.json")
 def relative_command(
     robot: str,
     data: tuple[Path, ...],
-    details: bool,
-    to: Output,
     diagnose: bool,
     exclude: tuple[str, ...],
-    pixels: Path | None,
-    joints: Path | None,
-    camera: Sequence[str],
-    board: Path | None,
+    to: Output,
     **chosen: Any,
 ) -> int:
     """Calibrate ROBOT without coordinates, by lengths, closures, contacts or poses in DATA.
@@ -81,23 +70,17 @@ def relative_command(
 
     With --diagnose the file holds the diagnosis as well, and the arm with the effects found.
     """
-    files, every = PixelFiles(pixels, joints, tuple(camera), board), list[Given](data)
+    files, every = record_of(PixelFiles, chosen), list[Given](data)
     if files.given:
         from minimax_cal.fitting.instruments.cameras import detected
 
         every.append(detected(*files.paths()))
     if exclude and not diagnose:
         raise OptionError("--without is of --diagnose; give both, or neither")
-    with to.stages() as progress:
-        found: RelativeCalibration | RelativeDiagnosis
-        if diagnose:
-            from minimax_cal.diagnosing.instruments import diagnose_relative
+    verb: Callable[..., Any] = relative
+    if diagnose:
+        from minimax_cal.diagnosing.instruments import diagnose_relative
 
-            found = diagnose_relative(robot, every, exclude=exclude, progress=progress, **chosen)
-        else:
-            found = relative(robot, every, progress, **chosen)
-    to.notice(*found.notices)
-    if to.deliver(found.json, found.status):
-        advice = options.keep(to.path, "relative.json")
-        options.present(details, [found.headline()], found.first_tables(), found.tables, advice)
-    return options.exit_code(found.status)
+        verb = partial(diagnose_relative, exclude=exclude)
+    found = to.work(verb, robot, every, **chosen)
+    return to.finish(found, status=found.status)

@@ -6,8 +6,7 @@ import click
 import numpy as np
 
 from minimax_cal.cli import options
-from minimax_cal.cli.schemas import print_schema, schema_option
-from minimax_cal.ground.files import json_text
+from minimax_cal.cli.schemas import schema_of, schema_option
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.ground.units import turned_for_people
 from minimax_cal.robots.kinematics import MDH_NAMES
@@ -16,7 +15,7 @@ from minimax_cal.robots.robot import Robot, builtin_robots, load_robot
 LENGTHS = ("a", "d")
 
 
-@click.command(name="robots", cls=options.InGroups)
+@options.command
 @click.argument("robot", required=False)
 @options.JSON
 @schema_option
@@ -26,24 +25,15 @@ def robots_command(robot: str | None, as_json: bool, schema: str | None) -> int:
     With ROBOT, a file or one of their names: its links, in mm and degrees.
     """
     if schema:
-        print_schema(schema)
-        return 0
+        return options.looked_up(True, schema_of(schema))
     if robot:
         arm = load_robot(robot)
-        if as_json:
-            click.echo(json_text(arm.to_dict()), nl=False)
-        else:
-            options.show(links_table(arm))
-        return 0
+        return options.looked_up(as_json, arm, links_table(arm))
     names = {name: load_robot(name) for name in builtin_robots()}
-    if as_json:
-        content = {name: arm.to_dict() for name, arm in names.items()}
-        click.echo(json_text({"schema": 1, "robots": content}), nl=False)
-        return 0
     rows = tuple((name, arm.name, arm.joints, arm.reach()) for name, arm in names.items())
     header = ("name", "robot", "joints", "links in all m")
-    options.show(Table("built-in robots", header, rows, ("", "", "d", ".2f")))
-    return 0
+    table = Table("built-in robots", header, rows, ("", "", "d", ".2f"))
+    return options.looked_up(as_json, {"schema": 1, "robots": names}, table)
 
 
 def links_table(robot: Robot) -> Table:

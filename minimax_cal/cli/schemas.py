@@ -8,8 +8,6 @@ from typing import Any
 
 import click
 
-from minimax_cal.ground.files import json_text
-
 KINDS = {  # name: (module, class that reads such a file)
     "robot": ("robots.robot", "RobotSchema"),
     "calibration": ("fitting.fit", "Fit"),
@@ -41,8 +39,3 @@ def schema_option(command: Callable[..., Any]) -> Callable[..., Any]:
         help="Print the JSON schema of a robot file, for editors, or of results: "
         + ", ".join(list(KINDS)[1:]) + ".",
     )(command)  # fmt: skip
-
-
-def print_schema(name: str) -> None:
-    """Print a JSON schema."""
-    click.echo(json_text(schema_of(name)), nl=False)

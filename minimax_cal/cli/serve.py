@@ -8,11 +8,11 @@ from pathlib import Path
 
 import click
 
-from minimax_cal.cli.options import PATH, InGroups
+from minimax_cal.cli.options import PATH, command
 from minimax_cal.serving.server import FOLDER, PORT, redirecting, serve
 
 
-@click.command(name="serve", cls=InGroups)
+@command
 @click.option(
     "--port",
     type=click.IntRange(0, 65535),

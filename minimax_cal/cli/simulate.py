@@ -7,8 +7,16 @@ from typing import Any
 
 import click
 
-from minimax_cal.cli import options
-from minimax_cal.cli.options import PATH, ROBOT, InGroups, options_from, options_of
+from minimax_cal.cli.options import (
+    PATH,
+    ROBOT,
+    Output,
+    command,
+    options_from,
+    options_of,
+    output,
+    writable,
+)
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text, write_whole
 from minimax_cal.ground.options import Option
@@ -18,7 +26,7 @@ from minimax_cal.modelling.simulate import Truth, simulate
 SESSION = "The session"
 
 
-@click.command(name="simulate", cls=InGroups)
+@command
 @ROBOT
 @options_of(
     simulate,
@@ -30,7 +38,7 @@ SESSION = "The session"
 @click.option(
     "--truth", type=PATH, help="Write the true robot, base and targets to this file (JSON)."
 )
-@options.output("the measurements (CSV)")
+@output("the measurements (CSV)")
 def simulate_command(
     robot: str,
     poses: int,
@@ -45,13 +53,11 @@ def simulate_command(
         raise OptionError("simulate needs -o FILE for the measurements")
     if output.suffix.lower() == ".json":
         raise OptionError(f"{output}: the measurements are a CSV; write a .csv")
-    options.writable(output, truth)
+    writable(output, truth)
     made = simulate(robot, poses, targets, seed, Truth(**chosen))
     write_measurements(output, made.data)
     if truth:
         content = {"robot": made.cell.robot.to_dict(), **made.cell.to_dict()}
         write_whole(truth, json_text(content))
-    for path in (output, truth):
-        if path:
-            options.say_written(path)
+    Output(None, False, None, False).wrote(output, truth)
     return 0

@@ -25,6 +25,7 @@ from minimax_cal.fitting.opened import open_result
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
 from minimax_cal.ground.facts import Apart, Fact, derived
+from minimax_cal.ground.options import option, takes
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table, records_of
@@ -162,18 +163,62 @@ class Compensation(Result):
         return {"targets": records_of(columns)}
 
 
+HOW = "How targets are corrected"
+
+
+@dataclass(frozen=True)
+class CompensateOptions:
+    """How targets are corrected.
+
+    frame: where the nominal arm stands, one of FRAMES.
+    tolerance: of the position, and of the orientation times the lever [m].
+    most_change: of a joint [rad; half as many m for a slide].
+    lever: what a radian counts as [m], NaN for the targets' own.
+    clock: the moment of the calibration's session, 0 to 1, that the arm is in: what follows that
+    session's time is then corrected as it was at that moment, and not at all where NaN.
+    rung: of a diagnosis, the last unless given, of which the confirmed effects count. The arm is
+    fitted again for exactly the effects that joints can correct (`deliver`).
+    keep_anyway: also where the calibrated arm is no better than the drawn one.
+    """
+
+    frame: str = option(
+        "best-fit",
+        "Where the nominal arm stands: best-fit (base and reflectors as the calibration placed "
+        "them), flange (the base so, the flange as drawn), own (on the calibrated base).",
+        group=HOW,
+    )
+    tolerance: float = option(
+        1e-5, "What may remain of a target that counts as reached.", "mm", group=HOW
+    )
+    most_change: float = option(
+        np.pi / 36.0,
+        "The most that a joint may change (a slide 8.7 mm per degree).",
+        "deg",
+        flag="--max-change",
+        group=HOW,
+    )
+    lever: float = option(
+        np.nan, "What a radian counts as [default: the targets' own].", "mm", group=HOW
+    )
+    clock: float = option(
+        np.nan,
+        "Correct what follows the session's time too, as at this moment of it, 0 to 1 [default: "
+        "not at all].",
+        group=HOW,
+    )
+    rung: int | None = None
+    keep_anyway: bool = option(
+        False, "Also where the calibrated arm is no better than the drawn one.", group=HOW
+    )
+
+
+@takes(options=CompensateOptions)
 def compensate(
     fit: Given,
     targets: Measurements | Array | Sequence[Sequence[float]],
     nominal: Robot | str | Path | None = None,
     *,
-    frame: str = "best-fit",
-    tolerance: float = 1e-5,
-    most_change: float = np.pi / 36.0,
-    lever: float = np.nan,
-    clock: float = np.nan,
-    rung: int | None = None,
-    keep_anyway: bool = False,
+    options: CompensateOptions,
 ) -> Compensation:
     """Joints that bring the calibrated arm to where the nominal one would stand.
 
@@ -187,23 +232,8 @@ def compensate(
     nominal
         The arm the controller believes in, its file or its name; that of the fit unless
         given.
-    frame
-        Where the nominal arm stands, one of FRAMES.
-    tolerance
-        Of the position, and of the orientation times the lever [m].
-    most_change
-        Of a joint [rad; half as many m for a slide].
-    lever
-        What a radian counts as [m], NaN for the targets' own.
-    clock
-        The moment of the calibration's session, 0 to 1, that the arm is in: what follows
-        that session's time is then corrected as it was at that moment, and not at all where
-        NaN.
-    rung
-        Of a diagnosis, the last unless given, of which the confirmed effects count. The arm
-        is fitted again for exactly the effects that joints can correct (`deliver`).
-    keep_anyway
-        Also where the calibrated arm is no better than the drawn one.
+    options
+        See `CompensateOptions`.
 
     Returns
     -------
@@ -219,13 +249,13 @@ def compensate(
     --------
     >>> q = mc.compensate(fit, targets, tolerance=2e-5).q
     """
-    check_choices(frame, tolerance, most_change, lever, clock)
+    check_choices(options)
     nominal = load_robot(nominal) if isinstance(nominal, str | Path) else nominal
-    known = open_result(fit, rung)
-    data = path_of(targets, known.cell.robot, 0.0 if np.isnan(clock) else clock)
+    known = open_result(fit, options.rung)
+    moment = None if np.isnan(options.clock) else options.clock
+    data = path_of(targets, known.cell.robot, moment or 0.0)
     torques = arm_of(known.cell).scene(data).measured_torques
-    moment = None if np.isnan(clock) else clock
-    made = kept(known, COMPENSATED, keep_anyway, moment, torques=torques)
+    made = kept(known, COMPENSATED, options.keep_anyway, moment, torques=torques)
     cell, drawn = made.cell, made.nominal if known.placed else None
     robot = made.nominal.robot if made.nominal else None
     if nominal is not None and not (robot and same(nominal, robot)):
@@ -235,28 +265,28 @@ def compensate(
         raise CalibrationError(f"{source}: does not tell its nominal robot; give nominal=")
     check_like(robot, cell.robot)
     arm = arm_of(cell)
-    base, tool, said = placed(cell, arm, robot, drawn, frame)
+    base, tool, said = placed(cell, arm, robot, drawn, options.frame)
     goal = base @ robot.pose(data.q) @ tool
-    lever = lever_of(cell) if np.isnan(lever) else lever
-    reach = Reach(arm, data, goal, lever, tolerance, most_change)
+    lever = lever_of(cell) if np.isnan(options.lever) else options.lever
+    reach = Reach(arm, data, goal, lever, options.tolerance, options.most_change)
     q, outcome = reach.best()
     lacks = (made.sentence(),) if made.lacks else ()
     said = (*data.notices, *said, *remarks(arm, data), *lacks)
     return Compensation(
         q, data.q, *reach.error(q), *reach.error(data.q), outcome, cell.robot.prismatic, data.line,
-        cell.robot.name, frame, said, made,
+        cell.robot.name, options.frame, said, made,
     )  # fmt: skip
 
 
-def check_choices(
-    frame: str, tolerance: float, most_change: float, lever: float, clock: float
-) -> None:
+def check_choices(options: CompensateOptions) -> None:
     """Raise OptionError for choices that `compensate` does not have."""
-    if frame not in FRAMES:
-        raise OptionError(f"no frame {frame!r}; choose {', '.join(FRAMES)}")
-    for name, value in (("tolerance", tolerance), ("largest change", most_change)):
+    if options.frame not in FRAMES:
+        raise OptionError(f"no frame {options.frame!r}; choose {', '.join(FRAMES)}")
+    sizes = {"tolerance": options.tolerance, "largest change": options.most_change}
+    for name, value in sizes.items():
         if not (np.isfinite(value) and value > 0.0):
             raise OptionError(f"{name} {value:g}: must be positive and finite")
+    lever, clock = options.lever, options.clock
     if lever <= 0.0 or lever > FARTHEST:
         raise OptionError(f"lever {lever:g} m: must be positive and finite, at most {FARTHEST:g}")
     if not (np.isnan(clock) or 0.0 <= clock <= 1.0):

@@ -14,6 +14,7 @@ from minimax_cal.correcting.exporters.job import Export, Job, job_of, read_sourc
 from minimax_cal.fitting.opened import Result
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
+from minimax_cal.ground.options import option, takes
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.urdf_file import read_urdf
 
@@ -38,17 +39,50 @@ class Exported:
         return {"delivered": own.to_dict() if own else block(self.format)}
 
 
+FORMAT = "The format"
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What to export.
+
+    urdf: a file whose joint origins are corrected, all else left as it is.
+    mjcf: one whose bodies, gains and springs are.
+    tip: last link of the chain in that file.
+    experimental: agree to a format whose frames its maker does not document (moc).
+    rung: of a diagnosis, the last unless given.
+    keep_anyway: also where the calibrated arm is no better than the drawn one.
+    """
+
+    urdf: Path | str | None = option(
+        None,
+        "Correct the joint origins of this URDF; all else stays, byte for byte.",
+        metavar="ORIGINAL",
+        read=Path,
+        group=FORMAT,
+    )
+    mjcf: Path | str | None = option(
+        None,
+        "Correct the bodies, gains and springs of this MJCF; all else stays.",
+        metavar="ORIGINAL",
+        read=Path,
+        group=FORMAT,
+    )
+    tip: str = option("", "The last link of the chain in that file.", metavar="LINK", group=FORMAT)
+    experimental: bool = option(False, "Agree to moc.", group=FORMAT, hidden=True)
+    rung: int | None = None
+    keep_anyway: bool = option(
+        False, "Also where the calibrated arm is no better than the drawn one.", group=FORMAT
+    )
+
+
+@takes(options=ExportOptions)
 def export(
     fit: Result | Robot,
     to: str,
     path: Path | str | None = None,
     *,
-    urdf: Path | str | None = None,
-    mjcf: Path | str | None = None,
-    tip: str = "",
-    experimental: bool = False,
-    rung: int | None = None,
-    keep_anyway: bool = False,
+    options: ExportOptions,
     notify: Callable[[str], object] = warnings.warn,
 ) -> str:
     """The robot of a calibration in a format that other programs load.
@@ -66,18 +100,8 @@ def export(
         urdf, ur-yaml, ros-yaml, ros2-control, dh-csv, json, mjcf or sdf.
     path
         Written to as well, where given.
-    urdf
-        A file whose joint origins are corrected, all else left as it is.
-    mjcf
-        One whose bodies, gains and springs are.
-    tip
-        Last link of the chain in that file.
-    experimental
-        Agree to a format whose frames its maker does not document (moc).
-    rung
-        Of a diagnosis, the last unless given.
-    keep_anyway
-        Also where the calibrated arm is no better than the drawn one.
+    options
+        See `ExportOptions`.
     notify
         Called with what the format cannot hold and other notices.
 
@@ -98,10 +122,7 @@ def export(
     if path is not None:
         check_writable(path)
     place = None if path is None else Path(path)
-    made = exported(
-        fit, to, place, urdf=urdf, mjcf=mjcf, tip=tip, experimental=experimental, rung=rung,
-        keep_anyway=keep_anyway,
-    )  # fmt: skip
+    made = exported(fit, to, place, options)
     written(made.file, place)
     for notice in made.notices:
         notify(notice)
@@ -112,29 +133,26 @@ def exported(
     fit: Result | Robot,
     to: str,
     path: Path | None = None,
-    *,
-    urdf: Path | str | None = None,
-    mjcf: Path | str | None = None,
-    tip: str = "",
-    experimental: bool = False,
-    rung: int | None = None,
-    keep_anyway: bool = False,
+    options: ExportOptions = ExportOptions(),
 ) -> Exported:
     """The bytes of the file, its notices, and what it delivers; arguments as of `export`."""
     table.exporter(to)
     if isinstance(fit, Path | str) and Path(fit).suffix.lower() in table.CONVERTERS.get(to, ()):
         return Exported(to, table.convert(Path(fit)))
-    source, found = read_source(fit, rung), None
+    source, found = read_source(fit, options.rung), None
     if isinstance(source, Job):
         job = source
     else:
-        found = kept(source, to, keep_anyway)
+        found = kept(source, to, options.keep_anyway)
         q = source.train.q if source.data.poses else None
         job = job_of(source.source, found.cell, found.nominal, q)
-    originals = () if urdf is None else (read_urdf(urdf),)
-    model = None if mjcf is None else Path(mjcf)
     job = replace(
-        job, originals=originals, model=model, path=path, tip=tip, experimental=experimental
+        job,
+        originals=() if options.urdf is None else (read_urdf(options.urdf),),
+        model=None if options.mjcf is None else Path(options.mjcf),
+        path=path,
+        tip=options.tip,
+        experimental=options.experimental,
     )
     file = table.export(job, to)
     if found is not None and not isinstance(source, Job):

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -60,7 +59,7 @@ from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.ground.options import check_left_out
+from minimax_cal.ground.options import check_left_out, option, takes
 from minimax_cal.ground.stages import name_rung, number_step
 from minimax_cal.ground.words import name_first
 from minimax_cal.measuring import checks
@@ -99,18 +98,50 @@ STEPS = (
 NOT_ASKED = Beyond(reason="not asked for")
 ROBUST = replace(SUM, trim=0.3)  # a fit that up to so many wrong points do not pull
 EARLIEST = 5  # visits before a jump that a study takes for possible, and after it
+SOUGHT = "What is sought"
 
 
+@dataclass(frozen=True)
+class DiagnosisOptions:
+    """What a diagnosis is to do.
+
+    seed, holdout: of the poses kept out of the fit, and their share.
+    holdout_by: a column (session, group ...) or region, whose poses are held out together.
+    instrument: u95 of a coordinate as 10um+2.5um/m, where the data do not say.
+    exclude: effects that are not to be considered.
+    quick: leave no parts of the poses out in turn, so that there is no claim outside the measured
+    poses.
+    """
+
+    seed: int = Options.seed
+    holdout: float = Options.holdout
+    holdout_by: str | None = None
+    instrument: str | None = None
+    exclude: Sequence[str] = option(
+        (),
+        "Do not consider this effect; `minimax-cal effects` lists them.",
+        metavar="EFFECT",
+        flag="--without",
+        many=tuple,
+        group=SOUGHT,
+    )
+    quick: bool = option(
+        False,
+        "Hold out no parts of the poses in turn: no claim outside the measured region.",
+        group=SOUGHT,
+    )
+
+    def step_of(self, progress: Progress, name: str) -> Progress:
+        """Progress of one of STEPS."""
+        return number_step(progress, STEPS.index(name) + 1, len(STEPS) - self.quick, name)
+
+
+@takes(options=DiagnosisOptions, read={"exclude": list})
 def diagnose(
     robot: Robot | str | Path,
     data: Measurements | str | Path | Sequence[str | Path],
     *,
-    seed: int = 0,
-    holdout: float = 0.2,
-    holdout_by: str | None = None,
-    instrument: str | None = None,
-    exclude: Sequence[str] = (),
-    quick: bool = False,
+    options: DiagnosisOptions,
     jobs: int = 1,
     cluster: str = "",
     progress: Progress = silent,
@@ -122,17 +153,8 @@ def diagnose(
     robot, data
         Loaded, or a name or path; data also as a list of paths, the campaigns of one arm,
         each a session.
-    seed, holdout
-        Of the poses kept out of the fit, and their share.
-    holdout_by
-        A column (session, group ...) or region, whose poses are held out together.
-    instrument
-        u95 of a coordinate as 10um+2.5um/m, where the data do not say.
-    exclude
-        Effects that are not to be considered.
-    quick
-        Leave no parts of the poses out in turn, so that there is no claim outside the
-        measured poses.
+    options
+        See `DiagnosisOptions`.
     jobs
         Processes that search parts of the poses, -1 for one a core.
     cluster
@@ -157,12 +179,11 @@ def diagnose(
     began = time.perf_counter()
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     given = measured(data)
-    check_left_out(exclude, EFFECTS)
+    check_left_out(options.exclude, EFFECTS)
     given = checks.check_joints(robot, given)
     checks.check_spread(robot, given)
-    options = DiagnosisOptions(seed, holdout, holdout_by, instrument, tuple(exclude), quick)
-    raw = with_groups(with_history(with_instrument(given, instrument)))
-    held, notices = held_out(raw, holdout, seed, holdout_by)
+    raw = with_groups(with_history(with_instrument(given, options.instrument)))
+    held, notices = held_out(raw, options.holdout, options.seed, options.holdout_by)
     if not held.any():
         raise DataError(
             f"{given.source}: no pose is held out; a diagnosis needs some that no fit has seen: "
@@ -182,27 +203,6 @@ def few_judges(held: Measurements) -> Iterator[str]:
             f"only {held.poses} poses are held out: what is said of new poses rests on these; "
             "calibrate with the effects found judges every pose by a fit without it"
         )
-
-
-@dataclass(frozen=True)
-class DiagnosisOptions:
-    """Arguments of `diagnose`."""
-
-    seed: int
-    holdout: float
-    holdout_by: str | None
-    instrument: str | None
-    exclude: tuple[str, ...]
-    quick: bool
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """For the file."""
-        return vars(self) | {"exclude": list(self.exclude)}
-
-    def step_of(self, progress: Progress, name: str) -> Progress:
-        """Progress of one of STEPS."""
-        return number_step(progress, STEPS.index(name) + 1, len(STEPS) - self.quick, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +270,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
             *notices_of(study, clean, ladder, late, effects),
             *filter(None, [wrong]),
         ),
-        provenance=Provenance.of(robot, asked.data, options.settings),
+        provenance=Provenance.of(robot, asked.data, vars(options)),
         seconds=time.perf_counter() - began,
         data=study.geometric.placed(clean.data),
         held=~np.isin(clean.data.line, train.line),

@@ -21,7 +21,7 @@ from minimax_cal.dynamics.budget import (
     without_harmful,
 )
 from minimax_cal.dynamics.given import (
-    Payload,
+    MotionKnown,
     gains_of,
     known_of,
     ratios_of,
@@ -58,7 +58,7 @@ from minimax_cal.evidence.limits import LEVEL
 from minimax_cal.evidence.selection import Choice, select
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import check_left_out
+from minimax_cal.ground.options import check_left_out, takes
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.robot import Robot, load_robot
@@ -93,15 +93,12 @@ class Found:
     lacking: tuple[tuple[str, str, str], ...]
 
 
+@takes(known=MotionKnown)
 def diagnose_motion(
     robot: Robot | str | Path,
     logs: Sequence[Run | str | Path] | str | Path,
     *,
-    holdout: float = 0.2,
-    holdout_run: str | Sequence[str] | None = None,
-    payload: Payload | None = None,
-    drive_gain: Sequence[float] | None = None,
-    ratio: float | Sequence[float] | None = None,
+    known: MotionKnown,
     exclude: Sequence[str] = (),
     progress: Progress = silent,
 ) -> MotionDiagnosis:
@@ -113,17 +110,8 @@ def diagnose_motion(
         Loaded, or a name or path; masses, inertias and drive gains of its file are used.
     logs
         Files or runs; each is a trajectory.
-    holdout
-        About this share of the trajectories is left out in turn to judge what each effect is worth.
-    holdout_run
-        Names of runs that judge instead, and that neither the search nor a fit sees.
-    payload
-        What the flange is known to carry: its mass [kg] and its centre in the last frame [m].  A
-        mass that a run itself reports counts for that run.
-    drive_gain
-        Torque for one ampere, of each joint [N m/A], where the logs hold currents.
-    ratio
-        Gear ratio, of all joints or of each.
+    known
+        See `MotionKnown`.
     exclude
         Effects that are not to be considered.
     progress
@@ -147,10 +135,10 @@ def diagnose_motion(
     check_left_out(exclude, LAWS)
     progress("reading logs")
     runs = runs_of(robot, arm_of, logs)
-    prepared = prepare(with_payload(runs, payload))
-    arm = Arm.of(arm_of, gains_of(arm_of, runs, drive_gain), ratios_of(arm_of, ratio),
-                 known_of(payload), prepared)  # fmt: skip
-    named = named_runs(prepared, holdout_run)
+    prepared = prepare(with_payload(runs, known.payload))
+    gain, ratio = gains_of(arm_of, runs, known.drive_gain), ratios_of(arm_of, known.ratio)
+    arm = Arm.of(arm_of, gain, ratio, known_of(known.payload), prepared)
+    holdout, named = known.holdout, named_runs(prepared, known.holdout_run)
     if not (named or 0.0 < holdout < 1.0):
         raise OptionError(f"holdout={holdout:g} must lie between 0 and 1")
     with threadpool_limits(limits=1, user_api="blas"):

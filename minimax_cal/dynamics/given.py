@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from minimax_cal.dynamics.regressor import link_parameters
 from minimax_cal.dynamics.run import CURRENT, Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.options import number, option
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.urdf import is_urdf, load_urdf
 
@@ -21,6 +24,70 @@ HEAVIEST, FARTHEST = 1e4, 10.0  # payload of the largest arms, several times ove
 LARGEST = 1e6  # a gear ratio, or a torque for one ampere [N m/A], and 1 / the least
 
 Payload = tuple[float, tuple[float, float, float]]
+ARM, JUDGED = "The arm", "What judges"
+
+
+def listed(text: str, name: str) -> tuple[float, ...]:
+    """Numbers separated by commas.  Raises OptionError."""
+    found = tuple(number(part) for part in text.split(","))
+    if not all(map(math.isfinite, found)):
+        raise OptionError(f"{name}={text!r}: give numbers separated by commas")
+    return found
+
+
+def carried(text: str) -> Payload:
+    """KG@x,y,z in kg and m.  Raises OptionError."""
+    mass, mark, at = text.partition("@")
+    parts = [number(part) for part in at.split(",")] if mark else [0.0, 0.0, 0.0]
+    if not number(mass) > 0.0 or len(parts) != 3 or not all(map(math.isfinite, parts)):
+        raise OptionError(f"payload={text!r}: give KG@x,y,z in kg and m, as 2@0,0,0.05")
+    return number(mass), (parts[0], parts[1], parts[2])
+
+
+@dataclass(frozen=True)
+class MotionKnown:
+    """What is known of an arm whose motion was logged, and which of its runs judge.
+
+    holdout: share of the runs that judge, left out in turn; in a simulator the last ones, and of a
+    single run its end.
+    holdout_run: names of runs that judge instead, and that neither the search nor a fit sees.
+    payload: what the flange is known to carry: its mass [kg] and its centre in the last frame [m].
+    A mass that a run itself reports counts for that run.
+    drive_gain: torque for one ampere, of each joint [N m/A], where the logs hold currents.
+    ratio: gear ratio, of all joints or of each.
+    """
+
+    holdout: float = option(
+        0.2, "Share of the runs that is left out in turn to judge.", group=JUDGED
+    )
+    holdout_run: str | Sequence[str] | None = option(
+        None,
+        "Judge on this run alone, which no fit and no search sees.",
+        metavar="NAME",
+        many=tuple,
+        group=JUDGED,
+    )
+    payload: Payload | None = option(
+        None,
+        "What the flange is known to carry: kg, and its centre in the last frame in m.",
+        metavar="KG@X,Y,Z",
+        read=carried,
+        group=ARM,
+    )
+    drive_gain: Sequence[float] | None = option(
+        None,
+        "Torque for one ampere of each joint, N m per A.",
+        metavar="LIST",
+        read=partial(listed, name="drive_gain"),
+        group=ARM,
+    )
+    ratio: float | Sequence[float] | None = option(
+        None,
+        "Gear ratio of all joints, or of each.",
+        metavar="LIST",
+        read=partial(listed, name="ratio"),
+        group=ARM,
+    )
 
 
 def joint_names(robot: Robot | str | Path) -> tuple[str, ...]:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from minimax_cal.ground.arrays import Array
 
 TORQUE = "N m"  # of a revolute joint; N of one that slides
@@ -51,6 +53,11 @@ class Run:
     def duration(self) -> float:
         """Time from the first row to the last [s]."""
         return float(self.time[-1] - self.time[0])
+
+    @property
+    def step(self) -> float:
+        """Typical time between rows [s]."""
+        return float(np.median(np.diff(self.time)))
 
     def at(self, rows: Array) -> Run:
         """Some rows, time as it is.  rows: (m,) mask."""

@@ -35,7 +35,7 @@ class Option:
     the value in the help.  flag: the option's name where it is not the field's.  read: the value
     from a text.  values: how many the option takes.  many: what gathers those of an option that
     may be given several times; without `read` they are names, also separated by commas.
-    group: under which heading the help lists it.
+    group: under which heading the help lists it.  hidden: whether it does not.
     """
 
     help: str = ""
@@ -46,6 +46,7 @@ class Option:
     values: int = 1
     many: Callable[[Iterable[Any]], Any] | None = None
     group: str = ""
+    hidden: bool = False
 
 
 def option(default: Any, help: str = "", unit: str = "", **more: Any) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -32,6 +32,10 @@ class Result:
     @abstractmethod
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
+
+    def first_tables(self) -> Sequence[Table]:
+        """What stands on a first screen."""
+        return (self.tables()[0].brief(),)
 
     def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """What of its file its fields do not tell by themselves.

@@ -5,20 +5,28 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from minimax_cal.fitting.opened import Opened, Result, open_result
+from minimax_cal.fitting.checks import POOR_FIT
+from minimax_cal.fitting.opened import Opened, open_result
+from minimax_cal.fitting.opened import Result as Given
+from minimax_cal.fitting.set_aside import aside_sentence, errors_of, with_them
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError
+from minimax_cal.ground.facts import Apart, Fact
+from minimax_cal.ground.results import Result
+from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
-from minimax_cal.measuring.checks import check_joints
-from minimax_cal.measuring.grouping import REPEAT
+from minimax_cal.measuring.aside import SetAside
+from minimax_cal.measuring.checks import check_joints, outliers
+from minimax_cal.measuring.grouping import REPEAT, groups
 from minimax_cal.measuring.measurements import Measurements, read_measurements
-from minimax_cal.measuring.spans import Span
+from minimax_cal.measuring.spans import Span, narrow, outside, spans_in_words
 from minimax_cal.modelling.cell import Cell, strangers
 from minimax_cal.modelling.model import model_of
 from minimax_cal.robots.robot import load_robot
@@ -46,7 +54,7 @@ class Saved:
 
 
 def evaluate(
-    source: Result,
+    source: Given,
     data: Measurements | Path | str,
     rung: int | None = None,
     new_frame: bool = False,
@@ -85,8 +93,95 @@ def evaluate(
     return accuracy(cell.error(data))
 
 
+@dataclass(frozen=True)
+class Evaluation(Result):
+    """How well the arm of a result predicts measurements.
+
+    fit, data: their files.  rung: of the result, its name.  training_poses: of the measurements.
+    outside: poses outside what the fit's joints spanned; narrow: joints that hardly moved there.
+    with_them: the accuracy where points that were set aside count, None without any.
+    """
+
+    KIND = "evaluation"
+
+    fit: str
+    rung: str
+    data: str
+    data_sha256: str
+    training_poses: int
+    outside: Annotated[int, Fact(key="outside_spans.poses")]
+    narrow: Annotated[tuple[str, ...], Fact(key="outside_spans.joints")]
+    accuracy: Accuracy
+    set_aside: tuple[SetAside, ...]
+    with_them: Apart[Accuracy | None]
+    name: Apart[str]
+    targets: Apart[tuple[str, ...]]
+    notices: Apart[tuple[str, ...]]
+
+    def headline(self) -> str:
+        """The error in a sentence."""
+        return f"{self.name} {self.data}: RMS {self.accuracy.rms_mm:.4f} mm."
+
+    def table(self) -> Table:
+        """The error of all targets and of each."""
+        return self.accuracy.table(f"{self.name} on {self.data}", self.targets)
+
+    def tables(self) -> tuple[Table, ...]:
+        """One alone."""
+        return (self.table(),)
+
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
+        """The accuracy of all points that were measured."""
+        return {"accuracy": {"holdout_with_them": self.with_them} if self.with_them else {}}
+
+
+def evaluated(
+    source: Given, data: Measurements | Path | str, rung: int | None, new_frame: bool
+) -> Evaluation:
+    """As `evaluate`, with what the reader should know."""
+    data = data if isinstance(data, Measurements) else read_measurements(data)
+    opened = open_result(source, rung)
+    cell, _, said = opened.placed_by(data, new_frame)
+    error = cell.error(data)
+    found = accuracy(error)
+    count, mixed = training_poses(data, opened, error)
+    doubts = outliers(data, np.linalg.norm(error, axis=-1))
+    if found.rms_mm > 1e3 * POOR_FIT * cell.robot.reach():
+        doubts.append(
+            f"{data.source}: the fit misses by {found.rms_mm:.3g} mm: check that data and fit "
+            "belong to the same robot, measurement frame, units and order of targets; if it was "
+            "measured from elsewhere, new_frame=True fits where"
+        )
+    away, few = outside(opened.spans, data.q), narrow(opened.spans)
+    if away.any():
+        doubts.append(
+            f"{data.source}: {away.sum()} of {data.poses} poses are outside what the joints of the "
+            f"fit spanned ({spans_in_words(few)}): no claim was made for them"
+        )
+    gone = None
+    if data.set_aside:
+        gone = with_them(error, groups(data), errors_of(cell, data))
+        doubts.append(aside_sentence(data.set_aside, gone))
+    step = opened.rungs[opened.number].name
+    return Evaluation(
+        fit=opened.source,
+        rung=step,
+        data=data.source,
+        data_sha256=data.digest,
+        training_poses=count,
+        outside=int(away.sum()),
+        narrow=tuple(span.joint for span in few),
+        accuracy=found,
+        set_aside=data.set_aside,
+        with_them=gone,
+        name=cell.robot.name if rung is None else f"{cell.robot.name}, {step},",
+        targets=data.target_names,
+        notices=(*data.notices, *said, *strangers(cell, data), *mixed, *doubts),
+    )
+
+
 def open_saved(
-    source: Result, data: Path | str = "", nominal: str = "", rung: int | None = None
+    source: Given, data: Path | str = "", nominal: str = "", rung: int | None = None
 ) -> Saved:
     """A result, or its file, with the measurements in a file, or with its own.
 

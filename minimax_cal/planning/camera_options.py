@@ -17,6 +17,10 @@ from minimax_cal.robots.transforms import from_rpy
 SIDES = {"-z": -1.0, "z": 1.0}  # of a board's frame: where its print looks
 GROUP = "Cameras in place of a tracker"
 PIXEL_NOISE = 0.1  # of u and v [px]
+FOR_CAMERAS = (  # options of a plan that are about cameras too
+    "criterion", "joints", "volume", "floor", "body", "jitter", "revisit", "approach", "candidates",
+    "seed",
+)  # fmt: skip
 
 
 def frame(text: str, name: str) -> Array:

@@ -25,7 +25,7 @@ from minimax_cal.ground.files import plain, saved_content
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.modelling.cell import Cell, pose_from_dict
-from minimax_cal.planning.camera_options import SIDES, CameraOptions, check_cameras
+from minimax_cal.planning.camera_options import FOR_CAMERAS, SIDES, CameraOptions, check_cameras
 from minimax_cal.planning.camera_prospect import CameraProspect, PixelNoise
 from minimax_cal.planning.camera_sight import CameraSight
 from minimax_cal.planning.options import USUAL, PlanOptions, check_options
@@ -34,11 +34,6 @@ from minimax_cal.planning.result import Plan
 from minimax_cal.planning.setting import Ground, check_same, surroundings
 from minimax_cal.planning.task import Task
 from minimax_cal.robots.robot import Robot, load_robot
-
-FOR_CAMERAS = (  # options of a plan that are about cameras too
-    "criterion", "joints", "volume", "floor", "body", "jitter", "revisit", "approach", "candidates",
-    "seed",
-)  # fmt: skip
 
 
 @takes(sees=CameraOptions, options=(PlanOptions, FOR_CAMERAS), read={"joints": lambda g: g or {}})

@@ -37,12 +37,14 @@ from minimax_cal.planning.motion import (
     improved,
     shrunk,
 )
+from minimax_cal.planning.options import PlanOptions
 from minimax_cal.planning.stops import ANGLES, rounded_csv
 from minimax_cal.planning.visibility import THICK, Room
 from minimax_cal.robots.gravity import masses_of, weighed
 from minimax_cal.robots.robot import Robot, load_robot
 
 GROUP = "A motion instead of poses"
+ROOM = ("joints", "volume", "floor", "body", "seed")  # options of a plan that are about motions too
 HARMONICS, SLOW_HARMONICS = 8, 3  # of a series
 SLOW_SPEED = 0.2  # peak of the slow part: friction below it is seen nowhere else [rad/s, m/s]
 SLOW_PERIOD = 30.0  # of the slow part at least [s]
@@ -207,16 +209,12 @@ def shown(told: Told) -> str:
     return f"{told.sigma:.2g} {told.unit}" if np.isfinite(told.sigma) else "not separable"
 
 
-@takes(options=MotionOptions)
+@takes(options=MotionOptions, room=(PlanOptions, ROOM), read={"joints": lambda g: g or {}})
 def plan_motion(
     robot: Robot | str | Path,
     *,
-    joints: Mapping[int, tuple[float, float]] | None = None,
-    volume: Sequence[Sequence[float]] = (),
-    floor: float = 0.0,
-    body: float | None = None,
-    seed: int = 0,
     options: MotionOptions,
+    room: PlanOptions,
     progress: Progress = silent,
 ) -> MotionPlan:
     """A motion whose torques tell masses and friction, within limits, and what it will tell.
@@ -225,16 +223,10 @@ def plan_motion(
     ----------
     robot
         A robot, its file, or a built-in name.
-    joints
-        Limits by joint index that narrow the robot's [rad, m].
-    volume
-        Lowest and highest corner of the box for the arm's points, base axes [m].
-    floor, body
-        Height of the floor, and radius of the arm's links [m].
-    seed
-        Of all that is random.
     options
         See `MotionOptions`.
+    room
+        See `PlanOptions`.
     progress
         Called with a sentence at each stage.
 
@@ -255,9 +247,9 @@ def plan_motion(
     began = time.perf_counter()
     arm = robot if isinstance(robot, Robot) else load_robot(robot)
     check_motion(options)
-    check_seed(seed)
-    bounds, notices = bounds_of(arm, options, joints or {}, volume, floor, body)
-    rng = np.random.default_rng(seed)
+    check_seed(room.seed)
+    bounds, notices = bounds_of(arm, options, room)
+    rng = np.random.default_rng(room.seed)
     progress("drawing motions")
     draw = partial(free_series, bounds, HARMONICS, options.duration)
     drawn = [draw(rng) for _ in range(DRAWN)]
@@ -274,14 +266,7 @@ def plan_motion(
         notices = (*notices, UNLOADED)
     if not weighed(arm).all():
         notices = (*notices, f"{arm.name} gives no masses: the noise is that of assumed ones")
-    settings = {
-        **plain(vars(options)),
-        "joints": {str(joint): limits for joint, limits in (joints or {}).items()},
-        "volume": volume,
-        "floor": floor,
-        "body": body,
-        "seed": seed,
-    }
+    settings = plain(vars(options) | {name: getattr(room, name) for name in ROOM})
     told = tuple(told_by(model, parts))
     seconds = time.perf_counter() - began
     base = model.basis.shape[1]
@@ -309,22 +294,17 @@ def check_motion(options: MotionOptions) -> None:
 
 
 def bounds_of(
-    robot: Robot,
-    options: MotionOptions,
-    joints: Mapping[int, tuple[float, float]],
-    volume: Sequence[Sequence[float]],
-    floor: float,
-    body: float | None,
+    robot: Robot, options: MotionOptions, room: PlanOptions
 ) -> tuple[Bounds, tuple[str, ...]]:
     """What the motion may do, and notices.  Raises OptionError."""
-    lower, upper, notices = limits_of(robot, joints)
+    lower, upper, notices = limits_of(robot, room.joints)
     lower, upper = (np.where(robot.passive, 0.0, limit) for limit in (lower, upper))
-    radius = THICK * robot.reach() if body is None else body
+    radius = THICK * robot.reach() if room.body is None else room.body
     up = np.array([[0.0, 0.0, 1.0]])
-    room = Room(robot, np.zeros((1, 3)), up, lower, upper, radius, floor)
+    space = Room(robot, np.zeros((1, 3)), up, lower, upper, radius, room.floor)
     scale = np.where(robot.prismatic, 1e-3 * 180.0 / np.pi, 1.0)  # degrees to mm
-    box = np.array(volume, dtype=float).reshape(-1, 3)
-    return Bounds(room, box, scale * options.speed, scale * options.acceleration), notices
+    box = np.array(room.volume, dtype=float).reshape(-1, 3)
+    return Bounds(space, box, scale * options.speed, scale * options.acceleration), notices
 
 
 @dataclass(frozen=True, eq=False)

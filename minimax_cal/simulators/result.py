@@ -106,6 +106,10 @@ class SimulatorGap(Result):
         """The ladder."""
         return (self.table(),)
 
+    def first_tables(self) -> tuple[Table, ...]:
+        """The ladder, without what explains its rungs."""
+        return (self.table().brief("model", "RMS mm", "max mm", "fit says mm"),)
+
     def headline(self) -> str:
         """The result in a sentence or two."""
         first, last = self.rungs[0], self.rungs[-1]

@@ -72,7 +72,7 @@ def test_the_motion_stays_within_its_limits(loaded: module.MotionPlan) -> None:
 def test_the_search_finds_more_than_it_drew(loaded: module.MotionPlan) -> None:
     robot = mc.load_robot(ARM)
     options = module.MotionOptions(10.0, SPEED, ACCELERATION)
-    bounds, _ = module.bounds_of(robot, options, {}, BOX, 0.0, None)
+    bounds, _ = module.bounds_of(robot, options, module.PlanOptions(volume=BOX))
     rng = np.random.default_rng(0)
     drawn = [module.free_series(bounds, module.HARMONICS, 10.0, rng) for _ in range(6)]
     model = module.model_of(robot, drawn)

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.dynamics.given import Payload, read_logs
+from minimax_cal.dynamics.given import MotionKnown, Payload, read_logs
 from minimax_cal.dynamics.logs import runs_text
 from minimax_cal.dynamics.regressor import link_parameters
 from minimax_cal.dynamics.run import Run
@@ -135,7 +135,7 @@ def test_the_ladder_says_so(made: SimpleNamespace) -> None:
 def reached(path: Path, module: str, runs: list[Run], payload: Payload | None = None) -> np.ndarray:
     """(n,) RMS torque that a file and its module miss on the last run, loaded again [N m]."""
     opened = open_model(path, 3)
-    judge = Judge.of(opened, runs, (0.2, None), payload, None, None)
+    judge = Judge.of(opened, runs, MotionKnown(payload=payload))
     with installed(Path(module).read_text() if module else "", opened.chain):
         return np.array(judge.torque(opened.chain).whole)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from minimax_cal.dynamics.logs.bags import is_bag, read_bag
 from minimax_cal.dynamics.logs.draft import Draft, drafts_of
@@ -16,6 +17,7 @@ from minimax_cal.dynamics.logs.write import runs_text
 from minimax_cal.dynamics.run import Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.importers import units_of
 from minimax_cal.measuring.importers.sheet import cut, open_text
 from minimax_cal.measuring.importers.words import along_arm
@@ -39,6 +41,44 @@ class LogFiles:
     def notices(self) -> tuple[str, ...]:
         """What is to be said of the files."""
         return tuple(dict.fromkeys(text for run in self.runs for text in run.notices))
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "joints": self.runs[0].joints,
+            "unit": self.runs[0].unit,
+            "runs": [
+                {
+                    "name": run.name,
+                    "source": run.source,
+                    "format": title,
+                    "rows": len(run.time),
+                    "duration_s": run.duration,
+                    "step_s": run.step,
+                    "payload_kg": run.payload,
+                    "columns": columns,
+                }
+                for run, title, columns in zip(self.runs, self.titles, self.columns, strict=True)
+            ],
+            "notices": self.notices,
+        }
+
+    def table(self) -> Table:
+        """A row a run."""
+        told, first = self.to_dict()["runs"], self.runs[0]
+        rows = tuple(
+            (run["name"], run["format"], run["rows"], run["duration_s"], 1.0 / run["step_s"],
+             run["columns"][0], first.unit)
+            for run in told
+        )  # fmt: skip
+        total, count = sum(run.duration for run in self.runs), len(told)
+        title = f"{count} run{'s' * (count > 1)}, {total:.1f} s, {first.joints} joints"
+        header = ("run", "format", "rows", "s", "rows a second", "first joint", "torque in")
+        return Table(title, header, rows)
+
+    def csv(self) -> str:
+        """As CSV of this project."""
+        return runs_text(self.runs, self.sliding)
 
 
 def read_runs(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
@@ -81,6 +81,10 @@ class PixelCalibration(RelativeCalibration):
         worst = (self.worst.table(),) if self.worst else ()
         parameters = parameter_table(self.parameters)
         return (self.accuracy_table(), self.claim_table(), *worst, parameters)
+
+    def first_tables(self) -> Sequence[Table]:
+        """What stands on the first screen."""
+        return (self.accuracy_table().brief(),)
 
     def headline(self) -> str:
         """The result in some sentences, with what it does not say."""

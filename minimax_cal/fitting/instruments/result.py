@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Annotated, Any
@@ -263,7 +263,7 @@ class RelativeCalibration(Measured, Result):
         header = ("only by", "directions", "parameters of the arm")
         return Table("identified by one file alone", header, rows, ("", "d", ""))
 
-    def first_tables(self) -> list[Table]:
+    def first_tables(self) -> Sequence[Table]:
         """What stands on the first screen."""
         first = [self.accuracy_table().brief("poses", "count", "RMS mm", "max mm")]
         if self.instruments:

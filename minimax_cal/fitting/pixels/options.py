@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -55,6 +56,53 @@ def cameras_of(texts: Sequence[str]) -> dict[str, str]:
     if len(named) < len(texts):
         raise OptionError("camera= gives one name twice; each camera has its own")
     return named
+
+
+@dataclass(frozen=True, eq=False)
+class PixelFiles:
+    """What is given of cameras."""
+
+    pixels: Path | None = option(
+        None,
+        "What cameras saw (CSV): pose, camera, target, u_px, v_px.",
+        metavar="FILE",
+        read=Path,
+        group=CAMERAS,
+    )
+    joints: Path | None = option(
+        None,
+        "The joint values of each pose of the detections (CSV): pose, q1_rad, ...",
+        metavar="FILE",
+        read=Path,
+        group=CAMERAS,
+    )
+    camera: Sequence[str] = option(
+        (),
+        "The K and D of a camera, as OpenCV or ROS write them (YAML); may be given several times.",
+        metavar="NAME=FILE",
+        read=str,
+        many=tuple,
+        group=CAMERAS,
+    )
+    board: Path | None = option(
+        None,
+        "The places of the targets on a board (CSV): target, x_mm, y_mm, z_mm [default: tags of "
+        "unknown place].",
+        metavar="FILE",
+        read=Path,
+        group=CAMERAS,
+    )
+
+    @property
+    def given(self) -> bool:
+        """Whether anything is."""
+        return any(vars(self).values())
+
+    def paths(self) -> tuple[Path, Path, dict[str, str], Path | None]:
+        """Detections, joints, cameras by name, board.  Raises OptionError."""
+        if not (self.pixels and self.joints and self.camera):
+            raise OptionError("cameras need all three of pixels=, joints= and camera='NAME=FILE'")
+        return self.pixels, self.joints, cameras_of(self.camera), self.board
 
 
 @dataclass(frozen=True)

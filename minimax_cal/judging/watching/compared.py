@@ -9,7 +9,7 @@ from minimax_cal.ground.facts import Apart, Fact, derived
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import for_people, in_own_unit
-from minimax_cal.judging.watching.moved import Moved, moved_table
+from minimax_cal.judging.watching.moved import OF_MOVED, Moved, moved_table
 from minimax_cal.measuring.accuracy import Accuracy
 
 
@@ -88,13 +88,11 @@ class Comparison(Result):
         )
         return f"{self.robot}: {', '.join(self.joints)} changed from {a} to {b} ({told})."
 
-    def first_table(self) -> Table:
+    def first_tables(self) -> tuple[Table, ...]:
         """What changed, by how much; where nothing did, the accuracy on common poses."""
         if self.changed:
-            return self.changed_table().brief(
-                "parameter", "by", "unit", "sigma", "p-value", "or as well"
-            )
-        return self.common_table().brief()
+            return (self.changed_table().brief(*OF_MOVED),)
+        return (self.common_table().brief(),)
 
     def changed_table(self) -> Table:
         """The parameters that explain the differences."""

@@ -59,6 +59,9 @@ class Moved:
         return in_own_unit(self, "by", "sigma")
 
 
+OF_MOVED = ("parameter", "by", "unit", "sigma", "p-value", "or as well")  # on a first screen
+
+
 def moved_table(title: str, moved: Sequence[Moved]) -> Table:
     """What moved, in mm and mrad."""
     return Table(

@@ -15,7 +15,7 @@ from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import in_files
 from minimax_cal.judging.tolerance import KINDS
-from minimax_cal.judging.watching.moved import Moved, moved_table
+from minimax_cal.judging.watching.moved import OF_MOVED, Moved, moved_table
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.solvers.status import Status
@@ -120,15 +120,12 @@ class Health(Result):
             text += f" {aside_sentence(self.set_aside, self.with_them)}"
         return text
 
-    def first_table(self) -> Table:
+    def first_tables(self) -> tuple[Table, ...]:
         """What moved, by how much; where nothing did, what was required."""
         if self.moved:
-            return moved_table("moved since the calibration", self.moved).brief(
-                "parameter", "by", "unit", "sigma", "p-value", "or as well"
-            )
-        return self.required_table().brief(
-            "error", "at most mm", "seen mm", "95 % from", "to", "verdict"
-        )
+            return (moved_table("moved since the calibration", self.moved).brief(*OF_MOVED),)
+        table = self.required_table()
+        return (table.brief(*table.header[:-1]),)
 
     def required_table(self) -> Table:
         """What was required, and what was seen."""

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,14 +14,16 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.importers import cmm, headed, programs
 from minimax_cal.measuring.importers import columns as mapped
 from minimax_cal.measuring.importers.assemble import Assembly, Meaning, assemble
 from minimax_cal.measuring.importers.reading import Given, Reading
 from minimax_cal.measuring.importers.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
 from minimax_cal.measuring.importers.words import ANGLES, LENGTHS, TEMPERATURES, TIMES
-from minimax_cal.measuring.measurements import Measurements, measurements_text
-from minimax_cal.measuring.set_aside import whole
+from minimax_cal.measuring.measurements import Measurements, check_finite, measurements_text
+from minimax_cal.measuring.mending import mended
+from minimax_cal.measuring.set_aside import left_out, whole
 
 __all__ = ["Imported", "csv_of", "import_files", "read_any", "save", "units_of"]
 
@@ -93,6 +96,33 @@ class Imported:
             for name, count in zip(data.target_names, data.seen.sum(0), strict=True)
         )
         return f"{data.poses} poses, {data.q.shape[1]} joints; points: {whole}"
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What is to be said of the files."""
+        return self.data.notices
+
+    def put_right(self, mend: Sequence[str] = (), leave_out: Sequence[str] = ()) -> Imported:
+        """With mends made and points set aside; what then still looks wrong is a notice.
+
+        mend, leave_out: as of `mended` and `left_out`.  Raises CalibrationError.
+        """
+        data = left_out(mended(self.data, mend), leave_out)
+        check_finite(data)  # what is left of it
+        off = (fault.text for fault in distance_faults(data))
+        return replace(self, data=replace(data, notices=(*data.notices, *off)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        files = zip(self.files().records(), self.columns(), strict=True)
+        return {
+            "poses": self.data.poses,
+            "joints": self.data.q.shape[1],
+            "targets": self.data.target_names,
+            "files": [{**file, "columns": table.records()} for file, table in files],
+            "set_aside": self.data.set_aside,
+            "notices": self.notices,
+        }
 
 
 def row_of(meaning: Meaning) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from minimax_cal.dynamics.diagnose import named_runs
-from minimax_cal.dynamics.given import Payload, known_of, ratios_of, torque_gains, with_payload
+from minimax_cal.dynamics.given import MotionKnown, known_of, ratios_of, torque_gains, with_payload
 from minimax_cal.dynamics.rows import Logs, prepare, rms_by_joint
 from minimax_cal.dynamics.run import Run
 from minimax_cal.dynamics.scene import Arm, Scene
@@ -66,20 +66,13 @@ class Judge:
     hold: Gains | Chain | None = None
 
     @staticmethod
-    def of(
-        opened: Opened,
-        runs: Sequence[Run],
-        holdout: tuple[float, str | Sequence[str] | None],
-        payload: Payload | None,
-        drive_gain: Sequence[float] | None,
-        ratio: float | Sequence[float] | None,
-    ) -> Judge:
+    def of(opened: Opened, runs: Sequence[Run], known: MotionKnown) -> Judge:
         """Of logs of the arm of a model.  Raises CalibrationError."""
-        robot = in_its_gravity(opened.chain)
-        gains = torque_gains(robot, runs, drive_gain)
-        learning, held = divided(with_payload(runs, payload), *holdout)
+        robot, payload = in_its_gravity(opened.chain), known.payload
+        gains = torque_gains(robot, runs, known.drive_gain)
+        learning, held = divided(with_payload(runs, payload), known.holdout, known.holdout_run)
         logs = prepare([*learning, *held])
-        arm = Arm.of(robot, gains, ratios_of(robot, ratio), known_of(payload), logs)
+        arm = Arm.of(robot, gains, ratios_of(robot, known.ratio), known_of(payload), logs)
         return Judge(arm, largest_inertia(opened.chain), prepare(learning), tuple(learning),
                      prepare(held), tuple(held), opened.given.source)  # fmt: skip
 

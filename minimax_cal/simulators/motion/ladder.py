@@ -11,12 +11,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from minimax_cal.dynamics.diagnose import diagnose_motion
-from minimax_cal.dynamics.given import Payload, read_logs, runs_of
+from minimax_cal.dynamics.given import MotionKnown, Payload, read_logs, runs_of
 from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
 from minimax_cal.dynamics.run import CURRENT, Run
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
+from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.urdf import MODELS
@@ -33,6 +34,7 @@ from minimax_cal.simulators.motion.result import MotionGap
 MOTOR = "dcmotor"  # what holds friction beside a constraint
 
 
+@takes(known=MotionKnown)
 def motion_gap(
     model: Path | str,
     logs: Sequence[Run | str | Path] | str | Path,
@@ -41,11 +43,7 @@ def motion_gap(
     diagnosis: MotionDiagnosis | Path | str | None = None,
     write: Path | str | None = None,
     tip: str = "",
-    holdout: float = 0.2,
-    holdout_run: str | Sequence[str] | None = None,
-    payload: Payload | None = None,
-    drive_gain: Sequence[float] | None = None,
-    ratio: float | Sequence[float] | None = None,
+    known: MotionKnown,
     gains: tuple[Sequence[float], Sequence[float]] | None = None,
     friction: str | None = None,
     driven: bool = True,
@@ -67,10 +65,8 @@ def motion_gap(
         Where the corrected model goes; what no element holds goes into a module beside it.
     tip
         Last body of the arm, where the model has several.
-    holdout, holdout_run
-        Share of the runs, or their names, that judge and that no fit sees; of a single run its end.
-    payload, drive_gain, ratio
-        As of `diagnose_motion`.
+    known
+        See `MotionKnown`.
     gains
         Stiffness [N m/rad] and damper [N m s/rad] of the drives, of all joints or of each.
     friction
@@ -101,14 +97,14 @@ def motion_gap(
     opened = open_model(model, runs[0].joints if runs else 0, tip)
     runs = runs_of(model, opened.chain.robot, runs)
     with threadpool_limits(limits=1, user_api="blas"):
-        judge = Judge.of(opened, runs, (holdout, holdout_run), payload, drive_gain, ratio)
+        judge = Judge.of(opened, runs, known)
         judge = judge.driving(opened, gains) if driven else judge
         first, notices = [judge.rung("as given", opened.chain)], tuple[str, ...]()
         if fit is not None:
             opened, notices = calibrated(opened, fit if isinstance(fit, Fit) else load_fit(fit))
             judge = judge.of_model(opened)
             first.append(judge.rung("calibrated geometry", opened.chain))
-        found = told_or_found(judge, opened, diagnosis, payload, progress)
+        found = told_or_found(judge, opened, diagnosis, known.payload, progress)
         judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
                                            soft=found.arm.soft))  # fmt: skip
         bench = bench_of(judge, opened, found, bristled=friction == MOTOR)
