@@ -79,7 +79,7 @@ def correlation_table(known: Uncertainty) -> Table:
 def distance_table(worst: WorstCase) -> Table:
     """Distances between targets that the minimax keeps."""
     title = "Distances between targets, kept as measured"
-    return Table.of(title, worst.distances, "pair", "measured=measured mm .4f",
+    return Table.of(title, worst.distances, "between=pair", "measured=measured mm .4f",
                     "tolerance=tolerance mm .4f", "multiplier .4g")  # fmt: skip
 
 
