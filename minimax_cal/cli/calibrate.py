@@ -96,7 +96,7 @@ def calibrate_command(
         json=lambda: json_text(fit.to_dict(poses=not without) | plain(more)),
         sentences=(*fit.sentences(), *[fit.solution()] * to.details),
         more=[found.table() for found in more.values()],
-        advice=advice(fit, robot, data, to.path),
+        advice=advice(fit, robot, data, to.output),
         draw=save_errors,
     )
 

@@ -10,15 +10,13 @@ from minimax_cal.cli.options import (
     FIT,
     Output,
     command,
-    failed,
     options_of,
     result_options,
 )
+from minimax_cal.cli.stderr import complain
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
 from minimax_cal.judging.watching.health import check
-
-ASKED = "What is asked"
 
 
 @command
@@ -26,19 +24,18 @@ ASKED = "What is asked"
 @DATA
 @options_of(
     check,
-    tolerance=Option('What is required in mm, as "rms 0.2, max 0.5".', group=ASKED),
+    "What is asked",
+    tolerance=Option('What is required in mm, as "rms 0.2, max 0.5".'),
     known=Option(
         "What is where it was at the calibration: frame (the instrument), targets (the "
         "reflectors).",
         metavar="NAMES",
         many=tuple,
-        group=ASKED,
     ),
-    seed=Option("The seed of samples behind the intervals.", group=ASKED),
+    seed=Option("The seed of samples behind the intervals."),
     simulated=Option(
         "The points are of a simulation and may be exact; a file that begins with # simulated says "
         "so itself.",
-        group=ASKED,
     ),
 )
 @result_options("the calibration with what moved refitted (JSON)", keep="checked.json")
@@ -49,4 +46,4 @@ def check_command(fit: Path, data: Path, to: Output, **chosen: Any) -> int:
     """
     found = check(fit, data, **chosen)
     to.finish(found, file=lambda: json_text(found.fit_dict()))
-    return 0 if found.valid else failed(found.headline())
+    return 0 if found.valid else complain(found.headline())

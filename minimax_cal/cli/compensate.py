@@ -16,12 +16,11 @@ from minimax_cal.cli.options import (
     WIDTH,
     Output,
     command,
-    failed,
     options_from,
     plain_option,
     result_options,
 )
-from minimax_cal.cli.stderr import AS_JSON, tell
+from minimax_cal.cli.stderr import AS_JSON, complain, tell
 from minimax_cal.correcting.compensate import HOW, CompensateOptions, Compensation, compensate
 from minimax_cal.correcting.programs.program import LANGUAGES, Program, is_program, read_program
 from minimax_cal.correcting.target_file import TargetFile, read_targets
@@ -74,7 +73,7 @@ def compensate_command(
     KRL (.src, .dat), whose points alone are changed.  Without -o the corrected file goes to stdout,
     its summary to stderr.
     """
-    check_alike(targets, to.path)
+    check_alike(targets, to.output)
     robot = None if nominal is None else load_robot(nominal)
     given: Program | TargetFile
     if is_program(targets):
@@ -87,12 +86,12 @@ def compensate_command(
     text = given.corrected(found)
     text = to.cells(text, safe_cells) if isinstance(text, str) else text
     to.finish(found, rows=lambda: text, show=lambda: show_corrected(found, text, to))
-    return failed(found.complaint()) if found.missed else 0
+    return complain(found.complaint()) if found.missed else 0
 
 
 def show_corrected(found: Compensation, text: str | bytes, to: Output) -> None:
     """The summary where the targets went to a file; else the targets, and the summary beside."""
-    if to.path:
+    if to.output:
         click.echo(found.summary(WIDTH))
         return
     if sys.stdout.isatty():

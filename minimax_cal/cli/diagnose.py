@@ -53,7 +53,7 @@ def diagnose_command(
         status=found.status,
         sentences=found.said,
         tables=partial(every_table, found),
-        advice=advice(found, robot, data, to.path),
+        advice=advice(found, robot, data, to.output),
         draw=save_diagnosis,
     )
 

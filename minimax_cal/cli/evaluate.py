@@ -57,4 +57,4 @@ def evaluate_command(
         raise OptionError(f"{more[0]}: evaluate takes one file of measurements; join them first")
     else:
         found = evaluated(fit, data, rung, new_frame)
-    return to.finish(found, show=lambda: show(found.table()))
+    return to.finish(found, show=lambda: show(*found.tables()))

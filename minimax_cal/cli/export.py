@@ -44,13 +44,13 @@ def export_command(fit: str, kind: str, to: Output, **chosen: Any) -> int:
     The geometry is fitted again for exactly the effects that the format carries.  With --json its
     own accuracy goes to stdout, and the file to -o alone.
     """
-    made = exported(fit, kind, to.path, ExportOptions(**chosen))
-    if to.path or not to.as_json:
-        written(made.file, to.path)
+    made = exported(fit, kind, to.output, ExportOptions(**chosen))
+    if to.output or not to.as_json:
+        written(made.file, to.output)
     to.notice(*made.file.notices, *([made.delivered.sentence()] if made.delivered else []))
-    to.wrote(to.path)
+    to.wrote(to.output)
     if to.as_json:
         click.echo(json_text(made.to_dict()), nl=False)
-    elif not to.path:
+    elif not to.output:
         click.echo(made.file.content, nl=False)
     return 0

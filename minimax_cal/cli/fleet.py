@@ -7,7 +7,8 @@ from typing import Any
 
 import click
 
-from minimax_cal.cli.options import PATH, Output, command, failed, result_options, show, workers
+from minimax_cal.cli.options import PATH, Output, command, result_options, show, workers
+from minimax_cal.cli.stderr import complain
 from minimax_cal.reporting.fleet.overview import fleet
 
 
@@ -27,4 +28,4 @@ def fleet_command(cells: Path, path: Path | None, jobs: int, to: Output, **chose
     to.wrote(path)
     to.finish(found, notices=(), show=lambda: show(found.table(), headline=found.headline()))
     names = ", ".join(row.cell for row in found.failed)
-    return failed(f"{len(found.failed)} cells failed: {names}") if names else 0
+    return complain(f"{len(found.failed)} cells failed: {names}") if names else 0

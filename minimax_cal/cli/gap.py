@@ -10,6 +10,7 @@ import click
 
 from minimax_cal.cli.options import (
     PATH,
+    RESULT,
     Output,
     command,
     exit_code,
@@ -47,10 +48,11 @@ def paired(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
 @click.argument("data", type=PATH, nargs=-1, required=True)
 @options_of(
     motion_gap,
-    fit=Option("Correct by this calibration of the arm.", metavar="FIT", read=Path, group=ARM),
-    diagnosis=Option("Correct by this diagnosis of the arm.", metavar="D", read=Path, group=ARM),
-    write=Option("Write the corrected model to this MJCF.", metavar="XML", read=Path),
-    tip=Option("The last body of the arm, where there are several.", metavar="BODY", group=ARM),
+    ARM,
+    fit=Option("Correct by this calibration of the arm.", metavar="FIT", read=Path),
+    diagnosis=Option("Correct by this diagnosis of the arm.", metavar="D", read=Path),
+    write=Option("Write the corrected model to this MJCF.", metavar="XML", read=Path, group=RESULT),
+    tip=Option("The last body of the arm, where there are several.", metavar="BODY"),
     holdout_run=Option(
         "Judge on this run alone, which no fit sees.", metavar="NAME", many=tuple, group=LOGS
     ),
@@ -63,11 +65,11 @@ def paired(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
 @options_from(MotionKnown, "payload", "drive_gain", "ratio", group=LOGS)
 @options_of(
     motion_gap,
+    LOGS,
     gains=Option(
         "Gains of the drives that move the model, of all joints or of each.",
         metavar="KP:KD,...",
         read=paired,
-        group=LOGS,
     ),
 )
 @options_from(Options, "holdout", "seed")

@@ -18,10 +18,10 @@ KNOWN = "What is known"
 @DATA
 @options_of(
     identify_arm,
+    KNOWN,
     joints=Option(
         "The type of each joint from the base on, as revolute,revolute,prismatic.",
         metavar="TYPES",
-        group=KNOWN,
     ),
 )
 @plain_option(KNOWN, "--name", default="identified arm", help="What the robot is called.")

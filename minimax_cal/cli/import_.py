@@ -37,7 +37,8 @@ TOLD = "What the files do not tell"
 @click.argument("files", nargs=-1, required=True, type=PATH, metavar="FILE...")
 @options_of(
     import_files,
-    joints=Option("The file of joint values, where FILE holds points only.", read=Path, group=TOLD),
+    TOLD,
+    joints=Option("The file of joint values, where FILE holds points only.", read=Path),
     columns=Option(
         "What the columns are, in order: smr1_mm,smr2_mm,smr3_mm,q_deg (skip*2 leaves two out), or "
         "by place: 1-3=smr1_mm,4-9=q_deg,Temp=temperature_C. One with joints alone is that of the "
@@ -45,21 +46,18 @@ TOLD = "What the files do not tell"
         metavar="MAPPING",
         read=str,
         many=tuple,
-        group=TOLD,
     ),
     units=Option(
         "The units that the files do not tell, as q=deg, smr=mm, u95=mm, time=dmy.",
         metavar="WHAT=UNIT",
         read=str,
         many=tuple,
-        group=TOLD,
     ),
     layout=Option(
         "Which points follow each other, in a file with several a pose.",
         metavar="[pose|target]",
-        group=TOLD,
     ),
-    decimal=Option("The decimal sign.", metavar="[point|comma]", group=TOLD),
+    decimal=Option("The decimal sign.", metavar="[point|comma]"),
 )
 @plain_option(
     TOLD,
@@ -108,7 +106,7 @@ def import_command(
 
     def rows() -> str:
         text = to.cells(csv_of(found), safe_cells)
-        measurements_in(rows_in(text, to.path or ""))  # it can be read again
+        measurements_in(rows_in(text, to.output or ""))  # it can be read again
         return text
 
     tables = (found.files(), *found.columns(), *[found.preview()] * preview)
@@ -119,11 +117,11 @@ def finish(
     found: Imported | LogFiles, to: Output, rows: Callable[[], str], *tables: Table, said: str = ""
 ) -> int:
     """Write and show what was understood."""
-    about = {"schema": 1, "output": to.path and str(to.path)}
+    about = {"schema": 1, "output": to.output and str(to.output)}
     wanted = to.deliver(lambda: json_text(plain(about | found.to_dict())), rows=rows)
     to.notice(*found.notices)
     if wanted:
         show(*tables)
-        for line in filter(None, (said, "" if to.path else "nothing written; add -o FILE")):
+        for line in filter(None, (said, "" if to.output else "nothing written; add -o FILE")):
             click.echo(line)
     return 0

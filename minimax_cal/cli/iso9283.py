@@ -39,13 +39,13 @@ def point_of(text: str) -> str | Sequence[float]:
 @SOME_DATA
 @options_of(
     iso9283,
-    nominal=Option("The robot before calibration, file or name [default: of the fit].", group=WHAT),
+    WHAT,
+    nominal=Option("The robot before calibration, file or name [default: of the fit]."),
     tcp=Option(
         "The tool centre point: centroid of the targets, one target (smr1), or X,Y,Z in mm in the "
         "last frame.",
         metavar="POINT",
         read=point_of,
-        group=WHAT,
     ),
 )
 @plain_option(WHAT, "--poses", is_flag=True, help="Print a row for every pose, too.")

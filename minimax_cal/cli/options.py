@@ -18,9 +18,8 @@ from click.core import ParameterSource
 from rich.console import Console
 from rich.text import Text
 
-from minimax_cal.cli import FAILED
 from minimax_cal.cli.progress import stages
-from minimax_cal.cli.stderr import PROGRESS, tell
+from minimax_cal.cli.stderr import PROGRESS, complain, tell
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, json_text, plain, write_whole
 from minimax_cal.ground.options import SI, Option, names_of, pair
@@ -38,6 +37,7 @@ MOST = 1e12  # of any number: squares of what is larger overflow somewhere
 RESULT = "Measurements and result"
 DRAWN = (".png", ".svg", ".pdf")
 Advice = Iterable[tuple[str, str]]  # what for, and the command
+Lazy = Callable[[], Any] | None  # what is made where it is asked for
 Made = TypeVar("Made")
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
@@ -124,10 +124,14 @@ def on_command_line() -> set[str]:
     return {name for name in at.params if at.get_parameter_source(name) is given}
 
 
-def options_of(verb: Callable[..., object], **told: Option) -> Decorator:
-    """Options of a command from arguments of a function, whose defaults are theirs, in SI."""
+def options_of(verb: Callable[..., object], group: str = "", /, **told: Option) -> Decorator:
+    """Options of a command from arguments of a function, whose defaults are theirs, in SI.
+
+    group: of those that tell none.
+    """
     known = signature(verb).parameters
-    return stacked(*(option_of(name, known[name].default, each) for name, each in told.items()))
+    options = {name: replace(each, group=each.group or group) for name, each in told.items()}
+    return stacked(*(option_of(name, known[name].default, each) for name, each in options.items()))
 
 
 def plain_option(group: str, *names: str, **more: Any) -> Decorator:
@@ -262,12 +266,30 @@ class Output:
     keep: what its file is called in advice; empty for a command without a first screen.
     """
 
-    path: Path | None
-    as_json: bool
-    figure: Path | None
-    quiet: bool
+    output: Path | None = None
+    as_json: bool = False
+    figure: Path | None = None
+    quiet: bool = False
     details: bool = False
     keep: str = ""
+
+    def by_ending(self, *, rows: bool, draws: bool) -> Output:
+        """With result and picture in the files whose ending says so, as .json or .svg.
+
+        Raises OptionError for a picture of a command that draws none, or for two of a kind.
+        """
+        output, ending = self.output, self.output.suffix.lower() if self.output else ""
+        if ending in DRAWN:
+            if not draws:
+                raise OptionError(f"{output}: this command draws no picture; write a .json")
+            if self.figure:
+                raise OptionError(f"{output}: the picture goes to {self.figure} already")
+            return replace(self, output=None, figure=output)
+        if ending == ".csv" and not rows:
+            raise OptionError(f"{output}: this command writes no CSV; write a .json")
+        if self.figure and self.figure.suffix.lower() == ".json" and not output:
+            return replace(self, output=self.figure, figure=None)
+        return self
 
     def stages(self) -> AbstractContextManager[Callable[[str], None]]:
         """A callback for each stage of long work, which stderr shows."""
@@ -306,9 +328,8 @@ class Output:
         self,
         json: Callable[[], str],
         status: Status = Status.CONVERGED,
-        *,
-        file: Callable[[], str] | None = None,
-        rows: Callable[[], str | bytes] | None = None,
+        file: Lazy = None,
+        rows: Lazy = None,
     ) -> bool:
         """Write a result where it was asked for; whether people want to read it too.
 
@@ -316,10 +337,10 @@ class Output:
         its ending asks for JSON.  A result that failed is not written to a file.
         """
         once = cache(json)
-        if self.path and status is not Status.FAILED:
-            made = rows if rows and self.path.suffix.lower() != ".json" else file or once
-            write_whole(self.path, made())
-            self.wrote(self.path)
+        if self.output and status is not Status.FAILED:
+            made = rows if rows and self.output.suffix.lower() != ".json" else file or once
+            write_whole(self.output, made())
+            self.wrote(self.output)
         if self.as_json:
             click.echo(once(), nl=False)
         return not self.as_json
@@ -331,10 +352,10 @@ class Output:
         status: Status = Status.CONVERGED,
         reason: str = "",
         notices: Iterable[str] | None = None,
-        json: Callable[[], str] | None = None,
-        file: Callable[[], str] | None = None,
-        rows: Callable[[], str | bytes] | None = None,
-        show: Callable[[], object] | None = None,
+        json: Lazy = None,
+        file: Lazy = None,
+        rows: Lazy = None,
+        show: Lazy = None,
         draw: Callable[[Any, Path], object] | None = None,
         **screen: Any,
     ) -> int:
@@ -345,7 +366,7 @@ class Output:
         """
         said = found.notices if notices is None else notices
         self.notice(*(text for text in said if text != reason))
-        if self.deliver(json or found.json, status, file=file, rows=rows):
+        if self.deliver(json or found.json, status, file, rows):
             (show or partial(self.present, found, **screen))()
         if self.figure and draw:
             draw(found, self.figure)
@@ -358,7 +379,7 @@ class Output:
         *,
         sentences: Sequence[str] = (),
         more: Sequence[Table] = (),
-        tables: Callable[[], Iterable[Table]] | None = None,
+        tables: Lazy = None,
         advice: Advice | None = None,
     ) -> None:
         """Print the first screen of a result, or with --details its sentences and every table.
@@ -376,7 +397,7 @@ class Output:
 
     def kept(self) -> Advice:
         """How to see every table, and to keep a result that was not written."""
-        if self.path:
+        if self.output:
             return [("To see every table", "add --details")]
         return [("To keep the result, and to see every table", f"add -o {self.keep} --details")]
 
@@ -389,20 +410,11 @@ def with_output(*, rows: bool = False, draws: bool = False, keep: str = "") -> D
 
     def made(command: Command) -> Command:
         @wraps(command)
-        def handed(
-            *given: Any,
-            quiet: bool,
-            as_json: bool = False,
-            output: Path | None = None,
-            figure: Path | None = None,
-            details: bool = False,
-            **more: Any,
-        ) -> Any:
-            output, figure = by_ending(output, figure, rows=rows, draws=draws)
-            writable(output)
-            drawable(figure)
-            to = Output(output, as_json, figure, quiet, details, keep)
-            return command(*given, to=to, **more)
+        def handed(*given: Any, **named: Any) -> Any:
+            to = replace(record_of(Output, named), keep=keep).by_ending(rows=rows, draws=draws)
+            writable(to.output)
+            drawable(to.figure)
+            return command(*given, to=to, **named)
 
         return handed
 
@@ -419,26 +431,6 @@ def measured(paths: Sequence[Path], in_rows: bool) -> Measurements:
 
     data = read_campaigns(paths)
     return data.in_visit_order() if in_rows and not ordered(data) else data
-
-
-def by_ending(
-    output: Path | None, figure: Path | None, *, rows: bool, draws: bool
-) -> tuple[Path | None, Path | None]:
-    """Where the result and where its picture go: by the ending of a file, as .json or .svg.
-
-    Raises OptionError for a picture of a command that draws none, or for two of a kind.
-    """
-    if output and output.suffix.lower() in DRAWN:
-        if not draws:
-            raise OptionError(f"{output}: this command draws no picture; write a .json")
-        if figure:
-            raise OptionError(f"{output}: the picture goes to {figure} already")
-        return None, output
-    if output and output.suffix.lower() == ".csv" and not rows:
-        raise OptionError(f"{output}: this command writes no CSV; write a .json")
-    if figure and figure.suffix.lower() == ".json" and not output:
-        return figure, None
-    return output, figure
 
 
 def result_options(what: str, *, keep: str = "", figure: str = "") -> Decorator:
@@ -515,13 +507,7 @@ def exit_code(status: Status, reason: str = "") -> int:
     """
     if status is Status.CONVERGED:
         return 0
-    return failed(f"{status}: {flagged(reason) or status.advice}")
-
-
-def failed(text: str) -> int:
-    """A line of error; the exit code."""
-    tell("error", text, exit_code=FAILED)
-    return FAILED
+    return complain(f"{status}: {flagged(reason) or status.advice}")
 
 
 def looked_up(as_json: bool, content: object, *tables: Table) -> int:

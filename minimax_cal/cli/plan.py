@@ -45,7 +45,6 @@ OTHERWISE = {  # what an option is about that is not about what is planned
     "motion": "a motion; add motion=", "cameras": "cameras; add camera= and board=",
     "poses": "poses, not about",
 }  # fmt: skip
-KNOWN = "What is known"
 NAMED = {"motion": "a motion", "cameras": "cameras"}
 
 
@@ -79,10 +78,9 @@ NAMED = {"motion": "a motion", "cameras": "cameras"}
 @options_from(CameraOptions)
 @options_of(
     plan,
-    fit=Option(
-        "A calibration (JSON): robot, base, targets, and its poses.", read=Path, group=KNOWN
-    ),
-    data=Option("Existing measurements (CSV); the plan adds to them.", read=Path, group=KNOWN),
+    "What is known",
+    fit=Option("A calibration (JSON): robot, base, targets, and its poses.", read=Path),
+    data=Option("Existing measurements (CSV); the plan adds to them.", read=Path),
 )
 @options_from(PlanOptions)
 @click.option(
@@ -130,7 +128,7 @@ def plan_command(
     return to.finish(
         found,
         rows=lambda: found.csv(unit),
-        tables=lambda: (*found.tables(), *[found.pose_table(unit)] * (to.path is None)),
+        tables=lambda: (*found.tables(), *[found.pose_table(unit)] * (to.output is None)),
         draw=save_plan,
     )
 

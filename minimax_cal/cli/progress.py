@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from typing import Any
 
 from rich.console import Console
@@ -62,7 +61,10 @@ def as_stage(text: str) -> Stage:
 
 
 class Ticker:
-    """The last stage as a line on stderr: after the first second, then every `EVERY` seconds."""
+    """The last stage and its time, drawn on a terminal as it is then.
+
+    Else a line on stderr: after the first second, then every `EVERY` seconds.
+    """
 
     def __init__(self, shown: Stages) -> None:
         self.shown, self.text = shown, Stage("reading")
@@ -73,22 +75,20 @@ class Ticker:
         self.text = as_stage(text)
         self.shown.times(self.text)
 
-    def tick(self) -> None:
-        """Print the line."""
-        tell("progress", self.shown.line(self.text))
+    def __rich__(self) -> Text:
+        return Text(self.shown.line(self.text), overflow="ellipsis", no_wrap=True)
 
     def run(self) -> None:
         """Print lines until the work is over."""
         pause = FIRST
         while not self.over.wait(pause):
-            self.tick()
+            tell("progress", self.shown.line(self.text))
             pause = EVERY
 
 
 @contextmanager
-def ticking(shown: Stages) -> Iterator[Callable[[str], None]]:
+def ticking(ticker: Ticker) -> Iterator[Callable[[str], None]]:
     """A callback for each stage, of which a thread prints the last now and then."""
-    ticker = Ticker(shown)
     thread = threading.Thread(target=ticker.run, name="progress", daemon=True)
     thread.start()
     try:
@@ -106,33 +106,20 @@ def stages(quiet: bool) -> Iterator[Callable[[str], None]]:
     line.
     """
     shown, console = Stages(), Console(stderr=True, quiet=quiet, highlight=False)
-    if AS_JSON.get() and not quiet:
-        yield lambda text: tell("progress", text, **shown.event(text))
-    elif quiet:
+    ticker = Ticker(shown)
+
+    def on_terminal(text: str) -> None:
+        ticker.show(text)
+        if ticker.text.rung:
+            console.print(Text(text))  # above the line that ticks
+
+    if quiet:
         yield silent
+    elif AS_JSON.get():
+        yield lambda text: tell("progress", text, **shown.event(text))
     elif console.is_terminal:
-        with Live(Clock(shown), console=console, transient=True, refresh_per_second=1) as live:
-            yield partial(on_terminal, live)
+        with Live(ticker, console=console, transient=True, refresh_per_second=1):
+            yield on_terminal
     else:
-        with ticking(shown) as show:
+        with ticking(ticker) as show:
             yield show
-
-
-class Clock:
-    """The last stage with the time so far, whenever it is drawn."""
-
-    def __init__(self, shown: Stages) -> None:
-        self.shown, self.text = shown, Stage("reading")
-
-    def __rich__(self) -> Text:
-        return Text(self.shown.line(self.text), overflow="ellipsis", no_wrap=True)
-
-
-def on_terminal(live: Live, text: str) -> None:
-    """Show a stage; a step that is done stays above it."""
-    stage, clock = as_stage(text), live.get_renderable()
-    if isinstance(clock, Clock):
-        clock.text = stage
-        clock.shown.times(stage)
-    if stage.rung:
-        live.console.print(Text(str(stage)))

@@ -6,12 +6,13 @@ import io
 import sys
 import warnings
 from collections.abc import Sequence
+from contextvars import copy_context
 
 import click
 
-from minimax_cal.cli import FAILED, INTERRUPTED, MISUSED
+from minimax_cal.cli import INTERRUPTED, MISUSED
 from minimax_cal.cli.commands import ENTRIES, Commands, Workflow
-from minimax_cal.cli.stderr import AS_JSON, tell
+from minimax_cal.cli.stderr import AS_JSON, complain
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
 
 
@@ -27,17 +28,16 @@ def cli() -> None:
 
 def outcome(arguments: Sequence[str] | None) -> int:
     """The exit code of a command line; whatever went wrong is one line of error."""
-    token = AS_JSON.set(False)
-    try:
-        return run_command(arguments)
-    finally:
-        AS_JSON.reset(token)
+    return copy_context().run(run_command, arguments)
 
 
 def run_command(arguments: Sequence[str] | None) -> int:
-    """As `outcome`, which also ends what an option said about stderr."""
+    """As `outcome`, which forgets what an option said about stderr."""
+    AS_JSON.set(False)
     if sys.stdout is None:  # a file that is opened next would take its place
-        return complain("stdout is closed and the result would be lost; end with >/dev/null")
+        return complain(
+            "stdout is closed and the result would be lost; end with >/dev/null", MISUSED
+        )
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without the letter shows another
@@ -47,20 +47,20 @@ def run_command(arguments: Sequence[str] | None) -> int:
             warnings.simplefilter("ignore", CalibrationWarning)  # the notices say the same
             code = cli.main(args=arguments, prog_name="minimax-cal", standalone_mode=False)
     except CalibrationError as error:
-        code = complain(said_by(error, arguments))
+        code = complain(said_by(error, arguments), MISUSED)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         code = MISUSED
     except click.ClickException as error:
         context = getattr(error, "ctx", None)
         hint = f" (see {context.command_path} --help)" if context else ""
-        code = complain(error.format_message() + hint)
+        code = complain(error.format_message() + hint, MISUSED)
     except (KeyboardInterrupt, click.Abort):
         code = complain("interrupted", INTERRUPTED)
     except OSError as error:
-        code = complain(f"the output cannot be written ({error.strerror})", FAILED)
+        code = complain(f"the output cannot be written ({error.strerror})")
     except MemoryError:
-        code = complain("there is not enough memory for this; give fewer poses or samples", FAILED)
+        code = complain("there is not enough memory for this; give fewer poses or samples")
     except Exception as error:
         code = numerical(error)
     return code or 0
@@ -81,13 +81,7 @@ def numerical(error: Exception) -> int:
     from qp_backends import BackendError
 
     if isinstance(error, BackendError):
-        return complain(str(error))
+        return complain(str(error), MISUSED)
     if isinstance(error, LinAlgError):
-        return complain(f"the numbers did not work out ({error}): more poses may help", FAILED)
+        return complain(f"the numbers did not work out ({error}): more poses may help")
     raise error
-
-
-def complain(message: str, code: int = MISUSED) -> int:
-    """One line on stderr."""
-    tell("error", message, exit_code=code)
-    return code

@@ -23,16 +23,15 @@ from minimax_cal.ground.options import Option
 from minimax_cal.measuring.measurements import write_measurements
 from minimax_cal.modelling.simulate import Truth, simulate
 
-SESSION = "The session"
-
 
 @command
 @ROBOT
 @options_of(
     simulate,
-    poses=Option("The number of poses.", group=SESSION),
-    targets=Option("The number of reflectors on the flange.", group=SESSION),
-    seed=Option("The seed of all that is random.", group=SESSION),
+    "The session",
+    poses=Option("The number of poses."),
+    targets=Option("The number of reflectors on the flange."),
+    seed=Option("The seed of all that is random."),
 )
 @options_from(Truth)
 @click.option(
@@ -59,5 +58,5 @@ def simulate_command(
     if truth:
         content = {"robot": made.cell.robot.to_dict(), **made.cell.to_dict()}
         write_whole(truth, json_text(content))
-    Output(None, False, None, False).wrote(output, truth)
+    Output().wrote(output, truth)
     return 0

@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from minimax_cal.cli import FAILED
 from minimax_cal.ground.words import one_line
 
 AS_JSON: ContextVar[bool] = ContextVar("AS_JSON", default=False)  # of the command that is at work
@@ -23,6 +24,12 @@ def tell(event: str, text: str, **more: Any) -> None:
         click.echo(json.dumps({"event": event, "text": line, **more}), err=True)
     else:
         click.echo(f"{event}: {line}", err=True)
+
+
+def complain(text: str, code: int = FAILED) -> int:
+    """A line of error; the exit code."""
+    tell("error", text, exit_code=code)
+    return code
 
 
 def tell_json(_: click.Context, __: click.Parameter, form: str) -> None:

@@ -43,12 +43,12 @@ def model_of(name: str, runs: Sequence[Run]) -> Robot | str:
 @options_from(MotionKnown)
 @options_of(
     diagnose_motion,
+    "What is sought",
     exclude=Option(
         "Do not consider this effect.",
         metavar="EFFECT",
         flag="--without",
         many=tuple,
-        group="What is sought",
     ),
 )
 @click.option(

@@ -25,7 +25,7 @@ from minimax_cal.fitting.opened import open_result
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
 from minimax_cal.ground.facts import Apart, Fact, derived
-from minimax_cal.ground.options import option, takes
+from minimax_cal.ground.options import grouped, takes
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table, records_of
@@ -164,6 +164,7 @@ class Compensation(Result):
 
 
 HOW = "How targets are corrected"
+how = grouped(HOW)
 
 
 @dataclass(frozen=True)
@@ -181,35 +182,26 @@ class CompensateOptions:
     keep_anyway: also where the calibrated arm is no better than the drawn one.
     """
 
-    frame: str = option(
+    frame: str = how(
         "best-fit",
         "Where the nominal arm stands: best-fit (base and reflectors as the calibration placed "
         "them), flange (the base so, the flange as drawn), own (on the calibrated base).",
-        group=HOW,
     )
-    tolerance: float = option(
-        1e-5, "What may remain of a target that counts as reached.", "mm", group=HOW
-    )
-    most_change: float = option(
+    tolerance: float = how(1e-5, "What may remain of a target that counts as reached.", "mm")
+    most_change: float = how(
         np.pi / 36.0,
         "The most that a joint may change (a slide 8.7 mm per degree).",
         "deg",
         flag="--max-change",
-        group=HOW,
     )
-    lever: float = option(
-        np.nan, "What a radian counts as [default: the targets' own].", "mm", group=HOW
-    )
-    clock: float = option(
+    lever: float = how(np.nan, "What a radian counts as [default: the targets' own].", "mm")
+    clock: float = how(
         np.nan,
         "Correct what follows the session's time too, as at this moment of it, 0 to 1 [default: "
         "not at all].",
-        group=HOW,
     )
     rung: int | None = None
-    keep_anyway: bool = option(
-        False, "Also where the calibrated arm is no better than the drawn one.", group=HOW
-    )
+    keep_anyway: bool = how(False, "Also where the calibrated arm is no better than the drawn one.")
 
 
 @takes(options=CompensateOptions)

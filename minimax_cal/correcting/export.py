@@ -14,7 +14,7 @@ from minimax_cal.correcting.exporters.job import Export, Job, job_of, read_sourc
 from minimax_cal.fitting.opened import Result
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
-from minimax_cal.ground.options import option, takes
+from minimax_cal.ground.options import grouped, takes
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.urdf_file import read_urdf
 
@@ -40,6 +40,7 @@ class Exported:
 
 
 FORMAT = "The format"
+of_format = grouped(FORMAT)
 
 
 @dataclass(frozen=True)
@@ -54,25 +55,23 @@ class ExportOptions:
     keep_anyway: also where the calibrated arm is no better than the drawn one.
     """
 
-    urdf: Path | str | None = option(
+    urdf: Path | str | None = of_format(  # noqa: RUF009
         None,
         "Correct the joint origins of this URDF; all else stays, byte for byte.",
         metavar="ORIGINAL",
         read=Path,
-        group=FORMAT,
     )
-    mjcf: Path | str | None = option(
+    mjcf: Path | str | None = of_format(  # noqa: RUF009
         None,
         "Correct the bodies, gains and springs of this MJCF; all else stays.",
         metavar="ORIGINAL",
         read=Path,
-        group=FORMAT,
     )
-    tip: str = option("", "The last link of the chain in that file.", metavar="LINK", group=FORMAT)
-    experimental: bool = option(False, "Agree to moc.", group=FORMAT, hidden=True)
+    tip: str = of_format("", "The last link of the chain in that file.", metavar="LINK")
+    experimental: bool = of_format(False, "Agree to moc.", hidden=True)
     rung: int | None = None
-    keep_anyway: bool = option(
-        False, "Also where the calibrated arm is no better than the drawn one.", group=FORMAT
+    keep_anyway: bool = of_format(
+        False, "Also where the calibrated arm is no better than the drawn one."
     )
 
 

@@ -59,7 +59,7 @@ from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.ground.options import check_left_out, option, takes
+from minimax_cal.ground.options import check_left_out, grouped, takes
 from minimax_cal.ground.stages import name_rung, number_step
 from minimax_cal.ground.words import name_first
 from minimax_cal.measuring import checks
@@ -98,7 +98,7 @@ STEPS = (
 NOT_ASKED = Beyond(reason="not asked for")
 ROBUST = replace(SUM, trim=0.3)  # a fit that up to so many wrong points do not pull
 EARLIEST = 5  # visits before a jump that a study takes for possible, and after it
-SOUGHT = "What is sought"
+sought = grouped("What is sought")
 
 
 @dataclass(frozen=True)
@@ -117,18 +117,15 @@ class DiagnosisOptions:
     holdout: float = Options.holdout
     holdout_by: str | None = None
     instrument: str | None = None
-    exclude: Sequence[str] = option(
+    exclude: Sequence[str] = sought(
         (),
         "Do not consider this effect; `minimax-cal effects` lists them.",
         metavar="EFFECT",
         flag="--without",
         many=tuple,
-        group=SOUGHT,
     )
-    quick: bool = option(
-        False,
-        "Hold out no parts of the poses in turn: no claim outside the measured region.",
-        group=SOUGHT,
+    quick: bool = sought(
+        False, "Hold out no parts of the poses in turn: no claim outside the measured region."
     )
 
     def step_of(self, progress: Progress, name: str) -> Progress:

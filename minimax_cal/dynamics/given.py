@@ -16,7 +16,7 @@ from minimax_cal.dynamics.regressor import link_parameters
 from minimax_cal.dynamics.run import CURRENT, Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import number, option
+from minimax_cal.ground.options import grouped, number
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.urdf import is_urdf, load_urdf
 
@@ -24,7 +24,8 @@ HEAVIEST, FARTHEST = 1e4, 10.0  # payload of the largest arms, several times ove
 LARGEST = 1e6  # a gear ratio, or a torque for one ampere [N m/A], and 1 / the least
 
 Payload = tuple[float, tuple[float, float, float]]
-ARM, JUDGED = "The arm", "What judges"
+ARM = "The arm"
+of_arm, judged = grouped(ARM), grouped("What judges")
 
 
 def listed(text: str, name: str) -> tuple[float, ...]:
@@ -48,45 +49,39 @@ def carried(text: str) -> Payload:
 class MotionKnown:
     """What is known of an arm whose motion was logged, and which of its runs judge.
 
-    holdout: share of the runs that judge, left out in turn; in a simulator the last ones, and of a
-    single run its end.
-    holdout_run: names of runs that judge instead, and that neither the search nor a fit sees.
     payload: what the flange is known to carry: its mass [kg] and its centre in the last frame [m].
     A mass that a run itself reports counts for that run.
     drive_gain: torque for one ampere, of each joint [N m/A], where the logs hold currents.
     ratio: gear ratio, of all joints or of each.
+    holdout: share of the runs that judge, left out in turn; in a simulator the last ones, and of a
+    single run its end.
+    holdout_run: names of runs that judge instead, and that neither the search nor a fit sees.
     """
 
-    holdout: float = option(
-        0.2, "Share of the runs that is left out in turn to judge.", group=JUDGED
-    )
-    holdout_run: str | Sequence[str] | None = option(
-        None,
-        "Judge on this run alone, which no fit and no search sees.",
-        metavar="NAME",
-        many=tuple,
-        group=JUDGED,
-    )
-    payload: Payload | None = option(
+    payload: Payload | None = of_arm(  # noqa: RUF009
         None,
         "What the flange is known to carry: kg, and its centre in the last frame in m.",
         metavar="KG@X,Y,Z",
         read=carried,
-        group=ARM,
     )
-    drive_gain: Sequence[float] | None = option(
+    drive_gain: Sequence[float] | None = of_arm(
         None,
         "Torque for one ampere of each joint, N m per A.",
         metavar="LIST",
         read=partial(listed, name="drive_gain"),
-        group=ARM,
     )
-    ratio: float | Sequence[float] | None = option(
+    ratio: float | Sequence[float] | None = of_arm(
         None,
         "Gear ratio of all joints, or of each.",
         metavar="LIST",
         read=partial(listed, name="ratio"),
-        group=ARM,
+    )
+    holdout: float = judged(0.2, "Share of the runs that is left out in turn to judge.")
+    holdout_run: str | Sequence[str] | None = judged(
+        None,
+        "Judge on this run alone, which no fit and no search sees.",
+        metavar="NAME",
+        many=tuple,
     )
 
 

@@ -16,7 +16,7 @@ from minimax_cal.fitting.robust import LOSSES, SQUARE, check_robust
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.facts import Fact, hints_of
-from minimax_cal.ground.options import option
+from minimax_cal.ground.options import grouped
 from minimax_cal.ground.records import as_kind
 from minimax_cal.ground.stages import Progress as Progress
 from minimax_cal.ground.stages import silent as silent
@@ -69,6 +69,11 @@ def prior_of(text: str) -> tuple[str, float]:
     raise OptionError(f"prior {text!r}: write NAME=SIGMA with a unit, as a*=0.5mm or theta2=1mrad")
 
 
+fitted, solved = grouped("What is fitted"), grouped("How it is solved")
+held_out, known = grouped("What is held out"), grouped("What is known")
+outliers = grouped("Outliers")
+
+
 @dataclass(frozen=True)
 class Options:
     """How to calibrate.
@@ -95,133 +100,87 @@ class Options:
     degrees (alpha, beta) or 30 degrees (theta).  simulated: the points may be exact.
     """
 
-    objective: str = option(
+    objective: str = fitted(
         "minimax",
         "What is minimised: sum, minimax (the worst target), point (the worst point), pose, or "
         "one target alone, as smr:2. Of pixels: sum (the default there), minimax, or camera (the "
         "worst camera).",
-        group="What is fitted",
     )
-    qp: QpSolver = option(  # noqa: RUF009
+    qp: QpSolver = solved(  # noqa: RUF009
         "daqp",
         "The backend of the quadratic programs of the minimax; `minimax-cal backends` lists them, "
         "and daqp:direct is the fastest.",
-        group="How it is solved",
     )
-    holdout: float = option(
-        0.2,
-        "The share of the poses that the fit does not see; a split column overrides it.",
-        group="What is held out",
+    holdout: float = held_out(
+        0.2, "The share of the poses that the fit does not see; a split column overrides it."
     )
-    seed: int = option(
-        0,
-        "The seed of the choice of held-out poses.",
-        group="What is held out",
-    )
-    holdout_by: str | None = option(
+    seed: int = held_out(0, "The seed of the choice of held-out poses.")
+    holdout_by: str | None = held_out(
         None,
         "Hold out whole groups of poses: a column, as session or group, or region; those are also "
         "left out in turn.",
         metavar="COLUMN",
-        group="What is held out",
     )
-    cv: bool = option(
+    cv: bool = held_out(
         False,
         "Cross-validate: judge every pose by a fit without it [default: when fewer than 20 are "
         "held out].",
-        group="What is held out",
     )
-    fix: Sequence[str] = option(
-        (),
-        "Keep these parameters nominal, as d2,beta*.",
-        many=tuple,
-        group="What is fitted",
+    fix: Sequence[str] = fitted((), "Keep these parameters nominal, as d2,beta*.", many=tuple)
+    free: Sequence[str] = fitted(
+        (), "Identify these where several parameters are not distinguishable.", many=tuple
     )
-    free: Sequence[str] = option(
-        (),
-        "Identify these where several parameters are not distinguishable.",
-        many=tuple,
-        group="What is fitted",
-    )
-    only: str = option(
-        "",
-        "Fit the joints' zero positions alone: offsets.",
-        metavar="offsets",
-        group="What is fitted",
-    )
-    instrument: str | None = option(
+    only: str = fitted("", "Fit the joints' zero positions alone: offsets.", metavar="offsets")
+    instrument: str | None = known(
         None,
         "u95 of a coordinate, where the data have no column for it: it weighs the points and tells "
         "the noise floor.",
         metavar="10um+2.5um/m",
-        group="What is known",
     )
-    priors: Mapping[str, float] = option(
+    priors: Mapping[str, float] = fitted(
         dict,
         "What is known of a parameter: how far it may be from its nominal value, as a*=0.5mm.",
         flag="--prior",
         metavar="NAME=SIGMA",
         read=prior_of,
         many=dict,
-        group="What is fitted",
     )
-    effects: Sequence[str | Term] = option(
+    effects: Sequence[str | Term] = fitted(
         (),
         "Fit these too, as joint_compliance:all,backlash:J6; `minimax-cal effects` lists them.",
         metavar="NAME:PLACE",
         many=tuple,
-        group="What is fitted",
     )
-    method: str = option(
+    method: str = solved(
         AUTO,
         "The method of least squares: auto (variable projection, damped where a start is far), "
         f"joint (all parameters at once, the fastest), {', '.join(METHODS)}.",
-        group="How it is solved",
     )
-    loss: str = option(
-        SQUARE,
-        f"How errors count, against outliers: {', '.join((SQUARE, *LOSSES))}.",
-        group="Outliers",
+    loss: str = outliers(
+        SQUARE, f"How errors count, against outliers: {', '.join((SQUARE, *LOSSES))}."
     )
-    trim: float = option(
-        0.0,
-        "Set aside at most this fraction of the points, the largest outliers.",
-        metavar="SHARE",
-        group="Outliers",
+    trim: float = outliers(
+        0.0, "Set aside at most this fraction of the points, the largest outliers.", metavar="SHARE"
     )
-    hessian: str = option(
-        "gauss-newton",
-        "The Hessian of the minimax: gauss-newton or bfgs.",
-        group="How it is solved",
+    hessian: str = solved("gauss-newton", "The Hessian of the minimax: gauss-newton or bfgs.")
+    distance: str = solved(
+        "two-sided", "How distances between targets are kept: two-sided, squared or off."
     )
-    distance: str = option(
-        "two-sided",
-        "How distances between targets are kept: two-sided, squared or off.",
-        group="How it is solved",
+    lever: float | None = fitted(
+        None, "What a radian counts as in the pose objective [default: the targets' own].", "mm"
     )
-    lever: float | None = option(
-        None,
-        "What a radian counts as in the pose objective [default: the targets' own].",
-        "mm",
-        group="What is fitted",
+    distance_tolerance: float | None = solved(
+        None, "How far a distance between targets may be off [default: as measured].", "mm"
     )
-    distance_tolerance: float | None = option(
-        None,
-        "How far a distance between targets may be off [default: as measured].",
-        "mm",
-        group="How it is solved",
-    )
-    allow_large_changes: bool = option(
+    allow_large_changes: bool = known(
         False,
         "Accept links that differ from the drawing by more than 5 % of the reach, 5 degrees "
         "(alpha, beta) or 30 degrees (theta).",
-        group="What is known",
     )
-    simulated: bool = option(
+    simulated: bool = known(
         False,
         "The points are of a simulation and may be exact; a file that begins with # simulated says "
         "so itself.",
-        group="What is known",
     )
     resolution: float = identify.RESOLUTION
 

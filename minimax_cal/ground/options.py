@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
-from functools import wraps
+from functools import partial, wraps
 from inspect import Parameter, signature
 from typing import Any, TypeVar
 
@@ -55,6 +55,11 @@ def option(default: Any, help: str = "", unit: str = "", **more: Any) -> Any:
     if default is dict:
         return field(default_factory=dict, metadata=told)
     return field(default=default, metadata=told)
+
+
+def grouped(group: str) -> Callable[..., Any]:
+    """`option` under a heading of the help."""
+    return partial(option, group=group)
 
 
 # ---- as keywords of a function -----------------------------------------------------------------
@@ -111,14 +116,15 @@ def as_parameter(one: Any, positional: bool) -> Parameter:
     return Parameter(one.name, kind, default=default, annotation=one.type)
 
 
-def documented(text: str, at: str, kind: type, names: Sequence[str]) -> str:
+def documented(text: str, at: str, kind: Any, names: Sequence[str]) -> str:
     """A docstring with what a record says of its fields in the place of an argument's entry."""
-    known, said = "|".join(names), " ".join((kind.__doc__ or "").split())
-    parts = re.split(rf"(?:^|(?<=\. ))((?:{known})(?:, (?:{known}))*): ", said)
-    entries = "".join(
-        f"    {some}\n        {words.strip()[:1].upper()}{words.strip()[1:]}\n"
-        for some, words in zip(parts[1::2], parts[2::2], strict=True)
-    )
+    every = "|".join(one.name for one in fields(kind))
+    said = " ".join((kind.__doc__ or "").split())
+    parts = re.split(rf"(?:^|(?<=\. ))((?:{every})(?:, (?:{every}))*): ", said)
+    entries = ""
+    for some, words in zip(parts[1::2], map(str.strip, parts[2::2]), strict=True):
+        if kept := ", ".join(one for one in some.split(", ") if one in names):
+            entries += f"    {kept}\n        {words[:1].upper()}{words[1:]}\n"
     return re.sub(rf"    {at}\n        .*\n", lambda _: entries, text)
 
 

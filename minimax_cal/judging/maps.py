@@ -19,7 +19,7 @@ from minimax_cal.fitting.uncertainty import FRAMES, Uncertainty, holding_radius,
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.facts import Apart, Fact, Milli, Mm
-from minimax_cal.ground.options import option
+from minimax_cal.ground.options import grouped
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.tables import Cell as TableCell
@@ -69,6 +69,9 @@ def predictor(
     return radius
 
 
+sections = grouped("The sections")
+
+
 @dataclass(frozen=True)
 class Grid:
     """What is mapped.  samples: of the joints.  bins: along the wider side of a section.
@@ -77,25 +80,13 @@ class Grid:
     median height of the samples and a fifth of the arm's reach [m].
     """
 
-    samples: int = option(
-        100_000, "The number of arm postures that are predicted.", group="The sections"
+    samples: int = sections(100_000, "The number of arm postures that are predicted.")
+    bins: int = sections(40, "The number of bins along the wider side of a section.")
+    height: float = sections(
+        np.nan, "The height of the horizontal section [default: the median].", "mm"
     )
-    bins: int = option(
-        40, "The number of bins along the wider side of a section.", group="The sections"
-    )
-    height: float = option(
-        np.nan,
-        "The height of the horizontal section [default: the median].",
-        "mm",
-        group="The sections",
-    )
-    slab: float = option(
-        np.nan,
-        "How thick a section is [default: a fifth of the reach].",
-        "mm",
-        group="The sections",
-    )
-    seed: int = option(0, "The seed of the samples.", group="The sections")
+    slab: float = sections(np.nan, "How thick a section is [default: a fifth of the reach].", "mm")
+    seed: int = sections(0, "The seed of the samples.")
 
 
 @dataclass(frozen=True, eq=False)

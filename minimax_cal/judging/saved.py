@@ -88,9 +88,7 @@ def evaluate(
     --------
     >>> print(mc.evaluate(fit, "new_poses.csv").rms_mm)
     """
-    data = data if isinstance(data, Measurements) else read_measurements(data)
-    cell, _, _ = open_result(source, rung).placed_by(data, new_frame)
-    return accuracy(cell.error(data))
+    return evaluated(source, data, rung, new_frame).accuracy
 
 
 @dataclass(frozen=True)
@@ -114,21 +112,16 @@ class Evaluation(Result):
     accuracy: Accuracy
     set_aside: tuple[SetAside, ...]
     with_them: Apart[Accuracy | None]
-    name: Apart[str]
-    targets: Apart[tuple[str, ...]]
+    shown: Apart[Table]
     notices: Apart[tuple[str, ...]]
 
     def headline(self) -> str:
         """The error in a sentence."""
-        return f"{self.name} {self.data}: RMS {self.accuracy.rms_mm:.4f} mm."
-
-    def table(self) -> Table:
-        """The error of all targets and of each."""
-        return self.accuracy.table(f"{self.name} on {self.data}", self.targets)
+        return f"RMS error {self.accuracy.rms_mm:.4f} mm on {self.data}."
 
     def tables(self) -> tuple[Table, ...]:
-        """One alone."""
-        return (self.table(),)
+        """The error of all targets and of each."""
+        return (self.shown,)
 
     def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """The accuracy of all points that were measured."""
@@ -163,6 +156,7 @@ def evaluated(
         gone = with_them(error, groups(data), errors_of(cell, data))
         doubts.append(aside_sentence(data.set_aside, gone))
     step = opened.rungs[opened.number].name
+    name = cell.robot.name if rung is None else f"{cell.robot.name}, {step},"
     return Evaluation(
         fit=opened.source,
         rung=step,
@@ -174,8 +168,7 @@ def evaluated(
         accuracy=found,
         set_aside=data.set_aside,
         with_them=gone,
-        name=cell.robot.name if rung is None else f"{cell.robot.name}, {step},",
-        targets=data.target_names,
+        shown=found.table(f"{name} on {data.source}", data.target_names),
         notices=(*data.notices, *said, *strangers(cell, data), *mixed, *doubts),
     )
 

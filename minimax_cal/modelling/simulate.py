@@ -10,7 +10,7 @@ import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import option
+from minimax_cal.ground.options import grouped
 from minimax_cal.ground.seeds import check_seed
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
@@ -21,6 +21,9 @@ from minimax_cal.robots.sampling import random_poses
 from minimax_cal.robots.transforms import transform
 
 MOST_POSES, MOST_TARGETS = 1_000_000, 20
+
+
+of_arm, of_instrument = grouped("The arm"), grouped("The instrument")
 
 
 @dataclass(frozen=True)
@@ -34,32 +37,22 @@ class Truth:
     span: most that a joint turns from 0, within its limits [rad].
     """
 
-    length: float = option(
-        0.5e-3,
-        "The standard deviation of the errors of a and d.",
-        "mm",
-        flag="--length-error",
-        group="The arm",
+    length: float = of_arm(
+        0.5e-3, "The standard deviation of the errors of a and d.", "mm", flag="--length-error"
     )
-    angle: float = option(
+    angle: float = of_arm(
         1.0e-3,
         "The standard deviation of the errors of theta, alpha, beta.",
         "mrad",
         flag="--angle-error",
-        group="The arm",
     )
-    compliance: float = option(
-        3.0e-7, "How far each joint turns under gravity's torque.", "urad/Nm", group="The arm"
+    compliance: float = of_arm(
+        3.0e-7, "How far each joint turns under gravity's torque.", "urad/Nm"
     )
-    noise: float = option(
-        10e-6,
-        "The standard deviation of a coordinate at the instrument.",
-        "um",
-        group="The instrument",
+    noise: float = of_instrument(
+        10e-6, "The standard deviation of a coordinate at the instrument.", "um"
     )
-    noise_per_metre: float = option(
-        2.5e-6, "How that noise grows with range.", "um/m", group="The instrument"
-    )
+    noise_per_metre: float = of_instrument(2.5e-6, "How that noise grows with range.", "um/m")
     distance: float = 3.0
     circle: float = 0.1
     span: float = np.pi

@@ -11,7 +11,7 @@ import numpy as np
 from minimax_cal.fitting.pixels.camera import FLANGE, GROUND
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import SI, number, option
+from minimax_cal.ground.options import SI, grouped, number
 from minimax_cal.robots.transforms import from_rpy
 
 SIDES = {"-z": -1.0, "z": 1.0}  # of a board's frame: where its print looks
@@ -34,6 +34,9 @@ def frame(text: str, name: str) -> Array:
     return from_rpy(1e-3 * parts[:3], SI["deg"] * parts[:2:-1])
 
 
+sight = grouped(GROUP)
+
+
 @dataclass(frozen=True)
 class CameraOptions:
     """Where cameras and board are, and what an image must show.
@@ -47,47 +50,40 @@ class CameraOptions:
     camera_prior: how well the files know the lenses, as ``f 0.1%, c 2px``.
     """
 
-    camera_on: str = option(
-        FLANGE, f"What the cameras are fixed to: {FLANGE} or {GROUND}.", group=GROUP
-    )
-    camera_at: Sequence[Array] = option(
+    camera_on: str = sight(FLANGE, f"What the cameras are fixed to: {FLANGE} or {GROUND}.")
+    camera_at: Sequence[Array] = sight(
         (),
         "About where a camera is in the flange's (or base's) frame, mm and deg; once for each, in "
         "their order.",
         metavar="X,Y,Z,A,B,C",
         read=partial(frame, name="camera_at"),
         many=tuple,
-        group=GROUP,
     )
-    board_at: Array | None = option(  # noqa: RUF009
+    board_at: Array | None = sight(  # noqa: RUF009
         None,
         "About where the board is in the base's (or flange's) frame, mm and deg.",
         metavar="X,Y,Z,A,B,C",
         read=partial(frame, name="board_at"),
-        group=GROUP,
     )
-    print_looks: str = option(
+    print_looks: str = sight(
         "-z",
         "Where the board's print looks in the frame of its file: -z, as OpenCV counts corners (y "
         "down), or z.",
         metavar="-z|z",
-        group=GROUP,
     )
-    distance: tuple[float, float] = option(
-        (0.3, 1.0), "From how near to how far a camera is sharp, m.", "m", group=GROUP
+    distance: tuple[float, float] = sight(
+        (0.3, 1.0), "From how near to how far a camera is sharp, m.", "m"
     )
-    incidence: float = option(
-        np.radians(60.0), "The largest angle between a line of sight and the board's normal.",
-        "deg", group=GROUP,
-    )  # fmt: skip
-    share: float = option(
-        0.8, "The share of the corners that an image must show.", metavar="SHARE", group=GROUP
+    incidence: float = sight(
+        np.radians(60.0), "The largest angle between a line of sight and the board's normal.", "deg"
     )
-    pixel_noise: float = option(PIXEL_NOISE, "The noise of u and v, px.", group=GROUP)
-    camera_prior: str = option(
-        "", "How well the files know the lenses, as `calibrate` takes it.",
-        metavar='"f 0.1%, c 2px"', group=GROUP,
-    )  # fmt: skip
+    share: float = sight(0.8, "The share of the corners that an image must show.", metavar="SHARE")
+    pixel_noise: float = sight(PIXEL_NOISE, "The noise of u and v, px.")
+    camera_prior: str = sight(
+        "",
+        "How well the files know the lenses, as `calibrate` takes it.",
+        metavar='"f 0.1%, c 2px"',
+    )
 
 
 def check_cameras(sees: CameraOptions, count: int) -> None:

@@ -22,7 +22,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.facts import Apart, Fact
 from minimax_cal.ground.files import plain
-from minimax_cal.ground.options import option, takes
+from minimax_cal.ground.options import grouped, takes
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.stages import Progress, silent
@@ -60,6 +60,9 @@ SHORTEST, LONGEST = 5.0, 300.0  # of a part [s]
 FASTEST_ROWS = 1000.0
 
 
+moved = grouped(GROUP)
+
+
 @dataclass(frozen=True)
 class MotionOptions:
     """What a motion is to be like.
@@ -70,23 +73,17 @@ class MotionOptions:
     rows: of the file, a second.
     """
 
-    duration: float = option(20.0, "How long a part of the motion takes, s.", group=GROUP)
-    speed: float = option(
-        np.radians(60.0), "The highest speed of a joint, deg/s (slides: mm/s).", "deg", group=GROUP
+    duration: float = moved(20.0, "How long a part of the motion takes, s.")
+    speed: float = moved(
+        np.radians(60.0), "The highest speed of a joint, deg/s (slides: mm/s).", "deg"
     )
-    acceleration: float = option(
-        np.radians(120.0),
-        "The highest acceleration of a joint, deg/s^2 (slides: mm/s^2).",
-        "deg",
-        group=GROUP,
+    acceleration: float = moved(
+        np.radians(120.0), "The highest acceleration of a joint, deg/s^2 (slides: mm/s^2).", "deg"
     )
-    payload: float | None = option(
-        None,
-        "A known mass at the flange; a part with it tells masses and drive gains apart.",
-        "kg",
-        group=GROUP,
+    payload: float | None = moved(
+        None, "A known mass at the flange; a part with it tells masses and drive gains apart.", "kg"
     )
-    rows: float = option(100.0, "Rows a second in the file.", flag="--rows-per-second", group=GROUP)
+    rows: float = moved(100.0, "Rows a second in the file.", flag="--rows-per-second")
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import plain
-from minimax_cal.ground.options import SI, option, pair, triple
+from minimax_cal.ground.options import SI, grouped, pair, triple
 from minimax_cal.ground.seeds import check_seed
 from minimax_cal.planning.prospect import Instrument
 from minimax_cal.planning.result import MEANINGS, POWER
@@ -31,6 +31,11 @@ def box(text: str) -> tuple[tuple[float, ...], ...]:
         raise OptionError(f"volume={text!r}: give x, y and z, as 700:1700,-500:500,300:1300")
     limits = [pair(axis, "volume", 1e-3) for axis in axes]
     return tuple(low for low, _ in limits), tuple(high for _, high in limits)
+
+
+aimed, seen = grouped("What the poses are for"), grouped("What the instrument sees")
+allowed, exact = grouped("What the arm may do"), grouped("How exact things are")
+visits, search = grouped("Visits"), grouped("The search")
 
 
 @dataclass(frozen=True)
@@ -54,131 +59,95 @@ class PlanOptions:
     approach: both for revisits from the other side.  revisit: poses to go back to.
     """
 
-    criterion: str = option(
+    criterion: str = aimed(
         "I",
         "What is minimised: "
         + "; ".join(f"{name}, {said}" for name, said in MEANINGS.items() if name != POWER)
         + ".",
-        group="What the poses are for",
     )
-    effects: Sequence[str] = option(
+    effects: Sequence[str] = aimed(
         (),
         "Effects that the calibration will fit too; they are unknown until then.",
         metavar="NAME:PLACE",
         many=tuple,
-        group="What the poses are for",
     )
-    separate: Sequence[str] = option(
+    separate: Sequence[str] = aimed(
         (),
         "Choose poses that distinguish two effects, as joint_compliance:J2 link_bending:L2.",
         metavar="EFFECT EFFECT",
         values=2,
-        group="What the poses are for",
     )
-    tracker: Sequence[float] = option(
+    tracker: Sequence[float] = seen(
         (),
         "Where the tracker stands, in base axes, mm [default: 3 m before the arm].",
         metavar="X,Y,Z",
         read=partial(triple, name="tracker"),
-        group="What the instrument sees",
     )
-    targets: int = option(
-        3,
-        "The number of reflectors on a circle of 100 mm radius about the flange's axis.",
-        group="What the instrument sees",
+    targets: int = seen(
+        3, "The number of reflectors on a circle of 100 mm radius about the flange's axis."
     )
-    spots: Sequence[Sequence[float]] = option(
+    spots: Sequence[Sequence[float]] = seen(
         (),
         "The place of a reflector in the flange's frame, mm; given once for each.",
         flag="--target",
         metavar="X,Y,Z",
         read=partial(triple, name="spots"),
         many=tuple,
-        group="What the instrument sees",
     )
-    normals: str = option(
-        "flange",
-        f"Where the reflectors look: {' or '.join(NORMALS)}.",
-        group="What the instrument sees",
+    normals: str = seen("flange", f"Where the reflectors look: {' or '.join(NORMALS)}.")
+    acceptance: float = seen(
+        np.radians(30.0), "The half angle of a reflector's cone; 180 is seen from anywhere.", "deg"
     )
-    acceptance: float = option(
-        np.radians(30.0),
-        "The half angle of a reflector's cone; 180 is seen from anywhere.",
-        "deg",
-        group="What the instrument sees",
+    whole: bool = seen(
+        False, "Take only poses at which all reflectors are seen.", flag="--all-targets"
     )
-    whole: bool = option(
-        False,
-        "Take only poses at which all reflectors are seen.",
-        flag="--all-targets",
-        group="What the instrument sees",
+    reach: tuple[float, float] = seen(
+        (0.5, 50.0), "From how near to how far the tracker measures, m.", "m", flag="--range"
     )
-    reach: tuple[float, float] = option(
-        (0.5, 50.0),
-        "From how near to how far the tracker measures, m.",
-        "m",
-        flag="--range",
-        group="What the instrument sees",
+    elevation: tuple[float, float] = seen(
+        (np.radians(-50.0), np.radians(75.0)), "How far down and up the tracker looks, deg.", "deg"
     )
-    elevation: tuple[float, float] = option(
-        (np.radians(-50.0), np.radians(75.0)),
-        "How far down and up the tracker looks, deg.",
-        "deg",
-        group="What the instrument sees",
-    )
-    joints: Mapping[int, tuple[float, float]] = option(
+    joints: Mapping[int, tuple[float, float]] = allowed(
         dict,
         "Narrow a joint's limits, deg (slides: mm).",
         flag="--joint",
         metavar="J2=LOW:HIGH",
         read=str,  # their unit depends on the robot: see `limits_of`
         many=tuple,
-        group="What the arm may do",
     )
-    volume: Sequence[Sequence[float]] = option(
+    volume: Sequence[Sequence[float]] = allowed(
         (),
         "The box in base axes that the flange must stay in, mm.",
         metavar="X0:X1,Y0:Y1,Z0:Z1",
         read=box,
-        group="What the arm may do",
     )
-    floor: float = option(
-        0.0, "The height of the floor above the base's origin.", "mm", group="What the arm may do"
+    floor: float = allowed(0.0, "The height of the floor above the base's origin.", "mm")
+    body: float | None = allowed(
+        None, "The radius of the arm's links [default: 4 % of its reach].", "mm"
     )
-    body: float | None = option(
-        None,
-        "The radius of the arm's links [default: 4 % of its reach].",
-        "mm",
-        group="What the arm may do",
-    )
-    noise: float | None = option(
+    noise: float | None = exact(
         None,
         f"The noise of a coordinate [default: as the data show it, else {1e6 * USUAL.noise:g}].",
         "um",
-        group="How exact things are",
     )
-    per_metre: float | None = option(
+    per_metre: float | None = exact(
         None,
         f"How that noise grows with range [default: {1e6 * USUAL.per_metre:g}].",
         "um/m",
         flag="--noise-per-metre",
-        group="How exact things are",
     )
-    jitter: float | None = option(
+    jitter: float | None = exact(
         None,
         "How far a joint stops from where it should [default: as the data show it, else "
         f"{1e6 * USUAL.jitter:g}].",
         "urad",
-        group="How exact things are",
     )
-    revisit: int = option(0, "Go back to so many of the poses.", metavar="K", group="Visits")
-    approach: str = option(
-        "none",
-        f"From which side to come to a revisited pose: {' or '.join(EFFORTS)}.",
-        group="Visits",
+    revisit: int = visits(0, "Go back to so many of the poses.", metavar="K")
+    approach: str = visits(
+        "none", f"From which side to come to a revisited pose: {' or '.join(EFFORTS)}."
     )
-    candidates: int = option(2000, "The number of poses to choose among.", group="The search")
-    seed: int = option(0, "The seed of candidates and starts.", group="The search")
+    candidates: int = search(2000, "The number of poses to choose among.")
+    seed: int = search(0, "The seed of candidates and starts.")
 
 
 def limits_of(texts: Sequence[str], robot: Robot) -> dict[int, tuple[float, float]]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from minimax_cal.fitting.options import listed
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
-from minimax_cal.ground.options import option, takes
+from minimax_cal.ground.options import grouped, takes
 from minimax_cal.judging.tolerance import claim_called, limits_of
 from minimax_cal.reporting.html import (
     Report,
@@ -31,7 +31,7 @@ from minimax_cal.reporting.html.motion import MotionSource, compose_motion, moti
 from minimax_cal.reporting.html.page import needed
 from minimax_cal.reporting.html.sources import Result
 
-ASKED, SAID = "What is required", "What the page says"
+asked, said = grouped("What is required"), grouped("What the page says")
 PAGES, PAPERS, PICTURES = (".html", ".htm"), (".pdf",), (".png",)
 
 
@@ -50,38 +50,28 @@ class Chosen:
     corrected targets.
     """
 
-    tolerance: str = option(
-        "", 'What is required, in mm, as "rms 0.2, max 0.5".', metavar="LIMITS", group=ASKED
+    tolerance: str = asked("", 'What is required, in mm, as "rms 0.2, max 0.5".', metavar="LIMITS")
+    tolerance_for: str = asked(
+        "inside", "Judge poses inside or outside the measured region.", metavar="CLAIM"
     )
-    tolerance_for: str = option(
-        "inside",
-        "Judge poses inside or outside the measured region.",
-        metavar="CLAIM",
-        group=ASKED,
-    )
-    deliver: tuple[str, ...] = option(
+    deliver: tuple[str, ...] = asked(
         (),
         "Judge by what this reaches: a format of export, or compensate; may be given several "
         "times [default: corrected targets, where the result holds effects].",
         metavar="FORMAT",
         many=tuple,
-        group=ASKED,
     )
-    facts: Path | str | None = option(
+    facts: Path | str | None = said(  # noqa: RUF009
         None,
         "A TOML file with serial_number, controller, tool, payload, temperature, instrument, "
         "certificate, place, validity.",
         metavar="FILE",
-        group=SAID,
     )
-    title: str = option("", "The title of the report [default: of the robot].", group=SAID)
-    customer: str = option("", "Who accepts the report.", metavar="NAME", group=SAID)
-    author: str = option("", "Who measured and evaluated.", metavar="NAME", group=SAID)
-    date: str = option(
-        "",
-        "The date of the report [default: SOURCE_DATE_EPOCH, or today].",
-        metavar="YYYY-MM-DD",
-        group=SAID,
+    title: str = said("", "The title of the report [default: of the robot].")
+    customer: str = said("", "Who accepts the report.", metavar="NAME")
+    author: str = said("", "Who measured and evaluated.", metavar="NAME")
+    date: str = said(
+        "", "The date of the report [default: SOURCE_DATE_EPOCH, or today].", metavar="YYYY-MM-DD"
     )
     rung: int | None = None
 

@@ -10,7 +10,7 @@ from minimax_cal.fitting.options import Options, check_priors, known_within
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import option
+from minimax_cal.ground.options import grouped
 from minimax_cal.ground.stages import Progress as Progress
 from minimax_cal.ground.stages import silent as silent
 from minimax_cal.modelling.effects.table import Term
@@ -50,6 +50,9 @@ def noise_of(text: str) -> tuple[str, float]:
     raise OptionError(f"noise {text!r}: write FILE=SIGMA in mm, as wires=0.2mm")
 
 
+fitted = grouped("What is fitted")
+
+
 @dataclass(frozen=True)
 class RelativeOptions:
     """How to calibrate.
@@ -70,35 +73,28 @@ class RelativeOptions:
     seed: int = Options.seed
     fix: Sequence[str] = ()
     free: Sequence[str] = ()
-    offset: bool = option(
-        False,
-        "Lengths: fit a constant offset of each wire (weakly determined).",
-        group="What is fitted",
-    )
-    known_distances: Sequence[Known] = option(
+    offset: bool = fitted(False, "Lengths: fit a constant offset of each wire (weakly determined).")
+    known_distances: Sequence[Known] = fitted(
         (),
         "Closures: the distance between two sockets' centres; gives the scale.",
         flag="--known-distance",
         metavar="A,B,MM",
         read=known_of,
         many=tuple,
-        group="What is fitted",
     )
-    lever: float | None = option(
+    lever: float | None = fitted(
         None,
         "Poses: what a radian counts as, linear over angular noise [default: of the columns "
         "u95_mm and rotation_u95_rad, else 100].",
         "mm",
-        group="What is fitted",
     )
-    noises: Mapping[str, float] = option(
+    noises: Mapping[str, float] = fitted(
         dict,
         "How noisy a file's numbers are, by its name without ending [default: as its residuals].",
         flag="--noise",
         metavar="FILE=SIGMA",
         read=noise_of,
         many=dict,
-        group="What is fitted",
     )
     priors: Mapping[str, float] = field(default_factory=dict)
     effects: Sequence[str | Term] = ()

@@ -13,9 +13,8 @@ from minimax_cal.fitting.options import Options, QpSolver, check_resolution, qp_
 from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import option
+from minimax_cal.ground.options import grouped
 
-CAMERAS = "Cameras"
 SUM, WORST_TARGET, WORST_CAMERA = OBJECTIVES = ("sum", "minimax", "camera")
 # How well a camera's file knows its lens: a share of the focal length, pixels of the centre, and
 # the first radial and both tangential coefficients; higher radial ones are known worse.
@@ -58,39 +57,35 @@ def cameras_of(texts: Sequence[str]) -> dict[str, str]:
     return named
 
 
+seen = grouped("Cameras")
+
+
 @dataclass(frozen=True, eq=False)
 class PixelFiles:
     """What is given of cameras."""
 
-    pixels: Path | None = option(
-        None,
-        "What cameras saw (CSV): pose, camera, target, u_px, v_px.",
-        metavar="FILE",
-        read=Path,
-        group=CAMERAS,
+    pixels: Path | None = seen(  # noqa: RUF009
+        None, "What cameras saw (CSV): pose, camera, target, u_px, v_px.", metavar="FILE", read=Path
     )
-    joints: Path | None = option(
+    joints: Path | None = seen(  # noqa: RUF009
         None,
         "The joint values of each pose of the detections (CSV): pose, q1_rad, ...",
         metavar="FILE",
         read=Path,
-        group=CAMERAS,
     )
-    camera: Sequence[str] = option(
+    camera: Sequence[str] = seen(
         (),
         "The K and D of a camera, as OpenCV or ROS write them (YAML); may be given several times.",
         metavar="NAME=FILE",
         read=str,
         many=tuple,
-        group=CAMERAS,
     )
-    board: Path | None = option(
+    board: Path | None = seen(  # noqa: RUF009
         None,
         "The places of the targets on a board (CSV): target, x_mm, y_mm, z_mm [default: tags of "
         "unknown place].",
         metavar="FILE",
         read=Path,
-        group=CAMERAS,
     )
 
     @property
@@ -122,28 +117,23 @@ class PixelOptions:
 
     objective: str = SUM
     qp: QpSolver = Options.qp
-    camera_on: str = option(
+    camera_on: str = seen(
         "",
         "What the cameras are fixed to: flange or ground [default: what fits better].",
         metavar="flange|ground",
-        group=CAMERAS,
     )
-    fix_camera: bool = option(
+    fix_camera: bool = seen(
         False,
         "Hold the lenses as their files say; how well these know them still counts in the sigmas.",
-        group=CAMERAS,
     )
-    camera_prior: str = option(
+    camera_prior: str = seen(
         "",
         "How well the files know the lenses: focal length, centre, radial and tangential "
         "distortion [default: f 0.1%, c 2px, k 0.005, p 0.0005].",
         metavar='"f 0.1%, c 2px"',
-        group=CAMERAS,
     )
-    drawn_prior: bool = option(
-        False,
-        "Take the drawing as a prior, as well as the robot's drawn_within says or better.",
-        group=CAMERAS,
+    drawn_prior: bool = seen(
+        False, "Take the drawing as a prior, as well as the robot's drawn_within says or better."
     )
     holdout: float = Options.holdout
     seed: int = Options.seed
