@@ -15,6 +15,7 @@ from minimax_cal.cli.options import (
     SOME_CAMPAIGNS,
     Output,
     command,
+    flag,
     measured,
     on_command_line,
     options_from,
@@ -53,10 +54,9 @@ BRIEF = 1000  # poses that one fit needs no compiled kernels for
     metavar="N",
     help="Calibrate N resampled sets of poses for bootstrap intervals (500 are enough).",
 )
-@click.option(
+@flag(
     "--no-poses",
     "without",
-    is_flag=True,
     help="Leave the poses out of the JSON, which of very many poses are nearly all of it.",
 )
 @result_options("the result (JSON)", keep="fit.json", figure="the errors before and after")

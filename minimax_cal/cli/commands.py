@@ -19,23 +19,23 @@ import click
 from minimax_cal.ground.errors import OptionError
 
 COMMANDS = {  # in the order of the work
-    "Calibrate": ("import", "calibrate", "identify", "relative"),
-    "Judge": ("evaluate", "check", "compare"),
-    "Diagnose": ("diagnose", "torques"),
-    "Plan": ("plan", "simulate"),
-    "Correct": ("compensate", "export"),
-    "Simulate": ("gap",),
-    "Report": ("report",),
-    "Work on a page": ("serve",),
-    "Look up": ("robots", "effects", "backends"),
-    "More": ("fleet", "iso9283", "map"),
+    "Calibrate": "import calibrate identify relative",
+    "Judge": "evaluate check compare",
+    "Diagnose": "diagnose torques",
+    "Plan": "plan simulate",
+    "Correct": "compensate export",
+    "Simulate": "gap",
+    "Report": "report",
+    "Work on a page": "serve",
+    "Look up": "robots effects backends",
+    "More": "fleet iso9283 map",
 }
 # parameters that name outputs
 WRITTEN = ("output", "figure", "path", "pdf", "truth", "write", "out")
 SPARED = ("numpy.f2py", "numpy.testing")  # which SciPy would load and no command uses
 LONG = ("relative", "diagnose", "plan", "gap")  # worth compiled kernels
 ELSEWHERE = {"import": "import_", "effects": "diagnose"}  # not in a module of their name
-ENTRIES = {name: ELSEWHERE.get(name, name) for part in COMMANDS.values() for name in part}
+ENTRIES = {name: ELSEWHERE.get(name, name) for name in " ".join(COMMANDS.values()).split()}
 HELP = r'def {}_command\(.*?"""(.*?)(?:"""|\n\n)'
 
 
@@ -136,7 +136,7 @@ class Workflow(click.Group):
         """The list of commands, part by part."""
         for part, names in COMMANDS.items():
             with formatter.section(part):
-                formatter.write_dl([(name, said_of(name)) for name in names])
+                formatter.write_dl([(name, said_of(name)) for name in names.split()])
 
 
 def said_of(name: str) -> str:

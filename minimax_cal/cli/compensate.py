@@ -17,7 +17,7 @@ from minimax_cal.cli.options import (
     Output,
     command,
     options_from,
-    plain_option,
+    options_of,
     result_options,
 )
 from minimax_cal.cli.stderr import AS_JSON, complain, tell
@@ -26,6 +26,7 @@ from minimax_cal.correcting.programs.program import LANGUAGES, Program, is_progr
 from minimax_cal.correcting.target_file import TargetFile, read_targets
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.options import Option
 from minimax_cal.ground.words import visible
 from minimax_cal.robots.robot import Robot, load_robot
 
@@ -33,26 +34,22 @@ from minimax_cal.robots.robot import Robot, load_robot
 @command
 @FIT
 @click.argument("targets", type=PATH)
-@plain_option(
+@options_of(
+    compensate,
     HOW,
-    "--robot",
-    "nominal",
-    help="The nominal robot of the controller, file or name [default: that of the fit].",
+    nominal=Option(
+        "The nominal robot of the controller, file or name [default: that of the fit].",
+        flag="--robot",
+    ),
 )
 @options_from(CompensateOptions)
-@plain_option(
+@options_of(
+    read_program,
     HOW,
-    "--tool",
-    default="",
-    metavar="FRAME",
-    help="The tool of a program: x,y,z,q1,q2,q3,q4 in mm, or one that it declares.",
-)
-@plain_option(
-    HOW,
-    "--wobj",
-    default="",
-    metavar="FRAME",
-    help="The work object of a program, in the same way.",
+    tool=Option(
+        "The tool of a program: x,y,z,q1,q2,q3,q4 in mm, or one that it declares.", metavar="FRAME"
+    ),
+    wobj=Option("The work object of a program, in the same way.", metavar="FRAME"),
 )
 @SAFE_CELLS
 @RUNG

@@ -14,6 +14,7 @@ from minimax_cal.cli.options import (
     RUNG,
     Output,
     command,
+    options_of,
     result_options,
     show,
 )
@@ -21,6 +22,7 @@ from minimax_cal.dynamics.evaluate import MotionEvaluation, evaluate_motion
 from minimax_cal.dynamics.result import MotionDiagnosis
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import saved_content
+from minimax_cal.ground.options import Option
 from minimax_cal.judging.saved import Evaluation, evaluated
 
 
@@ -36,10 +38,11 @@ def kind_of_file(path: Path) -> str:
 @DATA
 @click.argument("more", type=PATH, nargs=-1)
 @RUNG
-@click.option(
-    "--new-frame",
-    is_flag=True,
-    help="The instrument or the base stands elsewhere than in FIT: fit its frame, six numbers.",
+@options_of(
+    evaluated,
+    new_frame=Option(
+        "The instrument or the base stands elsewhere than in FIT: fit its frame, six numbers."
+    ),
 )
 @result_options("the accuracy (JSON)")
 def evaluate_command(

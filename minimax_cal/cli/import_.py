@@ -15,6 +15,7 @@ from minimax_cal.cli.options import (
     SAFE_CELLS,
     Output,
     command,
+    flag,
     options_of,
     output,
     plain_option,
@@ -76,7 +77,7 @@ TOLD = "What the files do not tell"
     "shift=1@40.. from line 40 on), reverse (points in the opposite order), joints=1:3:2:4:5:6 "
     "(columns of joints 2 and 3 swapped), scale=0.999 (of the points).",
 )
-@click.option("--preview", is_flag=True, help="Show the first rows as they were understood.")
+@flag("--preview", help="Show the first rows as they were understood.")
 @SAFE_CELLS
 @JSON
 @QUIET

@@ -17,8 +17,7 @@ from minimax_cal.cli.options import (
     result_options,
     show,
 )
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import Option
+from minimax_cal.ground.options import Option, numbers
 from minimax_cal.judging.standard import iso9283
 
 WHAT = "What is judged"
@@ -28,10 +27,7 @@ def point_of(text: str) -> str | Sequence[float]:
     """The TCP: a name as it is, or X,Y,Z in mm [m].  Raises OptionError."""
     if "," not in text:
         return text
-    try:
-        return [1e-3 * float(part) for part in text.split(",")]
-    except ValueError:
-        raise OptionError(f"tcp={text!r}: give centroid, a target, or X,Y,Z in mm") from None
+    return [1e-3 * part for part in numbers(text, "tcp", "centroid, a target, or X,Y,Z in mm")]
 
 
 @command

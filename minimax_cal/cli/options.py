@@ -49,10 +49,10 @@ CAMPAIGNS = click.argument("data", type=PATH, nargs=-1, required=True, metavar="
 SOME_CAMPAIGNS = click.argument("data", type=PATH, nargs=-1, metavar="[DATA...]")
 SOME_DATA = click.argument("data", type=PATH, required=False)
 FIT = click.argument("fit", type=PATH)
-ROWS = click.option(
+flag = partial(click.option, is_flag=True)
+ROWS = flag(
     "--rows-in-visit-order",
     "in_rows",
-    is_flag=True,
     help="Take the rows as the poses were visited, where the file tells no order.",
 )
 
@@ -77,18 +77,11 @@ RUNG = click.option(
     help="Use this step of a diagnosis: 0 nominal, 1 geometric, 2 ... with each effect [default: "
     "the last].",
 )
-JSON = click.option(
-    "--json", "as_json", is_flag=True, help="Print JSON and nothing else on stdout."
-)
-NO_NOTICES = click.option(
-    "--quiet", "-q", is_flag=True, help="Print no notices and no progress on stderr."
-)
-DETAILS = click.option(
-    "--details", is_flag=True, help="Print every table, not the first screen alone."
-)
-SAFE_CELLS = click.option(
+JSON = flag("--json", "as_json", help="Print JSON and nothing else on stdout.")
+NO_NOTICES = flag("--quiet", "-q", help="Print no notices and no progress on stderr.")
+DETAILS = flag("--details", help="Print every table, not the first screen alone.")
+SAFE_CELLS = flag(
     "--safe-cells",
-    is_flag=True,
     help="Put an apostrophe before cells that a spreadsheet would run as a formula.",
 )
 
@@ -160,7 +153,7 @@ def workers(default: int, shown: str) -> Decorator:
 
 def option_of(name: str, default: Any, told: Option) -> Decorator:
     """The click option of a field or argument, which is its default where it is not given."""
-    flag = told.flag or "--" + name.replace("_", "-")
+    spelt = told.flag or "--" + name.replace("_", "-")
     kind, shown, metavar, read = kind_of(default, told, name)
 
     def in_si(_: click.Context, __: click.Parameter, given: Any) -> Any:
@@ -171,7 +164,7 @@ def option_of(name: str, default: Any, told: Option) -> Decorator:
         return default if given is None else read(given)
 
     return click.option(
-        flag,
+        spelt,
         name,
         cls=Grouped,
         group=told.group,

@@ -8,15 +8,15 @@ from typing import Any
 
 import click
 
-KINDS = {  # name: (module, class that reads such a file)
-    "robot": ("robots.robot", "RobotSchema"),
-    "calibration": ("fitting.fit", "Fit"),
-    "relative": ("fitting.instruments.result", "RelativeCalibration"),
-    "pixels": ("fitting.instruments.pixel_result", "PixelCalibration"),
-    "diagnosis": ("diagnosing.result", "Diagnosis"),
-    "simulator_gap": ("simulators.result", "SimulatorGap"),
-    "motion_gap": ("simulators.motion.result", "MotionGap"),
-    "motion_diagnosis": ("dynamics.result", "MotionDiagnosis"),
+KINDS = {  # by name the class that reads such a file
+    "robot": "robots.robot.RobotSchema",
+    "calibration": "fitting.fit.Fit",
+    "relative": "fitting.instruments.result.RelativeCalibration",
+    "pixels": "fitting.instruments.pixel_result.PixelCalibration",
+    "diagnosis": "diagnosing.result.Diagnosis",
+    "simulator_gap": "simulators.result.SimulatorGap",
+    "motion_gap": "simulators.motion.result.MotionGap",
+    "motion_diagnosis": "dynamics.result.MotionDiagnosis",
 }
 
 
@@ -24,7 +24,7 @@ def schema_of(name: str) -> dict[str, Any]:
     """The JSON schema of a kind of file, made from what reads it."""
     from minimax_cal.ground.records import json_schema
 
-    module, kind = KINDS[name]
+    module, _, kind = KINDS[name].rpartition(".")
     return json_schema(getattr(import_module(f"minimax_cal.{module}"), kind))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from minimax_cal.cli.options import PATH, command
+from minimax_cal.cli.options import PATH, command, flag
 from minimax_cal.serving.server import FOLDER, PORT, redirecting, serve
 
 
@@ -26,7 +26,7 @@ from minimax_cal.serving.server import FOLDER, PORT, redirecting, serve
     show_default=True,
     help="Where the sessions are kept, a folder of plain files each.",
 )
-@click.option("--no-browser", is_flag=True, help="Print the address and open no browser.")
+@flag("--no-browser", help="Print the address and open no browser.")
 def serve_command(port: int | None, folder: Path, no_browser: bool) -> int:
     """A page to work in, in the browser of this machine: drop files, fit, diagnose, judge, plan.
 

@@ -16,7 +16,7 @@ from minimax_cal.dynamics.regressor import link_parameters
 from minimax_cal.dynamics.run import CURRENT, Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import grouped, number
+from minimax_cal.ground.options import grouped, number, numbers
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.urdf import is_urdf, load_urdf
 
@@ -26,14 +26,6 @@ LARGEST = 1e6  # a gear ratio, or a torque for one ampere [N m/A], and 1 / the l
 Payload = tuple[float, tuple[float, float, float]]
 ARM = "The arm"
 of_arm, judged = grouped(ARM), grouped("What judges")
-
-
-def listed(text: str, name: str) -> tuple[float, ...]:
-    """Numbers separated by commas.  Raises OptionError."""
-    found = tuple(number(part) for part in text.split(","))
-    if not all(map(math.isfinite, found)):
-        raise OptionError(f"{name}={text!r}: give numbers separated by commas")
-    return found
 
 
 def carried(text: str) -> Payload:
@@ -68,13 +60,13 @@ class MotionKnown:
         None,
         "Torque for one ampere of each joint, N m per A.",
         metavar="LIST",
-        read=partial(listed, name="drive_gain"),
+        read=partial(numbers, name="drive_gain"),
     )
     ratio: float | Sequence[float] | None = of_arm(
         None,
         "Gear ratio of all joints, or of each.",
         metavar="LIST",
-        read=partial(listed, name="ratio"),
+        read=partial(numbers, name="ratio"),
     )
     holdout: float = judged(0.2, "Share of the runs that is left out in turn to judge.")
     holdout_run: str | Sequence[str] | None = judged(

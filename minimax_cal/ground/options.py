@@ -93,7 +93,9 @@ def takes(
             except TypeError as error:
                 raise TypeError(f"{verb.__name__}() {error}") from None
             for at, (kind, _) in kinds.items():
+                empty = [one.name for one in chosen[at] if one.default is MISSING]
                 own = {one.name: bound.pop(one.name) for one in chosen[at] if one.name in bound}
+                own = {n: one for n, one in own.items() if not (one is None and n in empty)}
                 for name, reader in (read or {}).items():
                     if name in own:
                         own[name] = reader(own[name])
@@ -148,12 +150,19 @@ def number(text: str) -> float:
         return math.nan
 
 
+def numbers(
+    text: str, name: str, how: str = "numbers separated by commas", count: int = 0
+) -> tuple[float, ...]:
+    """Numbers separated by commas, so many unless 0.  Raises OptionError with how to give them."""
+    parts = tuple(map(number, text.split(",")))
+    if len(parts) != (count or len(parts)) or not all(map(math.isfinite, parts)):
+        raise OptionError(f"{name}={text!r}: give {how}")
+    return parts
+
+
 def triple(text: str, name: str) -> tuple[float, ...]:
     """Three lengths in millimetres, in metres.  Raises OptionError."""
-    parts = [number(part) for part in text.split(",")]
-    if len(parts) != 3 or not all(map(math.isfinite, parts)):
-        raise OptionError(f"{name}={text!r}: give x,y,z in mm, as 3000,0,500")
-    return tuple(1e-3 * part for part in parts)
+    return tuple(1e-3 * part for part in numbers(text, name, "x,y,z in mm, as 3000,0,500", 3))
 
 
 def pair(text: str, name: str, scale: float) -> tuple[float, float]:

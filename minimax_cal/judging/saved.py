@@ -129,7 +129,7 @@ class Evaluation(Result):
 
 
 def evaluated(
-    source: Given, data: Measurements | Path | str, rung: int | None, new_frame: bool
+    source: Given, data: Measurements | Path | str, rung: int | None, new_frame: bool = False
 ) -> Evaluation:
     """As `evaluate`, with what the reader should know."""
     data = data if isinstance(data, Measurements) else read_measurements(data)

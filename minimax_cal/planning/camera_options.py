@@ -11,7 +11,7 @@ import numpy as np
 from minimax_cal.fitting.pixels.camera import FLANGE, GROUND
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import SI, grouped, number
+from minimax_cal.ground.options import SI, grouped, numbers
 from minimax_cal.robots.transforms import from_rpy
 
 SIDES = {"-z": -1.0, "z": 1.0}  # of a board's frame: where its print looks
@@ -25,12 +25,8 @@ FOR_CAMERAS = (  # options of a plan that are about cameras too
 
 def frame(text: str, name: str) -> Array:
     """X,Y,Z,A,B,C in millimetres and degrees as a pose (4, 4) [m].  Raises OptionError."""
-    parts = np.array([number(part) for part in text.split(",")])
-    if len(parts) != 6 or not np.isfinite(parts).all():
-        raise OptionError(
-            f"{name}={text!r}: give X,Y,Z in mm and A,B,C in deg (about z, y, x), as "
-            "500,0,0,0,0,180"
-        )
+    how = "X,Y,Z in mm and A,B,C in deg (about z, y, x), as 500,0,0,0,0,180"
+    parts = np.array(numbers(text, name, how, 6))
     return from_rpy(1e-3 * parts[:3], SI["deg"] * parts[:2:-1])
 
 

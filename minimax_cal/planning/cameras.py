@@ -36,7 +36,7 @@ from minimax_cal.planning.task import Task
 from minimax_cal.robots.robot import Robot, load_robot
 
 
-@takes(sees=CameraOptions, options=(PlanOptions, FOR_CAMERAS), read={"joints": lambda g: g or {}})
+@takes(sees=CameraOptions, options=(PlanOptions, FOR_CAMERAS))
 def plan_cameras(
     robot: Robot | str | Path,
     poses: int,

@@ -206,7 +206,7 @@ def shown(told: Told) -> str:
     return f"{told.sigma:.2g} {told.unit}" if np.isfinite(told.sigma) else "not separable"
 
 
-@takes(options=MotionOptions, room=(PlanOptions, ROOM), read={"joints": lambda g: g or {}})
+@takes(options=MotionOptions, room=(PlanOptions, ROOM))
 def plan_motion(
     robot: Robot | str | Path,
     *,

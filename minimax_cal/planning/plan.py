@@ -31,7 +31,7 @@ STEPS = (0.2, 0.1, 0.05, 0.02)  # around the best so far, as a share of the join
 AROUND, KEPT = 2400, 400  # poses tried around all of them, and those kept, each time
 
 
-@takes(options=PlanOptions, read={"joints": lambda given: given or {}})
+@takes(options=PlanOptions)
 def plan(
     robot: Robot | str | Path,
     poses: int,

@@ -76,10 +76,10 @@ class Program:
         return self.text.replaced(changes).encode("latin-1")
 
 
-def read_program(path: Path | str, robot: Robot, tool: str = "", work: str = "") -> Program:
+def read_program(path: Path | str, robot: Robot, tool: str = "", wobj: str = "") -> Program:
     """A program and the joints that a nominal robot takes at its points.
 
-    tool, work: x,y,z,q1,q2,q3,q4 in mm, or the name of one that the program declares; the flange
+    tool, wobj: x,y,z,q1,q2,q3,q4 in mm, or the name of one that the program declares; the flange
     and the robot's base unless given.  Raises CalibrationError with the line.
     """
     language = LANGUAGES[Path(path).suffix.lower()]
@@ -104,7 +104,7 @@ def read_program(path: Path | str, robot: Robot, tool: str = "", work: str = "")
             f"{path}:{line}: {name} displaces the points after it, so their positions are not "
             "known; remove it, or correct a program without displaced points"
         )
-    known, given = language.frames(text), {"tool": tool, "wobj": work}
+    known, given = language.frames(text), {"tool": tool, "wobj": wobj}
     check_frames_stay(language, text, points, given)
     check_used(language, text, points, given)
     grip, table = (frame_of(one, known, option) for option, one in given.items())
