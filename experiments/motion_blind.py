@@ -34,7 +34,7 @@ from experiments.motion_cases import (
 )
 from experiments.sweep import Study, study_options
 from minimax_cal.dynamics.diagnose import family
-from minimax_cal.dynamics.given import known_of
+from minimax_cal.dynamics.given import MotionKnown
 from minimax_cal.dynamics.laws import USUAL, terms_of
 from minimax_cal.dynamics.model import first_body
 from minimax_cal.dynamics.regressor import PER_LINK
@@ -165,7 +165,7 @@ def oracle(made: Made, truth: tuple[Name, ...]) -> tuple[float, float]:
     """
     logs = prepare(made.runs)
     arm = Arm.of(made.robot, np.ones(made.robot.joints), np.full(made.robot.joints, RATIO),
-                 known_of(made.payload), logs)  # fmt: skip
+                 MotionKnown(payload=made.payload).load, logs)  # fmt: skip
     scene = Scene.of(arm, logs)
     columns = Columns(first_body(Columns(scene)).in_scene(scene))
     kept = logs.fitted.T

@@ -266,7 +266,7 @@ def in_one_fit(robot: object, both: Measurements) -> Names:
 def in_one_diagnosis(robot: object, both: Measurements) -> Names:
     """What a diagnosis of two sessions has confirmed of what moved."""
     try:
-        found = diagnose(robot, both, quick=True)  # type: ignore[arg-type]
+        found = diagnose(robot, both, quick=True)
     except CalibrationError:
         return None
     named = [

@@ -16,7 +16,6 @@ from minimax_cal.cli.options import (
     command,
     options_of,
     result_options,
-    show,
 )
 from minimax_cal.dynamics.evaluate import MotionEvaluation, evaluate_motion
 from minimax_cal.dynamics.result import MotionDiagnosis
@@ -60,4 +59,4 @@ def evaluate_command(
         raise OptionError(f"{more[0]}: evaluate takes one file of measurements; join them first")
     else:
         found = evaluated(fit, data, rung, new_frame)
-    return to.finish(found, show=lambda: show(*found.tables()))
+    return to.finish(found)

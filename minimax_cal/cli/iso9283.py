@@ -15,7 +15,6 @@ from minimax_cal.cli.options import (
     options_of,
     plain_option,
     result_options,
-    show,
 )
 from minimax_cal.ground.options import Option, numbers
 from minimax_cal.judging.standard import iso9283
@@ -55,4 +54,4 @@ def iso9283_command(fit: Path, data: Path | None, poses: bool, to: Output, **cho
     again give repeatability.
     """
     found = iso9283(fit, data, **chosen)
-    return to.finish(found, show=lambda: show(*found.tables(poses=poses)))
+    return to.finish(found, tables=lambda: found.tables(poses=poses))

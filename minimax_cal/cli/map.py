@@ -18,7 +18,6 @@ from minimax_cal.cli.options import (
     command,
     options_from,
     plain_option,
-    show,
     with_output,
 )
 from minimax_cal.fitting.uncertainty import FRAMES
@@ -71,4 +70,4 @@ def map_command(
     predict, measured, said = predicted(saved, frame, str(fit))
     found = workspace_map(saved, predict, Grid(**chosen), measured)
     notices = (*saved.notices, *said, *found.notices)
-    return to.finish(found, notices=notices, show=lambda: show(found.table()), draw=save_map)
+    return to.finish(found, notices=notices, draw=save_map)

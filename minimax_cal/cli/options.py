@@ -377,16 +377,18 @@ class Output:
     ) -> None:
         """Print the first screen of a result, or with --details its sentences and every table.
 
+        Every table alone where it has no first screen.
         sentences, tables, advice: other than its own, and how to keep it.  more: tables beside it.
         """
         sentences = sentences or [found.headline()]
+        if self.keep and not self.details:
+            advice = self.kept() if advice is None else advice
+            first_screen(sentences, *found.first_tables(), *more, advice=advice)
+            return
         if self.details:
             terminal().print(Text(visible(" ".join(sentences))))
             click.echo()
-            show(*(tables or found.tables)(), *more)
-        else:
-            advice = self.kept() if advice is None else advice
-            first_screen(sentences, *found.first_tables(), *more, advice=advice)
+        show(*(tables or found.tables)(), *more)
 
     def kept(self) -> Advice:
         """How to see every table, and to keep a result that was not written."""

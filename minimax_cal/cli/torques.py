@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,11 @@ from minimax_cal.cli.options import (
     command,
     options_from,
     options_of,
+    record_of,
     result_options,
 )
 from minimax_cal.dynamics.diagnose import diagnose_motion
-from minimax_cal.dynamics.given import MotionKnown, read_logs, runs_of, torque_gains
+from minimax_cal.dynamics.given import MotionKnown, read_logs, runs_of
 from minimax_cal.dynamics.run import Run
 from minimax_cal.ground.files import check_writable, json_text
 from minimax_cal.ground.options import Option
@@ -70,19 +70,18 @@ def torques_command(
     """
     if write is not None:
         check_writable(write, MODELS)
-    runs = read_logs(model, logs)
+    known, runs = record_of(MotionKnown, dict(chosen)), read_logs(model, logs)
     arm = model_of(model, runs)
     if write is not None:  # before what takes long
         drawn = arm if isinstance(arm, Robot) else load_robot(arm)
-        torque_gains(drawn, runs_of(arm, drawn, runs), chosen["drive_gain"])
+        known.torque_gains(drawn, runs_of(arm, drawn, runs))
     with to.stages() as progress:
         found, made = diagnose_motion(arm, runs, progress=progress, **chosen), None
         if write:
             from minimax_cal.simulators.motion.ladder import motion_gap
 
-            known = {one.name: chosen[one.name] for one in fields(MotionKnown)}
             made = motion_gap(model, runs, diagnosis=found, write=write, driven=False,
-                              progress=progress, **known)  # fmt: skip
+                              progress=progress, **vars(known))  # fmt: skip
     to.notice(*found.notices)
     if made:
         to.wrote(write, made.module)

@@ -20,14 +20,7 @@ from minimax_cal.dynamics.budget import (
     steps_of,
     without_harmful,
 )
-from minimax_cal.dynamics.given import (
-    MotionKnown,
-    gains_of,
-    known_of,
-    ratios_of,
-    runs_of,
-    with_payload,
-)
+from minimax_cal.dynamics.given import MotionKnown, runs_of
 from minimax_cal.dynamics.laws import ANGLE, CURVE, LAWS, USUAL, Term, terms_of
 from minimax_cal.dynamics.links import LinkChange, body_as_given, carried, weighing
 from minimax_cal.dynamics.logs.with_robot import LEAST_SCALE, MOST_SCALE
@@ -135,9 +128,8 @@ def diagnose_motion(
     check_left_out(exclude, LAWS)
     progress("reading logs")
     runs = runs_of(robot, arm_of, logs)
-    prepared = prepare(with_payload(runs, known.payload))
-    gain, ratio = gains_of(arm_of, runs, known.drive_gain), ratios_of(arm_of, known.ratio)
-    arm = Arm.of(arm_of, gain, ratio, known_of(known.payload), prepared)
+    prepared = prepare(known.loaded(runs))
+    arm = Arm.of(arm_of, known.gains(arm_of, runs), known.ratios(arm_of), known.load, prepared)
     holdout, named = known.holdout, named_runs(prepared, known.holdout_run)
     if not (named or 0.0 < holdout < 1.0):
         raise OptionError(f"holdout={holdout:g} must lie between 0 and 1")

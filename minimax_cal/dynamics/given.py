@@ -76,6 +76,63 @@ class MotionKnown:
         many=tuple,
     )
 
+    def loaded(self, runs: Sequence[Run]) -> list[Run]:
+        """The runs with the mass at the flange, where they say none.  Raises OptionError."""
+        if self.payload is None:
+            return [replace(run, payload=None) for run in runs]
+        mass, at = self.payload
+        if not (0.0 < mass <= HEAVIEST and np.abs(at).max() <= FARTHEST):
+            raise OptionError(
+                f"payload of {mass:.3g} kg at {tuple(at)} m: give at most {HEAVIEST:g} kg within "
+                f"{FARTHEST:g} m of the flange"
+            )
+        return [run if run.payload is not None else replace(run, payload=mass) for run in runs]
+
+    @property
+    def load(self) -> Array:
+        """(10,) inertial parameters of what the flange carries, per kilogram."""
+        if self.payload is None:
+            return np.zeros(10)
+        return link_parameters(1.0, np.array(self.payload[1], dtype=float), np.zeros(6))
+
+    def gains(self, robot: Robot, runs: Sequence[Run]) -> Array:
+        """(n,) torque per unit of the log; empty where currents have none.  Raises OptionError."""
+        n, given = robot.joints, self.drive_gain
+        if runs[0].unit != CURRENT:
+            if given is not None:
+                what = "holds torques, not currents; leave it"
+                raise OptionError(f"drive_gain: {runs[0].source} {what}")
+            return np.ones(n)
+        gain = np.array(robot.drive_gain if given is None else given, dtype=float)
+        if given is not None and (gain.shape != (n,) or not np.all(gain > 0.0) or extreme(gain)):
+            raise OptionError(
+                f"drive_gain must be {n} positive numbers up to {LARGEST:g}, N m per A, one for "
+                "each joint"
+            )
+        return gain if gain.size and np.isfinite(gain).all() else np.zeros(0)
+
+    def torque_gains(self, robot: Robot, runs: Sequence[Run]) -> Array:
+        """The same for a simulator.  Raises OptionError where none is known."""
+        gains = self.gains(robot, runs)
+        if not len(gains):
+            raise OptionError(
+                f"{runs[0].source}: holds currents; give drive_gain=, the torque for one ampere of "
+                "each joint: a simulator counts in N m"
+            )
+        return gains
+
+    def ratios(self, robot: Robot) -> Array:
+        """(n,) gear ratios.  Raises OptionError."""
+        if self.ratio is None:
+            return robot.ratio
+        values = np.atleast_1d(np.array(self.ratio, dtype=float))
+        if values.shape not in ((1,), (robot.joints,)) or extreme(values):
+            raise OptionError(
+                f"ratio must be a number, or one for each of {robot.joints} joints, between "
+                f"{1.0 / LARGEST:g} and {LARGEST:g}"
+            )
+        return np.array(np.broadcast_to(values, robot.joints))
+
 
 def joint_names(robot: Robot | str | Path) -> tuple[str, ...]:
     """Names of the joints, of a URDF."""
@@ -116,67 +173,6 @@ def runs_of(
                 "currents and torques apart"
             )
     return tuple(against_robot(robot, run) for run in runs)
-
-
-def with_payload(runs: Sequence[Run], payload: Payload | None) -> list[Run]:
-    """The runs with the mass at the flange, where they say none themselves.  Raises OptionError."""
-    if payload is None:
-        return [replace(run, payload=None) for run in runs]
-    mass, at = payload
-    if not (0.0 < mass <= HEAVIEST and np.abs(at).max() <= FARTHEST):
-        raise OptionError(
-            f"payload of {mass:.3g} kg at {tuple(at)} m: give at most {HEAVIEST:g} kg within "
-            f"{FARTHEST:g} m of the flange"
-        )
-    return [run if run.payload is not None else replace(run, payload=payload[0]) for run in runs]
-
-
-def known_of(payload: Payload | None) -> Array:
-    """(10,) inertial parameters of what the flange carries, per kilogram."""
-    return np.zeros(10) if payload is None else link_parameters(
-        1.0, np.array(payload[1], dtype=float), np.zeros(6)
-    )  # fmt: skip
-
-
-def gains_of(robot: Robot, runs: Sequence[Run], given: Sequence[float] | None) -> Array:
-    """(n,) torque per unit of the log; empty where currents have no gains.  Raises OptionError."""
-    n = robot.joints
-    if runs[0].unit != CURRENT:
-        if given is not None:
-            raise OptionError(f"drive_gain: {runs[0].source} holds torques, not currents; leave it")
-        return np.ones(n)
-    own = robot.drive_gain
-    gain = np.array(own if given is None else given, dtype=float)
-    if given is not None and (gain.shape != (n,) or not np.all(gain > 0.0) or extreme(gain)):
-        raise OptionError(
-            f"drive_gain must be {n} positive numbers up to {LARGEST:g}, N m per A, one for each "
-            "joint"
-        )
-    return gain if gain.size and np.isfinite(gain).all() else np.zeros(0)
-
-
-def torque_gains(robot: Robot, runs: Sequence[Run], given: Sequence[float] | None) -> Array:
-    """(n,) torque per unit of the log, for a simulator.  Raises OptionError where none is known."""
-    gains = gains_of(robot, runs, given)
-    if not len(gains):
-        raise OptionError(
-            f"{runs[0].source}: holds currents; give drive_gain=, the torque for one ampere of "
-            "each joint: a simulator counts in N m"
-        )
-    return gains
-
-
-def ratios_of(robot: Robot, given: float | Sequence[float] | None) -> Array:
-    """(n,) gear ratios.  Raises OptionError."""
-    if given is None:
-        return robot.ratio
-    values = np.atleast_1d(np.array(given, dtype=float))
-    if values.shape not in ((1,), (robot.joints,)) or extreme(values):
-        raise OptionError(
-            f"ratio must be a number, or one for each of {robot.joints} joints, between "
-            f"{1.0 / LARGEST:g} and {LARGEST:g}"
-        )
-    return np.array(np.broadcast_to(values, robot.joints))
 
 
 def extreme(values: Array) -> bool:

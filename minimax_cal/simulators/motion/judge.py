@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from minimax_cal.dynamics.diagnose import named_runs
-from minimax_cal.dynamics.given import MotionKnown, known_of, ratios_of, torque_gains, with_payload
+from minimax_cal.dynamics.given import MotionKnown
 from minimax_cal.dynamics.rows import Logs, prepare, rms_by_joint
 from minimax_cal.dynamics.run import Run
 from minimax_cal.dynamics.scene import Arm, Scene
@@ -68,11 +68,11 @@ class Judge:
     @staticmethod
     def of(opened: Opened, runs: Sequence[Run], known: MotionKnown) -> Judge:
         """Of logs of the arm of a model.  Raises CalibrationError."""
-        robot, payload = in_its_gravity(opened.chain), known.payload
-        gains = torque_gains(robot, runs, known.drive_gain)
-        learning, held = divided(with_payload(runs, payload), known.holdout, known.holdout_run)
+        robot = in_its_gravity(opened.chain)
+        gains = known.torque_gains(robot, runs)
+        learning, held = divided(known.loaded(runs), known.holdout, known.holdout_run)
         logs = prepare([*learning, *held])
-        arm = Arm.of(robot, gains, ratios_of(robot, known.ratio), known_of(payload), logs)
+        arm = Arm.of(robot, gains, known.ratios(robot), known.load, logs)
         return Judge(arm, largest_inertia(opened.chain), prepare(learning), tuple(learning),
                      prepare(held), tuple(held), opened.given.source)  # fmt: skip
 
