@@ -381,14 +381,23 @@ class Output:
         sentences, tables, advice: other than its own, and how to keep it.  more: tables beside it.
         """
         sentences = sentences or [found.headline()]
-        if self.keep and not self.details:
-            advice = self.kept() if advice is None else advice
-            first_screen(sentences, *found.first_tables(), *more, advice=advice)
-            return
         if self.details:
             terminal().print(Text(visible(" ".join(sentences))))
             click.echo()
-        show(*(tables or found.tables)(), *more)
+        if self.details or not self.keep:
+            show(*(tables or found.tables)(), *more)
+            return
+        whole = Console(highlight=False)
+        width = min(whole.width, FIRST_WIDTH) if whole.is_terminal else FIRST_WIDTH
+        console = Console(highlight=False, width=width)
+        for sentence in sentences:
+            console.print(Text(visible(sentence)))
+        click.echo()
+        for table in (*found.first_tables(), *more):
+            table.show(console)
+        for purpose, line in self.kept() if advice is None else advice:
+            console.print(Text(visible(f"{purpose}:")))
+            whole.print(Text(visible(f"  {line}")), soft_wrap=True)  # to be copied in one piece
 
     def kept(self) -> Advice:
         """How to see every table, and to keep a result that was not written."""
@@ -445,21 +454,6 @@ def result_options(what: str, *, keep: str = "", figure: str = "") -> Decorator:
 def output(what: str) -> Decorator:
     """The option -o."""
     return click.option("-o", "--output", type=PATH, help=f"Write {what} to this file.")
-
-
-def first_screen(sentences: Iterable[str], *tables: Table, advice: Advice) -> None:
-    """Print what people want to know first: sentences, small tables, and what to do next."""
-    whole = Console(highlight=False)
-    width = min(whole.width, FIRST_WIDTH) if whole.is_terminal else FIRST_WIDTH
-    console = Console(highlight=False, width=width)
-    for sentence in sentences:
-        console.print(Text(visible(sentence)))
-    click.echo()
-    for table in tables:
-        table.show(console)
-    for purpose, command in advice:
-        console.print(Text(visible(f"{purpose}:")))
-        whole.print(Text(visible(f"  {command}")), soft_wrap=True)  # to be copied in one piece
 
 
 def terminal() -> Console:

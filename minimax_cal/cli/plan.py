@@ -41,11 +41,7 @@ ALLOWED = {  # what is planned, and the options that are about it
     "poses": {*signature(plan).parameters, "figure"},
     "cameras": {*SEES, *FOR_CAMERAS, "robot", "poses", "fit", "figure"},
 }
-OTHERWISE = {  # what an option is about that is not about what is planned
-    "motion": "a motion; add motion=", "cameras": "cameras; add camera= and board=",
-    "poses": "poses, not about",
-}  # fmt: skip
-NAMED = {"motion": "a motion", "cameras": "cameras"}
+OTHERS = {"motion": "a motion; add motion=", "cameras": "cameras; add camera= and board="}
 
 
 @command
@@ -150,5 +146,5 @@ def check_given(kind: str) -> None:
     known = set().union(*ALLOWED.values()) - ALLOWED[kind]
     for name in sorted(on_command_line() & known):
         about = next(each for each, names in ALLOWED.items() if name in names)
-        what = OTHERWISE[about] + (f" {NAMED[kind]}" if about == "poses" else "")
+        what = OTHERS.get(about) or f"poses, not about {OTHERS[kind].partition(';')[0]}"
         raise OptionError(f"{name}= is about {what}")
