@@ -29,9 +29,13 @@ class Result:
     def headline(self) -> str:
         """The result in a sentence or two."""
 
-    @abstractmethod
+    def table(self) -> Table:
+        """The table of a result that has one alone."""
+        raise NotImplementedError
+
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
+        return (self.table(),)
 
     def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """What of its file its fields do not tell by themselves.
