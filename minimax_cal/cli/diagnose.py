@@ -31,7 +31,7 @@ from minimax_cal.fitting.options import Options
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, filled
 from minimax_cal.measuring.history import with_history
 from minimax_cal.reporting.plots.diagnosis import save_diagnosis
 from minimax_cal.reporting.tables import effects_list, effects_table, remainder_table, where_tables
@@ -78,10 +78,7 @@ def diagnose_command(
 
 def every_table(found: Diagnosis) -> Iterator[Table]:
     """Those of the result, and of where its errors lie."""
-    yield from found.tables()
-    left = remainder_table(found)
-    if left.rows:
-        yield left
+    yield from (*found.tables(), *filled(remainder_table(found)))
     yield from where_tables(found.where)
 
 
