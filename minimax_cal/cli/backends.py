@@ -20,5 +20,5 @@ def backends_command(as_json: bool) -> int:
         return 0
     missing = [name for name in qp_backends.names() if name not in found]
     rows = (*found.items(), *((name, "not installed") for name in missing))
-    options.show(Table("QP backends", ("name", "version"), tuple(rows)))
+    options.show(Table.made("QP backends", rows, "name | version"))
     return 0

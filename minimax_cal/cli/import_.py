@@ -137,14 +137,15 @@ def show_logs(found: LogFiles, to: Output, safe_cells: bool) -> int:
     to.notice(*found.notices)
     if not wanted:
         return 0
-    rows = tuple(
+    rows = (
         (run.name, title, len(run.time), run.duration, 1.0 / step_of(run), columns[0], run.unit)
         for run, title, columns in zip(found.runs, found.titles, found.columns, strict=True)
     )
-    header = ("run", "format", "rows", "s", "rows a second", "first joint", "torque in")
     total = sum(run.duration for run in found.runs)
-    many = f"{len(rows)} runs" if len(rows) > 1 else "1 run"
-    show(Table(f"{many}, {total:.1f} s, {found.runs[0].joints} joints", header, rows))
+    many = f"{len(found.runs)} runs" if len(found.runs) > 1 else "1 run"
+    title = f"{many}, {total:.1f} s, {found.runs[0].joints} joints"
+    columns = "run | format | rows | s | rows a second | first joint | torque in"
+    show(Table.made(title, rows, columns))
     if not to.path:
         click.echo("nothing written; add -o FILE")
     return 0

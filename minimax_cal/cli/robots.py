@@ -8,7 +8,7 @@ import numpy as np
 from minimax_cal.cli import options
 from minimax_cal.cli.schemas import print_schema, schema_option
 from minimax_cal.ground.files import json_text
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import turned_for_people
 from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.robots.robot import Robot, builtin_robots, load_robot
@@ -40,9 +40,9 @@ def robots_command(robot: str | None, as_json: bool, schema: str | None) -> int:
         content = {name: arm.to_dict() for name, arm in names.items()}
         click.echo(json_text({"schema": 1, "robots": content}), nl=False)
         return 0
-    rows = tuple((name, arm.name, arm.joints, arm.reach()) for name, arm in names.items())
-    header = ("name", "robot", "joints", "links in all m")
-    options.show(Table("built-in robots", header, rows, ("", "", "d", ".2f")))
+    rows = ((name, arm.name, arm.joints, arm.reach()) for name, arm in names.items())
+    columns = "name | robot | joints d | links in all m .2f"
+    options.show(Table.made("built-in robots", rows, columns))
     return 0
 
 
@@ -50,14 +50,12 @@ def links_table(robot: Robot) -> Table:
     """Links and limits in millimetres and degrees, in the convention of the robot's file."""
     (length, mm), (angle, deg) = turned_for_people("m"), turned_for_people("rad")
     scale = np.array([length if name in LENGTHS else angle for name in MDH_NAMES])
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[tuple[object, ...]] = []
     own, _ = robot.notation.written(robot.mdh, robot.prismatic)
     for i, (link, slides) in enumerate(zip(own, robot.prismatic, strict=True)):
         ends = (length if slides else angle) * np.array([robot.lower[i], robot.upper[i]])
-        numbers = [*(scale * link).tolist(), *ends.tolist()]
-        rows.append((f"J{i + 1}", *numbers, mm if slides else deg))
-    units = (f"{name} {mm if name in LENGTHS else deg}" for name in MDH_NAMES)
-    header = ("joint", *units, "from", "to", "in")
-    formats = ("", *[".3f"] * 5, *[".1f"] * 2, "")
+        rows.append((f"J{i + 1}", *(scale * link), *ends, mm if slides else deg))
+    heads = (f"{name} {mm if name in LENGTHS else deg} .3f" for name in MDH_NAMES)
     craig = " (modified DH)" if robot.notation.modified else ""
-    return Table(f"{robot.name}: links and limits{craig}", header, tuple(rows), formats)
+    title = f"{robot.name}: links and limits{craig}"
+    return Table.made(title, rows, "joint", *heads, "from .1f", "to .1f", "in")

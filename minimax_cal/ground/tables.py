@@ -225,9 +225,8 @@ def filled(*tables: Table) -> tuple[Table, ...]:
 def value_at(record: Any, place: str) -> Any:
     """What a record holds in the unit of files, as `facts` has it.
 
-    place: attributes, keys or numbers of an inner one, joined by dots; a*b is one times another.
+    place: attributes, keys or numbers, of one within the other where dots join them.
     """
-    place, _, factor = place.partition("*")
     found = record
     for name in place.split("."):
         if isinstance(found, Mapping):
@@ -238,7 +237,7 @@ def value_at(record: Any, place: str) -> Any:
             kind: Any = type(found)
             known = all_facts(kind).get(name)
             found = scaled(getattr(found, name), known.scale if known else 1.0)
-    return found * value_at(record, factor) if factor else found
+    return found
 
 
 def cell(value: Any) -> Cell:
@@ -248,7 +247,7 @@ def cell(value: Any) -> Cell:
         return "yes" if value else ""
     if isinstance(value, list | tuple):
         return ", ".join(map(str, value))
-    return math.nan if value is None else cast(Cell, value)
+    return math.nan if value is None else value if isinstance(value, float | int) else str(value)
 
 
 def unbroken(cell: str, *, right: bool) -> list[str]:
