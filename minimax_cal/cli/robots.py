@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import click
-import numpy as np
 
 from minimax_cal.cli import options
 from minimax_cal.cli.schemas import print_schema, schema_option
@@ -48,14 +47,15 @@ def robots_command(robot: str | None, as_json: bool, schema: str | None) -> int:
 
 def links_table(robot: Robot) -> Table:
     """Links and limits in millimetres and degrees, in the convention of the robot's file."""
-    (length, mm), (angle, deg) = turned_for_people("m"), turned_for_people("rad")
-    scale = np.array([length if name in LENGTHS else angle for name in MDH_NAMES])
-    rows: list[tuple[object, ...]] = []
+    units = [turned_for_people("m" if name in LENGTHS else "rad") for name in MDH_NAMES]
     own, _ = robot.notation.written(robot.mdh, robot.prismatic)
-    for i, (link, slides) in enumerate(zip(own, robot.prismatic, strict=True)):
-        ends = (length if slides else angle) * np.array([robot.lower[i], robot.upper[i]])
-        rows.append((f"J{i + 1}", *(scale * link), *ends, mm if slides else deg))
-    heads = (f"{name} {mm if name in LENGTHS else deg} .3f" for name in MDH_NAMES)
+    rows = (
+        (f"J{i + 1}", *(size * part for (size, _), part in zip(units, link, strict=True)),
+         scale * robot.lower[i], scale * robot.upper[i], unit)
+        for i, link in enumerate(own)
+        for scale, unit in [turned_for_people("m" if robot.prismatic[i] else "rad")]
+    )  # fmt: skip
+    heads = (f"{name} {unit} .3f" for name, (_, unit) in zip(MDH_NAMES, units, strict=True))
     craig = " (modified DH)" if robot.notation.modified else ""
     title = f"{robot.name}: links and limits{craig}"
     return Table.made(title, rows, "joint", *heads, "from .1f", "to .1f", "in")

@@ -107,8 +107,8 @@ class Compensation(Result):
             for j, by in enumerate(1e3 * (self.q - self.commanded).T)
         )
         return (
-            Table.made(f"{self.name}: error of the flange ({self.frame})", rows, "joints | targets "
-                       "d | RMS mm .4f | max mm .4f | RMS mrad .4f | max mrad .4f"),
+            Table.made(f"{self.name}: error of the flange ({self.frame})", rows, "joints | "
+                       "targets d | RMS mm .4f | max mm .4f | RMS mrad .4f | max mrad .4f"),
             Table.made("targets", found, "status | targets d | meaning"),
             Table.made("change of the joints", joints, "joint | unit | RMS .4f | max .4f"),
         )  # fmt: skip

@@ -15,14 +15,8 @@ from scipy.stats import binom
 import minimax_cal as mc
 from minimax_cal.diagnosing.diagnose import located
 from minimax_cal.diagnosing.where import Where, joint_equivalent, noise_of, where
-from minimax_cal.diagnosing.where.mean_squares import (
-    lack_of_fit,
-    shape_energy,
-    shape_scatter,
-)
-from minimax_cal.diagnosing.where.residual import (
-    residual_of,
-)
+from minimax_cal.diagnosing.where.mean_squares import lack_of_fit, shape_energy, shape_scatter
+from minimax_cal.diagnosing.where.residual import residual_of
 from minimax_cal.diagnosing.where.significance import flips, score_flips
 from minimax_cal.evidence.evened import TOGETHER, evened, times_before
 from minimax_cal.evidence.noise import orthonormal

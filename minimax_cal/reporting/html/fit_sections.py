@@ -64,23 +64,22 @@ def accuracy(sources: Sources) -> Blocks:
 
 def glance_table(sources: Sources) -> Table:
     """The numbers that matter, held-out ones first."""
-    names, pairs = ("nominal", "calibrated"), []
+    pairs = []
     if sources.fit:
         a = sources.fit.accuracy
         pairs = [(a["nominal"], a["holdout"]), (a["nominal_train"], a["train"])]
     elif sources.gap:
         first, last = sources.gap.ladder[1], sources.gap.ladder[-1]
         pairs = [(first.holdout, last.holdout), (first.train, last.train)]
-        names = ("geometry alone", "with effects")
-    rows = [
+    rows = (
         (f"{poses} poses, {what}", size := getattr(one, key), left := getattr(other, key),
          100.0 * (left / size - 1.0) if size else None)
         for poses, (one, other) in zip(("held-out", "training"), pairs, strict=False)
         for what, key in (("RMS", "rms_mm"), ("largest", "max_mm"))
         if other.poses
-    ]  # fmt: skip
-    columns = "position error | {} mm .3f | {} mm .3f | change % +.0f"
-    return Table.made("At a glance", rows, columns.format(*names))
+    )  # fmt: skip
+    heads = (f"{name} mm .3f" for name in names_of(sources))
+    return Table.made("At a glance", rows, "position error", *heads, "change % +.0f")
 
 
 def parts_accuracy(sources: Sources) -> Blocks:
@@ -153,10 +152,9 @@ def correlation_table(known: Uncertainty) -> Table:
     names = [name_parameter(code) for code in codes]
     one, other = np.triu_indices(len(found), 1)
     size = np.abs(found[one, other])
-    order = [int(i) for i in np.argsort(-np.nan_to_num(size), kind="stable")[:MOST_ROWS]]
     rows = (
         (names[one[i]], names[other[i]], found[one[i], other[i]])
-        for i in order
+        for i in np.argsort(-np.nan_to_num(size), kind="stable")[:MOST_ROWS]
         if size[i] >= STRONG
     )
     return Table.made("Strongest correlations", rows, "parameter | with | correlation +.3f")
@@ -176,9 +174,9 @@ def solution(fit: Fit) -> Blocks:
     blocks += filled(Table.made("Least squares", costs, "iterate d | cost mm^2 .6g"))
     if worst := fit.minimax:
         blocks += filled(
-            Table.of("Steps of the minimax", worst.trace, "iteration d | "
-                     "value=worst, of the start's .8f | violation .1e | kkt=KKT residual .1e | "
-                     "length=step length .3g | backend=QP backend"),
+            Table.of("Steps of the minimax", worst.trace,
+                     "iteration d | value=worst, of the start's .8f | violation .1e | "
+                     "kkt=KKT residual .1e | length=step length .3g | backend=QP backend"),
             worst.table(),
             Table.of("Distances between targets, kept as measured", worst.distances, "pair | "
                      "measured=measured mm .4f | tolerance=tolerance mm .4f | multiplier .4g"),
