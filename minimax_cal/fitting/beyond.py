@@ -19,6 +19,7 @@ from minimax_cal.fitting.intervals import max_interval, rms_interval, told
 from minimax_cal.fitting.uncertainty import Estimator, Linearised, PartSums, Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import Fact, derived
+from minimax_cal.ground.results import Record
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import Region, groups
@@ -60,7 +61,7 @@ class Trusted:
 
 
 @dataclass(frozen=True)
-class Beyond:
+class Beyond(Record):
     """The claim for poses where none was measured.
 
     typical: RMS over all parts together.  worst: of the worst part.  Both [mm], NaN with a

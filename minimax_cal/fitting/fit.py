@@ -105,6 +105,11 @@ class KeptDistance:
     tolerance: Annotated[float, Fact(key="tolerance_mm", scale=1e3)]
     multiplier: float
 
+    @property
+    def between(self) -> str:
+        """Which targets, for people."""
+        return " - ".join(self.pair)
+
 
 @dataclass(frozen=True, eq=False)
 class WorstCase:

@@ -11,7 +11,7 @@ import numpy as np
 from minimax_cal.fitting.identify import Because, Identification, Reason, name_reason
 from minimax_cal.fitting.uncertainty import quantile
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import Fact, in_file
+from minimax_cal.ground.facts import Fact, in_digits, in_file
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.records import stored
@@ -98,6 +98,7 @@ class Parameter:
         """For JSON, lengths in millimetres."""
         scale, _ = self.written
         out = in_file(self.scaled(*self.written))
+        out |= {name: in_digits(out[name]) for name in ("value", "nominal", "sigma")}
         if self.corrects:
             out |= {"correction": (self.value - self.nominal) * scale, "corrects": self.corrects}
         why = ("because", "like") if not self.reason else ()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -15,7 +15,9 @@ from minimax_cal.fitting.minimax_problem import DISTANCE_FORMS
 from minimax_cal.fitting.robust import LOSSES, SQUARE, check_robust
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.facts import Fact, hints_of
 from minimax_cal.ground.options import option
+from minimax_cal.ground.records import as_kind
 from minimax_cal.ground.stages import Progress as Progress
 from minimax_cal.ground.stages import silent as silent
 from minimax_cal.measuring.measurements import Measurements
@@ -29,9 +31,7 @@ from qp_backends import BackendError, Problem, Solution
 from qp_backends import solve as solve_qp
 from qp_backends.registry import backend
 
-if TYPE_CHECKING:
-    from pydantic import TypeAdapter
-
+SEED = Fact(least=0)
 OFFSETS = "offsets"  # what `only` may ask for
 FALLBACK = "daqp"  # a required package
 FUNCTION = "function "  # before the name of a QP solver that is none of the backends
@@ -233,25 +233,15 @@ class Options:
 
 def read_options(settings: Mapping[str, object], **given: object) -> Options:
     """The options that a result's file holds, but for those given.  Raises ValueError."""
+    texts = dict.fromkeys(("fix", "free", "effects"), tuple[str, ...])
+    kinds = {**hints_of(Options), **texts, "qp": str}  # effects and a QP solver have names there
     kept: dict[str, object] = {}
-    for name, reader in readers().items():
-        if name in settings and name not in given:
-            try:
-                kept[name] = reader.validate_python(settings[name])
-            except ValueError as error:
-                raise ValueError(f"provenance.settings.{name}: {settings[name]!r:.60}") from error
+    for name in kinds.keys() & settings.keys() - given.keys():
+        value, at = settings[name], f"provenance.settings.{name}"
+        if value is None and kinds[name] is float:
+            raise ValueError(f"{at}: should be a number")
+        kept[name] = as_kind(kinds[name], value, SEED if name == "seed" else Fact(), at)
     return Options(**{**kept, **given})  # type: ignore[arg-type]
-
-
-@cache
-def readers() -> dict[str, TypeAdapter[Any]]:
-    """What reads each option from a file; effects and a QP solver have names there."""
-    from pydantic import Field, TypeAdapter  # slow to load, and a fit needs none of it
-
-    kinds = {**get_type_hints(Options), "effects": tuple[str, ...], "qp": str}
-    kinds |= {"seed": Annotated[int, Field(ge=0)]}
-    tuples = dict.fromkeys(("fix", "free"), tuple[str, ...])
-    return {name: TypeAdapter(kind) for name, kind in (kinds | tuples).items()}
 
 
 def listed(names: str | Sequence[T]) -> Sequence[T | str]:

@@ -121,8 +121,20 @@ def in_file(record: Any) -> dict[str, Any]:
         at = out
         for step in inner:
             at = at.setdefault(step, {})
-        at[last] = scaled(value, known.scale)
+        at[last] = in_digits(scaled(value, known.scale)) if known.scale != 1.0 else value
     return out
+
+
+def in_digits(value: Any) -> Any:
+    """Numbers in 15 digits: read in another unit and written again they are the same text."""
+    if isinstance(value, float):
+        return float(f"{value:.15g}")
+    if isinstance(value, Mapping):
+        return {key: in_digits(part) for key, part in value.items()}
+    if isinstance(value, tuple | list):
+        parts = map(in_digits, value)
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return in_digits(value.tolist()) if hasattr(value, "tolist") else value
 
 
 def scaled(value: Any, factor: float) -> Any:

@@ -15,6 +15,14 @@ from minimax_cal.ground.records import AGAIN, check_schema, reading, stored
 from minimax_cal.ground.tables import Table
 
 
+class Record:
+    """A dataclass of facts that users look into: it tells itself as a file would."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return dict(plain(in_file(self)))
+
+
 class Result:
     """A record that people and programs read: a dataclass with `headline` and `tables`.
 

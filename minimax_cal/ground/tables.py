@@ -145,9 +145,9 @@ class Table:
         )
         least, widths = (list(column) for column in zip(*self.widths(), strict=True))
         over = sum(widths) + BETWEEN * len(widths) - room if room else 0
-        for i in sorted(range(len(widths)), key=lambda i: least[i] - widths[i]):  # sentences first
-            usual, widths[i] = widths[i], max(least[i], widths[i] - max(over, 0))
-            over -= usual - widths[i]
+        while over > 0 and widths != least:  # a letter from where most is to spare
+            i = max(range(len(widths)), key=lambda i: widths[i] - least[i])
+            widths[i], over = widths[i] - 1, over - 1
         for name, right, width in zip(self.header, self.numeric(), widths, strict=True):
             justify: Literal["left", "right"] = "right" if right else "left"
             table.add_column(Text(visible(name)), justify=justify, overflow="fold", width=width)

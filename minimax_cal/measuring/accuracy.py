@@ -11,6 +11,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import APART, Fact
+from minimax_cal.ground.results import Record
 from minimax_cal.ground.tables import Table
 
 # the accuracies of a result, and whether they are of held-out poses
@@ -20,7 +21,7 @@ HELD = {"nominal": True, "train": False, "holdout": True, "nominal_train": False
 
 
 @dataclass(frozen=True)
-class Accuracy:
+class Accuracy(Record):
     """Distances between measured and predicted points, over all measured points.
 
     sse_mm2, counts: per target, the sum of squares F_i and at how many poses it was measured.

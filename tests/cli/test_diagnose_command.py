@@ -213,9 +213,9 @@ def test_places_that_data_can_test(here: Path, capsys: pytest.CaptureFixture[str
     mc.write_measurements("one.csv", data.only(0))
     assert run("effects", "ur10", "one.csv") == 0
     out = capsys.readouterr().out
-    (row,) = (line for line in out.splitlines() if "target_shift" in line)
-    assert "smr" not in row
-    assert "a second target" in row
+    rows = [line for line in out.splitlines() if "target_shift" in line]  # a part of a wide table
+    assert not any("smr" in row for row in rows)
+    assert any("a second target" in row for row in rows)
 
 
 def test_tables_of_where_show_dashes_for_what_cannot_be_told() -> None:

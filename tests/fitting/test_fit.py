@@ -51,15 +51,6 @@ def assert_same(read: Any, made: Any) -> None:
     assert_allclose(read, made, rtol=1e-11, atol=1e-14)
 
 
-def rounded(content: Any) -> Any:
-    """JSON with twelve digits, which survive a change of units."""
-    if isinstance(content, dict):
-        return {key: rounded(value) for key, value in content.items()}
-    if isinstance(content, list):
-        return [rounded(value) for value in content]
-    return float(f"{content:.12g}") if isinstance(content, float) else content
-
-
 def test_what_was_saved_comes_back(fit: mc.Fit, saved: mc.Fit, rng: np.random.Generator) -> None:
     q = rng.uniform(-2.0, 2.0, (20, 6))
     assert_same(saved.predict(q), fit.predict(q))
@@ -106,15 +97,12 @@ def test_the_report_is_the_same(fit: mc.Fit, saved: mc.Fit) -> None:
     assert strip(one) == strip(other)
 
 
-def test_every_fact_is_in_the_file_and_shown_everywhere(
-    fit: mc.Fit, saved: mc.Fit, tmp_path: Path
-) -> None:
+def test_every_fact_is_in_the_file_and_shown_everywhere(fit: mc.Fit, tmp_path: Path) -> None:
     """What `Fit` declares, by its key; in words in the summary, the report and the page."""
     content = fit.to_dict()
     facts = {**stored_facts(mc.Fit), **derived_facts(mc.Fit)}
     for name, known in facts.items():
         assert (known.key or name) in content or getattr(fit, name) is None
-        assert rounded(plain(getattr(saved, name))) == rounded(plain(getattr(fit, name)))
     said = fit.solution()
     assert said.startswith(capitalise(facts_in_words(fit)))
     assert f"{fit.iterations} iterations" in said

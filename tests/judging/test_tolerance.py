@@ -119,4 +119,4 @@ def test_the_upper_limits_of_beyond_are_in_the_file(robot: mc.Robot) -> None:
     assert fit.beyond.worst is not None
     assert fit.beyond.rms_high_mm > fit.beyond.worst_mm
     assert fit.beyond.max_high_mm > max(fold.max_mm for fold in fit.beyond.folds) * 0.9
-    assert mc.Fit.from_dict(fit.to_dict()).beyond.to_dict() == fit.beyond.to_dict()
+    assert mc.Fit.from_dict(fit.to_dict()).beyond == fit.beyond

@@ -152,6 +152,8 @@ class Measured:
             for key, each in told.items()
             if each.rms_mrad is not None and each.max_mrad is not None
         }
+        if turns and len(turns) < len(told):
+            raise ValueError(f"{at}accuracy: of some only tells angles")
         numbers = {key: each.numbers for key, each in told.items()}
         return {"errors": {}, "numbers": numbers, "turns": turns, "stated": told}
 

@@ -178,8 +178,9 @@ def solution(fit: Fit) -> Blocks:
                      "iteration d | value=worst, of the start's .8f | violation .1e | "
                      "kkt=KKT residual .1e | length=step length .3g | backend=QP backend"),
             worst.table(),
-            Table.of("Distances between targets, kept as measured", worst.distances, "pair | "
-                     "measured=measured mm .4f | tolerance=tolerance mm .4f | multiplier .4g"),
+            Table.of("Distances between targets, kept as measured", worst.distances,
+                     "between=pair | measured=measured mm .4f | tolerance=tolerance mm .4f | "
+                     "multiplier .4g"),
         )  # fmt: skip
         ends = ", ".join(f"{name} {value:.1e}" for name, value in vars(worst.kkt).items())
         blocks.append(text(f"Conditions of optimality (Karush-Kuhn-Tucker) at the end: {ends}."))

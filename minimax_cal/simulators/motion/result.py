@@ -80,6 +80,11 @@ class MotionGap(Result):
     seconds: float
     along: Literal["trajectories"] = "trajectories"
 
+    def __post_init__(self) -> None:
+        rows = [(r.torque_rms_Nm, r.torque_rms, r.torque_rms_moving) for r in self.rungs]
+        if len({len(row) for some in rows for row in some}) > 1:
+            raise ValueError("rungs are not of one number of joints")
+
     def __repr__(self) -> str:
         return f"<MotionGap of {self.model}: {self.headline()}>"
 
