@@ -13,6 +13,6 @@ def backends_command(as_json: bool) -> int:
     """The QP backends that are installed, with their versions."""
     found = qp_backends.available()
     every = dict.fromkeys(qp_backends.names(), "not installed")
-    rows = tuple((found | every | found).items())  # those installed first
-    table = Table("QP backends", ("name", "version"), rows)
+    rows = (found | every | found).items()  # those installed first
+    table = Table.made("QP backends", rows, "name | version")
     return options.looked_up(as_json, {"schema": 1, "backends": found}, table)

@@ -28,7 +28,7 @@ from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.options import Options
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, filled
 from minimax_cal.measuring.history import with_history
 from minimax_cal.reporting.plots.diagnosis import save_diagnosis
 from minimax_cal.reporting.tables import effects_list, effects_table, remainder_table, where_tables
@@ -60,10 +60,7 @@ def diagnose_command(
 
 def every_table(found: Diagnosis) -> Iterator[Table]:
     """Those of the result, and of where its errors lie."""
-    yield from found.tables()
-    left = remainder_table(found)
-    if left.rows:
-        yield left
+    yield from (*found.tables(), *filled(remainder_table(found)))
     yield from where_tables(found.where)
 
 

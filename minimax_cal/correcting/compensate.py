@@ -27,7 +27,6 @@ from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
 from minimax_cal.ground.facts import Apart, Fact, derived
 from minimax_cal.ground.options import grouped, takes
 from minimax_cal.ground.results import Result
-from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table, records_of
 from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.checks import check_joints, limit_notices
@@ -91,32 +90,29 @@ class Compensation(Result):
 
     def tables(self) -> tuple[Table, ...]:
         """What the correction does, how targets ended, and by how much each joint changes."""
-        rows: list[tuple[TableCell, ...]] = []
+        rows: list[tuple[object, ...]] = []
         missed, expected = self.failed, self.expected
         for title, which, off in (
             ("as commanded", np.ones_like(missed), self.before),
             ("missed, by the model", missed, (self.distance, self.angle)),
         ):
             if which.any():
-                sizes = [float(f(1e3 * part[which])) for part in off for f in (rms, np.max)]
-                rows.append((title, int(which.sum()), *sizes))
+                sizes = (f(1e3 * part[which]) for part in off for f in (rms, np.max))
+                rows.append((title, which.sum(), *sizes))
         if not math.isnan(expected.rms):
-            mm = (expected.rms, expected.largest, math.nan, math.nan)
-            rows.append(("corrected, on the arm", len(missed) - self.missed, *mm))
-        header = ("joints", "targets", "RMS mm", "max mm", "RMS mrad", "max mrad")
-        formats = ("", "d", *[".4f"] * 4)
-        title = f"{self.name}: error of the flange ({self.frame})"
-        pose = Table(title, header, tuple(rows), formats)
-        found = [(o, self.outcome.count(o)) for o in Outcome if o in self.outcome]
-        ends = tuple((str(o), count, o.advice) for o, count in found)
-        outcome = Table("targets", ("status", "targets", "meaning"), ends, ("", "d", ""))
-        joints = tuple(
-            (f"J{j + 1}", "mm" if self.sliding[j] else "mrad", rms(by), float(np.abs(by).max()))
+            corrected = len(missed) - self.missed, expected.rms, expected.largest, None, None
+            rows.append(("corrected, on the arm", *corrected))
+        found = [(o, self.outcome.count(o), o.advice) for o in Outcome if o in self.outcome]
+        joints = (
+            (f"J{j + 1}", "mm" if self.sliding[j] else "mrad", rms(by), np.abs(by).max())
             for j, by in enumerate(1e3 * (self.q - self.commanded).T)
         )
-        each = Table("change of the joints", ("joint", "unit", "RMS", "max"), joints,
-                     ("", "", ".4f", ".4f"))  # fmt: skip
-        return pose, outcome, each
+        return (
+            Table.made(f"{self.name}: error of the flange ({self.frame})", rows, "joints | "
+                       "targets d | RMS mm .4f | max mm .4f | RMS mrad .4f | max mrad .4f"),
+            Table.made("targets", found, "status | targets d | meaning"),
+            Table.made("change of the joints", joints, "joint | unit | RMS .4f | max .4f"),
+        )  # fmt: skip
 
     def headline(self) -> str:
         """The result in a sentence."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from minimax_cal.diagnosing.result import VERDICTS, Explained, Finding, Untestable
+from minimax_cal.diagnosing.result import FOUND, VERDICTS, Explained, Finding, Untestable
 from minimax_cal.diagnosing.sentences import explained
 from minimax_cal.evidence.limits import LEVEL
 from minimax_cal.fitting.instruments import RelativeCalibration
@@ -15,8 +15,7 @@ from minimax_cal.ground.facts import APART, Fact, derived, in_file
 from minimax_cal.ground.files import number, plain
 from minimax_cal.ground.records import reading, stored
 from minimax_cal.ground.results import Result, merged
-from minimax_cal.ground.tables import Cell as TableCell
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, filled
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.solvers.status import Status
@@ -98,42 +97,33 @@ class RelativeDiagnosis(Explained, Result):
     def steps_table(self) -> Table:
         """The error budget, step by step, by file."""
         files = tuple(self.steps[0].files)
-        rows: tuple[tuple[TableCell, ...], ...] = tuple(
+        rows = (
             (name_step(step.name), step.holdout.rms_mm, step.holdout.max_mm,
              *(step.files[name].rms_mm for name in files))
             for step in self.steps
         )  # fmt: skip
-        header = ("model", "RMS mm", "max mm", *(f"{name} RMS mm" for name in files))
-        return Table(
-            "error budget, held-out poses", header, rows, ("", *[".4f"] * (len(header) - 1))
-        )
+        of_files = (f"{name} RMS mm .4f" for name in files)
+        columns = "model | RMS mm .4f | max mm .4f"
+        return Table.made("error budget, held-out poses", rows, columns, *of_files)
 
     def effects_table(self) -> Table:
         """The effects found, with what each does for held-out poses."""
-        rows: tuple[tuple[TableCell, ...], ...] = tuple(
+        rows = (
             (f.name, f.cause, 100.0 * f.share, f.before, f.after, f.chance, f.evidence)
             for f in self.effects
         )
-        header = ("effect", "cause", "share of error %", "before mm", "after mm", "p-value",
-                  "evidence")  # fmt: skip
         title = f"effects found; p-values below {LEVEL:g} are significant"
-        return Table(title, header, rows, ("", "", ".0f", ".4f", ".4f", "", ""))
-
-    def rival_table(self) -> Table:
-        """What these data cannot tell from the effects found."""
-        return super().rival_table().brief(*RIVALS)
+        return Table.made(title, rows, FOUND)
 
     def own_tables(self) -> tuple[Table, ...]:
         """Those of the diagnosis."""
-        every = (self.steps_table(), self.effects_table(), self.parameter_table(),
-                 self.rival_table(), self.untestable_table())  # fmt: skip
-        return tuple(table for table in every if table.rows)
+        return filled(self.steps_table(), self.effects_table(), self.parameter_table(),
+                      self.rival_table().brief(*RIVALS), self.untestable_table())  # fmt: skip
 
-    def first_tables(self) -> list[Table]:
+    def first_tables(self) -> tuple[Table, ...]:
         """What stands on the first screen."""
-        found = [self.effects_table().brief("effect", "share of error %", "before mm", "after mm",
-                                            "evidence")] if self.effects else []  # fmt: skip
-        return [self.steps_table(), *found]
+        shown = ("effect", "share of error %", "before mm", "after mm", "evidence")
+        return filled(self.steps_table(), self.effects_table().brief(*shown))
 
     def tables(self) -> tuple[Table, ...]:
         """Every table, those of the calibration last."""

@@ -25,8 +25,7 @@ from minimax_cal.ground.facts import APART, Fact, derived, in_file
 from minimax_cal.ground.files import finite, number, plain
 from minimax_cal.ground.records import AGAIN, array, as_kind, stored
 from minimax_cal.ground.results import Result
-from minimax_cal.ground.tables import Cell as TableCell
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.units import in_files
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.aside import SetAside
@@ -42,6 +41,9 @@ from minimax_cal.modelling.frames import frames_of
 from minimax_cal.robots.frames import CONVENTION, Frame
 from minimax_cal.solvers.status import Status
 
+FOUND = (  # columns of the effects
+    "effect | cause | share of error % .0f | before mm .4f | after mm .4f | p-value | evidence"
+)
 CURVE = ("q_rad", "turn_rad", "sigma_rad")
 SURE = 1e-15  # a smaller chance is as good as none
 SHOWN_LINES = 12  # lines of a fault that are told one by one
@@ -365,37 +367,31 @@ class Explained:
 
     def parameter_table(self) -> Table:
         """The parameters of every effect found: millimetres and milliradians."""
-        rows = tuple(
-            (f.name, p["name"], scale * p["value"],
-             scale * number(p["sigma"]), unit)
+        rows = (
+            (f.name, p["name"], scale * p["value"], scale * number(p["sigma"]), unit)
             for f in self.by_rung
             for p in f.parameters()
             for scale, unit in (PEOPLES.get(p["unit"], (1.0, p["unit"])),)
-        )  # fmt: skip
-        header = ("effect", "parameter", "value", "sigma", "unit")
-        return Table("parameters of the effects", header, rows, ("", "", ".4g", ".2g", ""))
+        )
+        columns = "effect | parameter | value .4g | sigma .2g | unit"
+        return Table.made("parameters of the effects", rows, columns)
 
     def rival_table(self) -> Table:
         """What these data cannot tell from the effects found, and what would tell them apart."""
-        rows = tuple(
-            (f.name, a.name, a.rho2, a.power, a.loss,
-             a.separate_with or "no measurement considered would")
-            for f in self.by_rung
-            for a in f.alternatives
-        )  # fmt: skip
-        header = ("effect", "alternative", "similarity", "power", "fits worse by",
-                  "what to measure next")  # fmt: skip
-        title = (
+        none = "no measurement considered would"
+        return Table.made(
             f"alternatives that these data do not exclude: they fit worse by less than {BAND:.0f}, "
-            f"or the power is below {ENOUGH:.0f}; at similarity 1 both move the arm alike"
-        )
-        return Table(title, header, rows,
-                     ("", "", ".3f", ".3g", ".3g", ""))  # fmt: skip
+            f"or the power is below {ENOUGH:.0f}; at similarity 1 both move the arm alike",
+            [(f.name, a.name, a.rho2, a.power, a.loss, a.separate_with or none)
+             for f in self.by_rung for a in f.alternatives],
+            "effect | alternative | similarity .3f | power .3g | fits worse by .3g | "
+            "what to measure next",
+        )  # fmt: skip
 
     def untestable_table(self) -> Table:
         """Effects that are neither found nor excluded."""
-        rows = tuple((name_effect(effect), needs) for effect, needs in self.not_testable)
-        return Table("not testable with these data", ("effect", "needs"), rows)
+        rows = ((name_effect(effect), needs) for effect, needs in self.not_testable)
+        return Table.made("not testable with these data", rows, "effect | needs")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -592,19 +588,13 @@ class Diagnosis(Explained, Result):
 
     def ladder_table(self) -> Table:
         """The error budget, step by step."""
-        rows: list[tuple[TableCell, ...]] = [
-            (name_step(step.name), step.train.rms_mm, step.train.max_mm, step.holdout.rms_mm,
-             step.holdout.max_mm)
-            for step in self.ladder
-        ]  # fmt: skip
         floor = self.floor.value
-        rows.append((f"noise floor ({self.floor.source})", floor, "", floor, ""))
-        return Table(
+        return Table.of(
             f"{self.robot}: error budget, step by step",
-            ("model", "train RMS mm", "train max mm", "held-out RMS mm", "held-out max mm"),
-            tuple(rows),
-            ("", ".4f", ".4f", ".4f", ".4f"),
-        )
+            [(name_step(step.name), step) for step in self.ladder],
+            "0=model | 1.train.rms_mm=train RMS mm .4f | 1.train.max_mm=train max mm .4f | "
+            "1.holdout.rms_mm=held-out RMS mm .4f | 1.holdout.max_mm=held-out max mm .4f",
+        ).plus((f"noise floor ({self.floor.source})", floor, "", floor, ""))
 
     def first_tables(self) -> tuple[Table, ...]:
         """What stands on the first screen: the budget in at most six steps.
@@ -620,11 +610,10 @@ class Diagnosis(Explained, Result):
             last = max((i for i, step in enumerate(self.ladder) if step.name in main), default=1)
             kept = min(last + 1, most - 1)
             every = [*every[:kept], (self.rest_of(kept), every[-1][1])]
-        rows: list[tuple[TableCell, ...]] = [(name, a.rms_mm, a.max_mm) for name, a in every]
         known = "" if self.floor.certain else ", at most"
-        rows.append((f"measurement noise{known}", self.floor.value, ""))
         title = "error budget, step by step, on held-out poses"
-        return (Table(title, ("model", "RMS mm", "max mm"), tuple(rows), ("", ".3f", ".3f")),)
+        shown = Table.of(title, every, "0=model | 1.rms_mm=RMS mm .3f | 1.max_mm=max mm .3f")
+        return (shown.plus((f"measurement noise{known}", self.floor.value, "")),)
 
     def rest_of(self, kept: int) -> str:
         """The steps after those kept, counted by kind, as + 16 minor and 2 possible effects."""
@@ -637,26 +626,23 @@ class Diagnosis(Explained, Result):
     def effects_table(self) -> Table:
         """The effects found, with what each does for held-out poses; possible ones last."""
         found = sorted(self.by_rung, key=lambda f: not f.established)
-        rows: list[tuple[TableCell, ...]] = [
+        rows = (
             (f"{f.name}{f.points(self.data)}",
              "as above" if f.cause in [e.cause for e in found[:i]] else f.cause,
              100.0 * f.share + 0.0, f.before, f.after, f.chance, f.evidence)
             for i, f in enumerate(found)
-        ]  # fmt: skip
+        )  # fmt: skip
         title = f"effects found, step by step; p-values below {LEVEL:g} are significant"
-        header = ("effect", "cause", "share of error %", "before mm", "after mm", "p-value",
-                  "evidence")  # fmt: skip
-        formats = ("", "", ".0f", ".4f", ".4f", "", "")
-        shown = len(header) - all(
-            f.established for f in found
-        )  # without the column that says one thing
-        return Table(title, header[:shown], tuple(row[:shown] for row in rows), formats[:shown])
+        every = Table.made(title, rows, FOUND)
+        plain = every.only(*range(len(every.header) - 1))  # without what says one thing
+        return plain if all(f.established for f in found) else every
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result, but for those of where the errors lie."""
-        every = (self.ladder_table(), self.beyond.table(), self.effects_table(),
-                 self.parameter_table(), self.rival_table(), self.untestable_table())  # fmt: skip
-        return tuple(table for table in every if table.rows)
+        return filled(
+            self.ladder_table(), self.beyond.table(), self.effects_table(), self.parameter_table(),
+            self.rival_table(), self.untestable_table(),
+        )  # fmt: skip
 
     @property
     def said(self) -> tuple[str, ...]:

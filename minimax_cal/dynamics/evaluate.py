@@ -53,14 +53,10 @@ class MotionEvaluation(Result):
         size = f"{np.median(self.steps[-1].rms):.3g} {self.unit}"
         return f"RMS torque missed, median of the joints: {size}."
 
-    def tables(self) -> tuple[Table, ...]:
-        """Step by step."""
-        return (self.table(),)
-
     def table(self) -> Table:
         """RMS of all rows by joint, step by step."""
         title = f"RMS torque [{self.unit}] on {', '.join(self.runs)}, all rows"
-        return table_by_joint(title, "step", [(one.name, one.rms) for one in self.steps])
+        return table_by_joint(title, "step", self.steps, "rms")
 
 
 def missed(model: TorqueModel, logs: Logs, columns: Columns) -> Array:

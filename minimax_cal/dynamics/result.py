@@ -19,7 +19,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import APART, Fact
 from minimax_cal.ground.records import stored
 from minimax_cal.ground.results import Result
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table, filled
 from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.robots.robot import robot_from_dict
 
@@ -191,25 +191,24 @@ class MotionDiagnosis(Result):
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
-        every = (self.budget_table(), self.effects_table(), self.unexplained_table())
-        return tuple(table for table in every if table.rows)
+        return filled(self.budget_table(), self.effects_table(), self.unexplained_table())
 
-    def budget_table(self) -> Table:
-        """The error budget: held-out RMS of each joint, step by step."""
-        title = f"Held-out RMS torque [{self.unit}], all rows ({self.held_out})"
-        rows = [(step.name, step.holdout_rms) for step in self.budget]
-        return table_by_joint(title, "step", rows)
+    def budget_table(self, which: str = "all", of: str = "holdout_rms") -> Table:
+        """The error budget: held-out RMS of each joint, step by step.  which: rows, of: those."""
+        title = f"Held-out RMS torque [{self.unit}], {which} rows ({self.held_out})"
+        return table_by_joint(title, "step", self.budget, of)
 
     def effects_table(self) -> Table:
         """The effects, the most valuable first."""
-        header = ("effect", "value", f"held-out RMS, moving [{self.unit}]", "confirmed")
-        return Table("Effects", header, tuple(one.row() for one in self.effects))
+        rows = (one.row() for one in self.effects)
+        worth = f"held-out RMS, moving [{self.unit}]"
+        return Table.made("Effects", rows, "effect | value", worth, "confirmed")
 
     def unexplained_table(self) -> Table:
         """What has no name, by joint."""
-        rows = tuple((u.place, u.follows, u.size, u.noise) for u in self.unexplained)
-        header = ("joint", "follows", f"size [{self.unit}]", f"remaining error [{self.unit}]")
-        return Table("Unexplained", header, rows, ("", "", ".3g", ".3g"))
+        return Table.of("Unexplained", self.unexplained, "place=joint | follows",
+                        f"size=size [{self.unit}] .3g",
+                        f"noise=remaining error [{self.unit}] .3g")  # fmt: skip
 
     def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """The headline, and the arm with its robot for itself."""
@@ -236,11 +235,10 @@ def grouped(effects: tuple[MotionEffect, ...]) -> str:
     return "; ".join(f"{words} at {', '.join(sorted(set(places[words])))}" for words in order)
 
 
-def table_by_joint(title: str, what: str, rows: Sequence[tuple[str, Sequence[float]]]) -> Table:
-    """A number of each joint, row by row.  what: the rows' names are."""
-    joints = [f"J{j + 1}" for j in range(len(rows[0][1]))]
-    cells: tuple[tuple[Cell, ...], ...] = tuple((name, *values) for name, values in rows)
-    return Table(title, (what, *joints), cells, ("", *[".3g"] * len(joints)))
+def table_by_joint(title: str, what: str, records: Sequence[object], of: str) -> Table:
+    """A number of each joint, a row a record.  what: their names are; of: the attribute."""
+    joints = range(len(getattr(records[0], of)))
+    return Table.of(title, records, f"name={what}", *(f"{of}.{j}=J{j + 1} .3g" for j in joints))
 
 
 def worth_by_joint(without: Array, with_it: Array) -> dict[str, tuple[float, float]]:

@@ -20,7 +20,7 @@ from minimax_cal.fitting.uncertainty import Estimator, Linearised, PartSums, Pos
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import Fact, derived
 from minimax_cal.ground.results import Record
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import Region, groups
 from minimax_cal.measuring.measurements import Measurements
@@ -116,6 +116,11 @@ class Beyond(Record):
         """Where it is."""
         return self.worst.where if self.worst else None
 
+    @property
+    def largest_mm(self) -> float:
+        """Largest distance in any part."""
+        return max((fold.max_mm for fold in self.folds), default=math.nan)
+
     @derived(key="narrow")
     def narrow_joints(self) -> list[str]:
         """Names of the joints that went too little for a claim."""
@@ -137,7 +142,6 @@ class Beyond(Record):
         parts = f"{len(self.folds)} parts"
         if self.missed:
             parts = f"{self.judged} (the fit needs the others)"
-        largest = max(fold.max_mm for fold in self.folds)
         less = ""
         if self.trusted:
             worst = f"{self.trusted.worst_mm:.3f} mm ({self.trusted.where})"
@@ -145,30 +149,26 @@ class Beyond(Record):
         return (
             f"Outside the measured region, {parts} left out in turn and predicted from the rest"
             f"{self.kept}: RMS {self.typical_mm:.3f} mm, worst part {self.worst_mm:.3f} mm RMS "
-            f"({self.worst.where}), largest error {largest:.3f} mm{less}."
+            f"({self.worst.where}), largest error {self.largest_mm:.3f} mm{less}."
         )
 
     def table(self) -> Table:
         """All parts together, and the worst few."""
         shown = sorted(self.folds, key=lambda fold: -fold.rms_mm)[:MAX_SHOWN_PARTS]
         count = sum(fold.poses for fold in self.folds)
-        most = max((fold.max_mm for fold in self.folds), default=math.nan)
         whole = self.judged or f"all {len(self.folds)} parts"
-        rows: list[tuple[Cell, ...]] = [
-            (f.where, f.poses, f.rms_mm, f.max_mm, f.geometric_mm) for f in shown
+        rows: list[tuple[object, ...]] = [
+            (whole, count, self.typical_mm, self.largest_mm, self.geometric_typical_mm)
         ]
-        if rows:
-            rows.append((whole, count, self.typical_mm, most, self.geometric_typical_mm))
-        if rows and self.trusted:
-            typical = self.trusted.typical_mm
-            rows.append((f"{whole}, without suspects", count, typical, math.nan, math.nan))
+        if self.trusted:
+            rows.append((f"{whole}, without suspects", count, self.trusted.typical_mm, None, None))
         how = f"each part judged by a fit without it{self.kept}"
-        return Table(
+        return Table.of(
             f"outside the measured region: {how}, the worst ones",
-            ("left out", "poses", "RMS mm", "max mm", "geometry alone RMS mm"),
-            tuple(rows),
-            ("", "d", ".4f", ".4f", ".4f"),
-        )
+            shown,
+            "where=left out | poses d | rms_mm=RMS mm .4f | max_mm=max mm .4f | "
+            "geometric_mm=geometry alone RMS mm .4f",
+        ).plus(*(rows if shown else ()))
 
 
 def not_claimed(robot: Robot, data: Measurements) -> Beyond:

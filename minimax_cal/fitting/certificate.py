@@ -121,9 +121,8 @@ class Certificate:
             f"points that decide: largest {1e3 * self.value:.4f} mm, to first order not below "
             f"{1e3 * self.bound:.4f} mm (gap {self.gap:.1e})"
         )
-        rows = tuple((p.target, p.line, 1e3 * p.distance, p.multiplier) for p in self.points)
-        header = ("target", "line", "distance mm", "multiplier")
-        return Table(title, header, rows, ("", "d", ".4f", ".4f"))
+        columns = "target | line d | distance=distance mm .4f | multiplier .4f"
+        return Table.of(title, self.points, columns)
 
 
 def certify(problem: MinimaxProblem, best: Optimum[State], line: Array) -> Certificate:

@@ -35,11 +35,10 @@ from minimax_cal.fitting.suspects import Suspect, aside, table_of
 from minimax_cal.fitting.told_poses import errors_of, measured_poses
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, uncertainty_from_dict
 from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.facts import APART, Fact, Later, derived, facts_in_words, in_file
+from minimax_cal.ground.facts import APART, Fact, Later, derived, facts_in_words, in_file, scaled
 from minimax_cal.ground.records import array, as_kind, read
 from minimax_cal.ground.results import Result
-from minimax_cal.ground.tables import Cell as TableCell
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import capitalise, list_counts
 from minimax_cal.measuring.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
 from minimax_cal.measuring.aside import SetAside
@@ -56,7 +55,7 @@ from minimax_cal.modelling.frames import frames_of, tables_of, with_effects
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, model_of, pose_weights
 from minimax_cal.modelling.parameters import Names
-from minimax_cal.robots.frames import CONVENTION, Frame
+from minimax_cal.robots.frames import CONVENTION, Frame, frames_tables
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.minimax import Kkt, Step
 from minimax_cal.solvers.status import Status
@@ -69,6 +68,7 @@ ACCURACIES = (  # where accuracy is told: title, key
     ("training, nominal", "nominal_train"),
     ("training, calibrated", "train"),
 )
+PLACED = ("base", "tool")  # frames on the first screen
 ROUGH = 1e-6  # a QP answered worse than this is told
 
 
@@ -134,16 +134,13 @@ class WorstCase:
 
     def table(self) -> Table:
         """Errors of targets or points, multipliers (they sum to one), activity."""
-        rows = tuple(
-            (name, float(size), float(mu), "yes" if name in self.active else "")
-            for name, size, mu in zip(self.functions, self.size, self.multiplier, strict=True)
-        )
-        header = ("error of", "F_i mm^2, of a point mm", "multiplier", "is the worst")
-        title = (
+        active = (name in self.active for name in self.functions)
+        return Table.made(
             "what the worst error on the training poses rests on; targets compare by F_i over the "
-            "number of their points"
+            "number of their points",
+            zip(self.functions, self.size, self.multiplier, active, strict=True),
+            "error of | F_i mm^2, of a point mm .4f | multiplier .4f | is the worst",
         )
-        return Table(title, header, rows, ("", ".4f", ".4f", ""))
 
 
 @dataclass(frozen=True)
@@ -433,37 +430,28 @@ class Fit(Result):
 
     def accuracy_table(self) -> Table:
         """Accuracy before and after, on the held-out and on the training poses."""
-        rows: list[tuple[TableCell, ...]] = [
-            (title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *a.by_target())
-            for title, a in self.accuracies()
-        ]
-        targets = tuple(f"{name} RMS mm" for name in self.cell.target_names)
-        return Table(
+        return Table.made(
             f"{self.cell.robot.name}: position accuracy, objective {self.objective}",
-            ("poses", "count", "RMS mm", "mean mm", "max mm", *targets),
-            tuple(rows),
-            ("", "d", *[".4f"] * (3 + len(targets))),
-        )
+            [(title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *a.by_target())
+             for title, a in self.accuracies()],
+            "poses | count d | RMS mm .4f | mean mm .4f | max mm .4f",
+            *(f"{name} RMS mm .4f" for name in self.cell.target_names),
+        )  # fmt: skip
 
     def first_tables(self) -> tuple[Table, ...]:
         """What stands on the first screen: accuracy in at most six rows, and the frames."""
-        rows = tuple(row for row in self.accuracy_rows() if row[1] != 0)
-        first = Table(
+        first = Table.made(
             f"position error, objective {self.objective}",
-            ("error at", "poses", "RMS mm", "95 % low", "95 % high", "max mm"),
-            rows,
-            ("", "d", *[".3f"] * 4),
+            [row for row in self.accuracy_rows() if row[1] != 0],
+            "error at | poses d | RMS mm .3f | 95 % low .3f | 95 % high .3f | max mm .3f",
         )
-        frames = [(name, self.frames[name]) for name in ("base", "tool") if name in self.frames]
-        placed = Table(
-            "base in the instrument's frame, tool in the flange's; Rz(A) Ry(B) Rx(C)",
-            ("frame", "X mm", "Y mm", "Z mm", "A deg", "B deg", "C deg"),
-            tuple((name, *frame.xyz_mm, *frame.abc_deg) for name, frame in frames),
-            ("", *[".3f"] * 3, *[".4f"] * 3),
+        frames = self.frames
+        placed, _ = frames_tables({name: frames[name] for name in PLACED if name in frames}, "")
+        return first, replace(
+            placed, title="base in the instrument's frame, tool in the flange's; Rz(A) Ry(B) Rx(C)"
         )
-        return first, placed
 
-    def accuracy_rows(self) -> Iterator[tuple[TableCell, ...]]:
+    def accuracy_rows(self) -> Iterator[tuple[object, ...]]:
         """New poses, inside and outside the measured region, then those of the fit."""
         inside = self.within
         if self.error_crossed.size or self.accuracy["holdout"].poses:
@@ -471,28 +459,26 @@ class Fit(Result):
             yield row_of("new poses, nominal", inside.before, drawn)
             yield row_of("new poses, calibrated", inside.after, inside.rms)
         if self.beyond.worst:
-            most = max(fold.max_mm for fold in self.beyond.folds)
-            yield "outside, calibrated", "", self.beyond.typical_mm, math.nan, math.nan, most
+            away = self.beyond
+            yield "outside, calibrated", "", away.typical_mm, None, None, away.largest_mm
         for key, name in (("nominal_train", "nominal"), ("train", "calibrated")):
             yield row_of(f"training poses, {name}", self.accuracy[key])
 
     def interval_table(self) -> Table:
         """95 % intervals of the held-out accuracy; empty where the poses are too few."""
-        rows = tuple(
-            (title, a.rms_mm, 1e3 * rms.low, 1e3 * rms.high, a.max_mm, 1e3 * largest.low,
-             1e3 * largest.high)
+        rows = [
+            (title, a.rms_mm, *scaled(rms, 1e3), a.max_mm, *scaled(largest, 1e3))
             for title, key in (("nominal", "nominal"), ("calibrated", "holdout"))
             for a, (rms, largest) in [(self.accuracy[key], self.intervals[key])]
             if math.isfinite(rms.low)
-        )  # fmt: skip
+        ]
         dash = any(np.isnan([row[3], row[6]]).any() for row in rows)
         why = "; a dash: too few poses, or too unlike each other, to tell an upper end"
-        return Table(
+        return Table.made(
             "held out, with 95 % intervals: of the RMS over such poses, of the largest error of as "
             f"many new ones{why if dash else ''}",
-            ("robot", "RMS mm", "from", "to", "max mm", "from", "to"),
             rows,
-            ("", *[".4f"] * 6),
+            "robot | RMS mm .4f | from .4f | to .4f | max mm .4f | from .4f | to .4f",
         )
 
     @property
@@ -508,7 +494,7 @@ class Fit(Result):
 
     def parameter_table(self) -> Table:
         """Every parameter of geometry."""
-        return parameter_table(p for p in self.parameters if not p.of_effect)
+        return parameter_table(self.parameters)
 
     def effect_table(self) -> Table:
         """The parameters of effects beyond geometry, as in the files; empty without any.
@@ -517,15 +503,15 @@ class Fit(Result):
         """
         maps = [term for term in self.cell.effects.terms if EFFECTS[term.effect].is_map]
         labels = tuple(f"{term.label}." for term in maps)
-        rows: list[tuple[TableCell, ...]] = []
+        rows: list[tuple[object, ...]] = []
         if maps:
             scene, effects = self.cell.scene(with_history(self.data)), self.cell.effects
             for term in maps:
                 own = effects.values[effects.terms.index(term)]
                 turn = Fitted((term,), (own,)).turn(scene)[:, joint_of(term.place)]
-                rows.append((f"{name_effect(*term.key)}, RMS", "rad", rms(turn), math.nan, ""))
+                rows.append((f"{name_effect(*term.key)}, RMS", "rad", rms(turn), None, ""))
         plain = table_of_effects(p for p in self.parameters if not p.name.startswith(labels))
-        return replace(plain, rows=(*plain.rows, *rows))
+        return plain.plus(*rows)
 
     def sentences(self) -> tuple[str, ...]:
         """The result: what went wrong if anything, inside, set aside, outside, identified."""
@@ -580,14 +566,12 @@ class Fit(Result):
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
-        every = [self.accuracy_table(), self.interval_table(), self.beyond.table()]
-        if self.minimax and self.objective != "point":
-            every.append(self.minimax.table())
-        if self.certificate:
-            every.append(self.certificate.table())
-        every += [*tables_of(self.frames), self.effect_table(), table_of(self.suspects, self.data)]
-        every.append(self.parameter_table())
-        return tuple(table for table in every if table.rows)
+        worst = None if self.objective == "point" else self.minimax
+        return filled(
+            self.accuracy_table(), self.interval_table(), self.beyond.table(),
+            *(one.table() for one in (worst, self.certificate) if one), *tables_of(self.frames),
+            self.effect_table(), table_of(self.suspects, self.data), self.parameter_table(),
+        )  # fmt: skip
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
@@ -682,15 +666,15 @@ class Fit(Result):
         }
 
 
-def row_of(name: str, of: Accuracy, ends: Interval = UNKNOWN) -> tuple[TableCell, ...]:
+def row_of(name: str, of: Accuracy, ends: Interval = UNKNOWN) -> tuple[object, ...]:
     """A row of the first table; ends: 95 % interval of the RMS [m]."""
-    return name, of.poses, of.rms_mm, 1e3 * ends.low, 1e3 * ends.high, of.max_mm
+    return name, of.poses, of.rms_mm, *scaled(ends, 1e3), of.max_mm
 
 
 def ends_of(seen: Accuracy) -> tuple[Interval, Interval]:
     """The intervals of RMS and largest error that a file tells [m]."""
-    (a, b), (c, d) = seen.rms_ci95_mm or NO_ENDS, seen.max_ci95_mm or NO_ENDS
-    return Interval(1e-3 * a, 1e-3 * b), Interval(1e-3 * c, 1e-3 * d)
+    rms, largest = seen.rms_ci95_mm or NO_ENDS, seen.max_ci95_mm or NO_ENDS
+    return Interval(*scaled(rms, 1e-3)), Interval(*scaled(largest, 1e-3))
 
 
 def accuracies_of(content: Mapping[str, Any], targets: int) -> dict[str, Accuracy]:

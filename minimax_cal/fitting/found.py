@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, overload
@@ -16,7 +15,6 @@ from minimax_cal.ground.facts import Fact, in_digits, in_file
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.records import stored
-from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import for_people, in_files, turned_for_people
 from minimax_cal.modelling.effects.words import name_parameter
@@ -216,30 +214,23 @@ def parameter_table(parameters: Iterable[Parameter]) -> Table:
 
     Of a correction there is a change alone: where base and tool stand, their frames say.
     """
-    rows: list[tuple[TableCell, ...]] = []
-    for p in parameters:
+    rows: list[tuple[object, ...]] = []
+    for p in (each for each in parameters if not each.of_effect):
         (size, unit), (scale, of_change) = turned_for_people(p.unit), p.scale
-        drawn, found = (math.nan if p.corrects else size * v for v in (p.nominal, p.value))
+        value = (None, None, "") if p.corrects else (size * p.nominal, size * p.value, unit)
         change = scale * (p.value - p.nominal)
-        unit = "" if p.corrects else unit
-        rows.append((p.title, drawn, found, unit, change, scale * p.sigma, of_change, p.why_not))
-    header = ("name", "nominal", "calibrated", "in", "change", "sigma", "in", NOT_IDENTIFIED)
-    formats = ("", ".4f", ".4f", "", "+.4f", ".2g", "", "")
-    return Table("parameters", header, tuple(rows), formats)
+        rows.append((p.title, *value, change, scale * p.sigma, of_change, p.why_not))
+    columns = "name | nominal .4f | calibrated .4f | in | change +.4f | sigma .2g | in"
+    return Table.made("parameters", rows, columns, NOT_IDENTIFIED)
 
 
 def table_of_effects(parameters: Iterable[Parameter]) -> Table:
     """Of parameters those of effects, as in the files."""
-    rows = tuple(
-        (
-            name_parameter(p.name),
-            p.written[1],
-            p.value * p.written[0],
-            p.sigma * p.written[0],
-            p.why_in_words,
-        )
+    rows = (
+        (name_parameter(p.name), unit, p.value * scale, p.sigma * scale, p.why_in_words)
         for p in parameters
+        for scale, unit in [p.written]
         if p.of_effect
     )
-    header = ("effect", "unit", "value", "sigma", NOT_IDENTIFIED)
-    return Table("effects beyond geometry", header, rows, ("", "", ".4g", ".2g", ""))
+    columns = "effect | unit | value .4g | sigma .2g"
+    return Table.made("effects beyond geometry", rows, columns, NOT_IDENTIFIED)

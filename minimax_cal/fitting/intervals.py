@@ -8,12 +8,14 @@ one pose in a hundred misses by ten times as much, a few dozen poses without one
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.facts import scaled
 from minimax_cal.measuring.accuracy import Accuracy
 
 MIN_POSES = 3  # poses; fewer say nothing about their spread
@@ -25,8 +27,7 @@ FARTHEST = 10.0  # times what was seen: an end beyond it is of the assumed law, 
 TINY = 1e-9  # of the mean square: an error that is exactly zero has no logarithm
 
 
-@dataclass(frozen=True)
-class Interval:
+class Interval(NamedTuple):
     """Two ends, NaN each where too little is known."""
 
     low: float
@@ -49,7 +50,7 @@ def told(interval: Interval, seen: float) -> Interval:
 
 def with_ends(seen: Accuracy, rms: Interval, largest: Interval) -> Accuracy:
     """An accuracy with intervals of its RMS and of its largest error [m]."""
-    ends = [(1e3 * interval.low, 1e3 * interval.high) for interval in (rms, largest)]
+    ends = [tuple(scaled(interval, 1e3)) for interval in (rms, largest)]
     return replace(seen, rms_ci95_mm=ends[0], max_ci95_mm=ends[1])
 
 

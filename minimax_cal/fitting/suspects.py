@@ -316,13 +316,10 @@ def aside(error: Array, data: Measurements, suspects: Sequence[Suspect]) -> Arra
 
 def table_of(suspects: Sequence[Suspect], data: Measurements) -> Table:
     """The list for people."""
-    return Table(
+    return Table.made(
         "outliers (1 % of the list are false alarms; they may be real effects)",
-        ("point", "target", "distance mm", "score", "p-value", "poses", "of the pose"),
-        tuple(
-            (data.called(s.line), s.target, 1e3 * s.distance, s.score, s.p_value,
-             "held out" if s.held else "training", "all targets" if s.together else "")
-            for s in suspects
-        ),
-        ("", "", ".4f", ".1f", ".1e", "", ""),
+        [(data.called(s.line), s.target, 1e3 * s.distance, s.score, s.p_value,
+          "held out" if s.held else "training", "all targets" if s.together else "")
+         for s in suspects],
+        "point | target | distance mm .4f | score .1f | p-value .1e | poses | of the pose",
     )  # fmt: skip

@@ -37,9 +37,13 @@ class Result:
     def headline(self) -> str:
         """The result in a sentence or two."""
 
-    @abstractmethod
+    def table(self) -> Table:
+        """The table of a result that has one alone."""
+        raise NotImplementedError
+
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
+        return (self.table(),)
 
     def first_tables(self) -> Sequence[Table]:
         """What stands on a first screen."""

@@ -6,7 +6,7 @@ import io
 import math
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from html import escape
 from typing import Any, Literal, cast
@@ -26,7 +26,8 @@ MAX_ROWS = 6  # of a table on a first screen
 LONGEST_NAME = 28  # letters of a cell that is a name; what is longer is a sentence, and wraps
 JOINT = "\N{WORD JOINER}"
 JOINED = rf"\1{JOINT}\2"
-COLUMN = re.compile(r"(\w+)(?:=(.*?))?(?: ([-+#]?\.?\d*[defg]))?")
+BAR = " | "  # between columns that one text tells
+HEAD = re.compile(r"(.*?)(?: ([-+#]?\.?\d*[defg]))?", re.DOTALL)  # header, format
 UNIT = re.compile(r"(\d) (\S{1,9})(?!\S)")  # of a number in a sentence
 
 LATEX_ESCAPES = str.maketrans(
@@ -45,15 +46,30 @@ class Table:
     formats: tuple[str, ...] = ()
 
     @staticmethod
-    def of(title: str, records: Sequence[object], *columns: str) -> Table:
-        """A row a record.  columns: attribute, header unless its name, format: "rms=RMS mm .4f".
+    def made(title: str, rows: Iterable[Iterable[object]], columns: str, *more: str) -> Table:
+        """Rows under a header.  columns: header and format of each, as "name | RMS mm .4f".
 
-        Values are in the units of files, as `facts` has them.
+        more: columns of which users may have named a part, one each.
         """
-        told = [cast(re.Match[str], COLUMN.fullmatch(each)).groups("") for each in columns]
-        rows = tuple(tuple(cell_of(record, name) for name, _, _ in told) for record in records)
-        header = tuple(shown or name.replace("_", " ") for name, shown, _ in told)
-        return Table(title, header, rows, tuple(spec for _, _, spec in told))
+        told = [cast(re.Match[str], HEAD.fullmatch(one)) for one in (*columns.split(BAR), *more)]
+        header, formats = zip(*(one.groups("") for one in told), strict=True)
+        return Table(title, header, tuple(tuple(map(cell, row)) for row in rows), formats)
+
+    @staticmethod
+    def of(title: str, records: Iterable[object], columns: str, *more: str) -> Table:
+        """A row a record.  columns: attribute, its header if another, format: "rms=RMS mm .4f".
+
+        Columns are told as for `made`; see `value_at` for the attribute.
+        """
+        told = [one.partition("=") for one in (*columns.split(BAR), *more)]
+        names = [name if named else name.partition(" ")[0] for name, named, _ in told]
+        heads = (head if named else name.replace("_", " ") for name, named, head in told)
+        rows = ([value_at(one, name) for name in names] for one in records)
+        return Table.made(title, rows, *heads)
+
+    def plus(self, *rows: Iterable[object]) -> Table:
+        """With more rows."""
+        return replace(self, rows=(*self.rows, *(tuple(map(cell, row)) for row in rows)))
 
     def brief(self, *header: str, rows: int = MAX_ROWS) -> Table:
         """Some of the columns, all unless named, and at most so many rows: the first and the last.
@@ -201,18 +217,37 @@ def records_of(columns: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
-def cell_of(record: object, name: str) -> Cell:
-    """An attribute of a record for people."""
-    kind: Any = type(record)
-    known = all_facts(kind).get(name)
-    value = getattr(record, name)
-    if known and known.scale != 1.0:
-        value = scaled(value, known.scale)
+def filled(*tables: Table) -> tuple[Table, ...]:
+    """The tables that have rows."""
+    return tuple(table for table in tables if table.rows)
+
+
+def value_at(record: Any, place: str) -> Any:
+    """What a record holds in the unit of files, as `facts` has it.
+
+    place: attributes, keys or numbers, of one within the other where dots join them.
+    """
+    found = record
+    for name in place.split("."):
+        if isinstance(found, Mapping):
+            found = found[name]
+        elif name.isdecimal():
+            found = found[int(name)]
+        else:
+            kind: Any = type(found)
+            known = all_facts(kind).get(name)
+            found = scaled(getattr(found, name), known.scale if known else 1.0)
+    return found
+
+
+def cell(value: Any) -> Cell:
+    """A value for people."""
+    value = value.item() if hasattr(value, "item") else value
     if isinstance(value, bool):
         return "yes" if value else ""
-    if isinstance(value, tuple):
+    if isinstance(value, list | tuple):
         return ", ".join(map(str, value))
-    return math.nan if value is None else cast(Cell, value)
+    return math.nan if value is None else value if isinstance(value, float | int) else str(value)
 
 
 def unbroken(cell: str, *, right: bool) -> list[str]:

@@ -20,10 +20,11 @@ from minimax_cal.fitting.options import Progress, silent, solver_of
 from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.facts import scaled
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.stages import count_stage
-from minimax_cal.ground.tables import Cell, Table, records_of
+from minimax_cal.ground.tables import Table, records_of
 from minimax_cal.ground.units import for_people, in_files
 from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import Model, SumOfSquares, with_poses
@@ -97,18 +98,15 @@ class Bootstrap:
 
     def table(self, level: float = 0.95) -> Table:
         """Every parameter with its percentiles, in mm, mrad, or the effect's own unit."""
-        rows: list[tuple[Cell, ...]] = []
+        rows: list[tuple[object, ...]] = []
         for i, (low, high) in enumerate(self.interval(level)):
             one, (scale, unit) = self.fit.parameters[self.names[i]], for_people(self.units[i])
             start = one.nominal if one.corrects else 0.0
             numbers = (self.value[i] - start, self.sigma[i], low - start, high - start)
-            rows.append((one.title, unit, *(scale * float(number) for number in numbers)))
-        return Table(
-            f"{len(self.change)} calibrations of resampled poses: {100.0 * level:g} % intervals",
-            ("name", "unit", "value", "sigma", "low", "high"),
-            tuple(rows),
-            ("", "", *[".5g"] * 4),
-        )
+            rows.append((one.title, unit, *scaled(numbers, scale)))
+        title = f"{len(self.change)} calibrations of resampled poses: {100.0 * level:g} % intervals"
+        columns = "name | unit | value .5g | sigma .5g | low .5g | high .5g"
+        return Table.made(title, rows, columns)
 
     def to_dict(self, level: float = 0.95) -> dict[str, Any]:
         """For JSON, lengths in millimetres."""
@@ -121,7 +119,7 @@ class Bootstrap:
             "lost": self.lost,
             "level": level,
             "parameters": records_of(columns),
-            "out_of_bag_rms_mm": None if np.isnan(rms.low) else [1e3 * rms.low, 1e3 * rms.high],
+            "out_of_bag_rms_mm": None if np.isnan(rms.low) else [*scaled(rms, 1e3)],
         }
         return dict(plain(whole))
 

@@ -22,7 +22,6 @@ from minimax_cal.ground.facts import Apart, Fact, Milli, Mm
 from minimax_cal.ground.options import grouped
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.seeds import check_seed
-from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.saved import AFTER, BEFORE, Saved
 from minimax_cal.measuring.spans import (
@@ -169,36 +168,32 @@ class WorkspaceMap(Result):
 
     def table(self) -> Table:
         """Predicted radius where the data reach and beyond; observed errors."""
-        rows: list[tuple[TableCell, ...]] = []
-        reached, outside = self.sampled.reached, self.sampled.outside
-        for title, mask in (
-            ("where the data reach", reached),
-            ("beyond", ~reached & ~outside),
-            ("outside the spans of joints that hardly moved: none", outside),
-        ):
-            share = 100.0 * float(mask.mean())
-            what = f"predicted, {title} ({share:.0f} % of the samples)"
-            rows.append((what, int(mask.sum()), *spread(self.sampled.radius[mask])))
-        for title, mask in (("held-out", self.seen.held), ("training", ~self.seen.held)):
-            for name, error in ((BEFORE, self.seen.before), (AFTER, self.seen.after)):
-                what = f"observed {name}, {title} poses"
-                rows.append((what, int(mask.sum()), *spread(error[mask])))
-        return Table(
+        seen, reached, outside = self.seen, self.sampled.reached, self.sampled.outside
+        every = [
+            (f"predicted, {title} ({100.0 * mask.mean():.0f} % of the samples)", mask,
+             self.sampled.radius)
+            for title, mask in (
+                ("where the data reach", reached),
+                ("beyond", ~reached & ~outside),
+                ("outside the spans of joints that hardly moved: none", outside),
+            )
+        ]  # fmt: skip
+        every += [
+            (f"observed {name}, {title} poses", mask, error)
+            for title, mask in (("held-out", seen.held), ("training", ~seen.held))
+            for name, error in ((BEFORE, seen.before), (AFTER, seen.after))
+        ]
+        return Table.made(
             f"{self.robot}: position over the workspace; predicted: radius that holds 95 %, by the "
             "fit's covariance; observed: error of the targets' centroid",
-            ("what", "count", "median mm", "95 % mm", "worst mm"),
-            tuple(row for row in rows if row[1]),
-            ("", "d", ".4f", ".4f", ".4f"),
+            [(what, mask.sum(), *spread(of[mask])) for what, mask, of in every if mask.any()],
+            "what | count d | median mm .4f | 95 % mm .4f | worst mm .4f",
         )
 
     def headline(self) -> str:
         """How many held-out poses miss by no more than is predicted."""
         count, of = self.inside
         return f"{self.robot}: {count} of {of} held-out poses are within the predicted radius."
-
-    def tables(self) -> tuple[Table, ...]:
-        """The table."""
-        return (self.table(),)
 
     def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """The table, and how many poses lie within."""

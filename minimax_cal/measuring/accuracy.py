@@ -12,7 +12,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import APART, Fact
 from minimax_cal.ground.results import Record
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 
 # the accuracies of a result, and whether they are of held-out poses
 Ends = tuple[float, float]
@@ -54,14 +54,9 @@ class Accuracy(Record):
         untold = (math.nan,) * len(targets)
         means, largest = self.means_mm or untold, self.largest_mm or untold
         columns = (targets, self.counts, self.by_target(), means, largest, self.sse_mm2)
-        rows: list[tuple[Cell, ...]] = list(zip(*columns, strict=True))
         total = (sum(self.counts), self.rms_mm, self.mean_mm, self.max_mm, sum(self.sse_mm2))
-        return Table(
-            title,
-            ("target", "points", "RMS mm", "mean mm", "max mm", "sum mm^2"),
-            (*rows, ("all", *total)),
-            ("", "d", ".4f", ".4f", ".4f", ".4f"),
-        )
+        heads = "target | points d | RMS mm .4f | mean mm .4f | max mm .4f | sum mm^2 .4f"
+        return Table.made(title, zip(*columns, strict=True), heads).plus(("all", *total))
 
 
 def accuracy(error: Array) -> Accuracy:

@@ -41,11 +41,11 @@ class Poses:
 
     def table(self) -> Table:
         """What each condition rejects."""
-        rows = tuple((name, 100.0 * share) for name, share in self.rejected.items())
+        rows = ((name, 100.0 * share) for name, share in self.rejected.items())
         title = f"{self.drawn} candidates of {self.tested} poses drawn"
         if self.count > self.drawn:
             title += f", and {self.count - self.drawn} near the best ones"
-        return Table(title, ("condition", "rejects alone %"), rows, ("", ".1f"))
+        return Table.made(title, rows, "condition | rejects alone % .1f")
 
     def join(self, q: Array, seen: Array) -> Poses:
         """With further candidates."""

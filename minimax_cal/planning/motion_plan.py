@@ -26,7 +26,6 @@ from minimax_cal.ground.options import grouped, takes
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.stages import Progress, silent
-from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.planning.candidates import limits_of
 from minimax_cal.planning.motion import (
@@ -130,28 +129,26 @@ class MotionPlan(Result):
 
     def motion_table(self) -> Table:
         """Range, speed and acceleration of each joint in each part."""
-        rows: list[tuple[TableCell, ...]] = []
+        rows: list[tuple[object, ...]] = []
         slides = self.robot.prismatic
         for part in self.parts:
             moved = part.series.at(part.series.grid(SURE_HZ))
             top = [np.abs(values).max(axis=0) for values in (moved.qd, moved.qdd)]
             sizes = np.stack([moved.q.min(axis=0), moved.q.max(axis=0), *top], axis=1)
             for j, size in enumerate(np.where(slides, 1e3, ANGLES["deg"])[:, None] * sizes):
-                unit = "mm" if slides[j] else "deg"
-                rows.append((part.name, f"J{j + 1}", *map(float, size), unit))
-        header = ("part", "joint", "from", "to", "speed /s", "acceleration /s^2", "unit")
-        return Table("motion", header, tuple(rows), ("", "", ".1f", ".1f", ".1f", ".1f", ""))
+                rows.append((part.name, f"J{j + 1}", *size, "mm" if slides[j] else "deg"))
+        columns = "part | joint | from .1f | to .1f | speed /s .1f | acceleration /s^2 .1f | unit"
+        return Table.made("motion", rows, columns)
 
     def told_table(self) -> Table:
         """Predicted standard deviations, a row a joint."""
         kinds = dict.fromkeys(told.parameter for told in self.told)
-        rows: list[tuple[TableCell, ...]] = [
+        rows = (
             (f"J{j + 1}", noise, *map(shown, self.told[j :: len(self.noise)]))
-            for j, noise in enumerate(self.noise.tolist())
-        ]
-        header = ("joint", "noise", *(f"{kind} +-" for kind in kinds))
-        formats = ("", ".3g", *("" for _ in kinds))
-        return Table("standard deviations, predicted", header, tuple(rows), formats)
+            for j, noise in enumerate(self.noise)
+        )
+        heads = (f"{kind} +-" for kind in kinds)
+        return Table.made("standard deviations, predicted", rows, "joint | noise .3g", *heads)
 
     def rows_of(self, unit: str, rate: float, speeds: bool) -> str:
         """CSV of all parts.  unit: of turning joints.  Raises OptionError."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,6 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import Apart, Fact, derived, scaled
 from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.results import Result
-from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table, records_of
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.planning.candidates import Poses
@@ -130,60 +128,47 @@ class Plan(Result):
         """The criterion: planned, random, and what no choice of candidates beats."""
         own, unit = self.criterion, "" if self.criterion == POWER else "um"
         sizes = map(self.shown, (self.size, self.random, self.bound))
-        rows: list[tuple[TableCell, ...]] = [(f"{own}: {MEANINGS[own]}", unit, *sizes)]
-        for name, both in (("I", self.here.mean), ("G", self.here.worst)):
-            if name != own:
-                rows.append((MEANINGS[name], "um", *scaled(both, 1e6), math.nan))
-        return Table(
-            f"{self.poses} poses by criterion {own}",
-            ("what", "unit", "planned", "random (median)", "no choice is better than"),
-            tuple(rows),
-            ("", "", ".4g", ".4g", ".4g"),
+        others = (
+            (MEANINGS[name], "um", *scaled(both, 1e6), None)
+            for name, both in (("I", self.here.mean), ("G", self.here.worst))
+            if name != own
         )
+        rows = [(f"{own}: {MEANINGS[own]}", unit, *sizes), *others]
+        columns = "what | unit | planned .4g | random (median) .4g | no choice is better than .4g"
+        return Table.made(f"{self.poses} poses by criterion {own}", rows, columns)
 
     def growth_table(self) -> Table:
         """How accuracy grows with the number of poses."""
         more = self.criterion not in ("G", "I")
-        rows = tuple(
+        rows = (
             (g.poses, *scaled((*g.mean, *g.worst), 1e6), *(map(self.shown, g.size) if more else ()))
             for g in self.growth
         )
-        name = "power" if self.criterion == POWER else f"{self.criterion} um"
-        last = (f"{name}, planned", f"{name}, random") if more else ()
-        return Table(
-            "predicted sigma of a position over the workspace",
-            ("poses", "mean um, planned", "mean um, random", "worst um, planned",
-             "worst um, random", *last),
-            rows,
-            ("d", *[".4g"] * (4 + len(last))),
-        )  # fmt: skip
+        own = "power" if self.criterion == POWER else f"{self.criterion} um"
+        names = ("mean um", "worst um", own) if more else ("mean um", "worst um")
+        heads = (f"{name}, {which} .4g" for name in names for which in ("planned", "random"))
+        title = "predicted sigma of a position over the workspace"
+        return Table.made(title, rows, "poses d", *heads)
 
     def index_table(self) -> Table:
         """Observability indices of the poses."""
-        rows = tuple((name, INDICES[name], *values) for name, values in self.indices.items())
-        return Table(
+        return Table.made(
             "observability indices of these poses alone (parameters by the motion they give)",
-            ("index", "what", "planned", "random (median)"),
-            rows,
-            ("", "", ".4g", ".4g"),
+            [(name, INDICES[name], *values) for name, values in self.indices.items()],
+            "index | what | planned .4g | random (median) .4g",
         )
 
     def pose_table(self, unit: str = "deg") -> Table:
         """Every stop, in order."""
         header, rows = stops(self.visits, self.cell, self.expected, unit)
-        formats = ("d", "", *[".3f"] * self.q.shape[1])
-        n = len(formats)
-        title = f"stops in order, travel {self.travel.ordered:.1f} rad"
-        return Table(title, tuple(header[:n]), tuple(tuple(row[:n]) for row in rows), formats)
+        title, n = f"stops in order, travel {self.travel.ordered:.1f} rad", 2 + self.q.shape[1]
+        heads = (f"{name} .3f" for name in header[2:n])
+        return Table.made(title, [row[:n] for row in rows], "order d | pose", *heads)
 
     def tables(self) -> tuple[Table, ...]:
         """Every table but the poses themselves."""
-        return (
-            self.criterion_table(),
-            self.growth_table(),
-            self.index_table(),
-            self.candidates.table(),
-        )
+        shown = self.criterion_table(), self.growth_table(), self.index_table()
+        return (*shown, self.candidates.table())
 
     # ---- files ---------------------------------------------------------------------------------
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from minimax_cal.diagnosing.result import Diagnosis
-from minimax_cal.diagnosing.where import triage_table
 from minimax_cal.ground.files import number
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, filled
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.scene import Scene
@@ -20,6 +18,12 @@ from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.robots.robot import load_robot
 
 LEVEL = 0.01  # chance of a pattern below which it is one
+TRIAGE = {  # mean squares per point, and what each is of
+    "noise": "noise, of any origin",
+    "shape": "targets against each other",
+    "repeat": "revisits against each other",
+    "pose": "static model error",
+}
 NOWHERE = "poses or joints at which it would show"
 
 
@@ -33,43 +37,48 @@ def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
 
     where: as in the JSON of a diagnosis.
     """
-    targets = tuple(
+    nothing = dict.fromkeys(("rms_mm", "share", "p"))
+    triage = (
+        (cause, *numbers(where["triage"][kind] or nothing, *nothing))
+        for kind, cause in TRIAGE.items()
+    )
+    targets = (
         (entry["target"], entry["points"], *numbers(entry, "rms_mm", "max_mm", "mean_sight_mm"))
         for entry in where["by_target"]
     )
-    joints = tuple(
+    joints = (
         (entry["joint"], unit, *numbers(entry, f"rms_{unit}", "share", "p"))
         for entry in where["by_joint"]
         for unit in ("mm" if "rms_mm" in entry else "mrad",)
     )
-    directions = tuple(
+    directions = (
         (name.removesuffix("_mm").replace("_", " "), number(value))
         for name, value in where["by_direction"].items()
     )
-    regions = tuple(
+    regions = (
         (cell["region"], *map(number, (*cell["radius_mm"], *cell["height_mm"])), cell["points"],
          number(cell["rms_mm"]))
         for cell in where["by_region"]["cells"]
     )  # fmt: skip
-    trends = tuple(
+    trends = (
         ({"clock": "visit order"}.get(name, name), *numbers(trend, "share", "p"))
         for name, trend in where["by_order"].items()
         if trend
     )
-    parts = (
-        ("by target", ("target", "points", "RMS mm", "max mm", "mean along the line of sight mm"),
-         targets, ("", "d", ".4f", ".4f", "+.4f")),
-        (f"as rotations of each joint; p-values below {LEVEL:g} are significant",
-         ("joint", "unit", "RMS", "share that its own value explains", "p-value"),
-         joints, ("", "", ".4f", ".2f", ".1g")),
-        ("by direction", ("direction", "RMS mm"), directions, ("", ".4f")),
-        ("by region", ("region", "from the base axis mm", "to mm", "height from mm", "to mm",
-                       "points", "RMS mm"), regions, ("", ".0f", ".0f", ".0f", ".0f", "d", ".4f")),
-        (f"trends; p-values below {LEVEL:g} are significant", ("against", "share explained",
-         "p-value"), trends, ("", ".2f", ".1g")),
+    sure, left = f"p-values below {LEVEL:g} are significant", "error after geometry,"
+    shown = filled(
+        Table.made(f"kind of error; {sure}", triage,
+                   "kind | RMS mm .4f | share .3f | p-value .2g"),
+        Table.made(f"{left} by target", targets, "target | points d | RMS mm .4f | max mm .4f | "
+                   "mean along the line of sight mm +.4f"),
+        Table.made(f"{left} as rotations of each joint; {sure}", joints, "joint | unit | RMS .4f | "
+                   "share that its own value explains .2f | p-value .1g"),
+        Table.made(f"{left} by direction", directions, "direction | RMS mm .4f"),
+        Table.made(f"{left} by region", regions, "region | from the base axis mm .0f | to mm .0f | "
+                   "height from mm .0f | to mm .0f | points d | RMS mm .4f"),
+        Table.made(f"{left} trends; {sure}", trends,
+                   "against | share explained .2f | p-value .1g"),
     )  # fmt: skip
-    left = [Table(f"error after geometry, {by}", *rest) for by, *rest in parts]
-    shown = tuple(table for table in (triage_table(where["triage"]), *left) if table.rows)
     for table in shown:
         table.cells()  # an entry that is no number is found here, where its file is known
     return shown
@@ -81,16 +90,12 @@ def remainder_table(found: Diagnosis) -> Table:
     if left:
         ends = zip(("at least", "at most"), left.floor_mm or (), strict=False)
         rows = [
-            ("follows the pose, and could be predicted", left.predictable_mm, math.nan),
-            *(
-                (f"  of it {name_place(place)}", math.nan, 100.0 * share)
-                for place, share in left.where
-            ),
-            ("random", left.unpredictable_mm, math.nan),
-            *((f"noise alone, {name}", end, math.nan) for name, end in ends),
+            ("follows the pose, and could be predicted", left.predictable_mm, None),
+            *((f"  of it {name_place(place)}", None, 100.0 * share) for place, share in left.where),
+            ("random", left.unpredictable_mm, None),
+            *((f"noise alone, {name}", end, None) for name, end in ends),
         ]
-    header = ("part", "RMS mm", "share %")
-    return Table("remaining error", header, tuple(rows), ("", ".4f", ".0f"))
+    return Table.made("remaining error", rows, "part | RMS mm .4f | share % .0f")
 
 
 def bare_scene() -> Scene:
@@ -120,10 +125,7 @@ def effects_list(scene: Scene | None = None) -> list[dict[str, Any]]:
 
 def effects_table(entries: Sequence[Mapping[str, Any]]) -> Table:
     """`effects_list` for people."""
-    header = {"effect": "name", "cause": "cause", "law": "law", "needs": "needs"}
+    columns = "effect=name | cause | law | needs"
     if "places" in entries[0]:
-        places = "places these data can test"
-        header = {"effect": "name", "places": places, "cause": "cause", "needs": "lacking"}
-    told = [{**entry, "places": ", ".join(entry.get("places", ()))} for entry in entries]
-    rows = tuple(tuple(entry[key] for key in header) for entry in told)
-    return Table("effects beyond geometry", tuple(header.values()), rows)
+        columns = "effect=name | places=places these data can test | cause | needs=lacking"
+    return Table.of("effects beyond geometry", entries, columns)

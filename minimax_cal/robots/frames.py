@@ -61,18 +61,15 @@ class Frame:
 
 def frames_tables(frames: Mapping[str, Frame], title: str) -> tuple[Table, Table]:
     """Frames by their names as X, Y, Z and A, B, C, and as quaternions and rotation vectors."""
-    rows = tuple((name, *frame.xyz_mm, *frame.abc_deg) for name, frame in frames.items())
-    turns = tuple(
-        (name, *frame.quaternion_wxyz, *frame.rotation_vector_rad) for name, frame in frames.items()
-    )
-    header = ("frame", "X mm", "Y mm", "Z mm", "A deg", "B deg", "C deg")
-    other = ("frame", "w", "x", "y", "z", "rx rad", "ry rad", "rz rad")
     return (
-        Table(f"{title}; {CONVENTION}", header, rows, ("", *[".3f"] * 3, *[".4f"] * 3)),
-        Table(
+        Table.made(
+            f"{title}; {CONVENTION}",
+            [(name, *frame.xyz_mm, *frame.abc_deg) for name, frame in frames.items()],
+            "frame | X mm .3f | Y mm .3f | Z mm .3f | A deg .4f | B deg .4f | C deg .4f",
+        ),
+        Table.made(
             "the same rotations as unit quaternions (w, x, y, z) and as rotation vectors",
-            other,
-            turns,
-            ("", *[".6f"] * 7),
+            [(n, *f.quaternion_wxyz, *f.rotation_vector_rad) for n, f in frames.items()],
+            "frame | w .6f | x .6f | y .6f | z .6f | rx rad .6f | ry rad .6f | rz rad .6f",
         ),
     )

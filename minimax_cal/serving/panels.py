@@ -13,7 +13,7 @@ from minimax_cal.diagnosing.result import load_diagnosis
 from minimax_cal.fitting.fit import load_fit
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import json_of
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import visible
 from minimax_cal.reporting.html.more_charts import waterfall
 from minimax_cal.reporting.html.page import figure_data, needed, template
@@ -232,11 +232,11 @@ def ladder_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
 
 
 @lru_cache(maxsize=KEPT)
-def diagnosis_words(path: str, moment: int, size: int) -> tuple[str, list[Table], dict[str, Any]]:
+def diagnosis_words(path: str, moment: int, size: int) -> tuple[str, tuple[Table, ...], Panel]:
     """Headline, tables and chart of a diagnosis' file as it was at a moment."""
     gap = load_diagnosis(path)
-    tables = [gap.ladder_table(), gap.effects_table(), gap.rival_table()]
-    return gap.headline(), [table for table in tables if table.rows], figure_data(waterfall(gap))
+    tables = filled(gap.ladder_table(), gap.effects_table(), gap.rival_table())
+    return gap.headline(), tables, figure_data(waterfall(gap))
 
 
 def verdict_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:

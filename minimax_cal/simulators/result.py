@@ -90,21 +90,14 @@ class SimulatorGap(Result):
 
     def table(self) -> Table:
         """The ladder."""
-        rows = tuple(
-            (name_step(r.name), r.holdout_rms_mm, r.holdout_max_mm, r.predicted_rms_mm,
-             r.sag_mrad, r.why)
-            for r in self.every
-        )  # fmt: skip
-        if math.isfinite(self.floor):
-            noise = (math.nan, math.nan, math.nan, self.floor_from)
-            rows = (*rows, ("noise floor", self.floor, *noise))
-        header = ("model", "RMS mm", "max mm", "fit says mm", "joints off mrad", "")
-        title = f"{self.robot} in the simulator: errors on {self.holdout_poses} held-out poses"
-        return Table(title, header, rows, ("", ".4f", ".4f", ".4f", ".3f", ""))
-
-    def tables(self) -> tuple[Table, ...]:
-        """The ladder."""
-        return (self.table(),)
+        ladder = Table.of(
+            f"{self.robot} in the simulator: errors on {self.holdout_poses} held-out poses",
+            [(name_step(rung.name), rung) for rung in self.every],
+            "0=model | 1.holdout_rms_mm=RMS mm .4f | 1.holdout_max_mm=max mm .4f | "
+            "1.predicted_rms_mm=fit says mm .4f | 1.sag_mrad=joints off mrad .3f | 1.why=",
+        )
+        noise = ("noise floor", self.floor, None, None, None, self.floor_from)
+        return ladder.plus(noise) if math.isfinite(self.floor) else ladder
 
     def first_tables(self) -> tuple[Table, ...]:
         """The ladder, without what explains its rungs."""

@@ -3,16 +3,14 @@
 import json
 from collections.abc import Iterator
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import ROOT, run
+from conftest import run
 
 import minimax_cal as mc
 from minimax_cal.cli.schemas import KINDS, schema_of
-from minimax_cal.fitting.instruments import flange_poses, write_relative
 from minimax_cal.robots.robot import robot_from_dict
 
 jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
@@ -48,27 +46,6 @@ def test_robots_as_they_are_written(name: str) -> None:
     file = resources.files("minimax_cal.robots") / "builtin" / f"{name}.json"
     for content in (json.loads(file.read_text("utf-8")), mc.load_robot(name).to_dict()):
         assert not faults("robot", content)
-
-
-def test_results_as_they_are_written(tmp_path: Path) -> None:
-    csv, made = ROOT / "examples" / "irb2600.csv", mc.simulate("irb2600", 40, 3, seed=1)
-    mc.diagnose("irb2600", csv).save(tmp_path / "diagnosis.json")
-    flange = flange_poses(made.data.q, made.cell.robot.pose(made.data.q))
-    write_relative(tmp_path / "flange.csv", flange)
-    mc.relative("irb2600", tmp_path / "flange.csv").save(tmp_path / "relative.json")
-    fits: dict[str, dict[str, Any]] = {
-        "minimax": {},
-        "sum": {"objective": "sum", "loss": "huber"},
-        "effects": {"effects": tmp_path / "diagnosis.json"},
-        "point": {"objective": "point"},
-    }
-    for name, options in fits.items():
-        mc.calibrate("irb2600", csv, **options).save(tmp_path / f"{name}.json")
-        content = json.loads((tmp_path / f"{name}.json").read_text())
-        assert not faults("calibration", content), name
-        assert not faults("robot", content["robot"])
-    for kind in ("diagnosis", "relative"):
-        assert not faults(kind, json.loads((tmp_path / f"{kind}.json").read_text())), kind
 
 
 def places(content: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:

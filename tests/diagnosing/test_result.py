@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-import minimax_cal as mc
 from minimax_cal.diagnosing.result import (
     SHOWN_LINES,
     Alternative,
@@ -222,18 +221,6 @@ def test_errors_and_curves_are_those_of_the_cells(made: Diagnosis) -> None:
     assert set(bare.curves) == {"residual", "order"}
     assert_array_equal(made.errors[1], 5e-4)
     assert made.curves == {}
-
-
-def test_a_file_is_read_back(made: Diagnosis) -> None:
-    bare = replace(made, stated_errors=None, stated_curves=None)
-    said = json.loads(bare.json())
-    again = mc.Diagnosis.from_dict(said)
-    for one, other in zip(again.cells, bare.cells, strict=True):
-        assert_allclose(one.base, other.base, rtol=0, atol=1e-14)
-        assert [t.text for t in one.effects.terms] == [t.text for t in other.effects.terms]
-    once_more = json.loads(again.json())
-    for part in ("verdict", "reasons", "effects", "gap", "noise", "structure", "not_testable"):
-        assert once_more[part] == said[part]
 
 
 # ---- tables ------------------------------------------------------------------------------------

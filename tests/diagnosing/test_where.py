@@ -14,22 +14,18 @@ from scipy.stats import binom
 
 import minimax_cal as mc
 from minimax_cal.diagnosing.diagnose import located
-from minimax_cal.diagnosing.where import Where, joint_equivalent, noise_of, triage_table, where
-from minimax_cal.diagnosing.where.mean_squares import (
-    lack_of_fit,
-    shape_energy,
-    shape_scatter,
-)
-from minimax_cal.diagnosing.where.residual import (
-    residual_of,
-)
+from minimax_cal.diagnosing.where import Where, joint_equivalent, noise_of, where
+from minimax_cal.diagnosing.where.mean_squares import lack_of_fit, shape_energy, shape_scatter
+from minimax_cal.diagnosing.where.residual import residual_of
 from minimax_cal.diagnosing.where.significance import flips, score_flips
 from minimax_cal.evidence.evened import TOGETHER, evened, times_before
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import plain
 from minimax_cal.measuring.grouping import from_means, groups
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.simulate import Truth, gravity, simulate
+from minimax_cal.reporting.tables import where_tables
 from minimax_cal.robots import kinematics
 
 SIGMA = 15e-6
@@ -390,7 +386,7 @@ def test_shares_add_up_and_what_cannot_be_told_is_null(rng: np.random.Generator)
         found = made.where(
             made.noise(rng) + made.turned(2e-5 * rng.normal(size=(60 + again, 6))), noise
         )
-        parts = found.triage.to_dict()
+        parts = plain(found.triage)
         assert {name for name, part in parts.items() if part is not None} == told
         shares = [part.share for part in vars(found.triage).values()]
         if told:
@@ -418,7 +414,7 @@ def test_one_target_a_row(rng: np.random.Generator) -> None:
     error[np.arange(3)[:, None] != which] = np.nan
     found = made.where(error)
     assert sum(gap.points for gap in found.by_target) == made.data.poses
-    assert found.triage.to_dict()["shape"] is None
+    assert plain(found.triage)["shape"] is None
 
 
 def test_a_slide_is_in_millimetres(rng: np.random.Generator) -> None:
@@ -428,7 +424,7 @@ def test_a_slide_is_in_millimetres(rng: np.random.Generator) -> None:
     dq[:, sliding] = 50e-6 * rng.normal(size=60)
     found = made.where(made.turned(dq), fit=False)
     gap = found.by_joint[sliding]
-    assert gap.to_dict()["rms_mm"] == pytest.approx(50e-3, rel=0.3)
+    assert plain(gap)["rms_mm"] == pytest.approx(50e-3, rel=0.3)
     assert "rms_mrad" in found.by_joint[0].to_dict()
 
 
@@ -455,8 +451,8 @@ def test_targets_that_scatter_on_their_own_show_beside_a_noise_that_is_declared(
 
 
 def test_a_table_holds_the_numbers(rng: np.random.Generator) -> None:
-    triage = scene().where(scene().noise(rng)).triage
-    text = triage_table(triage.to_dict()).text()
+    found = scene().where(scene().noise(rng))
+    triage, text = found.triage, where_tables(found.to_dict())[0].text()
     assert f"{1e3 * triage.noise.rms:.4f}" in text
     assert f"{triage.noise.share:.3f}" in text
 

@@ -22,7 +22,6 @@ from experiments.pixel_cells import (
     projected,
 )
 from minimax_cal.fitting.instruments.pixel_calibration import concluded, fitted
-from minimax_cal.fitting.instruments.pixel_result import PixelCalibration
 from minimax_cal.fitting.pixels.camera import INTRINSICS, distorted, slopes, undistorted
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.determined import determined
@@ -427,22 +426,6 @@ def test_claims_compare_sigma_and_drawing() -> None:
     assert not Claim(0.1, 1.0, 0.15, 0.05).is_better
     assert "the calibrated arm is better" in Claim(1e-4, 1e-3, 1e-3, 1e-3).sentence()
     assert "keep the drawn arm" in Claim(1e-4, 1e-3, 1e-4, 0.0).sentence()
-
-
-def test_a_result_comes_back_from_its_file(ground: Cell) -> None:
-    drawn, options = (
-        replace(ground.drawn, drawn_within=(1e-6, 1e-6)),
-        PixelOptions(objective="minimax"),
-    )
-    fit = fitted(drawn, data_of(ground), options)
-    again = PixelCalibration.from_dict(fit.to_dict())
-    assert again.status is Status.NO_BETTER
-    assert again.pixels == fit.pixels
-    assert_allclose(again.claim.sigma, fit.claim.sigma, rtol=1e-12)
-    assert_allclose(again.calibrated.mdh, fit.calibrated.mdh, rtol=0, atol=1e-15)
-    assert again.headline() == fit.headline()
-    assert "QPs: " in fit.headline()
-    assert again.to_dict()["minimax"] == fit.to_dict()["minimax"]
 
 
 def test_doubts_of_lenses_are_read() -> None:

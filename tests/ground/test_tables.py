@@ -16,6 +16,15 @@ TABLE = Table(
 )
 
 
+def test_a_table_of_records() -> None:
+    records = [("a", {"x": 1.5, "seen": True}), ("b", {"x": None, "seen": False})]
+    made = Table.of("t", records, "0=name | 1.x=size of |x| mm .2f | 1.seen=", "1.x=a | b=c .1f")
+    assert made.header == ("name", "size of |x| mm", "", "a | b=c")
+    assert made.plus(("c", 2, "", 2)).cells() == [
+        ["a", "1.50", "yes", "1.5"], ["b", "-", "", "-"], ["c", "2.00", "", "2.0"]
+    ]  # fmt: skip
+
+
 def test_one_number_reads_the_same_everywhere() -> None:
     for text in (TABLE.text(), TABLE.markdown(), TABLE.latex(), TABLE.html()):
         assert "0.123" in text

@@ -47,7 +47,7 @@ from minimax_cal.reporting.html import (
 from minimax_cal.reporting.html.charts import PALETTE
 from minimax_cal.reporting.html.content import label, some
 from minimax_cal.reporting.html.error_charts import box, cumulative, histogram, trend
-from minimax_cal.reporting.html.fit_tables import correlations
+from minimax_cal.reporting.html.more_charts import correlations
 from minimax_cal.reporting.html.page import script_json
 from minimax_cal.reporting.html.projection import flat
 from minimax_cal.reporting.html.scene import inside, magnification, skeleton, space_of

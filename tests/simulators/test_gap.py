@@ -84,18 +84,6 @@ def test_the_corrected_file_reproduces_the_last_rung(arm: Path, gap: SimulatorGa
     assert abs(again.rungs[0].holdout_rms_mm - gap.rungs[-1].holdout_rms_mm) < 1e-3
 
 
-def test_the_file_of_a_gap_reads_back(gap: SimulatorGap, tmp_path: Path) -> None:
-    gap.save(tmp_path / "gap.json")
-    content = json.loads((tmp_path / "gap.json").read_text())
-    assert content["kind"] == "simulator_gap"
-    assert all(rung.keys() >= KEYS for rung in content["rungs"])
-    assert (
-        SimulatorGap.from_dict(json.loads((tmp_path / "gap.json").read_text())).json() == gap.json()
-    )
-    with pytest.raises(mc.CalibrationError, match="is no simulator_gap"):
-        SimulatorGap.from_dict({**content, "kind": "diagnosis"})
-
-
 def test_a_report_tells_that_the_simulator_met_another_arm(arm: Path, gap: SimulatorGap) -> None:
     pytest.importorskip("plotly")
     fit = mc.load_fit(arm / "fit.json")

@@ -5,9 +5,9 @@ order; mean squares tell the instrument's noise, the targets' scatter against ea
 scatter between revisits and the static rest apart.
 """
 
-from minimax_cal.diagnosing.where.answer import Where, triage_table
+from minimax_cal.diagnosing.where.answer import Where
 from minimax_cal.diagnosing.where.locate import where
 from minimax_cal.diagnosing.where.mean_squares import noise_of
 from minimax_cal.diagnosing.where.smooth import joint_equivalent
 
-__all__ = ["Where", "joint_equivalent", "noise_of", "triage_table", "where"]
+__all__ = ["Where", "joint_equivalent", "noise_of", "where"]

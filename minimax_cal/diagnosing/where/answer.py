@@ -3,36 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import number, plain
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.facts import Apart, Fact, Milli, Mm, derived, in_file
+from minimax_cal.ground.files import plain
 
 
 @dataclass(frozen=True, eq=False)
 class TargetGap:
     """Errors of one target.  mean: (3,) in base axes; sight: mean along the line of sight [m]."""
 
-    name: str
+    name: Annotated[str, Fact(key="target")]
     points: int
-    rms: float
-    worst: float
-    mean: Array
-    sight: float
-
-    def to_dict(self) -> dict[str, object]:
-        """For JSON, in millimetres."""
-        return {
-            "target": self.name,
-            "points": self.points,
-            "rms_mm": plain(1e3 * self.rms),
-            "max_mm": plain(1e3 * self.worst),
-            "mean_mm": plain(1e3 * self.mean),
-            "mean_sight_mm": plain(1e3 * self.sight),
-        }
+    rms: Mm
+    worst: Annotated[float, Fact(key="max_mm", scale=1e3)]
+    mean: Milli[Array]
+    sight: Annotated[float, Fact(key="mean_sight_mm", scale=1e3)]
 
 
 @dataclass(frozen=True)
@@ -50,9 +38,9 @@ class JointGap:
         unit = "mm" if self.sliding else "mrad"
         return {
             "joint": self.joint,
-            f"rms_{unit}": plain(1e3 * self.rms),
-            "share": plain(self.share),
-            "p": plain(self.p),
+            f"rms_{unit}": 1e3 * self.rms,
+            "share": self.share,
+            "p": self.p,
         }
 
 
@@ -60,37 +48,11 @@ class JointGap:
 class Region:
     """Errors in one cell of the workspace.  radius, height: its edges [m]."""
 
-    name: str
-    radius: tuple[float, float]
-    height: tuple[float, float]
+    name: Annotated[str, Fact(key="region")]
+    radius: Milli[tuple[float, float]]
+    height: Milli[tuple[float, float]]
     points: int
-    rms: float
-
-    def to_dict(self) -> dict[str, object]:
-        """For JSON, in millimetres."""
-        return {
-            "region": self.name,
-            "radius_mm": [1e3 * edge for edge in self.radius],
-            "height_mm": [1e3 * edge for edge in self.height],
-            "points": self.points,
-            "rms_mm": plain(1e3 * self.rms),
-        }
-
-
-@dataclass(frozen=True)
-class Part:
-    """A part of the mean square: its root per point [m], its share, and p that it is nothing."""
-
-    rms: float
-    share: float
-    p: float
-
-    def to_dict(self) -> dict[str, object]:
-        """For JSON, in millimetres."""
-        return {"rms_mm": plain(1e3 * self.rms), "share": plain(self.share), "p": plain(self.p)}
-
-
-CANNOT_TELL = Part(math.nan, math.nan, math.nan)
+    rms: Mm
 
 
 @dataclass(frozen=True)
@@ -101,10 +63,18 @@ class Trend:
     p: float
 
     def to_dict(self) -> dict[str, object] | None:
-        """For JSON; null where the data hold no such column."""
-        if math.isnan(self.share):
-            return None
-        return {"share": plain(self.share), "p": plain(self.p)}
+        """For JSON; null where the data cannot tell."""
+        return None if math.isnan(self.share) else in_file(self)
+
+
+@dataclass(frozen=True)
+class Part(Trend):
+    """A part of the mean square: its share, p that it is nothing, and its root per point [m]."""
+
+    rms: Mm
+
+
+CANNOT_TELL = Part(math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -121,13 +91,6 @@ class Triage:
     repeat: Part
     pose: Part
 
-    def to_dict(self) -> dict[str, object]:
-        """For JSON; null where the data cannot tell."""
-        return {
-            name: None if math.isnan(part.rms) else part.to_dict()
-            for name, part in vars(self).items()
-        }
-
 
 @dataclass(frozen=True, eq=False)
 class Where:
@@ -140,15 +103,15 @@ class Where:
 
     by_target: tuple[TargetGap, ...]
     by_joint: tuple[JointGap, ...]
-    by_direction: dict[str, float]
-    by_region: tuple[Region, ...]
-    order: Trend
-    temperature: Trend
+    by_direction: Apart[dict[str, float]]
+    by_region: Annotated[tuple[Region, ...], Fact(key="by_region.cells")]
+    order: Annotated[Trend, Fact(key="by_order.clock")]
+    temperature: Annotated[Trend, Fact(key="by_order.temperature")]
     triage: Triage
-    noise: float
-    turn: Array
+    noise: Mm
+    turn: Apart[Array]
 
-    @property
+    @derived(key="by_region.worst")
     def worst_region(self) -> str:
         """The cell with the largest RMS, in words; empty if there are none."""
         if not self.by_region:
@@ -165,37 +128,5 @@ class Where:
 
     def to_dict(self) -> dict[str, object]:
         """For JSON: strictly JSON-able, units in the names, null for what cannot be told."""
-        return {
-            "by_target": [gap.to_dict() for gap in self.by_target],
-            "by_joint": [gap.to_dict() for gap in self.by_joint],
-            "by_direction": {
-                f"{name}_mm": plain(1e3 * rms) for name, rms in self.by_direction.items()
-            },
-            "by_region": {
-                "cells": [cell.to_dict() for cell in self.by_region],
-                "worst": self.worst_region,
-            },
-            "by_order": {
-                "clock": self.order.to_dict(),
-                "temperature": self.temperature.to_dict(),
-            },
-            "triage": self.triage.to_dict(),
-            "noise_mm": plain(1e3 * self.noise),
-        }
-
-
-def triage_table(triage: Mapping[str, Any]) -> Table:
-    """The mean squares, one a row.  triage: as `Triage.to_dict`."""
-    causes = {
-        "noise": "noise, of any origin",
-        "shape": "targets against each other",
-        "repeat": "revisits against each other",
-        "pose": "static model error",
-    }
-    nothing: dict[str, float | None] = {}
-    rows: tuple[tuple[Cell, ...], ...] = tuple(
-        (cause, *(number((triage[kind] or nothing).get(key)) for key in ("rms_mm", "share", "p")))
-        for kind, cause in causes.items()
-    )
-    title = "kind of error; p-values below 0.01 are significant"
-    return Table(title, ("kind", "RMS mm", "share", "p-value"), rows, ("", ".4f", ".3f", ".2g"))
+        directions = {f"{name}_mm": 1e3 * rms for name, rms in self.by_direction.items()}
+        return dict(plain({**in_file(self), "by_direction": directions}))

@@ -63,7 +63,7 @@ def triage(data: Measurements, rest: Residual, noise: float, known: float, dof: 
     static = max(0.0, total - sum(square for square, _ in told.values()))
     told["pose"] = (static, lack_of_fit(rest) if repeat_free >= 1.0 else math.nan)
     whole = max(sum(square for square, _ in told.values()), 1e-300)
-    parts = {name: Part(math.sqrt(ms), ms / whole, p) for name, (ms, p) in told.items()}
+    parts = {name: Part(ms / whole, p, math.sqrt(ms)) for name, (ms, p) in told.items()}
     return Triage(*(parts.get(name, CANNOT_TELL) for name in ("noise", "shape", "repeat", "pose")))
 
 

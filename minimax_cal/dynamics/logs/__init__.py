@@ -66,15 +66,15 @@ class LogFiles:
     def table(self) -> Table:
         """A row a run."""
         told, first = self.to_dict()["runs"], self.runs[0]
-        rows = tuple(
+        rows = (
             (run["name"], run["format"], run["rows"], run["duration_s"], 1.0 / run["step_s"],
              run["columns"][0], first.unit)
             for run in told
         )  # fmt: skip
         total, count = sum(run.duration for run in self.runs), len(told)
         title = f"{count} run{'s' * (count > 1)}, {total:.1f} s, {first.joints} joints"
-        header = ("run", "format", "rows", "s", "rows a second", "first joint", "torque in")
-        return Table(title, header, rows)
+        columns = "run | format | rows | s | rows a second | first joint | torque in"
+        return Table.made(title, rows, columns)
 
     def csv(self) -> str:
         """As CSV of this project."""

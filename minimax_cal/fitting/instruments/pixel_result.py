@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
@@ -16,9 +16,9 @@ from minimax_cal.fitting.pixels.worst import WorstPixels
 from minimax_cal.ground.facts import APART, Fact
 from minimax_cal.ground.records import as_kind
 from minimax_cal.ground.results import merged
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import capitalise
-from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.accuracy import NO_ENDS, Accuracy
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.solvers.status import Status
@@ -54,16 +54,12 @@ class PixelCalibration(RelativeCalibration):
 
     def accuracy_table(self) -> Table:
         """Errors in the image, and at the target, before and after, training and held out."""
-        rows: list[tuple[Cell, ...]] = []
-        for title, key in ACCURACIES:
-            found, (rms_px, max_px) = self.accuracy[key], self.pixels.get(key, (math.nan,) * 2)
-            rows.append((title, found.poses, rms_px, max_px, found.rms_mm, found.max_mm))
-        return Table(
+        return Table.made(
             f"{self.robot.name}: pixels, and the same at the target",
-            ("poses", "count", "RMS px", "max px", "RMS mm", "max mm"),
-            tuple(rows),
-            ("", "d", ".3f", ".3f", ".4f", ".4f"),
-        )
+            [(title, a.poses, *self.pixels.get(key, NO_ENDS), a.rms_mm, a.max_mm)
+             for title, key in ACCURACIES for a in [self.accuracy[key]]],
+            "poses | count d | RMS px .3f | max px .3f | RMS mm .4f | max mm .4f",
+        )  # fmt: skip
 
     def claim_table(self) -> Table:
         """Positions of the arm: what pixels and the drawing know."""
@@ -74,15 +70,15 @@ class PixelCalibration(RelativeCalibration):
             ("calibrated against drawn", 1e3 * self.claim.change),
         )
         title = "positions over the joints' whole range, base and tool fitted"
-        return Table(title, ("arm", "RMS mm"), rows, ("", ".4f"))
+        return Table.made(title, rows, "arm | RMS mm .4f")
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
-        worst = (self.worst.table(),) if self.worst else ()
+        worst = [self.worst.table()] if self.worst else []
         parameters = parameter_table(self.parameters)
         return (self.accuracy_table(), self.claim_table(), *worst, parameters)
 
-    def first_tables(self) -> Sequence[Table]:
+    def first_tables(self) -> tuple[Table, ...]:
         """What stands on the first screen."""
         return (self.accuracy_table().brief(),)
 
@@ -91,9 +87,7 @@ class PixelCalibration(RelativeCalibration):
         before, after, where = self.before_and_after()
         key = "holdout" if self.accuracy["holdout"].poses else "train"
         drawn = {"holdout": "nominal", "train": "nominal_train"}[key]
-        (px_before, _), (px_after, _) = (
-            self.pixels.get(name, (math.nan,) * 2) for name in (drawn, key)
-        )
+        (px_before, _), (px_after, _) = (self.pixels.get(name, NO_ENDS) for name in (drawn, key))
         text = (
             f"Pixels: RMS error {px_before:.3f} px -> {px_after:.3f} px ({before.rms_mm:.3f} mm -> "
             f"{after.rms_mm:.3f} mm at the target), at {where}. That says nothing of the arm's "

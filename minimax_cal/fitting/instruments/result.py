@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Annotated, Any
@@ -17,12 +17,11 @@ from minimax_cal.fitting.instruments.table import INSTRUMENTS, instrument
 from minimax_cal.fitting.intervals import Interval
 from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.facts import APART, Fact, Mm, derived, in_file
+from minimax_cal.ground.facts import APART, Fact, Mm, derived, in_file, scaled
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.records import as_kind, read, reading, stored
 from minimax_cal.ground.results import Result, merged
-from minimax_cal.ground.tables import Cell as TableCell
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
 from minimax_cal.modelling.cell import Cell, cell_from_dict, pose_from_dict
@@ -98,31 +97,23 @@ class Measured:
 
     def scores(self, title: str) -> Table:
         """Accuracy before and after, training and held out."""
-        rows: list[tuple[TableCell, ...]] = []
-        for heading, key in ACCURACIES:
-            a, turned = self.accuracy[key], [1e3 * value for value in self.turns.get(key, ())]
-            rows.append(
-                (heading, a.poses, self.numbers[key], a.rms_mm, a.mean_mm, a.max_mm, *turned)
-            )
-        turns = ("RMS mrad", "max mrad") if self.turns else ()
-        return Table(
-            title,
-            ("poses", "count", "numbers", "RMS mm", "mean mm", "max mm", *turns),
-            tuple(rows),
-            ("", "d", "d", *[".4f"] * (3 + len(turns))),
+        rows = ((heading, self.scored(key)) for heading, key in ACCURACIES)
+        columns = (
+            "0=poses | 1.poses=count d | 1.numbers=numbers d | 1.rms_mm=RMS mm .4f | "
+            "1.mean_mm=mean mm .4f | 1.max_mm=max mm .4f"
         )
+        turns = ("1.rms_mrad=RMS mrad .4f", "1.max_mrad=max mrad .4f") if self.turns else ()
+        return Table.of(title, rows, columns, *turns)
 
     def parts_table(self, title: str) -> Table:
-        """RMS errors part by part, as wire by wire."""
-        rows: tuple[tuple[TableCell, ...], ...] = tuple(
-            (
-                part,
-                *(1e3 * rms(np.linalg.norm(self.errors[key][i], axis=-1)) for _, key in ACCURACIES),
-            )
+        """RMS errors part by part, as wire by wire; empty for a single one."""
+        titles, keys = zip(*ACCURACIES, strict=True)
+        rows = (
+            (part, *(1e3 * rms(np.linalg.norm(self.errors[key][i], axis=-1)) for key in keys))
             for i, part in enumerate(self.parts)
+            if len(self.parts) > 1 and self.errors
         )
-        header = ("RMS mm", *(heading for heading, _ in ACCURACIES))
-        return Table(title, header, rows, ("", *[".4f"] * len(ACCURACIES)))
+        return Table.made(title, rows, "RMS mm", *(f"{each} .4f" for each in titles))
 
     @property
     def frames(self) -> dict[str, Frame]:
@@ -185,16 +176,15 @@ class InstrumentResult(Measured):
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         told = merged(in_file(self), self.measured_beside())
-        ends = [1e3 * self.interval.low, 1e3 * self.interval.high]
-        told["accuracy"]["holdout"]["rms_ci95_mm"] = ends
+        told["accuracy"]["holdout"]["rms_ci95_mm"] = list(scaled(self.interval, 1e3))
         return dict(plain(told))
 
     @staticmethod
     def from_dict(content: Any, at: str) -> InstrumentResult:
         """From `to_dict`.  Raises ValueError."""
         told, apart = stored(InstrumentResult, content, at), Measured.fields_of(content, f"{at}.")
-        low, high = apart["stated"]["holdout"].rms_ci95_mm or NO_ENDS
-        return InstrumentResult(**told, **apart, interval=Interval(1e-3 * low, 1e-3 * high))
+        ends = scaled(apart["stated"]["holdout"].rms_ci95_mm or NO_ENDS, 1e-3)
+        return InstrumentResult(**told, **apart, interval=Interval(*ends))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -248,49 +238,37 @@ class RelativeCalibration(Measured, Result):
 
     def files_table(self) -> Table:
         """Each of several files: held-out RMS before and after, and what it alone determines."""
-        rows: list[tuple[TableCell, ...]] = []
-        for one in self.instruments:
-            before, after, _ = one.before_and_after()
-            ends = (1e3 * one.interval.low, 1e3 * one.interval.high)
-            rows.append((one.name, before.rms_mm, after.rms_mm, *ends, 1e3 * one.noise))
-        header = ("file", "nominal mm", "RMS mm", "95 % from", "to", "noise mm")
-        return Table("each file, RMS", header, tuple(rows), ("", *[".4f"] * 5))
+        rows = (
+            (one.name, before.rms_mm, after.rms_mm, *scaled(one.interval, 1e3), 1e3 * one.noise)
+            for one in self.instruments
+            for before, after, _ in [one.before_and_after()]
+        )
+        columns = "file | nominal mm .4f | RMS mm .4f | 95 % from .4f | to .4f | noise mm .4f"
+        return Table.made("each file, RMS", rows, columns)
 
     def alone_table(self) -> Table:
         """What only one of the files determines."""
-        rows = tuple(
-            (one.name, one.directions_alone, ", ".join(one.alone) or "none")
-            for one in self.instruments
-        )
-        header = ("only by", "directions", "parameters of the arm")
-        return Table("identified by one file alone", header, rows, ("", "d", ""))
+        rows = ((one.name, one.directions_alone, one.alone or "none") for one in self.instruments)
+        columns = "only by | directions d | parameters of the arm"
+        return Table.made("identified by one file alone", rows, columns)
 
-    def first_tables(self) -> Sequence[Table]:
+    def first_tables(self) -> tuple[Table, ...]:
         """What stands on the first screen."""
         first = [self.accuracy_table().brief("poses", "count", "RMS mm", "max mm")]
         if self.instruments:
             first = [self.files_table(), self.alone_table()]
-        return [*first, *self.effect_tables()]
+        return filled(*first, table_of_effects(self.parameters))
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
-        parts = len(self.parts) > 1 and self.errors and not self.instruments
-        own: list[Table] = [self.parts_table(f"by {self.words.part}")] if parts else []
-        own += tables_of(self.frames)
+        first = self.first_tables()
+        if not self.instruments:
+            first = (self.accuracy_table(), *first[1:], self.parts_table(f"by {self.words.part}"))
+        every = [*first, *tables_of(self.frames)]
         for one in self.instruments:
-            own.append(one.scores(f"{one.name}: {one.words.quantity}"))
-            own += tables_of(one.frames)
-            if len(one.parts) > 1 and one.errors:
-                own.append(one.parts_table(f"{one.name}, by {one.words.part}"))
-        first = [self.files_table(), self.alone_table()] if self.instruments else [
-            self.accuracy_table()
-        ]  # fmt: skip
-        geometry = parameter_table(p for p in self.parameters if not p.of_effect)
-        return (*first, *self.effect_tables(), *own, geometry)
-
-    def effect_tables(self) -> tuple[Table, ...]:
-        """The parameters of effects beyond geometry; none without any."""
-        return (table_of_effects(self.parameters),) if self.cell else ()
+            every += [one.scores(f"{one.name}: {one.words.quantity}"), *tables_of(one.frames),
+                      one.parts_table(f"{one.name}, by {one.words.part}")]  # fmt: skip
+        return (*filled(*every), parameter_table(self.parameters))
 
     @property
     def given_open(self) -> str:

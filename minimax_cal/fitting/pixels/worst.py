@@ -152,11 +152,9 @@ class WorstPixels:
 
     def table(self) -> Table:
         """Every function, the heaviest first."""
-        order = np.argsort(-self.multiplier, kind="stable")
-        rows = tuple((self.functions[i], self.size[i], self.multiplier[i]) for i in order)
-        return Table(
-            "what decides the minimax", ("target", "RMS px", "multiplier"), rows, ("", ".4f", ".3f")
-        )
+        every = zip(self.functions, self.size, self.multiplier, strict=True)
+        rows = sorted(every, key=lambda row: -row[2])
+        return Table.made("what decides the minimax", rows, "target | RMS px .4f | multiplier .3f")
 
 
 def fit_worst(

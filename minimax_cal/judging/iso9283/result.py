@@ -14,8 +14,7 @@ from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.facts import Apart, Fact, scaled
 from minimax_cal.ground.results import Result
-from minimax_cal.ground.tables import Cell as TableCell
-from minimax_cal.ground.tables import Table, records_of
+from minimax_cal.ground.tables import Table, filled, records_of
 from minimax_cal.judging.iso9283.formulas import mean_of
 from minimax_cal.judging.iso9283.visits import (
     MAX_PAIRED_POSES,
@@ -94,122 +93,113 @@ class Iso9283(Result):
 
     def position_table(self) -> Table:
         """AP of the TCP."""
-        rows: tuple[tuple[TableCell, ...], ...] = tuple(
+        rows = (
             (title, name, *summary(size), *(1e3 * rms(axis) for axis in values.position.T),
              worst(part.names, size))
             for title, name, part, values in self.rows()
             if np.isfinite(size := millimetres(values.position)).any()
         )  # fmt: skip
-        return Table(
+        return Table.made(
             f"{self.robot}: pose accuracy AP of {self.tcp} (7.2), by the formulas of ISO 9283",
-            ("poses", "cell", "count", "AP mean mm", "RMS mm", "max mm",
-             "AP_x RMS mm", "AP_y RMS mm", "AP_z RMS mm", "worst pose"),
             rows,
-            ("", "", "d", *[".4f"] * 6, ""),
-        )  # fmt: skip
+            "poses | cell | count d | AP mean mm .4f | RMS mm .4f | max mm .4f | AP_x RMS mm .4f | "
+            "AP_y RMS mm .4f | AP_z RMS mm .4f | worst pose",
+        )
 
     def target_table(self) -> Table:
         """AP of each target; empty where there is only one."""
-        rows = tuple(
+        rows = (
             (title, name, target, *summary(millimetres(values.targets[:, i])))
             for title, name, _, values in self.rows()
             for i, target in enumerate(self.target_names)
             if len(self.target_names) > 1
         )
-        header = ("poses", "cell", "target", "count", "AP mean mm", "RMS mm", "max mm")
-        formats = ("", "", "", "d", *[".4f"] * 3)
-        return Table("pose accuracy AP of each target (7.2)", header, rows, formats)
+        columns = "poses | cell | target | count d | AP mean mm .4f | RMS mm .4f | max mm .4f"
+        return Table.made("pose accuracy AP of each target (7.2)", rows, columns)
 
     def orientation_table(self) -> Table:
         """AO and AO'; or why there is none."""
         title = "orientation accuracy (7.2)"
-        rows: tuple[tuple[TableCell, ...], ...] = tuple(
+        rows = [
             (words, name, *summary(1e3 * values.angle),
              *(1e3 * rms(axis) for axis in values.euler.T), part.locked)
             for words, name, part, values in self.rows()
             if np.isfinite(values.angle).any()
-        )  # fmt: skip
+        ]  # fmt: skip
         if not rows:
-            return Table(title, ("poses", "AO"), (("all", NO_TURNS),))
-        return Table(
+            return Table.made(title, [("all", NO_TURNS)], "poses | AO")
+        return Table.made(
             f"{title}: AO', the angle between attained and commanded; AO_a, AO_b, AO_c, Euler "
             f"angles about x, y, z ({LOCKED})",
-            ("poses", "cell", "count", "AO' mean mrad", "RMS mrad", "max mrad",
-             "AO_a RMS mrad", "AO_b RMS mrad", "AO_c RMS mrad", "left out"),
             rows,
-            ("", "", "d", *[".4f"] * 6, "d"),
-        )  # fmt: skip
+            "poses | cell | count d | AO' mean mrad .4f | RMS mrad .4f | max mrad .4f | "
+            "AO_a RMS mrad .4f | AO_b RMS mrad .4f | AO_c RMS mrad .4f | left out d",
+        )
 
     def distance_table(self) -> Table:
         """AD over pairs of poses, and RD where both were visited again."""
-        rows: list[tuple[TableCell, ...]] = []
-        for title, name, part, values in self.rows():
-            kinds = {"all": values.pairs, "consecutive": values.moves, "repeated": values.repeated}
-            for kind, errors in kinds.items():
-                if len(errors):
-                    scatter = part.scatter.distance if kind == "repeated" else np.zeros(0)
-                    most = 1e3 * float(scatter.max()) if len(scatter) else math.nan
-                    mean = 1e3 * float(errors.mean())
-                    rows.append((title, name, kind, *summary(1e3 * abs(errors)), mean, most))
-        return Table(
-            "distance accuracy AD and repeatability RD between poses of one part (7.3)",
-            ("poses", "cell", "pairs", "count", "|AD| mean mm", "RMS mm", "max mm",
-             "AD mean mm", "RD max mm"),
-            tuple(rows),
-            ("", "", "", "d", ".4f", ".4f", ".4f", "+.4f", ".4f"),
+        none = np.zeros(0)
+        rows = (
+            (title, name, kind, *summary(1e3 * abs(errors)), 1e3 * errors.mean(),
+             1e3 * scatter.max() if len(scatter) else None)
+            for title, name, part, values in self.rows()
+            for kind, errors, scatter in (("all", values.pairs, none),
+                                          ("consecutive", values.moves, none),
+                                          ("repeated", values.repeated, part.scatter.distance))
+            if len(errors)
         )  # fmt: skip
+        return Table.made(
+            "distance accuracy AD and repeatability RD between poses of one part (7.3)",
+            rows,
+            "poses | cell | pairs | count d | |AD| mean mm .4f | RMS mm .4f | max mm .4f | "
+            "AD mean mm +.4f | RD max mm .4f",
+        )
 
     def repeat_table(self) -> Table:
         """RP, vAP and RO of each pose that was visited again; empty without any."""
-        rows: list[tuple[TableCell, ...]] = []
-        for key, part in self.parts.items():
-            s = part.scatter
-            sizes = np.column_stack([s.one_way, s.all_ways, s.variation, s.euler, s.angle])
-            for i in np.flatnonzero(np.isfinite(s.all_ways)):
-                counts = int(s.stops[i]), int(s.ways[i])
-                rows.append((str(part.names[i]), PARTS[key], *counts, *(1e3 * sizes[i]).tolist()))
-        return Table(
+        rows = (
+            (part.names[i], PARTS[key], s.stops[i], s.ways[i],
+             *scaled((s.one_way[i], s.all_ways[i], s.variation[i], *s.euler[i], s.angle[i]), 1e3))
+            for key, part in self.parts.items()
+            for s in [part.scatter]
+            for i in np.flatnonzero(np.isfinite(s.all_ways))
+        )  # fmt: skip
+        return Table.made(
             f"pose repeatability (7.2) of {self.tcp}: RP of the worst single way of approach, RP "
             f"over all ways, vAP between ways, RO ({CYCLES} visits each way are due)",
-            ("pose", "poses", "visits", "ways", "RP mm", "RP all mm", "vAP mm",
-             "RO_a mrad", "RO_b mrad", "RO_c mrad", "RO' mrad"),
-            tuple(rows),
-            ("", "", "d", "d", *[".4f"] * 7),
-        )  # fmt: skip
+            rows,
+            "pose | poses | visits d | ways d | RP mm .4f | RP all mm .4f | vAP mm .4f | "
+            "RO_a mrad .4f | RO_b mrad .4f | RO_c mrad .4f | RO' mrad .4f",
+        )
 
     def pose_table(self) -> Table:
         """AP and AO of every pose."""
-        rows: list[tuple[TableCell, ...]] = []
-        for title, name, part, values in self.rows():
-            size = np.linalg.norm(values.position, axis=1)
-            columns = np.column_stack([size, values.position, values.angle, values.euler])
-            for pose, row in zip(part.names, (1e3 * columns).tolist(), strict=True):
-                rows.append((str(pose), title, name, *row))
-        return Table(
-            "every pose",
-            ("pose", "poses", "cell", "AP mm", "AP_x mm", "AP_y mm", "AP_z mm", "AO' mrad",
-             "AO_a mrad", "AO_b mrad", "AO_c mrad"),
-            tuple(rows),
-            ("", "", "", ".4f", *["+.4f"] * 3, ".4f", *["+.4f"] * 3),
+        rows = (
+            (pose, title, name, *row)
+            for title, name, part, v in self.rows()
+            for pose, row in zip(part.names, 1e3 * np.column_stack(
+                [np.linalg.norm(v.position, axis=1), v.position, v.angle, v.euler]
+            ), strict=True)
         )  # fmt: skip
+        return Table.made(
+            "every pose",
+            rows,
+            "pose | poses | cell | AP mm .4f | AP_x mm +.4f | AP_y mm +.4f | AP_z mm +.4f | "
+            "AO' mrad .4f | AO_a mrad +.4f | AO_b mrad +.4f | AO_c mrad +.4f",
+        )
 
     def conditions_table(self) -> Table:
         """What the standard asks of a test, and what these data tell."""
-        header = ("clause", "ISO 9283 asks", "these data")
-        return Table("why this is no test by ISO 9283", header, self.conditions)
+        columns = "clause | asked=ISO 9283 asks | told=these data"
+        return Table.of("why this is no test by ISO 9283", self.conditions, columns)
 
     def tables(self, *, poses: bool = False) -> tuple[Table, ...]:
         """Every table that holds something.  poses: with a row for each pose."""
-        shown = (
-            self.position_table(),
-            self.target_table(),
-            self.orientation_table(),
-            self.distance_table(),
-            self.repeat_table(),
-            *((self.pose_table(),) if poses else ()),
+        return filled(
+            self.position_table(), self.target_table(), self.orientation_table(),
+            self.distance_table(), self.repeat_table(), *([self.pose_table()] if poses else []),
             self.conditions_table(),
-        )
-        return tuple(table for table in shown if table.rows)
+        )  # fmt: skip
 
     def headline(self) -> str:
         """What is judged, and by what."""

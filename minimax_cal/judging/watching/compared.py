@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
-from minimax_cal.ground.facts import Apart, Fact, derived
+from minimax_cal.ground.facts import Apart, Fact, derived, scaled
 from minimax_cal.ground.results import Result
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.units import for_people, in_own_unit
-from minimax_cal.judging.watching.moved import OF_MOVED, Moved, moved_table
+from minimax_cal.judging.watching.moved import FIRST, Moved, moved_table
 from minimax_cal.measuring.accuracy import Accuracy
 
 
@@ -36,11 +36,6 @@ class Difference:
     def sigmas(self) -> float:
         """The same in sigmas."""
         return self.by / self.sigma
-
-    @property
-    def scale(self) -> tuple[float, str]:
-        """As people read it."""
-        return for_people(self.unit)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: lengths in mm, angles in rad."""
@@ -90,9 +85,8 @@ class Comparison(Result):
 
     def first_tables(self) -> tuple[Table, ...]:
         """What changed, by how much; where nothing did, the accuracy on common poses."""
-        if self.changed:
-            return (self.changed_table().brief(*OF_MOVED),)
-        return (self.common_table().brief(),)
+        first = self.changed_table().brief(*FIRST) if self.changed else self.common_table().brief()
+        return (first,)
 
     def changed_table(self) -> Table:
         """The parameters that explain the differences."""
@@ -100,31 +94,24 @@ class Comparison(Result):
 
     def common_table(self) -> Table:
         """The accuracy of both on common poses."""
-        return Table(
+        return Table.of(
             "the same poses; base and reflectors may have moved",
-            ("poses", "count", "A RMS mm", "A max mm", "B RMS mm", "B max mm"),
-            tuple(
-                (where, one.poses, one.rms_mm, one.max_mm, other.rms_mm, other.max_mm)
-                for where, one, other in self.accuracy
-            ),
-            ("", "d", *[".4f"] * 4),
+            self.accuracy,
+            "poses | a.poses=count d | a.rms_mm=A RMS mm .4f | a.max_mm=A max mm .4f | "
+            "b.rms_mm=B RMS mm .4f | b.max_mm=B max mm .4f",
         )
 
     def tables(self) -> tuple[Table, ...]:
         """Which joints changed, accuracy on common poses, every parameter."""
-        each = Table(
-            f"A: {self.names[0]}, B: {self.names[1]}",
-            ("parameter", "unit", "A", "B", "B - A", "sigma", "in sigmas", "not compared because"),
-            tuple(
-                (d.parameter, d.scale[1], d.scale[0] * d.a, d.scale[0] * d.b, d.scale[0] * d.by,
-                 d.scale[0] * d.sigma, d.sigmas, d.reason)
-                for d in self.differences
-            ),
-            ("", "", ".4f", ".4f", "+.4f", ".2g", "+.1f", ""),
-        )  # fmt: skip
-        return tuple(
-            table for table in (self.changed_table(), self.common_table(), each) if table.rows
+        rows = (
+            (d.parameter, unit, *scaled((d.a, d.b, d.by, d.sigma), scale), d.sigmas, d.reason)
+            for d in self.differences
+            for scale, unit in [for_people(d.unit)]
         )
+        columns = "parameter | unit | A .4f | B .4f | B - A +.4f | sigma .2g | in sigmas +.1f"
+        title = f"A: {self.names[0]}, B: {self.names[1]}"
+        each = Table.made(title, rows, columns, "not compared because")
+        return filled(self.changed_table(), self.common_table(), each)
 
     def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """The names."""

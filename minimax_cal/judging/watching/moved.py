@@ -35,6 +35,7 @@ CLEARER = 9.0  # by how much a link must explain more than a zero position, in s
 LIKEWISE = 6.6  # rivals lose less than this, in squared sigmas: the 99 % point of one
 OF_POWER = 1.645  # sigmas that a normal variable falls short of in 5 of 100 cases
 NOTHING = np.zeros(0, dtype=int)
+FIRST = ("parameter", "by", "unit", "sigma", "p-value", "or as well")  # on a first screen
 MAX_MOVED = 4  # parameters that are named; where more moved, the arm wants a calibration
 
 
@@ -59,21 +60,15 @@ class Moved:
         return in_own_unit(self, "by", "sigma")
 
 
-OF_MOVED = ("parameter", "by", "unit", "sigma", "p-value", "or as well")  # on a first screen
-
-
 def moved_table(title: str, moved: Sequence[Moved]) -> Table:
     """What moved, in mm and mrad."""
-    return Table(
-        title,
-        ("parameter", "joint", "unit", "by", "sigma", "p-value", "or as well"),
-        tuple(
-            (m.parameter, m.joint, for_people(m.unit)[1], 1e3 * m.by, 1e3 * m.sigma, m.p_value,
-             ", ".join(m.others))
-            for m in moved
-        ),
-        ("", "", "", "+.4f", ".2g", ".2g", ""),
-    )  # fmt: skip
+    rows = (
+        (m.parameter, m.joint, unit, scale * m.by, scale * m.sigma, m.p_value, m.others)
+        for m in moved
+        for scale, unit in [for_people(m.unit)]
+    )
+    columns = "parameter | joint | unit | by +.4f | sigma .2g | p-value .2g | or as well"
+    return Table.made(title, rows, columns)
 
 
 def joint_of(parameter: str) -> str:

@@ -12,10 +12,10 @@ from minimax_cal.fitting.set_aside import aside_sentence
 from minimax_cal.ground.facts import Apart, Fact, derived
 from minimax_cal.ground.files import json_text, write_whole
 from minimax_cal.ground.results import Result
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.units import in_files
 from minimax_cal.judging.tolerance import KINDS
-from minimax_cal.judging.watching.moved import OF_MOVED, Moved, moved_table
+from minimax_cal.judging.watching.moved import FIRST, Moved, moved_table
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.solvers.status import Status
@@ -123,38 +123,34 @@ class Health(Result):
     def first_tables(self) -> tuple[Table, ...]:
         """What moved, by how much; where nothing did, what was required."""
         if self.moved:
-            return (moved_table("moved since the calibration", self.moved).brief(*OF_MOVED),)
-        table = self.required_table()
-        return (table.brief(*table.header[:-1]),)
+            return (self.moved_table().brief(*FIRST),)
+        return (self.required_table().only(*range(6)).brief(),)
 
     def required_table(self) -> Table:
         """What was required, and what was seen."""
-        return Table(
-            f"required of {self.robot}; base and reflectors fitted to {self.poses} poses",
-            ("error", "at most mm", "seen mm", "95 % from", "to", "verdict", "confidence %"),
-            tuple(
-                (KINDS[v.kind], v.limit_mm, v.value_mm, *v.ends_mm, WORDS[v.valid],
-                 100 * v.confidence)
-                for v in self.verdicts
-            ),
-            ("", "g", ".4f", ".4f", ".4f", "", ".1f"),
-        )  # fmt: skip
+        rows = (
+            (KINDS[v.kind], v.limit_mm, v.value_mm, *v.ends_mm, WORDS[v.valid], 100 * v.confidence)
+            for v in self.verdicts
+        )
+        title = f"required of {self.robot}; base and reflectors fitted to {self.poses} poses"
+        columns = "error | at most mm g | seen mm .4f | 95 % from .4f | to .4f | verdict"
+        return Table.made(title, rows, columns, "confidence % .1f")
+
+    def moved_table(self) -> Table:
+        """What moved."""
+        return moved_table("moved since the calibration", self.moved)
 
     def tables(self) -> tuple[Table, ...]:
         """What was required, what moved, what could have been found."""
-        moved = moved_table("moved since the calibration", self.moved)
-        found = Table(
-            "smallest shift that these poses find in 95 of 100 cases",
-            ("zero position", "unit", "shift"),
-            tuple(
-                (name, "mm" if name in self.sliding else "mrad", 1e3 * size)
-                for name, size in self.findable.items()
-            ),
-            ("", "", ".3f"),
+        rows = (
+            (name, "mm" if name in self.sliding else "mrad", 1e3 * size)
+            for name, size in self.findable.items()
         )
-        header = ("zero position", "looks like", "measure")
-        hidden = Table("joints that these data cannot check", header, self.hidden)
-        return tuple(table for table in (self.required_table(), moved, found, hidden) if table.rows)
+        title = "smallest shift that these poses find in 95 of 100 cases"
+        found = Table.made(title, rows, "zero position | unit | shift .3f")
+        columns = "parameter=zero position | like=looks like | needs=measure"
+        hidden = Table.of("joints that these data cannot check", self.hidden, columns)
+        return filled(self.required_table(), self.moved_table(), found, hidden)
 
     def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """Accuracy, and what could be found: lengths in mm, angles in rad."""

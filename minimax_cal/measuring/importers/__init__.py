@@ -13,11 +13,11 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.files import write_whole
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.importers import cmm, headed, programs
 from minimax_cal.measuring.importers import columns as mapped
-from minimax_cal.measuring.importers.assemble import Assembly, Meaning, assemble
+from minimax_cal.measuring.importers.assemble import Assembly, assemble
 from minimax_cal.measuring.importers.reading import Given, Reading
 from minimax_cal.measuring.importers.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
 from minimax_cal.measuring.importers.words import ANGLES, LENGTHS, TEMPERATURES, TIMES
@@ -46,26 +46,20 @@ class Imported:
 
     def files(self) -> Table:
         """A row for each file."""
-        rows = tuple(
-            (
-                str(r.sheet.path),
-                r.format,
-                DELIMITERS.get(r.sheet.delimiter, "-"),
-                DECIMALS.get(r.sheet.decimal, "-"),
-                r.sheet.encoding,
-                len(r.line),
-                how,
-            )
+        rows = (
+            (s.path, r.format, DELIMITERS.get(s.delimiter, "-"), DECIMALS.get(s.decimal, "-"),
+             s.encoding, len(r.line), how)
             for r, how in zip(self.assembly.readings, self.assembly.matched, strict=True)
-        )
-        header = ("file", "format", "delimiter", "decimal", "encoding", "rows", "matched by")
-        return Table("files", header, rows)
+            for s in [r.sheet]
+        )  # fmt: skip
+        columns = "file | format | delimiter | decimal | encoding | rows | matched by"
+        return Table.made("files", rows, columns)
 
     def columns(self) -> tuple[Table, ...]:
         """A table for each file: its columns."""
-        header = ("column", "meaning", "unit", "known by", "first row, SI")
+        columns = "column.name=column | meaning | unit | known=known by | first=first row, SI"
         return tuple(
-            Table(str(r.sheet.path), header, tuple(map(row_of, meanings)))
+            Table.of(str(r.sheet.path), meanings, columns)
             for r, meanings in zip(self.assembly.readings, self.assembly.meanings, strict=True)
         )
 
@@ -73,7 +67,7 @@ class Imported:
         """The first rows as they were understood, and the last: a column each."""
         data = self.data
         some = sorted({*range(min(rows, data.poses)), data.poses - 1})
-        lines: list[tuple[Cell, ...]] = []
+        lines: list[tuple[object, ...]] = []
         for i, slides in enumerate(data.sliding):
             factor, unit = (1e3, "mm") if slides else (180.0 / np.pi, "deg")
             lines.append((f"joint {i + 1}", unit, *(factor * data.q[row, i] for row in some)))
@@ -84,9 +78,8 @@ class Imported:
                 lines.append((f"{name} {'xyz'[axis]}", "mm", *shown))
         for name, column in data.columns.items():
             lines.append((name, "", *(str(column[row]) for row in some)))
-        header = ("", "unit", *(f"line {data.line[row]}" for row in some))
-        formats = ("", "", *[".4f"] * len(some))
-        return Table("rows as understood", header, tuple(lines), formats)
+        heads = (f"line {data.line[row]} .4f" for row in some)
+        return Table.made("rows as understood", lines, " | unit", *heads)
 
     def headline(self) -> str:
         """What came out, in a line."""
@@ -123,12 +116,6 @@ class Imported:
             "set_aside": self.data.set_aside,
             "notices": self.notices,
         }
-
-
-def row_of(meaning: Meaning) -> tuple[str, ...]:
-    """A column as a row of the table."""
-    column = meaning.column
-    return (column.name, meaning.meaning, meaning.unit, meaning.known, meaning.first)
 
 
 def units_of(texts: Sequence[str]) -> dict[str, str]:

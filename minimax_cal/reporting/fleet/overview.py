@@ -49,13 +49,9 @@ class Fleet(Result):
 
     def table(self) -> Table:
         """A row a cell."""
-        return Table.of(f"cells of {self.source}", self.rows, "cell", "robot", "work",
-                        "end=verdict", "before_mm=before RMS mm .3f", "rms_mm=RMS mm .3f",
-                        "max_mm=max mm .3f", "changed", "why")  # fmt: skip
-
-    def tables(self) -> tuple[Table, ...]:
-        """A row a cell."""
-        return (self.table(),)
+        return Table.of(f"cells of {self.source}", self.rows, "cell | robot | work | end=verdict | "
+                        "before_mm=before RMS mm .3f | rms_mm=RMS mm .3f | max_mm=max mm .3f | "
+                        "changed | why")  # fmt: skip
 
     def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """How many cells, and how many failed."""

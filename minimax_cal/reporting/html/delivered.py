@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from minimax_cal.correcting.deliverable import COMPENSATED, Delivered, deliver
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.judging.tolerance import (
     NOT_PASSED,
     NOT_STATED,
@@ -141,25 +141,14 @@ def delivered_table(rows: Sequence[Row]) -> Table:
     """What each carries and reaches, beside the full model."""
     whole = rows[0].delivered
     every = (*whole.carries, *whole.not_carried)
-    shown: list[tuple[Cell, ...]] = [
-        (
-            "full model (no file has it)",
-            name_kinds(every),
-            "",
-            whole.whole.rms,
-            whole.whole.largest,
-            whole.whole.worst,
-            "",
-        )
-    ]
-    shown += [
-        (row.name, name_kinds(row.delivered.carries),
-         name_kinds(row.delivered.not_carried),
-         row.delivered.figures.rms, row.delivered.figures.largest, row.delivered.figures.worst,
-         row.verdict)
-        for row in rows
-    ]  # fmt: skip
-    header = ("delivered as", "includes", "leaves out", "inside, RMS mm", "inside, largest mm",
-              "outside, worst RMS mm", "verdict")  # fmt: skip
-    title = "Files and corrected targets, each fitted for exactly the effects that it includes"
-    return Table(title, header, tuple(shown), ("", "", "", ".3f", ".3f", ".3f", ""))
+    parts = [("full model (no file has it)", every, every[:0], whole.whole, "")]
+    for row in rows:
+        own = row.delivered
+        parts.append((row.name, own.carries, own.not_carried, own.figures, row.verdict))
+    return Table.made(
+        "Files and corrected targets, each fitted for exactly the effects that it includes",
+        [(name, name_kinds(held), name_kinds(rest), of.rms, of.largest, of.worst, verdict)
+         for name, held, rest, of, verdict in parts],
+        "delivered as | includes | leaves out | inside, RMS mm .3f | inside, largest mm .3f | "
+        "outside, worst RMS mm .3f | verdict",
+    )  # fmt: skip

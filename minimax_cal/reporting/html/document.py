@@ -6,22 +6,23 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
+from typing import Any
 
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.instruments import RelativeCalibration
 from minimax_cal.fitting.opened import RELATIVE
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import visible
 from minimax_cal.judging.tolerance import Limit
 from minimax_cal.reporting.html import fit_sections, gap_sections, simulator_section
 from minimax_cal.reporting.html.content import Block, Blocks, Note, Report, Section, text
 from minimax_cal.reporting.html.facts import told_facts
 from minimax_cal.reporting.html.first_page import Signed, page_blocks, signed
-from minimax_cal.reporting.html.fit_tables import settings_table
 from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.reporting.html.verdict import gap_verdict
 
+FILES, PACKAGES = "what | file | SHA-256", "package | version"  # columns of tables
 HEX = re.compile(r"[0-9a-f]{64}")
 FOLDERS = re.compile(r"(?:[A-Za-z]:)?[^,]*[/\\](?=[^/\\,]+\.[A-Za-z]\w*(?:,|$))")  # before a file
 
@@ -144,28 +145,36 @@ def named(sources: Sources) -> list[tuple[str, Fit | Diagnosis | RelativeCalibra
 
 def provenance_section(sources: Sources) -> Section:
     """Files, settings, versions and notices: what it takes to have the numbers again."""
-    files: list[tuple[str, str, str]] = []
+    files: dict[tuple[str, str, str], None] = {}
     settings: list[Table] = []
     notices: list[Block] = []
     for kind, result in named(sources):
-        files += [(f.kind, file_name(f.path), f.digest) for f in sources.files if f.kind == kind]
         told = result.provenance
-        if (
-            row := ("measurements", file_name(told.data), told.data_sha256 or "not recorded")
-        ) not in files:
-            files.append(row)
-        settings.append(settings_table(f"Settings of the {kind}", told.settings))
-        settings.append(Table(f"Versions used by the {kind}", ("package", "version"),
-                              tuple(told.versions.items())))  # fmt: skip
+        own = [(f.kind, file_name(f.path), f.digest) for f in sources.files if f.kind == kind]
+        data = ("measurements", file_name(told.data), told.data_sha256 or "not recorded")
+        files |= dict.fromkeys([*own, data])
+        rows = [(name, words(value)) for name, value in told.settings.items()]
+        settings.append(Table.made(f"Settings of the {kind}", rows, "setting | value"))
+        versions = told.versions.items()
+        settings.append(Table.made(f"Versions used by the {kind}", versions, PACKAGES))
         notices += [Note(f"{kind}: {notice}", "notice") for notice in result.notices]
-    made = (("minimax-cal", version("minimax-cal")), ("plotly", version("plotly")))
-    settings.append(Table("This report was made by", ("package", "version"), made))
-    return Section(
-        "provenance",
-        "Provenance",
-        (
-            Table("Files", ("what", "file", "SHA-256"), tuple(files)),
-            *(table for table in settings if table.rows),
-            *(notices or [text("The programs gave no notices.")]),
-        ),
-    )
+    notices = notices or [text("The programs gave no notices.")]
+    every = (Table.made("Files", files, FILES), *filled(*settings), made_by(), *notices)
+    return Section("provenance", "Provenance", every)
+
+
+def made_by() -> Table:
+    """The programs that made a report."""
+    rows = ((name, version(name)) for name in ("minimax-cal", "plotly"))
+    return Table.made("This report was made by", rows, PACKAGES)
+
+
+def words(value: Any) -> str:
+    """A setting as text."""
+    if value is None:
+        return "default"
+    if isinstance(value, list):
+        return ", ".join(map(str, value)) or "none"
+    if isinstance(value, dict):
+        return ", ".join(f"{key} = {part}" for key, part in value.items()) or "none"
+    return str(value)

@@ -16,7 +16,7 @@ from minimax_cal.fitting.crossed import intervals_of
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.same_arm import wild
 from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import capitalise
 from minimax_cal.judging.tolerance import (
     KINDS,
@@ -313,7 +313,7 @@ def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
 def result_table(sources: Sources, found: Signed) -> Table:
     """Before, result, its 95 % limit, what is required, verdict."""
     named = {(one.bound, one.limit.kind): one for one in found.judged}
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[tuple[object, ...]] = []
     for claim in found.claims:
         if claim.name == "outside" and claim.reason:
             continue
@@ -321,23 +321,24 @@ def result_table(sources: Sources, found: Signed) -> Table:
         for i, kind in enumerate(KINDS):
             bound = claim.bound(kind)
             one = named.get((bound, kind))
-            asked = one.limit.size_mm if one else math.nan
             which = f" ({claim.sets[i]})" if claim.sets[i] else ""
-            rows.append((f"{KINDS[kind]}, {title}{which}", claim.before[i], bound.value, bound.high,
-                         asked, one.verdict if one else ""))  # fmt: skip
-    if found.with_them:
-        for i, kind in enumerate(KINDS):
-            bound = found.with_them.bound(kind)
-            title = f"{KINDS[kind]}, inside, with {len(found.set_aside)} points set aside"
-            before = found.with_them.before[i]
-            rows.append((title, before, bound.value, bound.high, math.nan, ""))
+            asked = (one.limit.size_mm, one.verdict) if one else (None, "")
+            size = claim.before[i], bound.value, bound.high
+            rows.append((f"{KINDS[kind]}, {title}{which}", *size, *asked))
+    if (all_of := found.with_them) is not None:
+        rows += [
+            (f"{name}, inside, with {len(found.set_aside)} points set aside", before, bound.value,
+             bound.high, None, "")
+            for (kind, name), before in zip(KINDS.items(), all_of.before, strict=True)
+            for bound in [all_of.bound(kind)]
+        ]  # fmt: skip
     rows += iso_rows(sources.fit) if sources.fit else ()
-    header = ("error of position (on poses)", "before mm", "result mm", "95 % limit mm",
-              "required mm", "verdict")  # fmt: skip
-    return Table(f"Model: {found.model}", header, tuple(rows), ("", *[".3f"] * 3, ".3g", ""))
+    columns = "before mm .3f | result mm .3f | 95 % limit mm .3f | required mm .3g | verdict"
+    head = f"error of position (on poses) | {columns}"
+    return Table.made(f"Model: {found.model}", rows, head)
 
 
-def iso_rows(fit: Fit) -> list[tuple[Cell, ...]]:
+def iso_rows(fit: Fit) -> list[tuple[object, ...]]:
     """Mean and largest AP of held-out poses by the formulas of ISO 9283, where they can be had."""
     from minimax_cal.judging.standard import iso9283
 
@@ -350,7 +351,7 @@ def iso_rows(fit: Fit) -> list[tuple[Cell, ...]]:
         return []
     return [
         (f"AP of ISO 9283, {name} ({np.isfinite(sizes[1]).sum()} held out)",
-         *(float(take(size)) for size in sizes), math.nan, math.nan, "")
+         *map(take, sizes), None, None, "")
         for name, take in (("mean", np.nanmean), ("largest", np.nanmax))
     ]  # fmt: skip
 

@@ -6,9 +6,11 @@ import numpy as np
 
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.suspects import table_of
+from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.errors import CalibrationError
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, filled
 from minimax_cal.judging.iso9283 import iso9283
+from minimax_cal.modelling.effects.words import name_parameter
 from minimax_cal.modelling.frames import tables_of
 from minimax_cal.reporting.html.content import Block, Blocks, caveat, missing, text
 from minimax_cal.reporting.html.error_charts import (
@@ -19,26 +21,15 @@ from minimax_cal.reporting.html.error_charts import (
     histogram,
     over_time,
 )
-from minimax_cal.reporting.html.fit_tables import (
-    correlation_table,
-    cost_table,
-    distance_table,
-    glance_table,
-    iteration_table,
-)
-from minimax_cal.reporting.html.more_charts import correlation_map, iterations
+from minimax_cal.reporting.html.more_charts import correlation_map, correlations, iterations
 from minimax_cal.reporting.html.scene import workspace
 from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.reporting.html.verdict import fit_verdict, why_not
 
 SAME = 1e-6  # a file's own errors come back to this, or its effects need other columns [m]
 MOST_SUSPECTS = 50
+STRONG, MOST_ROWS = 0.5, 12  # correlations that have a row of their own, and how many
 NO_POSES = "The file holds no poses, so that nothing can be drawn; write it again with its poses."
-
-
-def filled(*tables: Table) -> tuple[Table, ...]:
-    """The tables that have rows."""
-    return tuple(table for table in tables if table.rows)
 
 
 def names_of(sources: Sources) -> Names:
@@ -69,6 +60,26 @@ def accuracy(sources: Sources) -> Blocks:
     else:
         blocks.append(missing(NO_POSES))
     return blocks
+
+
+def glance_table(sources: Sources) -> Table:
+    """The numbers that matter, held-out ones first."""
+    pairs = []
+    if sources.fit:
+        a = sources.fit.accuracy
+        pairs = [(a["nominal"], a["holdout"]), (a["nominal_train"], a["train"])]
+    elif sources.gap:
+        first, last = sources.gap.ladder[1], sources.gap.ladder[-1]
+        pairs = [(first.holdout, last.holdout), (first.train, last.train)]
+    rows = (
+        (f"{poses} poses, {what}", size := getattr(one, key), left := getattr(other, key),
+         100.0 * (left / size - 1.0) if size else None)
+        for poses, (one, other) in zip(("held-out", "training"), pairs, strict=False)
+        for what, key in (("RMS", "rms_mm"), ("largest", "max_mm"))
+        if other.poses
+    )  # fmt: skip
+    heads = (f"{name} mm .3f" for name in names_of(sources))
+    return Table.made("At a glance", rows, "position error", *heads, "change % +.0f")
 
 
 def parts_accuracy(sources: Sources) -> Blocks:
@@ -135,6 +146,20 @@ def correlated(fit: Fit) -> Blocks:
     return [correlation_map(fit.uncertainty), *table, note]
 
 
+def correlation_table(known: Uncertainty) -> Table:
+    """The pairs of parameters that these poses tell apart worst."""
+    codes, found = correlations(known)
+    names = [name_parameter(code) for code in codes]
+    one, other = np.triu_indices(len(found), 1)
+    size = np.abs(found[one, other])
+    rows = (
+        (names[one[i]], names[other[i]], found[one[i], other[i]])
+        for i in np.argsort(-np.nan_to_num(size), kind="stable")[:MOST_ROWS]
+        if size[i] >= STRONG
+    )
+    return Table.made("Strongest correlations", rows, "parameter | with | correlation +.3f")
+
+
 def solution(fit: Fit) -> Blocks:
     """How the numbers came about."""
     blocks: list[Block] = [
@@ -145,9 +170,18 @@ def solution(fit: Fit) -> Blocks:
     ]
     if fit.trace or fit.minimax:
         blocks.append(iterations(fit))
-    blocks += filled(cost_table(fit))
+    costs = ((i, 1e6 * cost) for i, cost in enumerate(fit.trace))
+    blocks += filled(Table.made("Least squares", costs, "iterate d | cost mm^2 .6g"))
     if worst := fit.minimax:
-        blocks += filled(iteration_table(worst), worst.table(), distance_table(worst))
+        blocks += filled(
+            Table.of("Steps of the minimax", worst.trace,
+                     "iteration d | value=worst, of the start's .8f | violation .1e | "
+                     "kkt=KKT residual .1e | length=step length .3g | backend=QP backend"),
+            worst.table(),
+            Table.of("Distances between targets, kept as measured", worst.distances,
+                     "between=pair | measured=measured mm .4f | tolerance=tolerance mm .4f | "
+                     "multiplier .4g"),
+        )  # fmt: skip
         ends = ", ".join(f"{name} {value:.1e}" for name, value in vars(worst.kkt).items())
         blocks.append(text(f"Conditions of optimality (Karush-Kuhn-Tucker) at the end: {ends}."))
     else:

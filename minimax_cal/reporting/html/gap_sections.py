@@ -7,6 +7,7 @@ import math
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.diagnosing.sentences import closed_words
 from minimax_cal.ground.records import reading
+from minimax_cal.ground.tables import filled
 from minimax_cal.reporting.html.content import Block, Blocks, missing, text
 from minimax_cal.reporting.html.more_charts import curve_chart, waterfall
 from minimax_cal.reporting.html.sources import Sources
@@ -17,8 +18,8 @@ CURVES = ("residual", "order")
 
 def gap_steps(gap: Diagnosis) -> Blocks:
     """How far the gap closes, rung by rung."""
-    left = remainder_table(gap)
-    return [waterfall(gap), gap.ladder_table(), text(closing(gap)), *([left] if left.rows else [])]
+    left = filled(remainder_table(gap))
+    return [waterfall(gap), gap.ladder_table(), text(closing(gap)), *left]
 
 
 def closing(gap: Diagnosis) -> str:
@@ -48,14 +49,14 @@ def causes(sources: Sources) -> Blocks:
     blocks += [curve_chart(k, gap.curves[k], gap.held) for k in CURVES if k in gap.curves]
     rivals = gap.rival_table()
     if rivals.rows:
-        blocks.append(rivals)
-        blocks.append(
+        blocks += [
+            rivals,
             text(
                 "Similarity: the fraction of the effect's motion that the alternative reproduces. "
                 "Power: how well these data distinguish the two. A measurement is proposed where "
                 "one helps."
-            )
-        )
+            ),
+        ]
     elif gap.effects:
         blocks.append(text("No alternative explains the effects as well; no further measurement is "
                            "needed to distinguish them."))  # fmt: skip
@@ -66,9 +67,8 @@ def causes(sources: Sources) -> Blocks:
 
 def untestable(gap: Diagnosis) -> Blocks:
     """What is neither found nor excluded."""
-    table = gap.untestable_table()
     note = missing("Every effect of the library could be tested with these data.")
-    return [table if table.rows else note]
+    return filled(gap.untestable_table()) or [note]
 
 
 def places(gap: Diagnosis) -> Blocks:

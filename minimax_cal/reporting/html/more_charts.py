@@ -29,7 +29,6 @@ from minimax_cal.reporting.html.charts import (
 )
 from minimax_cal.reporting.html.content import Figure, label, plain, some
 from minimax_cal.reporting.html.error_charts import panel_axes
-from minimax_cal.reporting.html.fit_tables import correlations
 
 LOWEST = 1e-18  # what a logarithmic axis shows of zero
 STRETCH = 2.0  # an axis that a few points stretch more than this is cut
@@ -68,6 +67,13 @@ def iterations(fit: Fit) -> Figure:
 
 
 MOST_LABELS = 24  # of a side of the map of correlations
+
+
+def correlations(known: Uncertainty) -> tuple[tuple[str, ...], Array]:
+    """Names of the identified parameters, and their correlations; NaN without a variance."""
+    place = np.flatnonzero(known.active)
+    names = tuple(known.names.all[i] for i in place)
+    return names, known.correlation[np.ix_(place, place)]
 
 
 def correlation_map(known: Uncertainty) -> Figure:

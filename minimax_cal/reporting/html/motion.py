@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from minimax_cal.dynamics.result import WORDS, MotionDiagnosis, table_by_joint
+from minimax_cal.dynamics.result import WORDS, MotionDiagnosis
 from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import visible
 from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.reporting.html.charts import (
@@ -37,7 +36,7 @@ from minimax_cal.reporting.html.content import (
     plain,
     text,
 )
-from minimax_cal.reporting.html.document import Wording, signers
+from minimax_cal.reporting.html.document import FILES, Wording, made_by, signers
 from minimax_cal.reporting.html.facts import told_facts
 from minimax_cal.reporting.html.sources import File, Result, content_of
 
@@ -116,9 +115,8 @@ def verdict_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
 
 def budget_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
     """Tables of all rows and of moving ones, and how both fall."""
-    moving = [(step.name, step.holdout_rms_moving) for step in found.budget]
-    title = f"Held-out RMS torque [{found.unit}], moving rows ({found.held_out})"
-    return budget_figure(found), found.budget_table(), table_by_joint(title, "step", moving)
+    moving = found.budget_table("moving", "holdout_rms_moving")
+    return budget_figure(found), found.budget_table(), moving
 
 
 def budget_figure(found: MotionDiagnosis) -> Figure:
@@ -145,14 +143,13 @@ def effect_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
     """Effects with their values, and what else they could be."""
     if not found.effects:
         return (text("No effect is shown by these logs."),)
-    rows = tuple(
+    rows = (
         (one.words, f"{WORDS[a.effect]} {name_place(a.place)}", a.rho2, a.separate_with)
         for one in found.effects
         for a in one.alternatives
     )
-    header = ("effect", "could be", "similarity", "what tells them apart")
-    others = [Table("Alternatives", header, rows, ("", "", ".2f", ""))] if rows else []
-    return (found.effects_table(), *others)
+    columns = "effect | could be | similarity .2f | what tells them apart"
+    return filled(found.effects_table(), Table.made("Alternatives", rows, columns))
 
 
 def joint_figures(found: MotionDiagnosis) -> tuple[Block, ...]:
@@ -203,17 +200,12 @@ def untestable_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
     """What these logs cannot tell, and the run that would."""
     if not found.not_testable:
         return (text("These logs test every effect."),)
-    rows = tuple((WORDS[one.effect], one.place, one.needs) for one in found.not_testable)
+    rows = ((WORDS[one.effect], one.place, one.needs) for one in found.not_testable)
     notes = [caveat(f"Too little motion: {one}.") for one in found.too_little]
-    return (*notes, Table("Not testable", ("effect", "at", "what would tell"), rows))
+    return (*notes, Table.made("Not testable", rows, "effect | at | what would tell"))
 
 
 def provenance_blocks(source: MotionSource) -> tuple[Block, ...]:
     """The file and the programs."""
-    one = source.file
-    made = (("minimax-cal", version("minimax-cal")), ("plotly", version("plotly")))
-    return (
-        Table("Files", ("what", "file", "SHA-256"),
-              (("motion diagnosis", visible(one.path), one.digest),)),
-        Table("This report was made by", ("package", "version"), made),
-    )  # fmt: skip
+    row = ("motion diagnosis", visible(source.file.path), source.file.digest)
+    return Table.made("Files", [row], FILES), made_by()

@@ -30,8 +30,8 @@ def blocks(sources: Sources) -> Blocks:
 
 def motion_blocks(gap: MotionGap) -> Blocks:
     """How far the model moves as the arm does, and what it could not hold."""
-    out: list[Block] = [gap.table(), text(gap.headline())]
-    out += [gap.tracking_table()] if gap.rungs[0].tracking_rms_mrad else []
+    first, *driven = gap.tables()
+    out: list[Block] = [first, text(gap.headline()), *driven]
     out += [text(f"{said[0].upper()}{said[1:]}.") for said in gap.sentences()]
     if gap.written:
         out.append(text(f"The corrected model is {gap.written}."))

@@ -119,15 +119,10 @@ class MotionGap(Result):
     def table(self) -> Table:
         """RMS torque of each joint, rung by rung."""
         title = f"RMS torque [{self.unit}] while moving, held out ({', '.join(self.held_out)})"
-        rows = [(rung.name, rung.torque_rms_moving) for rung in self.rungs]
-        return table_by_joint(title, "model", rows)
+        return table_by_joint(title, "model", self.rungs, "torque_rms_moving")
 
     def tables(self) -> tuple[Table, ...]:
         """Torques, and joint errors where drives moved the arm."""
-        return (self.table(), *((self.tracking_table(),) if self.drives else ()))
-
-    def tracking_table(self) -> Table:
-        """RMS joint error under the drives, rung by rung."""
         title = f"RMS joint error [mrad] under {self.drives}"
-        rows = [(rung.name, rung.tracking_rms_mrad) for rung in self.rungs]
-        return table_by_joint(title, "model", rows)
+        driven = table_by_joint(title, "model", self.rungs, "tracking_rms_mrad")
+        return (self.table(), driven) if self.drives else (self.table(),)
