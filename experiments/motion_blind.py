@@ -164,8 +164,8 @@ def oracle(made: Made, truth: tuple[Name, ...]) -> tuple[float, float]:
     friction taken out; where masses are the cause, usual friction alone.
     """
     logs = prepare(made.runs)
-    arm = Arm.of(made.robot, np.ones(made.robot.joints), np.full(made.robot.joints, RATIO),
-                 MotionKnown(payload=made.payload).load, logs)  # fmt: skip
+    ones = np.ones(made.robot.joints)
+    arm = Arm.of(made.robot, ones, RATIO * ones, MotionKnown(made.payload).load, logs)
     scene = Scene.of(arm, logs)
     columns = Columns(first_body(Columns(scene)).in_scene(scene))
     kept = logs.fitted.T

@@ -28,7 +28,7 @@ from minimax_cal.ground.files import json_text, plain
 from minimax_cal.ground.options import Option
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.columns import rows_in
-from minimax_cal.measuring.importers import Imported, csv_of, import_files
+from minimax_cal.measuring.importers import Imported, import_files
 from minimax_cal.measuring.measurements import measurements_in
 
 TOLD = "What the files do not tell"
@@ -106,7 +106,7 @@ def import_command(
     found = import_files(files, **chosen).put_right(mend, leave_out)
 
     def rows() -> str:
-        text = to.cells(csv_of(found), safe_cells)
+        text = to.cells(found.csv(), safe_cells)
         measurements_in(rows_in(text, to.output or ""))  # it can be read again
         return text
 

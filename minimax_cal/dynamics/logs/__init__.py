@@ -127,11 +127,7 @@ def import_logs(
         raise OptionError("name a log to read")
     if twice := [path for i, path in enumerate(files) if path in files[:i]]:
         raise DataError(f"{twice[0]}: is given twice; give each log once")
-    given = (
-        units
-        if isinstance(units, Mapping)
-        else units_of([units] if isinstance(units, str) else units)
-    )
+    given = units_of(units)
     drafts: list[Draft] = []
     for path in files:
         name = path.stem if [p.stem for p in files].count(path.stem) == 1 else str(path)

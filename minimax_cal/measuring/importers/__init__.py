@@ -25,7 +25,7 @@ from minimax_cal.measuring.measurements import Measurements, check_finite, measu
 from minimax_cal.measuring.mending import mended
 from minimax_cal.measuring.set_aside import left_out, whole
 
-__all__ = ["Imported", "csv_of", "import_files", "read_any", "save", "units_of"]
+__all__ = ["Imported", "import_files", "read_any", "save", "units_of"]
 
 # The first that fits a file is taken: of the text alone, then of its rows and columns.
 Read = Callable[[Sheet, Given, bool], Reading | None]  # None where a file is of another format
@@ -105,6 +105,12 @@ class Imported:
         off = (fault.text for fault in distance_faults(data))
         return replace(self, data=replace(data, notices=(*data.notices, *off)))
 
+    def csv(self) -> str:
+        """The contract's CSV; what nothing uses is kept as text, points set aside with why."""
+        data = whole(self.data)
+        columns = {name: blanks(column) for name, column in data.columns.items()}
+        return measurements_text(replace(data, columns={**columns, **data.unknown}))
+
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         files = zip(self.files().records(), self.columns(), strict=True)
@@ -118,9 +124,11 @@ class Imported:
         }
 
 
-def units_of(texts: Sequence[str]) -> dict[str, str]:
-    """Units by meaning from `q=deg,smr=mm`, or bare: `deg,mm`.  Raises OptionError."""
-    found: dict[str, str] = {}
+def units_of(given: str | Sequence[str] | Mapping[str, str]) -> Mapping[str, str]:
+    """Units by meaning, also from `q=deg,smr=mm`, or bare: `deg,mm`.  Raises OptionError."""
+    if isinstance(given, Mapping):
+        return given
+    found, texts = dict[str, str](), [given] if isinstance(given, str) else given
     for part in (p.strip() for text in texts for p in text.split(",") if p.strip()):
         name, equals, unit = part.rpartition("=")
         if not equals:
@@ -271,8 +279,6 @@ def given_by(
     sign = {name: sign for sign, name in DECIMALS.items()}.get(decimal, decimal)
     if sign not in ("", *DECIMALS):
         raise OptionError(f"decimal={decimal!r}: write comma or point")
-    if not isinstance(units, Mapping):
-        units = units_of([units] if isinstance(units, str) else units)
     mappings = [columns] if isinstance(columns, str) else list(columns)
     of_joints = [
         text for text in mappings if apart and "smr" not in text and OF_JOINTS.search(text)
@@ -283,7 +289,7 @@ def given_by(
             "columns=: two mappings of one file; give one for the points and, with joints=, one "
             "for the joints"
         )
-    return Given("".join(others), "".join(of_joints), units, layout, sign)
+    return Given("".join(others), "".join(of_joints), units_of(units), layout, sign)
 
 
 def file_of_joints(path: Path | str, turns: Sequence[Reading], given: Given) -> Reading:
@@ -308,14 +314,7 @@ def no_joints(points: Sequence[Reading]) -> str:
 
 def save(path: Path | str, imported: Imported) -> None:
     """Write the contract's CSV."""
-    write_whole(path, csv_of(imported))
-
-
-def csv_of(imported: Imported) -> str:
-    """The contract's CSV; columns that nothing uses are kept as text, points set aside with why."""
-    data = whole(imported.data)
-    columns = {name: blanks(column) for name, column in data.columns.items()}
-    return measurements_text(replace(data, columns={**columns, **data.unknown}))
+    write_whole(path, imported.csv())
 
 
 def blanks(column: Array) -> Array:
