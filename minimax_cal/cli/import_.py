@@ -118,9 +118,9 @@ def finish(
     found: Imported | LogFiles, to: Output, rows: Callable[[], str], *tables: Table, said: str = ""
 ) -> int:
     """Write and show what was understood."""
-    about = {"schema": 1, "output": to.output and str(to.output)}
-    wanted = to.deliver(lambda: json_text(plain(about | found.to_dict())), rows=rows)
-    to.notice(*found.notices)
+    content = {"schema": 1, "output": to.output and str(to.output), **found.to_dict()}
+    wanted = to.deliver(lambda: json_text(plain(content)), rows=rows)
+    to.notice(*content["notices"])
     if wanted:
         show(*tables)
         for line in filter(None, (said, "" if to.output else "nothing written; add -o FILE")):

@@ -73,7 +73,7 @@ def torques_command(
     known, runs = record_of(MotionKnown, dict(chosen)), read_logs(model, logs)
     arm = model_of(model, runs)
     if write is not None:  # before what takes long
-        drawn = arm if isinstance(arm, Robot) else load_robot(arm)
+        drawn = load_robot(arm)
         known.torque_gains(drawn, runs_of(arm, drawn, runs))
     with to.stages() as progress:
         found, made = diagnose_motion(arm, runs, progress=progress, **chosen), None

@@ -174,7 +174,7 @@ def diagnose(
     >>> print(mc.diagnose("irb2600", "poses.csv", exclude=["backlash"]).summary())
     """
     began = time.perf_counter()
-    robot = robot if isinstance(robot, Robot) else load_robot(robot)
+    robot = load_robot(robot)
     given = measured(data)
     check_left_out(options.exclude, EFFECTS)
     given = checks.check_joints(robot, given)
@@ -489,8 +489,8 @@ def resemblance(
     displacement: (k, m, 3) of the points of all rows in the measurement frame [m].  Both are seen
     by the training poses, after projection on what geometry cannot imitate.  For studies.
     """
-    robot = robot if isinstance(robot, Robot) else load_robot(robot)
-    data = with_history(data if isinstance(data, Measurements) else read_measurements(data))
+    robot = load_robot(robot)
+    data = with_history(read_measurements(data))
     train, _, _ = split(data, 0.2, 0)
     study = studied(robot, train, fit_cell(robot, train, SUM, silent))
     rows = np.isin(data.line, train.line)

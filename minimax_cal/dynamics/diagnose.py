@@ -124,7 +124,7 @@ def diagnose_motion(
     >>> print(mc.diagnose_motion("arm.urdf", ["run1.csv", "run2.csv"]).summary())
     """
     began = time.perf_counter()
-    arm_of = robot if isinstance(robot, Robot) else load_robot(robot)
+    arm_of = load_robot(robot)
     check_left_out(exclude, LAWS)
     progress("reading logs")
     runs = runs_of(robot, arm_of, logs)

@@ -91,7 +91,7 @@ def evaluate_motion(
     --------
     >>> print(mc.evaluate_motion("motion.json", ["other.csv"]).table())
     """
-    found = motion if isinstance(motion, MotionDiagnosis) else load_motion(motion)
+    found = load_motion(motion)
     arm = found.arm
     runs = runs_of(arm.robot, arm.robot, logs)
     if runs[0].unit != found.unit:

@@ -284,13 +284,13 @@ def check_parts(found: MotionDiagnosis) -> None:
         raise ValueError(f"no effect {unknown[0]!r:.40}")
 
 
-def load_motion(path: Path | str) -> MotionDiagnosis:
+def load_motion(path: MotionDiagnosis | Path | str) -> MotionDiagnosis:
     """A motion diagnosis from its file.
 
     Parameters
     ----------
     path
-        Of the JSON that `save` or `minimax-cal torques -o` wrote.
+        Of the JSON that `save` or `minimax-cal torques -o` wrote; a diagnosis stays as it is.
 
     Returns
     -------

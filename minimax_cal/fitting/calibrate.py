@@ -91,7 +91,7 @@ def calibrate_with(
 ) -> Fit:
     """`calibrate`, which calls this, with its options in one."""
     began = time.perf_counter()
-    robot = robot if isinstance(robot, Robot) else load_robot(robot)
+    robot = load_robot(robot)
     data = checked(robot, measured(data), options)
     poses = parted(robot, data, options)
     progress("start")

@@ -715,13 +715,13 @@ def identified(
     return Identification(active, {p.name: p.why for p in parameters if p.reason}, singular, scale)
 
 
-def load_fit(path: Path | str) -> Fit:
+def load_fit(path: Fit | Path | str) -> Fit:
     """A calibration from its file, whole.
 
     Parameters
     ----------
     path
-        What `Fit.save` or `minimax-cal calibrate -o` wrote.
+        What `Fit.save` or `minimax-cal calibrate -o` wrote; a calibration stays as it is.
 
     Returns
     -------

@@ -83,9 +83,11 @@ class Result:
             return cls(**{**told, **cls.told_beside(content, told, source)})
 
     @classmethod
-    def load(cls, path: Path | str) -> Self:
-        """From its file.  Raises CalibrationError."""
-        return cls.from_dict(saved_content(path), str(path))
+    def load(cls, path: Self | Path | str) -> Self:
+        """From its file; a result stays as it is.  Raises CalibrationError."""
+        if isinstance(path, Path | str):
+            return cls.from_dict(saved_content(path), str(path))
+        return path
 
     def json(self, *, poses: bool = True) -> str:
         """`to_dict` as text."""

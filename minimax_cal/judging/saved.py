@@ -132,7 +132,7 @@ def evaluated(
     source: Given, data: Measurements | Path | str, rung: int | None, new_frame: bool = False
 ) -> Evaluation:
     """As `evaluate`, with what the reader should know."""
-    data = data if isinstance(data, Measurements) else read_measurements(data)
+    data = read_measurements(data)
     opened = open_result(source, rung)
     cell, _, said = opened.placed_by(data, new_frame)
     error = cell.error(data)

@@ -50,9 +50,9 @@ def read_campaigns(paths: Sequence[Path | str]) -> Measurements:
 
 def measured(data: Measurements | Path | str | Sequence[Path | str]) -> Measurements:
     """Measurements as they are, of a file, or of several as sessions.  Raises DataError."""
-    if isinstance(data, Measurements):
-        return data
-    return read_campaigns([data] if isinstance(data, str | Path) else data)
+    if isinstance(data, Measurements | str | Path):
+        return read_measurements(data)
+    return read_campaigns(data)
 
 
 def session_names(paths: Sequence[Path | str]) -> list[str]:

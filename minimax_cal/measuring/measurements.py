@@ -290,14 +290,15 @@ def check_u95(data: Measurements) -> Measurements:
     return data
 
 
-def read_measurements(path: Path | str) -> Measurements:
+def read_measurements(path: Measurements | Path | str) -> Measurements:
     """Measurements of a CSV file whose columns tell their units.
 
     Parameters
     ----------
     path
         With joints q1_deg ... or q1_rad ... (slides q3_mm), points smr1_x_mm ... or
-        smr1_x_m ..., and what else is known (order, temperature_C ...).
+        smr1_x_m ..., and what else is known (order, temperature_C ...).  Measurements stay as
+        they are.
 
     Returns
     -------
@@ -313,7 +314,7 @@ def read_measurements(path: Path | str) -> Measurements:
     --------
     >>> data = mc.read_measurements("poses.csv")
     """
-    return measurements_in(read_rows(path))
+    return path if isinstance(path, Measurements) else measurements_in(read_rows(path))
 
 
 def measurements_in(file: Rows) -> Measurements:

@@ -100,7 +100,7 @@ def simulate(
     --------
     >>> data = mc.simulate("irb2600", 60, truth=mc.Truth(noise=20e-6)).data
     """
-    robot = robot if isinstance(robot, Robot) else load_robot(robot)
+    robot = load_robot(robot)
     if not (1 <= poses <= MOST_POSES and 1 <= targets <= MOST_TARGETS):
         raise OptionError(
             f"simulate needs at least one pose and one target, at most {MOST_POSES} and "

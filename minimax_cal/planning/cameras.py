@@ -85,7 +85,7 @@ def plan_cameras(
     """
     options = replace(options, whole=len(camera) == 1)
     began = time.perf_counter()
-    robot = robot if isinstance(robot, Robot) else load_robot(robot)
+    robot = load_robot(robot)
     check_options(options, poses, robot)
     progress("start")
     if fit is not None:

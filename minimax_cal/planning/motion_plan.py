@@ -239,7 +239,7 @@ def plan_motion(
     >>> mc.plan_motion("irb2600", payload=5.0).save("motion.json")
     """
     began = time.perf_counter()
-    arm = robot if isinstance(robot, Robot) else load_robot(robot)
+    arm = load_robot(robot)
     check_motion(options)
     check_seed(room.seed)
     bounds, notices = bounds_of(arm, options, room)

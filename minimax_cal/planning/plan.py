@@ -72,7 +72,7 @@ def plan(
     --------
     >>> print(mc.plan("irb2600", 40, tracker=(3.0, 0.0, 0.5)).headline())
     """
-    robot = robot if isinstance(robot, Robot) else load_robot(robot)
+    robot = load_robot(robot)
     return planned(
         robot, poses, options, "" if fit is None else fit, "" if data is None else data, progress
     )

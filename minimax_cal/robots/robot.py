@@ -548,13 +548,13 @@ PARSERS: dict[str, tuple[Callable[[str], Any], type[Exception]]] = {
 }
 
 
-def load_robot(source: Path | str) -> Robot:
+def load_robot(source: Robot | Path | str) -> Robot:
     """A built-in robot by name, or a robot file (.json, .toml, .yaml, .csv, .urdf).
 
     Parameters
     ----------
     source
-        Name or path; ``robot.urdf#link`` names the last link of a chain.
+        Name or path; ``robot.urdf#link`` names the last link of a chain.  A robot stays as it is.
 
     Returns
     -------
@@ -570,9 +570,9 @@ def load_robot(source: Path | str) -> Robot:
     --------
     >>> robot = mc.load_robot("irb2600")
     """
+    if isinstance(source, Robot) or str(source) in builtin_robots():
+        return source if isinstance(source, Robot) else builtin_robot(str(source))
     path = Path(source)
-    if str(source) in builtin_robots():
-        return builtin_robot(str(source))
     from minimax_cal.robots.urdf import is_urdf, load_urdf  # not for a built-in robot
 
     if is_urdf(source):

@@ -103,7 +103,7 @@ def simulator_gap(
         check_writable(write, MODELS)
     mujoco()
     progress("reading the model")
-    rows = data if isinstance(data, Measurements) else read_measurements(data)
+    rows = read_measurements(data)
     given = read_model(model)
     chain = chain_of(given.compiled(), rows.q.shape[1], given.source, tip, unknown=given.assumed)
     check_joints(chain.robot, rows)

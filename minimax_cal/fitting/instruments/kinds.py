@@ -141,7 +141,7 @@ def asked_of(
     robot: Robot | str | Path, data: Given | Sequence[Given], options: RelativeOptions
 ) -> Asked:
     """Data loaded and checked, and split.  Raises CalibrationError."""
-    robot = robot if isinstance(robot, Robot) else load_robot(robot)
+    robot = load_robot(robot)
     given = [data] if isinstance(data, Given) else list(data)
     every = sorted(map(loaded, given), key=lambda data: not instrument_of(data).on_arm)
     check_given(every)

@@ -80,7 +80,7 @@ def calibrate_pixels(
     """
     began = time.perf_counter()
     check_options(options)
-    robot = robot if isinstance(robot, Robot) else load_robot(robot)
+    robot = load_robot(robot)
     cameras = [read_camera(name, path) for name, path in camera.items()]
     data = read_pixels(pixels, joints, cameras, board)
     data = replace(data, at=check_joints(robot, data.at))

@@ -59,7 +59,7 @@ def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
     --------
     >>> print(mc.compare("may.json", "june.json").summary())
     """
-    fits = tuple(fit if isinstance(fit, Fit) else load_fit(fit) for fit in (a, b))
+    fits = tuple(load_fit(fit) for fit in (a, b))
     one, other = fits
     names = tuple("calibration" if isinstance(each, Fit) else str(each) for each in (a, b))
     names = (f"{names[0]} A", f"{names[1]} B") if names[0] == names[1] else names

@@ -92,8 +92,8 @@ def check(
     """
     limits, known = required(tolerance), checked_known(known)
     check_seed(seed)
-    fit = fit if isinstance(fit, Fit) else load_fit(fit)
-    data = data if isinstance(data, Measurements) else read_measurements(data)
+    fit = load_fit(fit)
+    data = read_measurements(data)
     watched, said = watched_of(fit, data, known)
     check_arm(fit.cell.robot, watched.data)
     links = in_names(fit, watched, fit.identification.active)

@@ -90,12 +90,7 @@ class Imported:
         )
         return f"{data.poses} poses, {data.q.shape[1]} joints; points: {whole}"
 
-    @property
-    def notices(self) -> tuple[str, ...]:
-        """What is to be said of the files."""
-        return self.data.notices
-
-    def put_right(self, mend: Sequence[str] = (), leave_out: Sequence[str] = ()) -> Imported:
+    def put_right(self, mend: Sequence[str], leave_out: Sequence[str]) -> Imported:
         """With mends made and points set aside; what then still looks wrong is a notice.
 
         mend, leave_out: as of `mended` and `left_out`.  Raises CalibrationError.
@@ -113,14 +108,14 @@ class Imported:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        files = zip(self.files().records(), self.columns(), strict=True)
+        data, files = self.data, zip(self.files().records(), self.columns(), strict=True)
         return {
-            "poses": self.data.poses,
-            "joints": self.data.q.shape[1],
-            "targets": self.data.target_names,
+            "poses": data.poses,
+            "joints": data.q.shape[1],
+            "targets": data.target_names,
             "files": [{**file, "columns": table.records()} for file, table in files],
-            "set_aside": self.data.set_aside,
-            "notices": self.notices,
+            "set_aside": data.set_aside,
+            "notices": data.notices,
         }
 
 

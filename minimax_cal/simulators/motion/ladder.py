@@ -101,7 +101,7 @@ def motion_gap(
         judge = judge.driving(opened, gains) if driven else judge
         first, notices = [judge.rung("as given", opened.chain)], tuple[str, ...]()
         if fit is not None:
-            opened, notices = calibrated(opened, fit if isinstance(fit, Fit) else load_fit(fit))
+            opened, notices = calibrated(opened, load_fit(fit))
             judge = judge.of_model(opened)
             first.append(judge.rung("calibrated geometry", opened.chain))
         found = told_or_found(judge, opened, diagnosis, known.payload, progress)
@@ -155,7 +155,7 @@ def told_or_found(
             ratio=ratio,
             progress=progress,
         )
-    found = given if isinstance(given, MotionDiagnosis) else load_motion(given)
+    found = load_motion(given)
     if found.unit != judge.held.unit or found.arm.robot.joints != opened.chain.robot.joints:
         raise OptionError("diagnosis: is of another arm or another unit; leave it, to make one")
     return found
