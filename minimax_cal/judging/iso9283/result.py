@@ -190,8 +190,8 @@ class Iso9283(Result):
 
     def conditions_table(self) -> Table:
         """What the standard asks of a test, and what these data tell."""
-        columns = "clause | asked=ISO 9283 asks | told=these data"
-        return Table.of("why this is no test by ISO 9283", self.conditions, columns)
+        columns = "clause | ISO 9283 asks | these data"
+        return Table.made("why this is no test by ISO 9283", self.conditions, columns)
 
     def tables(self, *, poses: bool = False) -> tuple[Table, ...]:
         """Every table that holds something.  poses: with a row for each pose."""

@@ -83,7 +83,7 @@ class MotionGap(Result):
     def __post_init__(self) -> None:
         rows = [(r.torque_rms_Nm, r.torque_rms, r.torque_rms_moving) for r in self.rungs]
         if len({len(row) for some in rows for row in some}) > 1:
-            raise ValueError("rungs are not of one number of joints")
+            raise ValueError("its steps are not of one number of joints")
 
     def __repr__(self) -> str:
         return f"<MotionGap of {self.model}: {self.headline()}>"
