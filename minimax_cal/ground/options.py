@@ -103,6 +103,7 @@ def takes(
             return verb(**bound)
 
         asked.__signature__ = known  # type: ignore[attr-defined]
+        del asked.__wrapped__  # its source has other arguments, which documentation would read
         asked.__doc__ = verb.__doc__ or ""
         for at, (kind, _) in kinds.items():
             asked.__doc__ = documented(asked.__doc__, at, kind, [one.name for one in chosen[at]])
