@@ -41,10 +41,9 @@ class Fact:
 
 
 APART = Fact(apart=True)
-MILLI = Fact(scale=1e3, unit="mm")
 Apart = Annotated[Value, APART]
-Milli = Annotated[Value, MILLI]
-Mm = Annotated[float, MILLI]  # metres, in millimetres in files
+Milli = Annotated[Value, Fact(scale=1e3, unit="mm")]  # metres, in millimetres in files
+Mm = Milli[float]
 
 
 class Derived(cached_property[Value]):

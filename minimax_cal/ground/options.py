@@ -74,6 +74,7 @@ def takes(
     positional: fields that need no keyword.  read: what makes a field's value of what is given.
     Signature and docstring say the fields as the dataclass has them.
     """
+    readers = read or {}
     kinds = {at: one if isinstance(one, tuple) else (one, None) for at, one in records.items()}
     chosen = {
         at: [one for one in fields(kind) if names is None or one.name in names]
@@ -96,17 +97,16 @@ def takes(
                 empty = [one.name for one in chosen[at] if one.default is MISSING]
                 own = {one.name: bound.pop(one.name) for one in chosen[at] if one.name in bound}
                 own = {n: one for n, one in own.items() if not (one is None and n in empty)}
-                for name, reader in (read or {}).items():
-                    if name in own:
-                        own[name] = reader(own[name])
+                own = {n: readers[n](one) if n in readers else one for n, one in own.items()}
                 bound[at] = kind(**own)
             return verb(**bound)
 
         asked.__signature__ = known  # type: ignore[attr-defined]
         del asked.__wrapped__  # its source has other arguments, which documentation would read
-        asked.__doc__ = verb.__doc__ or ""
         for at, (kind, _) in kinds.items():
-            asked.__doc__ = documented(asked.__doc__, at, kind, [one.name for one in chosen[at]])
+            asked.__doc__ = documented(
+                asked.__doc__ or "", at, kind, [one.name for one in chosen[at]]
+            )
         return asked
 
     return made
