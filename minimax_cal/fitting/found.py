@@ -11,12 +11,12 @@ import numpy as np
 from minimax_cal.fitting.identify import Because, Identification, Reason, name_reason
 from minimax_cal.fitting.uncertainty import quantile
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import Fact, in_digits, in_file
+from minimax_cal.ground.facts import Fact, in_digits
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.records import stored
 from minimax_cal.ground.tables import Table
-from minimax_cal.ground.units import for_people, in_files, turned_for_people
+from minimax_cal.ground.units import for_people, in_files, in_own_unit, turned_for_people
 from minimax_cal.modelling.effects.words import name_parameter
 from minimax_cal.modelling.parameters import BASE_NAMES, Names
 
@@ -96,11 +96,11 @@ class Parameter:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON, lengths in millimetres."""
-        scale, _ = self.written
-        out = in_file(self.scaled(*self.written))
+        out = in_own_unit(self, "value", "nominal", "sigma")
         out |= {name: in_digits(out[name]) for name in ("value", "nominal", "sigma")}
         if self.corrects:
-            out |= {"correction": (self.value - self.nominal) * scale, "corrects": self.corrects}
+            correction = self.written[0] * (self.value - self.nominal)
+            out |= {"correction": correction, "corrects": self.corrects}
         why = ("because", "like") if not self.reason else ()
         return dict(plain({key: value for key, value in out.items() if key not in why}))
 

@@ -92,7 +92,7 @@ class Table:
     def numeric(self) -> list[bool]:
         """Which columns hold numbers (and are aligned right)."""
         return [
-            any(isinstance(row[i], (int, float)) for row in self.rows)
+            any(isinstance(row[i], int | float) for row in self.rows)
             for i in range(len(self.header))
         ]
 
@@ -127,9 +127,9 @@ class Table:
 
     def widths(self) -> list[tuple[int, int]]:
         """Of each column, the least that breaks no number, unit or name, and the usual one."""
-        out = []
+        rows, out = self.cells(), []
         for i, (name, right) in enumerate(zip(self.header, self.numeric(), strict=True)):
-            cells = [visible(row[i]) for row in self.cells()]
+            cells = [visible(row[i]) for row in rows]
             parts = [part for cell in cells for part in unbroken(cell, right=right)]
             least = max(map(len, [*parts, *visible(name).split()]), default=1)
             out.append((least, max(map(len, [*cells, visible(name)]))))
@@ -272,4 +272,4 @@ def show(cell: Cell, spec: str) -> str:
     if isinstance(cell, float) and math.isnan(cell):
         return "-"
     text = format(cell, spec)
-    return text[1:] if text.startswith("-") and not text.strip("-0.") else text
+    return text if text.strip("-0.") else text.lstrip("-")

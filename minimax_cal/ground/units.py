@@ -18,7 +18,7 @@ def turned_for_people(unit: str) -> tuple[float, str]:
 
 def in_mm(metres: float) -> float:
     """A length for a file, in 15 digits: read and written again it is the same text."""
-    return float(f"{1e3 * float(metres):.15g}")
+    return float(f"{1e3 * metres:.15g}")
 
 
 def in_own_unit(record: Any, *sizes: str) -> dict[str, Any]:
