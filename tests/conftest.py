@@ -137,3 +137,11 @@ def run(*arguments: object) -> int:
         main([str(a) for a in arguments])
     code = ended.value.code
     return code if isinstance(code, int) else 0
+
+
+def spots(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Every place in a JSON; of a long list the first entry only."""
+    if not isinstance(value, dict | list):
+        return []
+    parts = value.items() if isinstance(value, dict) else enumerate(value[:1])
+    return [spot for key, part in parts for spot in ((*at, key), *spots(part, (*at, key)))]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, spots
 
 import minimax_cal as mc
 from minimax_cal.cli.schemas import KINDS, schema_of
@@ -112,14 +112,6 @@ def test_a_file_is_as_its_schema_says(name: str) -> None:
     jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
     made = jsonschema.Draft202012Validator(schema_of(name.partition(",")[0]))
     assert not [fault.message for fault in made.iter_errors(json.loads(result_of(name).json()))]
-
-
-def spots(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Every place in a JSON; of a long list the first entry only."""
-    if not isinstance(value, dict | list):
-        return []
-    parts = value.items() if isinstance(value, dict) else enumerate(value[:1])
-    return [spot for key, part in parts for spot in ((*at, key), *spots(part, (*at, key)))]
 
 
 @pytest.mark.parametrize("name", MAKERS)

@@ -19,7 +19,7 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 from click.testing import CliRunner, Result
-from conftest import SHARED, run
+from conftest import SHARED, run, spots
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
@@ -712,14 +712,6 @@ def test_what_is_no_json_is_said(
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def places(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Every place in a JSON; of a long list the first entry only."""
-    if not isinstance(value, dict | list):
-        return []
-    parts = value.items() if isinstance(value, dict) else enumerate(value[:1])
-    return [spot for key, part in parts for spot in ((*at, key), *places(part, (*at, key)))]
-
-
 @pytest.mark.parametrize("slips", [20, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["fit.json", "gap.json"])
 def test_no_slip_in_a_file_is_a_traceback(
@@ -727,11 +719,11 @@ def test_no_slip_in_a_file_is_a_traceback(
 ) -> None:
     rng = np.random.default_rng(1)
     whole = json.loads((results / name).read_text())
-    spots = places(whole)
+    every = spots(whole)
     odd = [None, "x", -1, 1e30, [], {}, [None], True]
     for _ in range(slips):
         content = copy.deepcopy(whole)
-        *way, last = spots[rng.integers(len(spots))]
+        *way, last = every[rng.integers(len(every))]
         part = content
         for key in way:
             part = part[key]
