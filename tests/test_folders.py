@@ -15,6 +15,7 @@ FOLDERS = (
     "robots",
     "measuring",
     "modelling",
+    "instruments",
     "fitting",
     "judging",
     "diagnosing",

@@ -105,7 +105,7 @@ def by_cameras(
     robot: str, data: tuple[Path, ...], files: PixelFiles, to: Output, chosen: dict[str, Any]
 ) -> int:
     """Calibrate from pixels.  Raises OptionError for what they do not know."""
-    from minimax_cal.fitting.instruments.pixel_calibration import calibrate_pixels
+    from minimax_cal.fitting.several.pixel_calibration import calibrate_pixels
 
     if data:
         raise OptionError(

@@ -17,10 +17,10 @@ from minimax_cal.cli.options import (
     record_of,
     result_options,
 )
-from minimax_cal.fitting.instruments import RelativeOptions, relative
-from minimax_cal.fitting.instruments.kinds import Given
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.pixels.options import PixelFiles, PixelOptions
+from minimax_cal.fitting.several import RelativeOptions, relative
+from minimax_cal.fitting.several.kinds import Given
 from minimax_cal.ground.errors import OptionError
 
 SOUGHT = "What is sought"
@@ -72,7 +72,7 @@ def relative_command(
     """
     files, every = record_of(PixelFiles, chosen), list[Given](data)
     if files.given:
-        from minimax_cal.fitting.instruments.cameras import detected
+        from minimax_cal.fitting.several.cameras import detected
 
         every.append(detected(*files.paths()))
     if exclude and not diagnose:

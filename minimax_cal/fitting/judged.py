@@ -38,7 +38,6 @@ from minimax_cal.fitting.same_arm import wild
 from minimax_cal.fitting.second_visits import contradictions
 from minimax_cal.fitting.set_aside import judged_with
 from minimax_cal.fitting.solve import PER, Solved
-from minimax_cal.fitting.start import EVERYWHERE
 from minimax_cal.fitting.stations import jumps
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.ground.arrays import Array
@@ -49,6 +48,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Frames
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.parameters import State, links_of
+from minimax_cal.modelling.start import EVERYWHERE
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.least_squares import name_of
 from minimax_cal.solvers.status import Status

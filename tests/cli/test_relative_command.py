@@ -9,7 +9,7 @@ import pytest
 import minimax_cal as mc
 from experiments.relative import SIMULATORS, Arm
 from minimax_cal.cli import main
-from minimax_cal.fitting.instruments import write_relative
+from minimax_cal.instruments import write_relative
 from minimax_cal.robots.robot import robot_from_dict
 from minimax_cal.robots.sampling import random_poses
 

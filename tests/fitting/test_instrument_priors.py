@@ -11,10 +11,10 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.cli.running import outcome
-from minimax_cal.fitting.instruments import closures, distances, flange_poses
-from minimax_cal.fitting.instruments.closing import reach
-from minimax_cal.fitting.instruments.data import RelativeData
-from minimax_cal.fitting.instruments.result import RelativeCalibration
+from minimax_cal.fitting.several.result import RelativeCalibration
+from minimax_cal.instruments import closures, distances, flange_poses
+from minimax_cal.instruments.closing import reach
+from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.robots.robot import robot_from_dict
 
 QUARTER = np.pi / 2
@@ -101,7 +101,7 @@ def test_a_firm_prior_keeps_the_drawing() -> None:
             assert 0.0 < p.sigma < 2e-9
 
 
-def wires() -> tuple[mc.Simulation, RelativeData]:
+def wires() -> tuple[mc.Simulation, Instrument]:
     made = mc.simulate("irb2600", 60, 1, 2)
     point = made.cell.predict(made.data.q)[:, 0]
     anchors = np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 1.0], [-1.0, -1.0, 2.0]])

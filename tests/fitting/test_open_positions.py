@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.relative import NOISE, SIMULATORS, Arm, rms_mm, spot_of, true_errors
-from minimax_cal.fitting.instruments import RelativeCalibration, relative
+from minimax_cal.fitting.several import RelativeCalibration, relative
 from minimax_cal.robots.sampling import random_poses
 
 SCALE = {"irb2600": "d4", "ur10": "a2"}  # the longest length, kept as drawn where none is known

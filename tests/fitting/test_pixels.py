@@ -21,7 +21,6 @@ from experiments.pixel_cells import (
     make_cell,
     projected,
 )
-from minimax_cal.fitting.instruments.pixel_calibration import concluded, fitted
 from minimax_cal.fitting.pixels.camera import INTRINSICS, distorted, slopes, undistorted
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.determined import determined
@@ -30,6 +29,7 @@ from minimax_cal.fitting.pixels.judge import Claim
 from minimax_cal.fitting.pixels.model import PixelModel, Scene, Sight
 from minimax_cal.fitting.pixels.options import PixelOptions, check_options, doubts_of
 from minimax_cal.fitting.pixels.start import by_rotations, directions, merged, start_scene
+from minimax_cal.fitting.several.pixel_calibration import concluded, fitted
 from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.status import Status
 

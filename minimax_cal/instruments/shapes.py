@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 import scipy
 
-from minimax_cal.fitting.instruments.refine import spots_aside
-from minimax_cal.fitting.instruments.rows import SPOT, scaled_lstsq
-from minimax_cal.fitting.instruments.touches import PLANE, SPHERE, Surface
-from minimax_cal.fitting.instruments.wires import linear_target
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.model import Model
-from minimax_cal.robots import kinematics
-from minimax_cal.robots.kinematics import Chain, rotation
-from minimax_cal.robots.robot import Robot
+from minimax_cal.instruments.instrument import SPOT, scaled_lstsq, spots_aside
+from minimax_cal.instruments.protocol import FlangePoses
+from minimax_cal.instruments.wires import linear_target
+from minimax_cal.robots.kinematics import rotation
 from minimax_cal.robots.transforms import nearest_rotation
+
+PLANE, SPHERE = "plane", "sphere"
 
 MAX_STARTS, MAX_TRIES = 3, 60  # places of the ball that are refined; gaps looked at for each
 ROUNDS = 5  # of a sphere's fit by its distances
@@ -26,8 +24,35 @@ BODY = tuple(f"body_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
 
 
 @dataclass(frozen=True, eq=False)
+class Surface:
+    """What a probe touches.
+
+    kind: PLANE or SPHERE.  size: radius of a sphere, or offset of a face from the body's origin
+    along its normal, NaN where not known [m].  normal: (3,) outward in the body's frame of a plane
+    that is a face of the body, else (0,).
+    """
+
+    label: str
+    kind: str = PLANE
+    size: float = np.nan
+    normal: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def is_face(self) -> bool:
+        """Whether it is a face of the body."""
+        return bool(len(self.normal))
+
+    @property
+    def ends(self) -> tuple[str, ...]:
+        """Endings of its own parameters' names, the size last."""
+        if self.kind == SPHERE:
+            return ("x", "y", "z", "radius")
+        return ("offset",) if self.is_face else ("tilt1", "tilt2", "offset")
+
+
+@dataclass(frozen=True, eq=False)
 class Shapes:
-    """Which surfaces there are, and where their parameters stand among a block's own.
+    """Which surfaces there are, and where their parameters stand among the instrument's own.
 
     surfaces: s of them.  axes: (s, 3, 3) rows n, u, v: of a plane the normal from which its tilts
     count, and two axes across it.  turn: (3, 3) rotation from which the body's turn counts.
@@ -60,16 +85,16 @@ class Shapes:
         return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
     def body(self, own: Array) -> tuple[Array, Array]:
-        """Rotation (..., 3, 3) and origin (..., 3) of the body."""
-        return self.turn @ rotation(own[..., -4:-1]), own[..., -7:-4]
+        """Rotation (3, 3) and origin (3,) of the body."""
+        return self.turn @ rotation(own[-4:-1]), own[-7:-4]
 
     def plane(self, at: int, own: Array) -> tuple[Array, Array, Array]:
-        """Normal (..., 3) of a plane, and its derivatives by the two tilts."""
+        """Normal (3,) of a plane, and its derivatives by the two tilts."""
         n0, u, v = self.axes[at]
-        a, b = own[..., self.slots()[at]][..., 0, None], own[..., self.slots()[at]][..., 1, None]
+        a, b, _ = own[self.slots()[at]]
         size = np.sqrt(1.0 + a**2 + b**2)
         n = (n0 + a * u + b * v) / size
-        one, other = ((w - n * (n @ w)[..., None]) / size for w in (u, v))
+        one, other = ((w - n * (n @ w)) / size for w in (u, v))
         return n, one, other
 
 
@@ -115,7 +140,7 @@ def found_on(
     return out
 
 
-def linear_spots(links: Chain, surfaces: Sequence[Surface], touched: Array) -> list[Array]:
+def linear_spots(arm: FlangePoses, surfaces: Sequence[Surface], touched: Array) -> list[Array]:
     """Places (3,) of the ball on the flange that each surface by itself suggests [m].
 
     With the last frame (R, o), a plane's n.(o + R t) = c is linear and homogeneous in n, the nine
@@ -123,14 +148,13 @@ def linear_spots(links: Chain, surfaces: Sequence[Surface], touched: Array) -> l
     """
     out = []
     for at, surface in enumerate(surfaces):
-        here = np.flatnonzero(touched == at)
-        o, axes = links.origin[:, here], links.axes[..., here]
+        here = touched == at
+        o, turn = arm.origin[here], arm.rotation[here]
         if surface.kind == SPHERE:
-            some = Chain(*(getattr(links, each.name)[..., here] for each in fields(links)))
-            out.append(linear_target(some, np.zeros((len(here), 1)), with_offset=False))
+            some = arm._replace(origin=o, rotation=turn)
+            out.append(linear_target(some, np.zeros((len(o), 1)), with_offset=False))
             continue
-        products = np.einsum("kcm->mck", axes).reshape(len(here), 9)
-        rows = np.concatenate([o.T, products, -np.ones((len(here), 1))], axis=1)
+        rows = np.concatenate([o, turn.reshape(len(o), 9), -np.ones((len(o), 1))], axis=1)
         found = np.linalg.svd(rows)[2][-1]
         size = max(float(found[:3] @ found[:3]), 1e-12)
         out.append(found[:3] @ found[3:12].reshape(3, 3) / size)
@@ -138,17 +162,16 @@ def linear_spots(links: Chain, surfaces: Sequence[Surface], touched: Array) -> l
 
 
 def placed_best(
-    robot: Robot, model: Model, surfaces: tuple[Surface, ...], ball: float, touched: Array
+    arm: FlangePoses, surfaces: tuple[Surface, ...], ball: float, touched: Array
 ) -> tuple[Shapes, Array]:
     """Where ball and surfaces fit the arm as drawn best, and their values.
 
     For a given place of the ball on the flange each surface is found in closed form, which leaves
     three unknowns: least squares from several places.
     """
-    links = kinematics.chain(robot.mdh, model.q, model.prismatic)
 
     def found(spot: Array) -> tuple[Array, list[tuple[Array, float]]]:
-        p = kinematics.points(links, spot[None])[0].T
+        p = arm.place(spot)
         return p, found_on(p, surfaces, ball, touched)
 
     def misses(spot: Array) -> Array:
@@ -161,7 +184,7 @@ def placed_best(
             out[here] = reached - size
         return out
 
-    spots = [*linear_spots(links, surfaces, touched), *spots_aside(robot, np.zeros(3))[1:]]
+    spots = [*linear_spots(arm, surfaces, touched), *spots_aside(arm, np.zeros(3))[1:]]
     best = sorted(spots, key=lambda one: float((misses(one) ** 2).sum()))[:MAX_STARTS]
     tries = [
         scipy.optimize.least_squares(misses, spot, method="lm", max_nfev=MAX_TRIES) for spot in best

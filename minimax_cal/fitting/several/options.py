@@ -10,32 +10,13 @@ from minimax_cal.fitting.options import Options, check_priors, known_within
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import grouped
 from minimax_cal.ground.stages import Progress as Progress
 from minimax_cal.ground.stages import silent as silent
+from minimax_cal.instruments.options import InstrumentOptions, fitted
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import Names
 
-Known = tuple[str, str, float]
 FAR = 4.0  # sigmas of a prior that an arm may be off
-
-
-def known_of(text: str) -> Known:
-    """A,B,MM: two sockets and the distance of their centres.  Raises OptionError."""
-    parts = [part.strip() for part in text.split(",")]
-    number = parts[-1].removesuffix("mm").strip()
-    if len(parts) == 3 and parts[0] and parts[1] and re.fullmatch(r"[-+.\deE]+", number):
-        try:
-            return parts[0], parts[1], 1e-3 * float(number)
-        except ValueError:
-            pass
-    raise OptionError(f"known_distances={text!r}: write two sockets and a length, as A,B,500.02")
-
-
-def known_text(known: Known) -> str:
-    """A known distance as it was asked for."""
-    first, second, distance = known
-    return f"known_distances={f'{first},{second},{1e3 * distance:g}'!r}"
 
 
 def noise_of(text: str) -> tuple[str, float]:
@@ -50,17 +31,12 @@ def noise_of(text: str) -> tuple[str, float]:
     raise OptionError(f"noise {text!r}: write FILE=SIGMA in mm, as wires=0.2mm")
 
 
-fitted = grouped("What is fitted")
-
-
 @dataclass(frozen=True)
-class RelativeOptions:
+class RelativeOptions(InstrumentOptions):
     """How to calibrate.
 
-    holdout: share kept out of the fit.  seed: of that choice.  fix, free: names or patterns as
-    ``beta*``.  offset: of lengths, fit a constant one of each wire.
-    known_distances: of closures, sockets A, B and the distance of their centres [m].
-    lever: of poses, what a radian counts as [m]; the file's own unless given.
+    holdout, seed, offset, known_distances, lever: see `InstrumentOptions`.  fix, free: names or
+    patterns as ``beta*``.
     noises: sigma of a number of a file by its name [m], or a text as 0.2mm; of others residuals
     say it.  priors: sigma of a parameter's deviation from nominal, by name [m, rad], or a text as
     5mm.  effects: of the arm beyond geometry, fitted with it, as joint_compliance:all; or a
@@ -69,25 +45,8 @@ class RelativeOptions:
     method: of the least squares.  resolution: relative singular value that counts as not measured.
     """
 
-    holdout: float = Options.holdout
-    seed: int = Options.seed
     fix: Sequence[str] = ()
     free: Sequence[str] = ()
-    offset: bool = fitted(False, "Lengths: fit a constant offset of each wire (weakly determined).")
-    known_distances: Sequence[Known] = fitted(
-        (),
-        "Closures: the distance between two sockets' centres; gives the scale.",
-        flag="--known-distance",
-        metavar="A,B,MM",
-        read=known_of,
-        many=tuple,
-    )
-    lever: float | None = fitted(
-        None,
-        "Poses: what a radian counts as, linear over angular noise [default: of the columns "
-        "u95_mm and rotation_u95_rad, else 100].",
-        "mm",
-    )
     noises: Mapping[str, float] = fitted(
         dict,
         "How noisy a file's numbers are, by its name without ending [default: as its residuals].",

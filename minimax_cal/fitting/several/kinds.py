@@ -13,31 +13,30 @@ import numpy as np
 
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.identify import Because
-from minimax_cal.fitting.instruments import fit, plausible, remarks
-from minimax_cal.fitting.instruments.checks import check_given, check_noises, check_options
-from minimax_cal.fitting.instruments.data import RelativeData
-from minimax_cal.fitting.instruments.file import read_relative
-from minimax_cal.fitting.instruments.fit import InstrumentFit, Train
-from minimax_cal.fitting.instruments.identify import left_open, position_sigma, positions_by
-from minimax_cal.fitting.instruments.options import (
+from minimax_cal.fitting.intervals import rms_interval, told
+from minimax_cal.fitting.opened import listed_effects
+from minimax_cal.fitting.options import listed, priors_of
+from minimax_cal.fitting.several import fit, plausible, remarks
+from minimax_cal.fitting.several.checks import check_given, check_noises, check_options
+from minimax_cal.fitting.several.fit import InstrumentFit, Train
+from minimax_cal.fitting.several.identify import left_open, position_sigma, positions_by
+from minimax_cal.fitting.several.options import (
     Progress,
     RelativeOptions,
     read_noises,
     silent,
 )
-from minimax_cal.fitting.instruments.points import points
-from minimax_cal.fitting.instruments.result import (
+from minimax_cal.fitting.several.result import (
     SEVERAL,
     InstrumentResult,
     Measured,
     RelativeCalibration,
 )
-from minimax_cal.fitting.instruments.table import instrument_of
-from minimax_cal.fitting.intervals import rms_interval, told
-from minimax_cal.fitting.opened import listed_effects
-from minimax_cal.fitting.options import listed, priors_of
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.options import takes
+from minimax_cal.instruments.file import read_relative
+from minimax_cal.instruments.instrument import Instrument
+from minimax_cal.instruments.tracker import points
 from minimax_cal.measuring.accuracy import HELD
 from minimax_cal.measuring.campaigns import session_names
 from minimax_cal.measuring.checks import check_joints, limit_notices
@@ -49,10 +48,11 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.joint_fit import fitted
 from minimax_cal.modelling.model import TARGET
+from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.status import Status
 
-Given = RelativeData | Measurements | str | Path
+Given = Instrument | Measurements | str | Path
 
 
 READ: Mapping[str, Callable[[Any], Any]] = {  # what people give of an option, as its record has it
@@ -113,7 +113,7 @@ class Asked:
     """
 
     robot: Robot
-    every: Sequence[RelativeData]
+    every: Sequence[Instrument]
     options: RelativeOptions
     splits: Sequence[tuple[Array, tuple[str, ...]]]
 
@@ -143,25 +143,25 @@ def asked_of(
     """Data loaded and checked, and split.  Raises CalibrationError."""
     robot = load_robot(robot)
     given = [data] if isinstance(data, Given) else list(data)
-    every = sorted(map(loaded, given), key=lambda data: not instrument_of(data).on_arm)
+    every = sorted(map(loaded, given), key=lambda data: not data.on_arm)
     check_given(every)
     check_options(every, options)
     every = [replace(each, at=with_history(check_joints(robot, each.at))) for each in every]
     check_noises(labels_of(every), every, options)
     for each in every:
-        instrument_of(each).check_slips(robot, each, options)
-    splits = [instrument_of(each).held_back(each, options) for each in every]
+        plausible.check_slips(robot, each, options)
+    splits = [each.held_back(options) for each in every]
     return Asked(robot, every, options, splits)
 
 
-def loaded(data: Given) -> RelativeData:
+def loaded(data: Given) -> Instrument:
     """Data as they are, or of a file."""
     if isinstance(data, Measurements):
         return points(data)
-    return data if isinstance(data, RelativeData) else read_relative(data)
+    return data if isinstance(data, Instrument) else read_relative(data)
 
 
-def labels_of(every: Sequence[RelativeData]) -> list[str]:
+def labels_of(every: Sequence[Instrument]) -> list[str]:
     """What files are called: by their stems; data from arrays by their kind."""
     files = [Path(data.at.source) for data in every if data.at.digest]
     names = iter(session_names(files) if files else ())
@@ -191,8 +191,8 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
     source = replace(every[0].at, source=sources, digest=" ".join(d.at.digest for d in every))
     geometry = found.stiff or found
     settings = options.settings()
-    for block in reversed(found.stack.blocks):  # the first one's stand
-        settings |= block.choices
+    for one in reversed(found.stack.instruments):  # the first one's stand
+        settings |= one.choices
     result = RelativeCalibration(
         **vars(whole),
         robot=robot.with_mdh(geometry.state.mdh),
@@ -204,7 +204,7 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
         identification=found.identification,
         position_sigma=sigma_of_positions(robot, found),
         positions_open=open_positions(robot, found),
-        beyond=instrument_of(every[0]).beyond(robot, found, options) if single else (),
+        beyond=remarks.beyond(robot, found, options) if single else (),
         notices=tuple(dict.fromkeys(notices)),
         provenance=Provenance.of(robot, source, settings),
         instruments=() if single else instruments_of(found, every, splits, measured),
@@ -215,7 +215,7 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
 
 def judged(
     robot: Robot,
-    every: Sequence[RelativeData],
+    every: Sequence[Instrument],
     splits: Sequence[tuple[Array, tuple[str, ...]]],
     found: InstrumentFit,
     measured: Sequence[Measured],
@@ -223,11 +223,15 @@ def judged(
     options: RelativeOptions,
 ) -> RelativeCalibration:
     """The result with what the reader should know, failed where it is no calibration."""
-    instruments = list(enumerate(map(instrument_of, every)))
-    unfitted = [one.unfitted(robot, found, i, options) for i, one in instruments]
+    instruments = list(enumerate(found.stack.instruments))
+    unfitted = [remarks.unfitted(robot, found, i, options) for i, _ in instruments]
     wrong = plausible.contradiction(robot, every, found, measured, [mend for _, mend in unfitted])
     said = [
-        *(remark for i, one in instruments for remark in one.remarks(robot, found, i, options)),
+        *(
+            remark
+            for i, one in instruments
+            for remark in one.remarks(fit.own_parameters(robot, found, i), found.noise[i])
+        ),
         *remarks.of_beyond(result),
         *remarks.of_scale(found),
         *remarks.weak(found, result, measured),
@@ -244,24 +248,27 @@ def judged(
 
 
 def measured_by(
-    robot: Robot, found: InstrumentFit, i: int, data: RelativeData, held: Array
+    robot: Robot, found: InstrumentFit, i: int, data: Instrument, held: Array
 ) -> Measured:
     """The errors of an instrument, as drawn and calibrated.  held: (m,)."""
-    block, states = found.stack.blocks[i], found.state_of(i)
-    models = [found.stack.model_at(robot, i, data, x) for x in (found.nominal, found.state)]
-    pairs = list(zip(models, states, strict=True))
-    nominal, calibrated = (block.errors(model, x, data, held) for model, x in pairs)
-    turned = [block.turns(model, x, data)[None] for model, x in pairs]
+    stack = found.stack
+    seen = []
+    for x in found.state_of(i):
+        block = stack.blocks[i].at_rows_of(robot, data, stack.laws, x)
+        seen.append((block.instrument, block.flange(x), block.own(x)))
+    nominal, calibrated = (one.errors(arm, own, held) for one, arm, own in seen)
+    turned = [one.turns(arm, own)[None] for one, arm, own in seen]
+    train, (_, drawn), x = stack.instruments[i], seen[0][1:], found.state_of(i)[1]
     turns = by_key(turned[0], turned[1], held) if turned[0].size else {}
     counts = data.count(held)
     return Measured(
         kind=data.kind,
-        parts=block.parts,
+        parts=train.parts,
         errors=by_key(nominal, calibrated, held),
         numbers={key: counts[is_held] for key, is_held in HELD.items()},
         turns={key: (rms(t), float(t.max()) if t.size else np.nan)
                for key, t in turns.items()},
-        instrument=block.placed(states[1], states[0]),
+        instrument=train.placed(stack.blocks[i].flange(x), seen[1][2], drawn),
     )  # fmt: skip
 
 
@@ -298,17 +305,17 @@ def cell_of(robot: Robot, found: InstrumentFit) -> Cell:
 
     Where these are is all that the laws know of them.
     """
-    stack, data = found.stack, [train.data for train in found.trains]
-    scene = stack.scenes(robot, data, found.state)[0]
+    stack = found.stack
+    scene = stack.scenes(robot, found.state)[0]
     effects = fitted(stack.laws.terms, scene, stack.values(found.state))
     amid = scene.target_positions.mean(axis=0, keepdims=True)
-    sessions = Sessions({}, Clock.of(data[0].at))
+    sessions = Sessions({}, Clock.of(found.trains[0].data.at))
     return Cell(robot.with_mdh(found.state.mdh), np.eye(4), (TARGET,), amid, effects, sessions)
 
 
 def instruments_of(
     found: InstrumentFit,
-    every: Sequence[RelativeData],
+    every: Sequence[Instrument],
     splits: Sequence[tuple[Array, tuple[str, ...]]],
     measured: Sequence[Measured],
 ) -> tuple[InstrumentResult, ...]:
@@ -323,7 +330,7 @@ def instruments_of(
                 **vars(each),
                 name=found.stack.labels[i],
                 interval=told(interval, 1e-3 * each.accuracy["holdout"].rms_mm),
-                noise=float(found.noise[i]) / found.stack.blocks[i].row_noise,
+                noise=float(found.noise[i]) / found.stack.instruments[i].row_noise,
                 alone=alone.names,
                 directions_alone=alone.directions,
             )
@@ -333,18 +340,26 @@ def instruments_of(
 
 def sigma_of_positions(robot: Robot, found: InstrumentFit) -> float:
     """`identify.position_sigma`, of the target of the first file."""
-    stack, block, place = found.stack, found.stack.blocks[0], place_of(found)
-    x = block.arm_state(stack.part(found.state, 0))
+    place, stack = place_of(found), found.stack
     covariance = found.covariance[np.ix_(place, place)]
-    return position_sigma(robot, block.model, x, covariance, stack.laws)
+    values = stack.values(found.state)
+    spots = targets_of(found, found.state)
+    return position_sigma(robot, found.state.mdh, spots, covariance, stack.laws, values)
+
+
+def targets_of(found: InstrumentFit, x: State) -> Array:
+    """(k, 3) targets of the first file on the flange, its origin where there is none [m]."""
+    block = found.stack.blocks[0]
+    spots = block.instrument.targets(block.own(found.stack.part(x, 0)))
+    return spots if len(spots) else np.zeros((1, 3))
 
 
 def place_of(found: InstrumentFit) -> Array:
     """Where the parameters that move the target of the first file stand among all."""
     stack = found.stack
     every = np.arange(stack.names.count)
-    own = stack.own(0)[stack.blocks[0].spots]
-    return np.concatenate([every[: stack.names.geometric], own, every[stack.lawless :]])
+    own = stack.own(0)[stack.instruments[0].targets_at]
+    return np.concatenate([every[: 5 * stack.names.joints + 6], own, every[stack.lawless :]])
 
 
 def open_positions(robot: Robot, found: InstrumentFit) -> tuple[str, ...]:
@@ -353,11 +368,11 @@ def open_positions(robot: Robot, found: InstrumentFit) -> tuple[str, ...]:
     Asked of the arm as drawn, where what is redundant is so exactly.  Not those that were fixed.
     """
     fit = found.stiff or found
-    stack, block, place = fit.stack, fit.stack.blocks[0], place_of(fit)
+    stack, place = fit.stack, place_of(fit)
     reasons = fit.identification.reasons
     names = [stack.names.all[i] for i in place]
     fixed = [name in reasons and reasons[name].kind is Because.FIXED for name in names]
     asked = ~np.array(fixed) & stack.movable[place]
-    jacobian = positions_by(robot, block.model, block.arm_state(stack.part(fit.nominal, 0)))
+    jacobian = positions_by(robot, fit.nominal.mdh, targets_of(fit, fit.nominal))
     left = left_open(jacobian, fit.identification.active[place], asked)
     return tuple(name for name, is_open in zip(names, left, strict=True) if is_open)

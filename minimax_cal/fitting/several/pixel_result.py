@@ -9,10 +9,10 @@ from typing import Annotated, Any
 
 from minimax_cal.fitting.fit import ACCURACIES
 from minimax_cal.fitting.found import parameter_table
-from minimax_cal.fitting.instruments.result import RelativeCalibration
 from minimax_cal.fitting.pixels.judge import Claim
 from minimax_cal.fitting.pixels.options import SUM
 from minimax_cal.fitting.pixels.worst import WorstPixels
+from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.ground.facts import APART, Fact
 from minimax_cal.ground.records import as_kind
 from minimax_cal.ground.results import merged

@@ -12,15 +12,19 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.bounds import bounds
 from minimax_cal.modelling.effects.scene import BESIDE, Scene
-from minimax_cal.modelling.effects.table import EFFECTS, Pick, Term, names_of, parse, ridge_of
+from minimax_cal.modelling.effects.table import (
+    EFFECTS,
+    Pick,
+    Term,
+    fields_of,
+    names_of,
+    parse,
+    ridge_of,
+)
 from minimax_cal.modelling.effects.table import terms as terms_of
-from minimax_cal.modelling.joint_fit import extended
-from minimax_cal.modelling.model import Model
-from minimax_cal.modelling.parameters import State
-from minimax_cal.robots.robot import Robot
+from minimax_cal.modelling.joint_fit import fitted
 
 
 def is_shared(name: str) -> bool:
@@ -65,12 +69,16 @@ class Laws:
         names, units = names_of(found, scene)
         return Laws(found, names, units)
 
-    def on(self, model: Model, robot: Robot, at: Measurements, state: State) -> Model:
-        """A stiff arm with these laws, linear at a state.
+    def fields(self, scene: Scene, values: Array) -> tuple[Array, Array]:
+        """(d, k, 3, m) motions of a scene's targets per unit, and (k, 3, m) what they leave [m].
 
-        model: the arm at poses, at: the same with their columns.  state: with values (k,).
+        That is what finite turns add at the values (d,).
         """
-        return extended(model, robot, at, state, self.terms)[0] if self.terms else model
+        fields, more = fields_of(self.terms, scene), np.zeros(scene.points.shape)
+        if values.any():
+            exact = fitted(self.terms, scene, values).points(scene)
+            more = exact - scene.points - np.tensordot(values, fields, 1)
+        return fields, more
 
     def sigma(self, scene: Scene) -> Array:
         """(k,) of the priors of mean zero, infinite where there is none [SI]."""

@@ -4,30 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
 from minimax_cal.fitting.found import Parameter, link_by_link
 from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.instruments.identify import (
+from minimax_cal.fitting.options import freed
+from minimax_cal.fitting.several.identify import (
     Alone,
     determined_alone,
     generic_count,
     identified,
 )
-from minimax_cal.fitting.instruments.laws import Laws
-from minimax_cal.fitting.instruments.options import (
+from minimax_cal.fitting.several.laws import Laws
+from minimax_cal.fitting.several.options import (
     Progress,
     RelativeOptions,
     sigmas_of,
 )
-from minimax_cal.fitting.instruments.stack import Known, Squares, Stack
-from minimax_cal.fitting.instruments.table import instrument_of
-from minimax_cal.fitting.options import freed
+from minimax_cal.fitting.several.stack import Known, Squares, Stack, started
 from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS, without_resting
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.modelling.effects.bounds import at_bounds
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.near import between, is_kept
@@ -45,7 +45,7 @@ class Train:
     """What is fitted: each instrument's training measurements and what the file is called."""
 
     label: str
-    data: Any  # of the instrument's own class
+    data: Instrument
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +82,11 @@ class InstrumentFit:
 
 def stack_of(robot: Robot, trains: Sequence[Train], options: RelativeOptions) -> Stack:
     """The training measurements as a least-squares problem."""
-    alone = [instrument_of(each.data).block(robot, each.data, options) for each in trains]
-    blocks = [one.beside([*alone[:i], *alone[i + 1 :]]) for i, one in enumerate(alone)]
-    stack = Stack.of(robot, blocks, [each.label for each in trains])
+    alone = [each.data.ready(robot, options) for each in trains]
+    every = [one.beside([*alone[:i], *alone[i + 1 :]]) for i, one in enumerate(alone)]
+    stack = Stack.of(robot, every, [each.label for each in trains])
     given = [options.noises.get(label, np.nan) for label in stack.labels]
-    of_rows = [sigma * block.row_noise for sigma, block in zip(given, blocks, strict=True)]
+    of_rows = [sigma * one.row_noise for sigma, one in zip(given, every, strict=True)]
     return replace(stack, given=np.square(of_rows))
 
 
@@ -96,16 +96,15 @@ def allowed_of(stack: Stack, options: RelativeOptions) -> tuple[Array, Array]:
     allowed = ~names.match(options.fix, "fix")
     wanted = freed(names, options.free, allowed)
     allowed[5 * names.joints : names.geometric] = False
-    for i, block in enumerate(stack.blocks):
-        allowed[stack.own(i)] &= [name not in block.held for name in block.own]
+    for i, one in enumerate(stack.instruments):
+        allowed[stack.own(i)] &= [name not in one.held for name in one.names]
     return allowed, wanted
 
 
 def start_of(robot: Robot, stack: Stack, allowed: Array) -> State:
     """The arm as drawn, and what fits it best."""
-    free = [allowed[stack.own(i)] for i in range(len(stack.blocks))]
-    pairs = zip(stack.blocks, free, strict=True)
-    return stack.state(robot.mdh, [block.start(robot, own) for block, own in pairs])
+    every = enumerate(stack.instruments)
+    return stack.state(robot.mdh, [started(robot, one, allowed[stack.own(i)]) for i, one in every])
 
 
 def fit_instruments(
@@ -113,7 +112,7 @@ def fit_instruments(
 ) -> InstrumentFit:
     """Fit the identifiable parameters to the training measurements.  Raises DataError."""
     progress("start")
-    trains = [replace(train, data=train.data.in_block_order()) for train in trains]
+    trains = [replace(train, data=train.data.in_order()) for train in trains]
     stack = stack_of(robot, trains, options)
     allowed, wanted = allowed_of(stack, options)
     known = Known(links_of(robot.mdh), sigmas_of(stack.names, options))
@@ -162,9 +161,8 @@ def with_laws(
 
     known: of the links.
     """
-    data = [train.data for train in fit.trains]
-    scenes = fit.stack.scenes(robot, data, fit.state)
-    stack, begin = fit.stack.bent(robot, data, laws, fit.state)
+    scenes = fit.stack.scenes(robot, fit.state)
+    stack, begin = fit.stack.bent(robot, laws, fit.state)
     first, count = stack.names.geometric, len(laws.names)
     own = fit.nominal.effects[: stack.lawless - first]
     drawn = replace(fit.nominal, effects=np.pad(own, (0, count)))
@@ -207,10 +205,10 @@ def laws_of(robot: Robot, fit: InstrumentFit, texts: Sequence[str | Term]) -> La
     fit: of geometry alone.  Raises OptionError.
     """
     from minimax_cal.evidence.selection import best_variant  # slow to import
-    from minimax_cal.fitting.instruments.linear import rows_of_all, scene_of_all
+    from minimax_cal.fitting.several.linear import rows_of_all, scene_of_all
     from minimax_cal.modelling.dictionary import ArmLaws
 
-    if any(block.kind == "pixels" for block in fit.stack.blocks):
+    if any(one.kind == "pixels" for one in fit.stack.instruments):
         raise OptionError(
             "effects= is not for pixels yet: leave them out, or fit the effects from the others"
         )
@@ -220,7 +218,7 @@ def laws_of(robot: Robot, fit: InstrumentFit, texts: Sequence[str | Term]) -> La
         laws = ArmLaws(scene, rows_of_all(scene, fit))
         return cast(Term, best_variant(laws, chosen, several))
 
-    each = fit.stack.scenes(robot, [train.data for train in fit.trains], fit.state)
+    each = fit.stack.scenes(robot, fit.state)
     return Laws.of(scene, each, texts, pick)
 
 
@@ -256,7 +254,7 @@ def weighed(
     priors = problem.known is not None and problem.known.any
     if len(problem.stack.blocks) == 1 and not priors:
         return problem, solved(problem)
-    count = [block.numbers for block in problem.stack.blocks]
+    count = [one.degrees for one in problem.stack.instruments]
     none = np.zeros(problem.stack.names.count, dtype=bool)
     cost = [float(error @ error) for error, _ in problem.stack.rows_by_block(begin, none)]
     variance = np.maximum(np.divide(cost, count), LEAST_NOISE**2)
@@ -300,7 +298,7 @@ def remaining(problem: Squares, x: State) -> tuple[Array, Array]:
     grams = [w * slope @ slope.T for w, slope in zip(stack.precision, slopes, strict=True)]
     inverse = solve_normal(sum(grams) + problem.prior, np.eye(len(grams[0])))
     paid = np.array([float(np.trace(inverse @ gram)) for gram in grams])
-    spare = np.maximum([block.numbers for block in stack.blocks] - paid, 1.0)
+    spare = np.maximum([one.degrees for one in stack.instruments] - paid, 1.0)
     return np.array([float(error @ error) for error in errors]), spare
 
 
@@ -314,7 +312,7 @@ def covariance_of(problem: Squares, x: State, variance: Array) -> Array:
     active, stack = problem.active, problem.stack
     _, jacobians = stack.rows(x, active)
     inverse = solve_normal(jacobians @ jacobians.T + problem.prior, np.eye(len(jacobians)))
-    middle = (jacobians * stack.weights) @ jacobians.T + problem.prior
+    middle = (jacobians * stack.weights(x)) @ jacobians.T + problem.prior
     covariance = np.full((len(active),) * 2, np.nan)
     unit = float((variance * stack.precision).mean())
     covariance[np.ix_(active, active)] = unit * inverse @ middle @ inverse
@@ -326,12 +324,12 @@ def check_count(trains: Sequence[Train], stack: Stack, unknowns: int) -> None:
     every = [each.data for each in trains]
     for data in every:
         data.check_training()
-    given = sum(block.given for block in stack.blocks)
+    given = sum(one.given for one in stack.instruments)
     different = sum(data.independent for data in every) + given
-    unknowns -= sum(block.costless for block in stack.blocks)
+    unknowns -= sum(one.costless for one in stack.instruments)
     if different <= unknowns:
         where = " and ".join(data.at.source for data in every)
-        what = instrument_of(every[0]).words.counted if len(every) == 1 else "numbers"
+        what = every[0].words.counted if len(every) == 1 else "numbers"
         raise DataError(
             f"{where}: {different} independent {what} in training, but {unknowns} unknown "
             "parameters need more; measure at more poses, hold out fewer or fix parameters (fix)"
@@ -355,6 +353,18 @@ def every_parameter(robot: Robot, fit: InstrumentFit) -> tuple[Parameter, ...]:
 
 def own_parameters(robot: Robot, fit: InstrumentFit, i: int) -> tuple[Parameter, ...]:
     """An instrument's own, as people read them."""
-    every, own = every_parameter(robot, fit), fit.stack.own(i)
-    fitted, covariance = tuple(every[j] for j in own), fit.covariance[np.ix_(own, own)]
-    return fit.stack.blocks[i].listed(fitted, *fit.state_of(i), covariance)
+    every, place, one = every_parameter(robot, fit), fit.stack.own(i), fit.stack.instruments[i]
+    found = [every[j] for j, name in zip(place, one.names, strict=True) if name not in one.held]
+    drawn, ended = (fit.stack.blocks[i].own(x) for x in fit.state_of(i))
+    told = one.told(ended, drawn, fit.covariance[np.ix_(place, place)])
+    if not told:
+        return tuple(found)
+    kept, rest = found[: one.targets_at.start], found[one.targets_at.start :]
+    stem = found[0].name.removesuffix(one.names[0])
+    known = all(each.identifiable for each in rest)
+    why = "" if known else "same motion as links and base"
+    for name, unit, *numbers in told:
+        value, was, sigma = map(float, numbers)
+        sure = sigma if known else np.nan
+        kept.append(Parameter(stem + name, value, was, sure, unit, known, why))
+    return tuple(kept)

@@ -4,21 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.identify import Because
-from minimax_cal.fitting.instruments.data import RelativeData
-from minimax_cal.fitting.instruments.fit import InstrumentFit
-from minimax_cal.fitting.instruments.result import Measured, RelativeCalibration
-from minimax_cal.fitting.instruments.table import instrument
 from minimax_cal.fitting.same_arm import WILD_ANGLE
+from minimax_cal.fitting.several.fit import InstrumentFit, allowed_of, fit_instruments
+from minimax_cal.fitting.several.identify import identified
+from minimax_cal.fitting.several.options import RelativeOptions, silent
+from minimax_cal.fitting.several.result import Measured, RelativeCalibration
+from minimax_cal.fitting.several.stack import Stack
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.measuring import checks
 from minimax_cal.modelling.model import TARGET
 from minimax_cal.robots.kinematics import MDH_NAMES
+from minimax_cal.robots.robot import Robot
 
+LEAST = 5e-6  # a fit that misses by less leaves nothing to explain [m]
 WEAK = 3.0  # times what was measured: positions that are told worse are weakly told
 WILD_LENGTH = 0.02  # of the reach: no link is farther from its drawing
 
@@ -36,15 +42,15 @@ def of_scale(fit: InstrumentFit) -> tuple[str, ...]:
     kept = [name for name, why in reasons.items() if why.kind is Because.NO_SCALE]
     if not kept:
         return ()
-    first = instrument(fit.stack.blocks[0].kind)
+    first = fit.stack.instruments[0]
     return (
-        f"the scale is not identifiable from {first.name}: {kept[0]} is kept as drawn, and if that "
+        f"the scale is not identifiable from {first.kind}: {kept[0]} is kept as drawn, and if that "
         "is wrong by a part in a thousand, so is every length; sigmas leave this out; "
         + first.scale[-1],
     )
 
 
-def general(result: Measured, data: RelativeData, held: Array) -> tuple[str, ...]:
+def general(result: Measured, data: Instrument, held: Array) -> tuple[str, ...]:
     """What the reader should know: nothing held out, measurements that stand out."""
     notices = []
     if not held.any():
@@ -63,7 +69,7 @@ def weak(
     """A notice where positions are told far worse than what was measured."""
     rms_mm = min(each.accuracy["train"].rms_mm for each in measured)
     expected_mm = 1e3 * result.position_sigma
-    more = [instrument(block.kind).words.more for block in fit.stack.blocks]
+    more = [one.words.more for one in fit.stack.instruments]
     untold = [
         p.name for p in result.parameters if TARGET in p.name and p.because is Because.NOT_TOLD
     ]
@@ -96,3 +102,38 @@ def unlikely(result: RelativeCalibration, measured: Sequence[Measured]) -> tuple
             f"implausibly large changes (mm, mrad): {named}; is the robot file the right one?"
         )
     return tuple(notices)
+
+
+def unfitted(robot: Robot, fit: InstrumentFit, i: int, options: RelativeOptions) -> tuple[str, str]:
+    """A notice, and its mend, where more of an instrument would explain what the fit leaves."""
+    one, noise = fit.stack.instruments[i], float(fit.noise[i])
+    more = one.wider(options)
+    if not more or noise < LEAST:
+        return "", ""
+    try:
+        wider = fit_instruments(robot, fit.trains, replace(options, **dict[str, Any](more)), silent)
+    except DataError:  # too few numbers for so many unknowns
+        return "", ""
+    return one.told_wider(noise, float(wider.noise[i]))
+
+
+def beyond(robot: Robot, fit: InstrumentFit, options: RelativeOptions) -> tuple[str, ...]:
+    """Parameters that a lone instrument tells, and one point of it would not."""
+    one = fit.stack.instruments[0]
+    point = one.lone
+    if point is None:
+        return ()
+    lone = Stack.of(robot, [point.ready(robot, options)], [""])
+    own = one.lone_values(fit.stack.blocks[0].own(fit.stack.part(fit.state, 0)))
+    x = lone.state(fit.state.mdh, [own])
+    allowed, wanted = allowed_of(lone, options)
+    alone = identified(
+        robot, lone, lone.reference(robot, x), x, allowed, wanted,
+        known=np.zeros(lone.names.count, dtype=bool), resolution=options.resolution,
+    )  # fmt: skip
+    rows = lone.names.geometric + one.targets_at.start
+    more = fit.identification.active[:rows] & ~alone.active[:rows]
+    told = [name for name, known in zip(one.lone_names, alone.active[rows:], strict=False)
+            if not known]  # fmt: skip
+    rest = one.lone_names[len(alone.active) - rows :]
+    return (*(lone.names.all[i] for i in np.flatnonzero(more)), *told, *rest)

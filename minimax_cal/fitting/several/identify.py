@@ -18,25 +18,24 @@ from minimax_cal.fitting.identify import (
     Identification,
     Kept,
     drop_order,
-    plenty_of_poses,
     redundant,
     scale_keeper,
 )
-from minimax_cal.fitting.instruments.laws import NO_LAWS, Laws
-from minimax_cal.fitting.instruments.record import FRAMELESS
-from minimax_cal.fitting.instruments.rows import motion
-from minimax_cal.fitting.instruments.stack import Stack
-from minimax_cal.fitting.instruments.table import instrument
+from minimax_cal.fitting.several.laws import NO_LAWS, Laws
+from minimax_cal.fitting.several.stack import Stack
 from minimax_cal.ground.arrays import Array
+from minimax_cal.instruments.instrument import FRAMELESS, PLENTY, anywhere
+from minimax_cal.instruments.protocol import Arm, Given, ResidualRows, by_arm, corners
 from minimax_cal.modelling.cell import still
-from minimax_cal.modelling.model import TARGET, Model
+from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.model import TARGET
 from minimax_cal.modelling.parameters import State
-from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import hat
 from minimax_cal.robots.robot import Robot
 
 STILL = 1e-7  # relative motion of a column that moves nothing
 SHARED = 0.05  # of a direction that others leave open: a parameter with less is known without it
+NO_VALUES: Array = np.zeros(0)
 OPEN = 1e-4  # of the largest column: positions that a parameter moves by less depend on it no more
 LENGTHS = "all lengths together: "
 ALL_OWN = "all frames, anchors and targets of the files moved together"
@@ -50,20 +49,26 @@ def order_of(robot: Robot, stack: Stack) -> Array:
     """
     names, laws = stack.names, range(stack.lawless, stack.names.count)
     extra = np.arange(names.geometric, stack.lawless)
-    soft = np.array([name in b.given_up for b in stack.blocks for name in b.own], dtype=bool)
+    soft = np.array([name.startswith(one.given_up) for one in stack.instruments
+                     for name in one.names], dtype=bool)  # fmt: skip
     order = [*laws, *extra[soft], *drop_order(robot, names), *extra[~soft]]
     return np.array([int(i) for i in order], dtype=int)
 
 
 def length_row(stack: Stack, x: State) -> Array:
-    """(p,) derivative of the distance between two places of the first block's target."""
-    block, columns = stack.blocks[0], stack.columns(0)
-    point, moved = motion(block.model, stack.part(x, 0), np.ones(len(columns), dtype=bool))
-    far = int(np.argmax(((point - point[:, :1]) ** 2).sum(axis=0)))
-    gap = point[:, far] - point[:, 0]
-    row = np.zeros(stack.names.count)
+    """(p,) derivative of the distance between two places of the first instrument's target."""
+    block, x, links = stack.blocks[0], stack.part(x, 0), 5 * stack.names.joints
+    one = block.instrument
+    arm = block.flange(x, np.ones(links + stack.names.count - stack.lawless, dtype=bool))
+    point = arm.place(one.targets(block.own(x))[0])
+    ends = np.array([int(np.argmax(((point - point[0]) ** 2).sum(axis=1))), 0])
+    gap = point[ends[0]] - point[0]
     along = gap / max(float(np.linalg.norm(gap)), 1e-12)
-    row[columns] = along @ (moved[..., far] - moved[..., 0]).T
+    by_point, none = np.stack([along, -along]), np.zeros((2, 3))
+    slopes = by_arm(arm, ResidualRows(none[:, 0], ends, point[ends], by_point, none, none[:, :0]))
+    row, (far, near) = np.zeros(stack.names.count), arm.rotation[ends]
+    row[:links], row[stack.lawless :] = np.split(slopes.sum(axis=1), [links])
+    row[stack.own(0)[one.targets_at][:3]] = along @ (far - near)
     return row
 
 
@@ -72,7 +77,7 @@ def open_scale(reference: Stack, x: State, plain: Array, active: Array, order: A
 
     Not so where the user fixed a length of the arm.
     """
-    if any(block.has_length for block in reference.blocks):
+    if any(one.has_length for one in reference.instruments):
         return False
     row = length_row(reference, x)
     if not row.any():  # one socket: nothing has a length
@@ -104,7 +109,7 @@ def identified(
     stiff = stack.lawless
     size, scale = np.sqrt(np.diag(plain)), np.sqrt(np.diag(gram) / max(stack.points, 1))
     kept = Kept(names, allowed, {}).without(~allowed & names.links, Because.FIXED)
-    unmoved = {instrument(block.kind).unmoved for block in stack.blocks}
+    unmoved = {one.unmoved for one in stack.instruments}
     for motion_of, reason in (
         (size, unmoved.pop() if len(unmoved) == 1 else FRAMELESS),
         (scale, "moves nothing at these poses"),
@@ -118,13 +123,13 @@ def identified(
     keeper = scale_keeper(robot, kept.active, wanted) if no_length else []
     order = np.array(list(dict.fromkeys([*keeper, *(int(i) for i in order)])))
     gone = redundant(plain, kept.active[:stiff], order[order < stiff], RANK_TOLERANCE)
-    no_scale = LENGTHS + "; ".join(instrument(stack.blocks[0].kind).scale)
+    no_scale = LENGTHS + "; ".join(stack.instruments[0].scale)
     kept = kept.without(gone, Because.SAME_MOTION).without(
         [i for i in gone if i in keeper], Because.NO_SCALE, no_scale
     )
     told = gram + np.diag(np.where(known, np.maximum(np.diag(gram), RANK_TOLERANCE), 0.0))
     kept = kept.without(redundant(told, kept.active, order, resolution), Because.NOT_TOLD)
-    whole = stack.blocks[0].whole if len(stack.blocks) == 1 else ALL_OWN
+    whole = stack.instruments[0].words.whole if len(stack.blocks) == 1 else ALL_OWN
     own = names.effects[: stiff - names.geometric]
     stems = {name.rpartition("_")[0] for name in own if whole}
     curves = gram + np.diag(np.where(known & (np.arange(names.count) >= stiff), np.diag(gram), 0.0))
@@ -176,17 +181,16 @@ def determined_alone(stack: Stack, x: State, active: Array, resolution: float) -
 
 
 def position_sigma(
-    robot: Robot, model: Model, x: State, covariance: Array, laws: Laws = NO_LAWS
-) -> float:
+    robot: Robot, mdh: Array, spots: Array, covariance: Array, laws: Laws = NO_LAWS,
+    values: Array = NO_VALUES,
+) -> float:  # fmt: skip
     """RMS of a position's standard deviation at random poses, by the parameters alone [m].
 
-    Of the targets' centroid in base axes.  The best rigid motion of all positions is taken out: a
-    base is fitted wherever an arm is put to work.  covariance: (p, p) of the model's parameters,
-    behind them those of laws by which the arm gives way, NaN where not identified.
+    Arguments as of `positions_by`.  covariance: (p, p), NaN where not identified.
     """
     known = np.isfinite(np.diag(covariance))
-    known[5 * model.names.joints : 5 * model.names.joints + 6] = False  # the base, fitted again
-    jacobian = positions_by(robot, model, x, laws)
+    known[5 * robot.joints : 5 * robot.joints + 6] = False  # the base, fitted again
+    jacobian = positions_by(robot, mdh, spots, laws, values)
     # by its square root: where much is known badly, rounding would make the sum itself negative
     spread, axes = np.linalg.eigh(covariance[np.ix_(known, known)])
     root = jacobian[:, known] @ (axes * np.sqrt(np.maximum(spread, 0.0)))
@@ -213,19 +217,29 @@ def left_open(jacobian: Array, active: Array, asked: Array) -> Array:
     return out
 
 
-def positions_by(robot: Robot, model: Model, x: State, laws: Laws = NO_LAWS) -> Array:
+def positions_by(
+    robot: Robot, mdh: Array, spots: Array, laws: Laws = NO_LAWS, values: Array = NO_VALUES
+) -> Array:
     """(3 m, p) motion of the targets' centroid at random poses per unit of each parameter.
 
-    But for the best rigid motion of all positions; behind the model's parameters those of laws.
+    But for the best rigid motion of all positions: a base is fitted wherever an arm is put to work.
+    mdh: (n, 5).  spots: (k, 3) targets on the flange [m].  The parameters are links, a base, the
+    targets and the laws, with values (d,).
     """
-    some = plenty_of_poses(robot, replace(model, names=replace(model.names, effects=())))
-    here = still(robot.commanded(some.q), model.names.target_names, robot)
-    some = laws.on(some, robot, here, x)
-    jacobian = some.jacobian(x).mean(axis=0)
-    jacobian = jacobian.reshape(-1, jacobian.shape[-1])
-    links = kinematics.chain(x.mdh, some.q, some.prismatic)
-    point = kinematics.points(links, x.target_positions).mean(axis=0).T
-    point = point - point.mean(axis=0)
-    rigid = np.concatenate([np.tile(np.eye(3), (len(point), 1, 1)), -hat(point)], axis=2)
+    at, spot = still(anywhere(robot, PLENTY).q, (), robot), spots.mean(axis=0)
+    arm, frame = Arm.of(robot, at.q), (np.eye(3), np.zeros(3))
+    if laws.terms:
+        scene = Scene.of(robot.with_mdh(mdh), at, frame, corners(spot), arm.q)
+        arm = replace(arm, given=Given.of(arm.at(mdh), spot, *laws.fields(scene, values), values))
+    flange = arm.at(mdh, values, np.ones(5 * len(mdh) + len(values), dtype=bool))
+    point, pose = np.repeat(flange.place(spot), 3, axis=0), np.repeat(np.arange(PLENTY), 3)
+    axes, none = np.tile(np.eye(3), (PLENTY, 1)), np.zeros((len(pose), 3))
+    by = by_arm(flange, ResidualRows(none[:, 0], pose, point, axes, none, none[:, :0])).T
+    target = flange.rotation.reshape(-1, 3) / len(spots)
+    links, bends = np.split(by, [5 * len(mdh)], axis=1)
+    jacobian = np.hstack([links, np.zeros((len(by), 6)), *[target] * len(spots), bends])
+    stiff = arm.at(mdh).place(spot)
+    stiff = stiff - stiff.mean(axis=0)
+    rigid = np.concatenate([np.tile(np.eye(3), (len(stiff), 1, 1)), -hat(stiff)], axis=2)
     basis, _ = np.linalg.qr(rigid.reshape(-1, 6))
     return np.asarray(jacobian - basis @ (basis.T @ jacobian))

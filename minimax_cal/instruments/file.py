@@ -7,21 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.fitting.instruments.data import RelativeData, checked
-from minimax_cal.fitting.instruments.record import Columns
-from minimax_cal.fitting.instruments.table import INSTRUMENTS, instrument
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import csv_text, write_whole
+from minimax_cal.instruments.instrument import Columns, Instrument, checked
+from minimax_cal.instruments.table import INSTRUMENTS, instrument
 from minimax_cal.measuring.columns import read_rows
 from minimax_cal.measuring.measurements import file_column
 
 
-def columns_of(path: Path | str, header: Sequence[str]) -> Columns[RelativeData]:
+def columns_of(path: Path | str, header: Sequence[str]) -> Columns:
     """Those of the instrument that a header announces.  Raises DataError."""
-    every = [found for found in map(instrument, INSTRUMENTS) if found.columns]
-    found: list[tuple[str, Columns[RelativeData]]] = []
-    for columns in (each.columns for each in every if each.columns):
+    every = [one.file for one in map(instrument, INSTRUMENTS) if one.file]
+    found: list[tuple[str, Columns]] = []
+    for columns in every:
         names = [name for name in header if columns.announce.fullmatch(name)]
         wrong = [name for name in names if not columns.own.fullmatch(name)]
         if wrong:
@@ -30,7 +29,7 @@ def columns_of(path: Path | str, header: Sequence[str]) -> Columns[RelativeData]
             )
         found += [(names[0], columns)] if names else []
     if not found:
-        named = ", or ".join(each.columns.written for each in every if each.columns)
+        named = ", or ".join(each.written for each in every)
         raise DataError(f"{path}:1: no measured columns; name them {named}")
     first = [each for each in found if not each[1].yields] or found
     if len(first) > 1:
@@ -41,13 +40,13 @@ def columns_of(path: Path | str, header: Sequence[str]) -> Columns[RelativeData]
     return first[0][1]
 
 
-def read_relative(path: Path | str) -> RelativeData:
+def read_relative(path: Path | str) -> Instrument:
     """Read a CSV file of any instrument, by its columns.  Raises DataError."""
     file = read_rows(path)
     return checked(columns_of(path, file.header).read(file))
 
 
-def write_relative(path: Path | str, data: RelativeData) -> None:
+def write_relative(path: Path | str, data: Instrument) -> None:
     """Write CSV as `read_relative` reads it: radians (mm for slides) and millimetres."""
     at = data.at
     columns: dict[str, Array] = {

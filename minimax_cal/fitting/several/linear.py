@@ -12,15 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.evidence.noise import orthonormal
-from minimax_cal.fitting.instruments.fit import InstrumentFit
-from minimax_cal.fitting.instruments.rows import Block, through
+from minimax_cal.fitting.several.fit import InstrumentFit
 from minimax_cal.ground.arrays import Array
+from minimax_cal.instruments.protocol import ResidualRows
 from minimax_cal.measuring.grouping import groups
-from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.model import NO_MIX
-from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.rows import MAX_COMPUTED_NOISE, Posed
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
@@ -30,28 +27,28 @@ APART = 2.0  # times the largest spread of joints: eigenvalues of rows that hold
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """A block where a fit ended.
+    """An instrument where a fit ended.
 
-    block: its rows pose by pose.  x: its state without laws.  root: what a row is multiplied by.
-    poses: which of all poses are its own.  cell: (rows,) place of each row among all, pose by pose.
+    rows: as it reads there.  targets: how many it has.  root: (rows,) what each is multiplied by.
+    poses: which of all poses are its own.  cell: (rows,) place of each among all, pose by pose.
+    shapeless: (m, r, r) see `Instrument.shapeless`.
     """
 
-    block: Block
-    x: State
+    rows: ResidualRows
+    targets: int
     root: Array
     poses: slice
     cell: Array
+    shapeless: Array
 
     def of(self, fields: Array) -> Array:
-        """(d, rows) motions of its targets (d, k, 3, m), m its own poses, as its rows."""
-        model, d = self.block.model, len(fields)
-        names = replace(model.names, effects=("",) * d)
-        bent = through(self.block, replace(model, fields=fields, moved=NO_MIX, names=names))
-        own = len(self.block.own)
-        active = np.arange(self.block.model.names.joints * 5 + 6 + own + d)
-        x = replace(self.x, effects=np.concatenate([self.x.effects[:own], np.zeros(d)]))
-        _, slope = bent.rows(x, active >= len(active) - d)
-        return np.asarray(slope * self.root)
+        """(d, rows) motions (d, k, 3, m) of its targets, m its own poses, as its rows."""
+        rows = self.rows
+        target = rows.part if self.targets > 1 else np.zeros_like(rows.pose)
+        slopes = np.einsum(
+            "rc,drc->dr", rows.by_point, fields[:, target, :, rows.pose].swapaxes(0, 1)
+        )
+        return np.asarray(rows.settled(slopes, loose=True)[1] * self.root)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +65,7 @@ class StackRows(Posed):
         d, (m, r) = len(fields), self.weight.shape
         out = np.zeros((d, m * r))
         for look in self.looks:
-            count = len(look.block.model.y)
-            out[:, look.cell] = look.of(fields[:, :count, :, look.poses])
+            out[:, look.cell] = look.of(fields[:, : look.targets, :, look.poses])
         return self.turned(out)
 
     def turned(self, rows: Array) -> Array:
@@ -82,23 +78,17 @@ class StackRows(Posed):
 def scene_of_all(robot: Robot, fit: InstrumentFit) -> Scene:
     """All poses that any instrument saw, each with its targets, in the frame of the base."""
     stack, x = fit.stack, fit.state
-    seen = [
-        with_history(block.seen_at(train.data))
-        for block, train in zip(stack.blocks, fit.trains, strict=True)
+    every = stack.scenes(robot, x)
+    most = max(scene.targets for scene in every)
+    points = [
+        np.concatenate([one.points, np.repeat(one.points[:1], most - one.targets, axis=0)])
+        for one in every
     ]
-    states = [block.arm_state(stack.part(x, i)) for i, block in enumerate(stack.blocks)]
-    q = np.concatenate([block.model.q for block in stack.blocks])
-    most = max(len(state.target_positions) for state in states)
-    points = []
-    for block, state in zip(stack.blocks, states, strict=True):
-        links = kinematics.chain(x.mdh, block.model.q, block.model.prismatic)
-        spots = state.target_positions
-        some = np.concatenate([spots, np.repeat(spots[:1], most - len(spots), axis=0)])
-        points.append(kinematics.points(links, some))
+    q = np.concatenate([block.arm.q for block in stack.blocks])
     links = kinematics.chain(x.mdh, q, robot.prismatic)
     return Scene(
-        robot.with_mdh(x.mdh), joined(seen), links, states[0].target_positions,
-        np.concatenate(points, axis=-1), np.eye(3), np.zeros(3),
+        robot.with_mdh(x.mdh), joined([one.data for one in every]), links,
+        every[0].target_positions, np.concatenate(points, axis=-1), np.eye(3), np.zeros(3),
     )  # fmt: skip
 
 
@@ -129,26 +119,29 @@ def joined(seen: list[Measurements]) -> Measurements:
 def rows_of_all(scene: Scene, fit: InstrumentFit) -> StackRows:
     """The rows of all instruments.  scene: `scene_of_all`; fit: of geometry alone."""
     stack, active = fit.stack, fit.identification.active
-    starts = np.cumsum([0, *(len(block.model.q) for block in stack.blocks)]).tolist()
-    loose = [block.by_pose() for block in stack.blocks]
-    of_row = [block.pose_of_row for block in loose]
-    slots = [place_in(rows) for rows in of_row]
+    starts = np.cumsum([0, *(len(block.arm.q) for block in stack.blocks)]).tolist()
+    read = [block.read(stack.part(fit.state, i)) for i, block in enumerate(stack.blocks)]
+    slots = [place_in(rows.pose_of_row) for rows in read]
     width = max(int(slot.max()) + 1 for slot in slots)
-    looks, errors, slopes = [], [], []
-    every = zip(loose, of_row, slots, np.sqrt(stack.precision), starts, strict=False)
-    for i, (block, pose, slot, root, start) in enumerate(every):
+    looks, errors, slopes, places = [], [], [], []
+    every = zip(stack.blocks, read, slots, np.sqrt(stack.precision), starts, strict=False)
+    for i, (block, rows, slot, precise, start) in enumerate(every):
         x, columns = stack.part(fit.state, i), stack.columns(i)
-        root = root / np.sqrt(block.weights)
-        cell = (start + pose) * width + slot
-        look = Look(block, x, root, slice(start, start + len(block.model.q)), cell)
-        error, slope = block.rows(x, active[columns])
+        root = precise / np.sqrt(rows.weights)
+        one, own = block.instrument, block.own(x)
+        shapeless = one.shapeless(block.flange(x), own)
+        at, poses = (
+            (start + rows.pose_of_row) * width + slot,
+            slice(start, start + len(block.arm.q)),
+        )
+        looks.append(Look(rows, len(one.targets(own)), root, poses, at, shapeless))
+        error, slope = block.rows(x, active[columns], loose=True)
         whole = np.zeros((len(active), len(root)))
         whole[columns[active[columns]]] = slope * root
-        looks.append(look)
         errors.append(error * root)
         slopes.append(whole)
-    places = [block.places_of_rows() * look.root for block, look in zip(loose, looks, strict=True)]
-    return assembled(scene, fit, looks, errors, [*slopes], places, width)
+        places.append(rows.places * root)
+    return assembled(scene, fit, looks, errors, slopes, places, width)
 
 
 def assembled(
@@ -174,12 +167,11 @@ def assembled(
         own = np.zeros((len(more), total))
         own[:, look.cell] = more
         beside.append(own)
-        shape = look.block.shapeless(look.x)
+        shape = look.shapeless
         dead[look.poses, : shape.shape[1], : shape.shape[1]] = shape
     arms = np.zeros((scene.joints, total))
     for look in looks:
-        count = len(look.block.model.y)
-        arms[:, look.cell] = look.of(scene.jacobian[:, :count, :, look.poses])
+        arms[:, look.cell] = look.of(scene.jacobian[:, : look.targets, :, look.poses])
     by_pose = np.moveaxis(arms.reshape(scene.joints, scene.poses, width), 0, -1)
     spread = by_pose @ np.swapaxes(by_pose, 1, 2)
     far = APART * max(float(np.trace(spread, axis1=1, axis2=2).max()), 1.0)

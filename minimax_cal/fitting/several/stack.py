@@ -9,26 +9,35 @@ from itertools import pairwise
 
 import numpy as np
 
-from minimax_cal.fitting.instruments.data import RelativeData
-from minimax_cal.fitting.instruments.laws import NO_LAWS, Laws
-from minimax_cal.fitting.instruments.rows import Block, own_state, through
+from minimax_cal.fitting.several.laws import NO_LAWS, Laws
 from minimax_cal.ground.arrays import Array
+from minimax_cal.instruments.instrument import Instrument
+from minimax_cal.instruments.protocol import (
+    Arm,
+    FlangePoses,
+    Given,
+    ResidualRows,
+    by_arm,
+    corners,
+)
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.joint_fit import scene_of
-from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import BASE_NAMES, Names, State
 from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers import least_squares
+from minimax_cal.solvers.least_squares import METHODS, Limits
 
-ANGLES = ("_rx", "_ry", "_rz", "_tilt1", "_tilt2")  # endings of names
+SCREENED = Limits(step=1e-6)  # tells one start from another; the best is refined
 
 
 @dataclass(frozen=True)
 class OwnNames(Names):
     """Parameters of an arm whose base is the frame, and so none of them, and of instruments.
 
-    laws: units of the last ones, those of the laws by which the arm gives way.
+    own: units of the instruments' parameters.  laws: of the last ones, those of the laws by which
+    the arm gives way.
     """
 
+    own: tuple[str, ...] = ()
     laws: tuple[str, ...] = ()
 
     @cached_property
@@ -40,10 +49,74 @@ class OwnNames(Names):
     @cached_property
     def units(self) -> tuple[str, ...]:
         """(p,) SI."""
-        turned = [name.endswith(ANGLES) for name in self.all]
-        length = self.linear & ~np.array(turned)
-        own = length[: self.count - len(self.laws)]
-        return (*("m" if each else "rad" for each in own), *self.laws)
+        links = ("m" if length else "rad" for length in self.linear[: self.geometric])
+        return (*links, *self.own, *self.laws)
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """An instrument, and the arm at its poses.
+
+    A state of it has the links and, as effects, the e parameters of the instrument's own and those
+    of the laws by which its arm gives way; its p parameters are in the order of `Names`: links, the
+    base (which is the frame), its own, the laws'.
+    """
+
+    instrument: Instrument
+    arm: Arm
+
+    @staticmethod
+    def of(robot: Robot, one: Instrument) -> Block:
+        """With a stiff arm."""
+        return Block(one, Arm.of(robot, one.at.q))
+
+    def own(self, x: State) -> Array:
+        """(e,) of the instrument."""
+        return x.effects[: len(self.instrument.names)]
+
+    def flange(self, x: State, active: Array | None = None) -> FlangePoses:
+        """The flange at a state.  active: (5n + d,) as `Arm.at` has it."""
+        return self.arm.at(x.mdh, x.effects[len(self.instrument.names) :], active)
+
+    def read(self, x: State) -> ResidualRows:
+        """What the instrument says at a state."""
+        return self.instrument.read(self.flange(x), self.own(x))
+
+    def rows(self, x: State, active: Array, *, loose: bool = False) -> tuple[Array, Array]:
+        """Measured minus predicted (..., rows) [m], derivative of the latter (..., active, rows).
+
+        active: (p,).  loose: as `ResidualRows.settled`.
+        """
+        if x.mdh.ndim > 2:
+            found = [self.rows(x.take(np.array(i)), active) for i in range(len(x.mdh))]
+            return np.stack([error for error, _ in found]), np.stack([slope for _, slope in found])
+        n, e = 5 * len(x.mdh), len(self.instrument.names)
+        links, _, own, laws = np.split(active, [n, n + 6, n + 6 + e])
+        flange = self.flange(x, np.concatenate([links, laws]))
+        rows = self.instrument.read(flange, self.own(x))
+        by, count = by_arm(flange, rows), int(links.sum())
+        slopes = np.concatenate([by[:count], rows.by_own.T[own], by[count:]])
+        return rows.settled(slopes, loose=loose)
+
+    def scene(self, robot: Robot, x: State, spots: Array) -> Scene:
+        """What laws look at, with the geometry of a state.  spots: (k, 3) on the flange [m]."""
+        one = self.instrument
+        return Scene.of(robot.with_mdh(x.mdh), one.seen, one.base(self.own(x)), spots, self.arm.q)
+
+    def at_rows_of(self, robot: Robot, one: Instrument, laws: Laws, x: State) -> Block:
+        """The same at other measurements of the instrument, the laws linear at a state."""
+        block = Block.of(robot, self.instrument.at_rows_of(one))
+        return block.bent(robot, laws, x)
+
+    def bent(self, robot: Robot, laws: Laws, x: State) -> Block:
+        """The same looking at an arm that gives way, linear at a state with the laws' values."""
+        if not laws.terms:
+            return self
+        own, values = np.split(x.effects, [len(self.instrument.names)])
+        middle = self.instrument.targets(own).mean(axis=0)
+        scene = self.scene(robot, x, corners(middle))
+        given = Given.of(self.arm.at(x.mdh), middle, *laws.fields(scene, values), values)
+        return replace(self, arm=replace(self.arm, given=given))
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,18 +137,24 @@ class Stack:
     laws: Laws = NO_LAWS
 
     @staticmethod
-    def of(robot: Robot, blocks: Sequence[Block], labels: Sequence[str]) -> Stack:
-        """Blocks that weigh alike."""
-        stems = [f"{label}." if len(blocks) > 1 else "" for label in labels]
-        own = [stem + name for stem, one in zip(stems, blocks, strict=True) for name in one.own]
-        names = OwnNames(robot.joints, (), tuple(own), robot.notation.names(robot.joints))
-        count = len(blocks)
-        return Stack(tuple(blocks), tuple(labels), names, np.ones(count), np.full(count, np.nan))
+    def of(robot: Robot, every: Sequence[Instrument], labels: Sequence[str]) -> Stack:
+        """Instruments that weigh alike."""
+        stems = [f"{label}." if len(every) > 1 else "" for label in labels]
+        own = [stem + name for stem, one in zip(stems, every, strict=True) for name in one.names]
+        units = tuple(unit for one in every for unit in one.units)
+        names = OwnNames(robot.joints, (), tuple(own), robot.notation.names(robot.joints), units)
+        blocks, count = tuple(Block.of(robot, one) for one in every), len(every)
+        return Stack(blocks, tuple(labels), names, np.ones(count), np.full(count, np.nan))
+
+    @property
+    def instruments(self) -> tuple[Instrument, ...]:
+        """Of the blocks."""
+        return tuple(block.instrument for block in self.blocks)
 
     @property
     def points(self) -> int:
         """Number of compared points."""
-        return sum(block.points for block in self.blocks)
+        return sum(one.points for one in self.instruments)
 
     @cached_property
     def movable(self) -> Array:
@@ -86,7 +165,7 @@ class Stack:
     @cached_property
     def slots(self) -> tuple[slice, ...]:
         """Where the parameters of each block stand among the instruments' own."""
-        ends = np.cumsum([0, *(len(block.own) for block in self.blocks)]).tolist()
+        ends = np.cumsum([0, *(len(one.names) for one in self.instruments)]).tolist()
         return tuple(slice(*pair) for pair in pairwise(ends))
 
     @property
@@ -116,41 +195,25 @@ class Stack:
         """(k,) of the laws."""
         return x.effects[..., self.lawless - self.names.geometric :]
 
-    def scenes(self, robot: Robot, data: Sequence[RelativeData], x: State) -> list[Scene]:
-        """What laws look at, block by block, with the geometry of a state.
+    def scenes(self, robot: Robot, x: State) -> list[Scene]:
+        """What laws look at, block by block, with the geometry of a state and the targets."""
+        parts = [(block, self.part(x, i)) for i, block in enumerate(self.blocks)]
+        return [block.scene(robot, at, block.instrument.targets(block.own(at)))
+                for block, at in parts]  # fmt: skip
 
-        data: of each block, in the order of its poses.
-        """
-        out = []
-        for i, (block, each) in enumerate(zip(self.blocks, data, strict=True)):
-            state = block.arm_state(self.part(x, i))
-            out.append(scene_of(robot, block.seen_at(each), block.model, state))
-        return out
-
-    def bent(
-        self, robot: Robot, data: Sequence[RelativeData], laws: Laws, x: State
-    ) -> tuple[Stack, State]:
+    def bent(self, robot: Robot, laws: Laws, x: State) -> tuple[Stack, State]:
         """The same instruments looking at an arm that gives way, linear at a state; that state.
 
-        data: as `scenes`.  Laws that the stack did not have yet have the value 0.
+        Laws that the stack did not have yet have the value 0.
         """
         values = self.values(x) if self.laws.names else np.zeros(len(laws.names))
-        blocks = []
-        for i, (block, each) in enumerate(zip(self.blocks, data, strict=True)):
-            state = replace(block.arm_state(self.part(x, i)), effects=values)
-            model = laws.on(block.model, robot, block.seen_at(each), state)
-            blocks.append(through(block, model))
         stiff = self.names.effects[: self.lawless - self.names.geometric]
         names = replace(self.names, effects=(*stiff, *laws.names), laws=laws.units)
-        own = x.effects[..., : len(stiff)]
-        stack = replace(self, blocks=tuple(blocks), names=names, laws=laws)
-        return stack, replace(x, effects=np.concatenate([own, values], axis=-1))
-
-    def model_at(self, robot: Robot, i: int, data: RelativeData, x: State) -> Model:
-        """The arm of a block at all rows of its data, its laws linear at a state."""
-        block = self.blocks[i]
-        state = replace(block.arm_state(self.part(x, i)), effects=self.values(x))
-        return self.laws.on(block.model_at(robot, data), robot, block.seen_at(data), state)
+        x = replace(x, effects=np.concatenate([x.effects[: len(stiff)], values]))
+        stack = replace(self, names=names, laws=laws)
+        every = enumerate(self.blocks)
+        blocks = tuple(block.bent(robot, laws, stack.part(x, i)) for i, block in every)
+        return replace(stack, blocks=blocks), x
 
     def rows_by_block(self, x: State, active: Array) -> Iterator[tuple[Array, Array]]:
         """Of each block: measured minus predicted (..., rows), as heavy as those of any other.
@@ -176,10 +239,10 @@ class Stack:
         )
         return errors, jacobians
 
-    @property
-    def weights(self) -> Array:
-        """(rows,) see `Block.weights`."""
-        return np.concatenate([block.weights for block in self.blocks])
+    def weights(self, x: State) -> Array:
+        """(rows,) how much more each weighs than its noise says."""
+        every = (block.read(self.part(x, i)) for i, block in enumerate(self.blocks))
+        return np.concatenate([rows.weights for rows in every])
 
     def gram(self, x: State) -> Array:
         """The Gram matrix of all parameters at a state: (p, p)."""
@@ -187,13 +250,19 @@ class Stack:
         return np.asarray(jacobian @ jacobian.T)
 
     def reference(self, robot: Robot, x: State) -> Stack:
-        """Every block at plenty of poses, alike in weight."""
-        found = [b.reference(robot, self.part(x, i)) for i, b in enumerate(self.blocks)]
+        """Every instrument at plenty of poses, alike in weight."""
+        found = [
+            Block.of(robot, block.instrument.elsewhere(robot, block.own(self.part(x, i))))
+            for i, block in enumerate(self.blocks)
+        ]
         return replace(self, blocks=tuple(found), precision=np.ones(len(found)))
 
     def closed(self, robot: Robot, x: State) -> Stack:
-        """Every block where the arm at a state itself fits it."""
-        found = [b.closed(robot, self.part(x, i)) for i, b in enumerate(self.blocks)]
+        """Every instrument where the arm as drawn itself fits it."""
+        found = []
+        for i, block in enumerate(self.blocks):
+            one = block.instrument.fitting(robot, block.own(self.part(x, i)))
+            found.append(Block(one, replace(block.arm, q=robot.turned(one.at.q))))
         return replace(self, blocks=tuple(found))
 
 
@@ -293,3 +362,32 @@ class Squares:
         whole = np.zeros((*dx.shape[:-1], self.stack.names.count))
         whole[..., self.active] = dx
         return x.step(whole)
+
+
+# ---- the start ---------------------------------------------------------------------------------
+
+
+def started(robot: Robot, one: Instrument, free: Array) -> Array:
+    """(e,) own unknowns that fit the arm as drawn best, of several starts.  free: (e,) mask."""
+    starts = np.stack(list(one.starts(Block.of(robot, one).arm.at(robot.mdh), free)))
+    if not one.refines:
+        return np.asarray(starts[0])
+    active = np.concatenate([np.zeros(5 * robot.joints + 6, dtype=bool), free])
+    few, whole = (Stack.of(robot, [some], [""]) for some in (one.take(one.screened()), one))
+    x = own_state(robot.mdh, starts[0]).repeat(len(starts))
+    x.effects[:] = starts
+    if len(starts) > 1:
+        some, points = Squares(few, active), float(few.points)
+        first = least_squares.solve(some, x, len(starts), points, limits=SCREENED, trace=False)
+        cost = np.where(np.isfinite(first.cost), first.cost, np.inf)
+        x = first.x.take(np.array([int(cost.argmin())]))
+    limits, points = Limits(damping=1e-6), float(whole.points)
+    found = least_squares.solve(Squares(whole, active), x, 1, points, METHODS["snllm"], limits)
+    return np.asarray(found.x.effects[0])
+
+
+def own_state(mdh: Array, own: Array) -> State:
+    """A state of a block, or of several.  mdh: (..., n, 5).  own: (..., e)."""
+    *batch, _, _ = mdh.shape
+    rotation = np.broadcast_to(np.eye(3), (*batch, 3, 3))
+    return State(mdh, rotation, np.zeros((*batch, 3)), np.zeros((*batch, 0, 3)), own)

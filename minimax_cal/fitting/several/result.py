@@ -12,8 +12,6 @@ import numpy as np
 from minimax_cal.fitting.fit import ACCURACIES, Provenance
 from minimax_cal.fitting.found import Parameter, parameter_table, table_of_effects
 from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.instruments.record import Words
-from minimax_cal.fitting.instruments.table import INSTRUMENTS, instrument
 from minimax_cal.fitting.intervals import Interval
 from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.ground.arrays import Array, rms
@@ -23,6 +21,8 @@ from minimax_cal.ground.records import as_kind, read, reading, stored
 from minimax_cal.ground.results import Result, merged
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import name_first
+from minimax_cal.instruments.instrument import Words
+from minimax_cal.instruments.table import INSTRUMENTS, instrument
 from minimax_cal.measuring.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
 from minimax_cal.modelling.cell import Cell, cell_from_dict, pose_from_dict
 from minimax_cal.modelling.frames import paired, tables_of

@@ -11,7 +11,6 @@ import numpy as np
 
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.found import Parameter, link_by_link
-from minimax_cal.fitting.instruments.pixel_result import PIXELS, PixelCalibration
 from minimax_cal.fitting.options import listed, qp_name
 from minimax_cal.fitting.pixels.camera import FLANGE, read_camera
 from minimax_cal.fitting.pixels.data import PixelData, read_pixels
@@ -22,6 +21,7 @@ from minimax_cal.fitting.pixels.model import Scene, units_of
 from minimax_cal.fitting.pixels.options import PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import contradiction, file_notices, outlier_notices
 from minimax_cal.fitting.pixels.uncertainty import Uncertainty
+from minimax_cal.fitting.several.pixel_result import PIXELS, PixelCalibration
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
