@@ -17,9 +17,11 @@ from minimax_cal.fitting.identify import (
     Because,
     Identification,
     Kept,
+    doubted_last,
     drop_order,
     redundant,
     scale_keeper,
+    with_priors,
 )
 from minimax_cal.fitting.several.laws import NO_LAWS, Laws
 from minimax_cal.fitting.several.stack import Stack
@@ -119,21 +121,22 @@ def identified(
         kept = kept.without(kept.active & still, Because.OTHER, reason)
     order = order_of(robot, stack)
     order = np.concatenate([order[~wanted[order]], order[wanted[order]]])
+    order = doubted_last(order, names, known)
     no_length = open_scale(reference, x, plain, kept.active[:stiff], order[order < stiff])
     keeper = scale_keeper(robot, kept.active, wanted) if no_length else []
     order = np.array(list(dict.fromkeys([*keeper, *(int(i) for i in order)])))
     gone = redundant(plain, kept.active[:stiff], order[order < stiff], RANK_TOLERANCE)
+    gone = [i for i in gone if not known[i] or i in keeper]
     no_scale = LENGTHS + "; ".join(stack.instruments[0].scale)
     kept = kept.without(gone, Because.SAME_MOTION).without(
         [i for i in gone if i in keeper], Because.NO_SCALE, no_scale
     )
-    told = gram + np.diag(np.where(known, np.maximum(np.diag(gram), RANK_TOLERANCE), 0.0))
+    told = with_priors(gram, known)
     kept = kept.without(redundant(told, kept.active, order, resolution), Because.NOT_TOLD)
     whole = stack.instruments[0].words.whole if len(stack.blocks) == 1 else ALL_OWN
     own = names.effects[: stiff - names.geometric]
     stems = {name.rpartition("_")[0] for name in own if whole}
-    curves = gram + np.diag(np.where(known & (np.arange(names.count) >= stiff), np.diag(gram), 0.0))
-    return kept.identification(curves, scale, stems - {TARGET, "base"}, whole)
+    return kept.identification(told, scale, stems - {TARGET, "base"}, whole)
 
 
 def generic_count(robot: Robot, reference: Stack, x: State, allowed: Array) -> int:
@@ -197,7 +200,7 @@ def position_sigma(
     return float(np.sqrt(3.0 * (root**2).sum() / len(jacobian)))
 
 
-def left_open(jacobian: Array, active: Array, asked: Array) -> Array:
+def lacking(jacobian: Array, active: Array, asked: Array) -> Array:
     """(p,) the fewest of the parameters asked for with which all of them would be determined.
 
     Those that move positions as no others together do.  jacobian: (r, p) as `positions_by`.

@@ -19,7 +19,7 @@ from minimax_cal.fitting.options import listed, priors_of
 from minimax_cal.fitting.several import fit, plausible, remarks
 from minimax_cal.fitting.several.checks import check_given, check_noises, check_options
 from minimax_cal.fitting.several.fit import InstrumentFit, Train
-from minimax_cal.fitting.several.identify import left_open, position_sigma, positions_by
+from minimax_cal.fitting.several.identify import lacking, position_sigma, positions_by
 from minimax_cal.fitting.several.options import (
     Progress,
     RelativeOptions,
@@ -190,7 +190,7 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
     sources = ", ".join(data.at.source for data in every)
     source = replace(every[0].at, source=sources, digest=" ".join(d.at.digest for d in every))
     geometry = found.stiff or found
-    settings = options.settings()
+    settings, left_open = options.settings(), open_positions(robot, found)
     for one in reversed(found.stack.instruments):  # the first one's stand
         settings |= one.choices
     result = RelativeCalibration(
@@ -202,8 +202,8 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
         seconds=time.perf_counter() - began,
         parameters=fit.parameters_of(robot, found),
         identification=found.identification,
-        position_sigma=sigma_of_positions(robot, found),
-        positions_open=open_positions(robot, found),
+        position_sigma=np.nan if left_open else sigma_of_positions(robot, found),
+        positions_open=left_open,
         beyond=remarks.beyond(robot, found, options) if single else (),
         notices=tuple(dict.fromkeys(notices)),
         provenance=Provenance.of(robot, source, settings),
@@ -223,21 +223,17 @@ def judged(
     options: RelativeOptions,
 ) -> RelativeCalibration:
     """The result with what the reader should know, failed where it is no calibration."""
-    instruments = list(enumerate(found.stack.instruments))
-    unfitted = [remarks.unfitted(robot, found, i, options) for i, _ in instruments]
+    unfitted = [remarks.unfitted(robot, found, i, options) for i in range(len(every))]
     wrong = plausible.contradiction(robot, every, found, measured, [mend for _, mend in unfitted])
     said = [
-        *(
-            remark
-            for i, one in instruments
-            for remark in one.remarks(fit.own_parameters(robot, found, i), found.noise[i])
-        ),
+        *(remark for i, one in enumerate(found.stack.instruments)
+          for remark in one.remarks(fit.own_parameters(robot, found, i), found.noise[i])),
         *remarks.of_beyond(result),
         *remarks.of_scale(found),
         *remarks.weak(found, result, measured),
         *remarks.unlikely(result, measured),
         *filter(None, (*(notice for notice, _ in unfitted), wrong)),
-    ]
+    ]  # fmt: skip
     for data, (held, _), each in zip(every, splits, measured, strict=True):
         said += remarks.general(each, data, held)
     return replace(
@@ -251,15 +247,14 @@ def measured_by(
     robot: Robot, found: InstrumentFit, i: int, data: Instrument, held: Array
 ) -> Measured:
     """The errors of an instrument, as drawn and calibrated.  held: (m,)."""
-    stack = found.stack
-    seen = []
+    stack, seen = found.stack, []
     for x in found.state_of(i):
         block = stack.blocks[i].at_rows_of(robot, data, stack.laws, x)
         seen.append((block.instrument, block.flange(x), block.own(x)))
     nominal, calibrated = (one.errors(arm, own, held) for one, arm, own in seen)
     turned = [one.turns(arm, own)[None] for one, arm, own in seen]
-    train, (_, drawn), x = stack.instruments[i], seen[0][1:], found.state_of(i)[1]
     turns = by_key(turned[0], turned[1], held) if turned[0].size else {}
+    train, drawn, own = stack.instruments[i], seen[0][2], seen[1][2]
     counts = data.count(held)
     return Measured(
         kind=data.kind,
@@ -268,7 +263,7 @@ def measured_by(
         numbers={key: counts[is_held] for key, is_held in HELD.items()},
         turns={key: (rms(t), float(t.max()) if t.size else np.nan)
                for key, t in turns.items()},
-        instrument=train.placed(stack.blocks[i].flange(x), seen[1][2], drawn),
+        instrument=train.placed(stack.blocks[i].flange(x), own, drawn),
     )  # fmt: skip
 
 
@@ -310,7 +305,7 @@ def cell_of(robot: Robot, found: InstrumentFit) -> Cell:
     effects = fitted(stack.laws.terms, scene, stack.values(found.state))
     amid = scene.target_positions.mean(axis=0, keepdims=True)
     sessions = Sessions({}, Clock.of(found.trains[0].data.at))
-    return Cell(robot.with_mdh(found.state.mdh), np.eye(4), (TARGET,), amid, effects, sessions)
+    return Cell(scene.robot, np.eye(4), (TARGET,), amid, effects, sessions)
 
 
 def instruments_of(
@@ -374,5 +369,5 @@ def open_positions(robot: Robot, found: InstrumentFit) -> tuple[str, ...]:
     fixed = [name in reasons and reasons[name].kind is Because.FIXED for name in names]
     asked = ~np.array(fixed) & stack.movable[place]
     jacobian = positions_by(robot, fit.nominal.mdh, targets_of(fit, fit.nominal))
-    left = left_open(jacobian, fit.identification.active[place], asked)
+    left = lacking(jacobian, fit.identification.active[place], asked)
     return tuple(name for name, is_open in zip(names, left, strict=True) if is_open)

@@ -73,11 +73,12 @@ def weak(
     untold = [
         p.name for p in result.parameters if TARGET in p.name and p.because is Because.NOT_TOLD
     ]
-    if not all(more) or (expected_mm <= WEAK * rms_mm and not untold):
+    if not all(more) or not (expected_mm > WEAK * rms_mm or untold):
         return ()
     where = f" ({', '.join(untold)} not at all)" if untold else ""
+    sigma = "" if result.positions_open else f"by the sigmas to {expected_mm:.3g} mm, "
     return (
-        f"positions are poorly determined{where}: by the sigmas to {expected_mm:.3g} mm, "
+        f"positions are poorly determined{where}: {sigma}"
         f"what was measured fits to {rms_mm:.3g} mm, and model error makes positions worse still; "
         f"turn the flange more from pose to pose, and measure with {more[0]}",
     )

@@ -192,8 +192,9 @@ class RelativeCalibration(Measured, Result):
     """A robot calibrated from lengths, closures or poses, or from several files together.
 
     robot: calibrated; nominal: as drawn.  position_sigma: expected error of a position over the
-    joints' range, by the parameters' sigmas alone, the base fitted [m].  positions_open: parameters
-    that positions depend on and that the measurements do not determine; no sigma holds these.
+    joints' range, by the parameters' sigmas alone, the base fitted [m]; NaN while a direction that
+    moves positions is open.  positions_open: parameters that positions depend on and that the
+    measurements do not determine.
     beyond: parameters that whole poses tell and one reflector does not.  instruments: each of
     several files.  cell: the arm with its effects, fitted together; None without any.  robot is
     then of a fit without them.
@@ -271,14 +272,16 @@ class RelativeCalibration(Measured, Result):
         return (*filled(*every), parameter_table(self.parameters))
 
     @property
-    def given_open(self) -> str:
-        """On what a position's sigma rests, as the begin of a sentence."""
-        if not self.positions_open:
-            return "By the parameters' sigmas alone"
-        many = "is" if len(self.positions_open) == 1 else "are"
+    def position_claim(self) -> str:
+        """How good positions are, as a sentence."""
+        if self.positions_open:
+            return (
+                f"These data do not determine {name_first(self.positions_open)}, on which "
+                "positions depend: how good a position is they do not say."
+            )
         return (
-            f"These data do not determine {name_first(self.positions_open)}, on which positions "
-            f"depend: if {'it' if many == 'is' else 'they'} {many} as drawn, by the sigmas alone"
+            "By the parameters' sigmas alone a position over the joints' range is good to "
+            f"{1e3 * self.position_sigma:.3f} mm RMS once a base is fitted."
         )
 
     def headline(self) -> str:
@@ -287,9 +290,8 @@ class RelativeCalibration(Measured, Result):
         text = (
             f"{self.words.quantity.capitalize()}: RMS error {before.rms_mm:.3f} mm -> "
             f"{after.rms_mm:.3f} mm, largest {before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, "
-            f"at {where}. {self.words.caution}{self.given_open} a position over the "
-            f"joints' range is good to {1e3 * self.position_sigma:.3f} mm RMS once a base is "
-            f"fitted. {self.identified} of {len(self.parameters)} parameters identified (condition "
+            f"at {where}. {self.words.caution}{self.position_claim} {self.identified} of "
+            f"{len(self.parameters)} parameters identified (condition "
             f"{self.identification.condition:.3g}); {self.status} after {self.iterations} "
             f"iterations, {self.seconds:.2f} s."
         )
