@@ -25,8 +25,8 @@ from experiments import sweep
 from experiments.real import here, real
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.positions import position_sigma
 from minimax_cal.fitting.several import RelativeCalibration, relative
-from minimax_cal.fitting.several.identify import position_sigma
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.instruments import Instrument, closures, distances, flange_poses

@@ -18,6 +18,7 @@ from minimax_cal.fitting.claims import (
     crossed_of,
     drawn_crossed_of,
     is_crossed,
+    other_points,
     unjudged,
     unseen_suspects,
 )
@@ -184,6 +185,7 @@ class Judged:
             *self.alarming,
             *bad_rows(self.suspects, data),
             *unjudged(data, self.crossed[1]),
+            *other_points(self.robot, self.solved, after),
             *([said_of_exchanged(data, self.swapped)] if swapped else []),
             *([said_without(better, rms_of(*self.unseen))] if better and better.wrong else []),
             *filter(None, [self.ending[1]]),

@@ -16,10 +16,10 @@ from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.intervals import rms_interval, told
 from minimax_cal.fitting.opened import listed_effects
 from minimax_cal.fitting.options import listed, priors_of
+from minimax_cal.fitting.positions import lacking, position_sigma, positions_by
 from minimax_cal.fitting.several import fit, plausible, remarks
 from minimax_cal.fitting.several.checks import check_given, check_noises, check_options
 from minimax_cal.fitting.several.fit import InstrumentFit, Train
-from minimax_cal.fitting.several.identify import lacking, position_sigma, positions_by
 from minimax_cal.fitting.several.options import (
     Progress,
     RelativeOptions,

@@ -280,7 +280,8 @@ class RelativeCalibration(Measured, Result):
                 "positions depend: how good a position is they do not say."
             )
         return (
-            "By the parameters' sigmas alone a position over the joints' range is good to "
+            "By the parameters' sigmas alone, which hold neither effects that the model lacks nor "
+            "errors of what is fixed, a position over the joints' range is good to "
             f"{1e3 * self.position_sigma:.3f} mm RMS once a base is fitted."
         )
 
