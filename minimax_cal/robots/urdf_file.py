@@ -22,6 +22,7 @@ from minimax_cal.robots.transforms import from_rpy, transform
 
 ASSUMED = "assumed"  # attribute of an <inertial> of ours whose mass nobody told
 MOVING = ("revolute", "continuous", "prismatic")
+UPRIGHT: Array = np.array([0.0, 0.0, 1.0])
 ATTRIBUTE = re.compile(rb"""([^\s=<>"']+)\s*=\s*("[^"]*"|'[^']*')""")
 
 
@@ -66,7 +67,7 @@ class Joint:
     lower: float
     upper: float
     mimic: Mimic | None
-    element: Element
+    element: Element = Element("joint", {}, 0, 0, 0)
 
     @property
     def moves(self) -> bool:
@@ -85,7 +86,7 @@ class Urdf:
     """A file.  masses: kg and centre of gravity in the link's frame [m], of links that have any.
 
     inertias: (3, 3) about the centre of gravity in the link's axes, of links that have any
-    [kg m^2].
+    [kg m^2].  up: (3,) vertical in the root.  notices: what of the file is not in it.
     """
 
     source: str
@@ -95,6 +96,8 @@ class Urdf:
     joints: tuple[Joint, ...]
     masses: Mapping[str, tuple[float, Array]]
     inertias: Mapping[str, Array] = field(default_factory=dict)
+    up: Array = field(default_factory=UPRIGHT.copy)
+    notices: tuple[str, ...] = ()
 
     def from_link(self, name: str) -> list[Joint]:
         """The joints that hang on a link."""
