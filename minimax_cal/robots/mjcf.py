@@ -217,9 +217,11 @@ def tree_of(
         parent, frame = names[above], inverse(poses[above]) @ poses[body]
         for number in range(first, first + int(model.body_jntnum[body])):
             if number in moving:
-                joints.append(joint_at(model, number, parent, frame, (mimics or {}).get(number)))
-                parent, frame = joints[-1].child, shifted(-model.jnt_pos[number])
-        joints.append(fixed(parent, names[body], frame))
+                joint = joint_at(model, number, parent, frame)
+                joints.append(replace(joint, mimic=(mimics or {}).get(number)))
+                parent, frame = joint.child, shifted(-model.jnt_pos[number])
+        if parent != names[body]:
+            joints.append(fixed(parent, names[body], frame))
         if model.body_mass[body] > 0.0:
             inward = inverse(poses[body])
             turn = inward[:3, :3] @ data.ximat[body].reshape(3, 3)
@@ -237,20 +239,23 @@ def tree_of(
     return Urdf(source, b"", Path(source).stem, "world", tuple(joints), masses, inertias, up)
 
 
-def joint_at(model: Any, number: int, parent: str, frame: Array, mimic: Mimic | None) -> Joint:
+def joint_at(model: Any, number: int, parent: str, frame: Array) -> Joint:
     """A joint on a link, at its value 0.  frame: (4, 4) its body in that, at its reference [m]."""
     kind, name = KINDS[int(model.jnt_type[number])], joint_name(model, number)
+    body = int(model.jnt_bodyid[number])
+    last = number + 1 == model.body_jntadr[body] + model.body_jntnum[body]
+    whole = last and not model.jnt_pos[number].any()
     limited = kind in MOVING and bool(model.jnt_limited[number])
     joint = Joint(
         name=name,
         kind="continuous" if kind == "revolute" and not limited else kind,
         parent=parent,
-        child=f"{name} (axis)",
+        child=body_name(model, body) if whole else f"{name} (axis)",
         origin=frame @ shifted(model.jnt_pos[number]),
         axis=np.array(model.jnt_axis[number]),
         lower=float(model.jnt_range[number, 0]) if limited else -np.inf,
         upper=float(model.jnt_range[number, 1]) if limited else np.inf,
-        mimic=mimic,
+        mimic=None,
     )
     if not joint.moves:
         return joint
