@@ -106,7 +106,9 @@ def only_tip(urdf: Urdf, links: Sequence[str], root: str) -> str:
             f"link, as {Path(urdf.source).name}#{tips[0]} or with tip="
         )
     if not tips:
-        raise RobotError(f"{urdf.source}: has no revolute, continuous or prismatic joint")
+        held = [j for j in urdf.joints if j.kind != j.element.attributes.get("type", j.kind)]
+        only = " that its limits (lower = upper) do not hold" if held else ""
+        raise RobotError(f"{urdf.source}: has no revolute, continuous or prismatic joint{only}")
     return tips[0]
 
 

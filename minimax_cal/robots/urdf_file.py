@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from xml.parsers import expat
 
@@ -221,7 +221,7 @@ def numbers(
 
 
 def joint_of(element: Element, name: str, source: str) -> Joint:
-    """A <joint>."""
+    """A <joint>; one whose limits are the same number is fixed there."""
     where, ends = f"joint {name!r}", []
     for tag in ("parent", "child"):
         end = element.child(tag)
@@ -245,9 +245,9 @@ def joint_of(element: Element, name: str, source: str) -> Joint:
     if given and kind in ("revolute", "prismatic"):
         lower, upper = (float(numbers(limit, n, (0.0,), where, source)[0])
                         for n in ("lower", "upper"))  # fmt: skip
-        if lower >= upper:
-            raise RobotError(f"{source}:{element.line}: {where}: limit lower is not below upper")
-    return Joint(
+        if lower > upper:
+            raise RobotError(f"{source}:{element.line}: {where}: limit lower is above upper")
+    joint = Joint(
         name=name,
         kind=kind,
         parent=ends[0],
@@ -259,6 +259,10 @@ def joint_of(element: Element, name: str, source: str) -> Joint:
         mimic=mimic_of(element.child("mimic"), where, source),
         element=element,
     )
+    if lower < upper:
+        return joint
+    held = joint.motion(np.array([lower]))[0]
+    return replace(joint, kind="fixed", origin=origin @ held, mimic=None)
 
 
 def mimic_of(element: Element | None, where: str, source: str) -> Mimic | None:
@@ -313,6 +317,8 @@ def root_of(links: Mapping[str, Element], joints: tuple[Joint, ...], source: str
                 "closed chains are not supported"
             )
         parents[joint.child] = joint.parent
+    if not links:
+        raise RobotError(f"{source}: holds no <link>, so no robot")
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
         said = ", ".join(roots[:6]) or "none: the joints form a ring"

@@ -224,12 +224,39 @@ def test_a_chain_between_two_links_and_grippers_left_out() -> None:
     assert to_robot(urdf, "right_link0:").chain[-1].child == "right_flange"
 
 
+@pytest.mark.dev
+def test_a_joint_whose_limits_are_one_number_is_fixed_there() -> None:
+    pinocchio = pytest.importorskip("pinocchio")
+    rows = [row for row in ARM if row[0] != "continuous"]
+    rows[1] = (*rows[1][:4], 'lower="0.3" upper="0.3"')
+    rows[3] = (*rows[3][:4], 'lower="-0.2" upper="-0.2"')
+    text = urdf_of(tuple(rows))
+    model = to_robot(parse_urdf(text.encode()))
+    robot = robot_from_dict(model.content)
+    theirs = pinocchio.buildModelFromXML(text)
+    data, frame = theirs.createData(), theirs.getFrameId(model.chain[-1].child)
+    assert robot.joints == theirs.nq - 2 == 2
+    for q in random_joints(robot.lower, robot.upper, 20):
+        pinocchio.framesForwardKinematics(theirs, data, np.array([0.3, -0.2, *q]))
+        ours = model.base @ robot.pose(q) @ model.tool
+        assert_allclose(ours, data.oMf[frame].homogeneous, **EXACT)
+
+
+ENDS = '<parent link="a"/><child link="b"/>'
 JOINT = '<joint name="j" type="revolute"><parent link="a"/><child link="b"/>{}</joint>'
 BROKEN = {
     "": r":1: is not XML \(no element found\)",
     "<robot><link": ":1: is not XML",
     "<html/>": "its root is <html>, expected <robot>",
-    "<robot/>": "expected one root link, found none",
+    "<robot/>": "holds no <link>, so no robot",
+    f'<robot><joint name="j" type="fixed">{ENDS}</joint></robot>': "no link 'a'",
+    "<robot>"
+    + "".join(
+        f'<link name="{a}"/><joint name="j{a}" type="fixed"><parent link="{a}"/>'
+        f'<child link="{b}"/></joint>'
+        for a, b in ("ab", "ba")
+    )
+    + "</robot>": "expected one root link, found none: the joints form a ring",
     '<robot><link name="a"/></robot>': "has no revolute, continuous or prismatic joint",
     "<robot><link/></robot>": "<link> has no name",
     '<robot><xacro:macro name="x"/></robot>': "this is xacro, not URDF; expand it first",
@@ -247,7 +274,8 @@ BROKEN = {
             '<origin xyz="1 nan 2"/>': "expected 3 numbers",
             '<origin rpy="0 ${pi} 0"/>': "is xacro; expand it first",
             '<axis xyz="0 0 0"/>': "its axis is a zero vector",
-            '<limit lower="1" upper="-1"/>': "limit lower is not below upper",
+            '<limit lower="1" upper="-1"/>': "limit lower is above upper",
+            '<limit lower="0" upper="0"/>': r"joint that its limits \(lower = upper\) do not hold",
             '<limit lower="one"/>': "expected a number",
             '<mimic joint="k"/>': "mimics 'k', no moving joint of this chain",
             '<mimic joint="j"/>': "mimics 'j', a ring",
