@@ -139,6 +139,9 @@ def joints_of(model: Any, count: int, source: str, tip: str) -> tuple[int, ...]:
     Where more lie on the way, those that an actuator drives; of several the driven arm.
     """
     found: dict[tuple[int, ...], list[str]] = {}
+    tip = tip.rpartition(":")[2]
+    sites = {model.site(i).name: int(model.site_bodyid[i]) for i in range(model.nsite)}
+    tip = model.body(sites[tip]).name if tip in sites else tip
     for body in range(1, model.nbody):
         name = model.body(body).name
         if tip and name != tip:

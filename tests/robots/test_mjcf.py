@@ -5,7 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import run
 from numpy.testing import assert_allclose
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
@@ -209,3 +212,58 @@ def test_one_line_says_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
     with pytest.raises(mc.OptionError, match=r"needs mujoco: pip install .*\[mujoco\]"):
         mc.load_robot(tmp_path / "arm.xml")
+
+
+def six_of(side: str, y: float) -> str:
+    """An arm of six joints with a site at its flange."""
+    inside = f'<site name="{side}_flange" pos="0 0 .1"/>'
+    places = ("0 0 .3", "0 .1 .1", ".4 0 .05", ".35 .02 0", "0 .1 0", ".1 0 0")
+    for i, axis in reversed(
+        list(enumerate(("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0")))
+    ):
+        inside = (
+            f'<body name="{side}_{i}" pos="{places[i]}"><joint name="{side}_j{i}" axis="{axis}" '
+            f'range="-140 140" damping="5"/><inertial pos=".05 0 0" mass="{6 - i}" '
+            f'diaginertia=".02 .02 .02"/>{inside}</body>'
+        )
+    return f'<body name="{side}_base" pos="0 {y} .5">{inside}</body>'
+
+
+def test_an_arm_of_a_cell_is_corrected_by_the_command_that_is_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    motors = "".join(
+        f'<position joint="{side}_j{i}" kp="2000" kv="100"/>'
+        for side in ("left", "right")
+        for i in range(6)
+    )
+    bodies = six_of("left", 0.4) + six_of("right", -0.4)
+    text = f"<mujoco><worldbody>{bodies}</worldbody><actuator>{motors}</actuator></mujoco>"
+    Path("cell.xml").write_text(text)
+    arm = "cell.xml#left_base:left_flange"
+    command = f"simulate {arm} --poses 50 --seed 1 --compliance 0 --truth true.json -o poses.csv"
+    assert run(*command.split()) == 0
+    assert run("calibrate", arm, "poses.csv", "-o", "fit.json") == 0
+    lines = capsys.readouterr().out.splitlines()
+    (line,) = (each for each in lines if "minimax-cal export" in each)
+    assert run(*line.split()[1:]) == 0
+    before, after = (mujoco.MjModel.from_xml_path(f) for f in ("cell.xml", "calibrated.xml"))
+    q = mc.read_measurements("poses.csv").q
+    goal = mc.load_robot("true.json").pose(q)[:, :3, 3]
+
+    def missed(model: Any) -> float:
+        """RMS distance of the site from the true flange, base and tool fitted [m]."""
+        own = np.hstack([q, np.zeros((len(q), 6))])
+        there = np.array([pose_in(model, each, "left_flange") for each in own])
+
+        def off(x: Array) -> Array:
+            point = there[:, :3, :3] @ x[6:] + there[:, :3, 3]
+            return np.asarray(Rotation.from_rotvec(x[:3]).apply(point) + x[3:6] - goal).ravel()
+
+        x = least_squares(off, [0.0] * 9, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+        return float(np.sqrt((off(x) ** 2).sum() / len(q)))
+
+    assert missed(after) < 0.05 * missed(before)
+    for name in ("right_0", "right_5"):
+        assert_allclose(after.body(name).pos, before.body(name).pos, atol=1e-12)

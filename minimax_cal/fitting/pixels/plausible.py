@@ -90,7 +90,7 @@ def other_poses(robot: Robot, data: PixelData, seen: Array) -> list[tuple[str, P
     text = (
         f"{len(wrong)} of {len(rows)} images are paired with other poses: that of pose "
         f"{data.labels[rows[wrong[0]]]} is of pose {data.labels[pose[wrong[0]]]}; was an image or "
-        "a row lost? pair images and joint values anew"
+        "a row lost? pair images and joint values again"
     )
     some = data.some(known)
     return [(text, replace(some, pose=place[some.pose]))]
