@@ -170,7 +170,7 @@ def chunks(text: str) -> Iterator[list[str]]:
 PLAIN = {"mm", "deg", "mrad", "um"}  # units
 RUN = [
     "index.md", "tutorial.md", "backends.md", "own_effect.md", "from_matlab.md",
-    "several_instruments.md", "own_instrument.md",
+    "several_instruments.md", "own_instrument.md", "mjcf_to_mjcf.md", "controller_pose.md",
 ]  # fmt: skip
 
 
@@ -183,6 +183,8 @@ def test_pages_print_what_they_say(
     own_registries: None,
 ) -> None:
     pytest.importorskip("matplotlib", reason="pictures need pip install minimax-cal[plot]")
+    if name == "mjcf_to_mjcf.md":
+        pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     scope: dict[str, object] = {}

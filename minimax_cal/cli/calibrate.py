@@ -31,6 +31,7 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text, plain
 from minimax_cal.reporting.plots.figures import save_errors
 from minimax_cal.robots.kernels.choice import work
+from minimax_cal.robots.urdf import ends_of, has_links, is_urdf
 from minimax_cal.solvers.status import Status
 
 if TYPE_CHECKING:
@@ -130,8 +131,14 @@ def advice(
         alone = "" if fit.cell.effects.terms else " by geometry alone"
         correct = f"minimax-cal compensate {written} targets.csv -o corrected.csv"
         yield f"To correct joint targets, or a program, for the controller{alone}", correct
-        write = f"minimax-cal export {written} --to mjcf -o arm.xml"
-        yield f"To write a file for MuJoCo, or --to urdf, dh-csv and others{alone}", write
+        write, file = "To write a file for MuJoCo, or --to urdf, dh-csv and others", "--to mjcf"
+        out = "arm.xml"
+        if has_links(robot):
+            name, tip = ends_of(robot)
+            kind = "urdf" if is_urdf(robot) else "mjcf"
+            write, out = f"To correct a copy of {name}", f"calibrated{Path(name).suffix}"
+            file = f"--to {kind} --{kind} {name}" + f" --tip {tip}" * bool(tip)
+        yield f"{write}{alone}", f"minimax-cal export {written} {file} -o {out}"
         yield "To see every parameter and table", "add --details"
     else:
         yield "To keep the result, and to see every table", "add -o fit.json --details"

@@ -200,7 +200,8 @@ def notices_of(fit: PixelFit, held: Array) -> list[str]:
             "well as drawn_within says; a board of known size gives it"
         )
     if fit.held:
-        out.append("the lenses are held as their files say; their doubt counts in every sigma")
+        known = "their doubt counts in every sigma" if fit.lens_sigma.any() else "as known"
+        out.append(f"the lenses are held as their files say, {known}")
     if not held.any():
         out.append("no pose is held out: nothing here says how the fit does on new poses")
     return out
