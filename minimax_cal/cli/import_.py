@@ -27,9 +27,9 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text, plain
 from minimax_cal.ground.options import Option
 from minimax_cal.ground.tables import Table
-from minimax_cal.measuring.columns import rows_in
 from minimax_cal.measuring.importers import Imported, import_files
 from minimax_cal.measuring.measurements import measurements_in
+from minimax_cal.reading.rows import rows_in
 
 TOLD = "What the files do not tell"
 

@@ -11,7 +11,8 @@ from minimax_cal.correcting.compensate import Compensation
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import csv_text
-from minimax_cal.measuring.columns import (
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.reading.rows import (
     JOINT,
     TARGET,
     TEXT,
@@ -22,9 +23,7 @@ from minimax_cal.measuring.columns import (
     optional_kind,
     read_rows,
     useless,
-    whole_rows,
 )
-from minimax_cal.measuring.measurements import Measurements
 
 ADDED = ("residual_mm", "residual_mrad", "status")
 USED = ("order", "temperature", "payload", "tau", "approach", "session")
@@ -65,7 +64,6 @@ def read_targets(path: Path | str) -> TargetFile:
             f"{path}:1: column {done[0]}: these joints are corrected already, and would be twice; "
             "give the targets as programmed"
         )
-    file = whole_rows(file)
     q, sliding = file.joints()
     columns: dict[str, Array] = {}
     idle = useless(header)

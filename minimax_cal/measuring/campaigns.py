@@ -11,8 +11,8 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.columns import TEXT
 from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.reading.rows import TEXT
 
 MOST_FILES = 100
 LABELS = ("pose", "group")  # which mean something in their own file only

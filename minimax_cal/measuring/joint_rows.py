@@ -7,7 +7,8 @@ import re
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.columns import (
+from minimax_cal.measuring.measurements import Measurements, check_columns, check_u95
+from minimax_cal.reading.rows import (
     JOINT,
     TARGET,
     TEXT,
@@ -16,9 +17,7 @@ from minimax_cal.measuring.columns import (
     near,
     optional_kind,
     useless,
-    whole_rows,
 )
-from minimax_cal.measuring.measurements import Measurements, check_columns, check_u95
 
 ANY_TARGET = ("smr1_x_mm", "smr1_y_mm", "smr1_z_mm")  # the header's rules ask for one
 NOTHING = re.compile(r"(?!)")
@@ -34,7 +33,6 @@ def joint_rows(
     """
     bare = [name for name in file.header if not TARGET.fullmatch(name)]
     header_check(file.path, [*bare, *ANY_TARGET])
-    file = whole_rows(file)
     q, sliding = file.joints()
     columns, notices = optional_columns(file, own, doubts)
     at = Measurements(

@@ -14,9 +14,8 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import csv_text, write_whole
 from minimax_cal.ground.words import name_first, one_line
 from minimax_cal.measuring.aside import SetAside
-from minimax_cal.measuring.columns import (
+from minimax_cal.reading.rows import (
     JOINT,
-    SIMULATED,
     TARGET,
     TEXT,
     Rows,
@@ -25,8 +24,8 @@ from minimax_cal.measuring.columns import (
     optional_kind,
     read_rows,
     useless,
-    whole_rows,
 )
+from minimax_cal.reading.sheet import SIMULATED
 
 APPROACH = re.compile(r"approach\d+")
 FARTHEST = 1e5  # no instrument measures farther [m]
@@ -321,7 +320,7 @@ def measurements_in(file: Rows) -> Measurements:
     """The measurements in a file's rows.  Raises DataError."""
     path, header = file.path, file.header
     header_check(path, header)
-    q, sliding = whole_rows(file).joints()
+    q, sliding = file.joints()
     found = sorted({int(m[1]) for name in header if (m := TARGET.fullmatch(name))})
     y = np.full((len(q), len(found), 3), np.nan)
     for name in header:

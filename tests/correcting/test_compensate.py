@@ -503,7 +503,7 @@ def test_command_says_which_targets_are_missed(saved: Path, tmp_path: Path) -> N
         (DEGREES.replace("speed", "temperature_C"), "a,1,2,3,4,50,6,0,-300", "-300 cannot be"),
         (DEGREES.replace("_deg", "_rad"), "a,10,20,30,40,50,60,0,v", "degrees?"),
         (DEGREES.replace("q3_deg", "q3_mm"), "a,1,2,3,4,5,6,0,v", "joint 3"),
-        ("q1_rad;q2_rad", "0;0", "commas"),
+        ("q1_rad;q2_rad", "0;0", "2 joint columns"),
     ],
 )
 def test_command_tells_slips(saved: Path, tmp_path: Path, header: str, row: str, word: str) -> None:

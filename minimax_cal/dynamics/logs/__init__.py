@@ -10,7 +10,6 @@ from typing import Any
 from minimax_cal.dynamics.logs.bags import is_bag, read_bag
 from minimax_cal.dynamics.logs.draft import Draft, drafts_of
 from minimax_cal.dynamics.logs.faults import checked
-from minimax_cal.dynamics.logs.formats import is_log
 from minimax_cal.dynamics.logs.repeats import check_repeats
 from minimax_cal.dynamics.logs.table import Log, read_table
 from minimax_cal.dynamics.logs.write import runs_text
@@ -19,8 +18,9 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.importers import units_of
-from minimax_cal.measuring.importers.sheet import cut, open_text
-from minimax_cal.measuring.importers.words import along_arm
+from minimax_cal.reading.formats import is_log
+from minimax_cal.reading.sheet import cut, open_text
+from minimax_cal.reading.words import along_arm
 
 __all__ = ["LogFiles", "are_logs", "import_logs", "read_runs", "runs_text"]
 

@@ -10,17 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.dynamics.logs.formats import (
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.reading.formats import (
     FORMATS,
     LENGTH,
     Format,
     Place,
     format_of,
 )
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.columns import is_simulated
-from minimax_cal.measuring.importers.sheet import Sheet, cut, open_text
+from minimax_cal.reading.sheet import Sheet, cut, numbers_of, open_text
 
 MOST_TORN = 0.01  # share of rows that a log may lose to torn lines
 MOST_JOINTS = 100  # of any machine; guards against a number that is none of a joint
@@ -165,7 +164,7 @@ def of_format(
         joints=names_of(sheet, places, joints),
         run=() if run is None else tuple(sheet.cells[row][run] for row in whole),
         notices=(*reading.notices(), *unused(sheet, form, places)),
-        simulated=is_simulated(sheet.text),
+        simulated=sheet.simulated,
     )
 
 
@@ -310,25 +309,13 @@ class Cells:
             return self.lists(at, cells)
         return self.numbers(at, cells)[:, None]
 
-    def numbers(self, at: int, cells: list[str]) -> Array:
+    def numbers(self, at: int, cells: Sequence[str]) -> Array:
         """(m,) numbers, NaN where there is none."""
-        if self.sheet.decimal == ",":
-            cells = [cell.replace(",", ".") for cell in cells]
-        try:
-            if any("_" in cell for cell in cells):
-                raise ValueError
-            out = np.array(cells, dtype=float)
-        except ValueError:
-            out = np.array([self.number(at, row, cell) for row, cell in enumerate(cells)])
+        out = numbers_of(cells, self.sheet.decimal)
+        for row in np.flatnonzero(np.isnan(out)).tolist():
+            if cells[row] and cells[row].lower().strip("+-") != "nan":
+                self.broken.setdefault(row, f"column {self.sheet.header[at]}: {cells[row]!r}")
         return np.where(np.isfinite(out), out, np.nan)
-
-    def number(self, at: int, row: int, cell: str) -> float:
-        """One number, NaN where the cell is empty or holds none."""
-        try:
-            return float(cell if "_" not in cell else "no number") if cell else np.nan
-        except ValueError:
-            self.broken.setdefault(row, f"column {self.sheet.header[at]}: {cell!r}")
-            return np.nan
 
     def lists(self, at: int, cells: list[str]) -> Array:
         """(m, k) numbers of cells like [1, 2, 3] or [1 2 3]."""

@@ -16,12 +16,12 @@ from minimax_cal.fitting.instruments.rows import Plain, of_laws
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.columns import TARGET, Rows
 from minimax_cal.measuring.measurements import Measurements, measurements_in
 from minimax_cal.modelling.cell import pose_to_dict
 from minimax_cal.modelling.model import Block as Poses
 from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.modelling.parameters import BASE_NAMES, State
+from minimax_cal.reading.rows import TARGET, Rows
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import right_jacobian
 from minimax_cal.robots.robot import Robot

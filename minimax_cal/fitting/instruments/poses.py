@@ -23,12 +23,12 @@ from minimax_cal.fitting.reflectors import LEVER, posed, reflectors, spots_of
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.columns import Rows
 from minimax_cal.measuring.joint_rows import joint_rows
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
 from minimax_cal.modelling.cell import pose_to_dict
 from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.modelling.parameters import BASE_NAMES, State
+from minimax_cal.reading.rows import Rows
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import hat, rotation_vector
 from minimax_cal.robots.robot import Robot

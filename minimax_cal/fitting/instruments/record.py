@@ -11,8 +11,8 @@ from minimax_cal.fitting.instruments.data import D
 from minimax_cal.fitting.instruments.options import RelativeOptions
 from minimax_cal.fitting.instruments.rows import Block
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.columns import Rows
 from minimax_cal.measuring.grouping import held_out
+from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.robot import Robot
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from minimax_cal.fitting.instruments.data import (
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.columns import Rows
 from minimax_cal.measuring.joint_rows import joint_rows
+from minimax_cal.reading.rows import Rows
 
 CONTACT = re.compile(r"surface|kind|(?:radius|ball_radius|offset)_(?:mm|m)|normal_[xyz]")
 PLANE, SPHERE = "plane", "sphere"

@@ -19,9 +19,9 @@ from minimax_cal.fitting.instruments.data import (
 from minimax_cal.fitting.instruments.options import RelativeOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.columns import Rows
 from minimax_cal.measuring.grouping import groups, held_out
 from minimax_cal.measuring.joint_rows import joint_rows
+from minimax_cal.reading.rows import Rows
 
 SOCKET = re.compile("socket")
 WHOLE = 5  # sockets from which on whole ones are held out

@@ -33,11 +33,11 @@ from minimax_cal.fitting.instruments.rows import (
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.columns import Rows
 from minimax_cal.measuring.joint_rows import joint_rows
 from minimax_cal.measuring.measurements import FARTHEST
 from minimax_cal.modelling.model import Model, arm_at
 from minimax_cal.modelling.parameters import State
+from minimax_cal.reading.rows import Rows
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import Chain
 from minimax_cal.robots.robot import Robot

@@ -19,11 +19,11 @@ from minimax_cal.measuring.importers import cmm, headed, programs
 from minimax_cal.measuring.importers import columns as mapped
 from minimax_cal.measuring.importers.assemble import Assembly, assemble
 from minimax_cal.measuring.importers.reading import Given, Reading
-from minimax_cal.measuring.importers.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
-from minimax_cal.measuring.importers.words import ANGLES, LENGTHS, TEMPERATURES, TIMES
 from minimax_cal.measuring.measurements import Measurements, check_finite, measurements_text
 from minimax_cal.measuring.mending import mended
 from minimax_cal.measuring.set_aside import left_out, whole
+from minimax_cal.reading.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
+from minimax_cal.reading.words import ANGLES, LENGTHS, TEMPERATURES, TIMES
 
 __all__ = ["Imported", "import_files", "read_any", "save", "units_of"]
 

@@ -11,7 +11,6 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.aside import FILE
-from minimax_cal.measuring.columns import is_simulated
 from minimax_cal.measuring.importers.headed import KEPT
 from minimax_cal.measuring.importers.join import (
     Places,
@@ -24,10 +23,10 @@ from minimax_cal.measuring.importers.join import (
 from minimax_cal.measuring.importers.reading import Column, Given, Reading
 from minimax_cal.measuring.importers.times import STAMPED, celsius, seconds
 from minimax_cal.measuring.importers.units import decide
-from minimax_cal.measuring.importers.words import ANGLES, LENGTHS
 from minimax_cal.measuring.measurements import Measurements, check_finite
 from minimax_cal.measuring.set_aside import COLUMN, from_column, set_aside, sound
 from minimax_cal.measuring.tools import by_tool
+from minimax_cal.reading.words import ANGLES, LENGTHS
 
 TEXTS = ("session", "group", "split", "pose", "tool", COLUMN)
 MARKED = "marked deleted in the tracker's file"
@@ -139,7 +138,7 @@ def assemble(points: Sequence[Reading], joints: Reading, given: Given) -> Assemb
         notices=tuple(notice for reading in readings for notice in reading.notices),
         source=str(joints.sheet.path),
         digest=hashlib.sha256("".join(r.sheet.text for r in readings).encode()).hexdigest(),
-        simulated=any(is_simulated(r.sheet.text) for r in readings),
+        simulated=any(r.sheet.simulated for r in readings),
     )
     matched = (*(spot.how for spot in places), "")[: len(readings)]
     data = by_tool(without_marked(from_column(data), points, places))

@@ -15,8 +15,8 @@ from minimax_cal.measuring.importers.reading import (
     checked,
     family_of,
 )
-from minimax_cal.measuring.importers.sheet import Sheet, is_number
-from minimax_cal.measuring.importers.words import (
+from minimax_cal.reading.sheet import Sheet, is_number
+from minimax_cal.reading.words import (
     WORDS,
     along_arm,
     joint_number,

@@ -11,7 +11,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import name_first
-from minimax_cal.measuring.importers.sheet import COMMA, POINT, Sheet
+from minimax_cal.reading.sheet import COMMA, POINT, Sheet, numbers_of
 
 POINT_NAME = re.compile(r"smr(\d+)_([xyz])")
 
@@ -131,10 +131,10 @@ class Reading:
 
     def numbers(self, column: Column, *, empty: bool = True) -> Array:
         """A column as floats, NaN where empty.  Raises DataError."""
-        out = np.full(len(column.cells), np.nan)
-        for i, cell in enumerate(column.cells):
-            if cell or not empty:
-                out[i] = self.number(column, i, cell)
+        out = numbers_of(column.cells, self.sheet.decimal)
+        for i in np.flatnonzero(~np.isfinite(out)):
+            if column.cells[i] or not empty:
+                out[i] = self.number(column, int(i), column.cells[i])
         return out
 
     def number(self, column: Column, row: int, cell: str) -> float:

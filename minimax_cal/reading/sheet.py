@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import codecs
 import csv
+import hashlib
+import io
 import re
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,17 +17,25 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.ground.files import check_table, read_raw
-from minimax_cal.measuring.importers.words import is_understood, unit_name
-from minimax_cal.measuring.spreadsheet import is_workbook, text_of_workbook
+from minimax_cal.ground.files import read_raw
+from minimax_cal.reading.words import is_understood, unit_name
+from minimax_cal.reading.workbook import is_workbook, text_of_workbook
 
 DELIMITERS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "spaces"}
 DECIMALS = {".": "point", ",": "comma"}
 POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 COMMA = re.compile(r"[-+]?(\d*),(\d+)([eE][-+]?\d+)?")
 COMMENTS = ("#", "%", "//", "!")
+SIMULATED = "# simulated"  # first line of a file whose points were computed, not measured
+ENCODINGS = (  # names and codecs; the last takes any bytes, and cp1252 is meant by latin-1 mostly
+    ("utf-8", "utf-8-sig"), ("utf-16", "utf-16"), ("gb2312", "gb2312"), ("latin-1", "cp1252"),
+    ("latin-1", "latin-1"),
+)  # fmt: skip
+MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+PACKED = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how spreadsheets begin
 WORKBOOK = "workbook"
 COORDINATES = 3  # of a point
+BLANK = " \t,;"
 LOOKED_AT = 200  # rows that decide the delimiter
 NumberedRow = tuple[int, list[str]]  # the line of the file, and its cells
 
@@ -55,38 +66,90 @@ class Sheet:
         """Number of columns."""
         return len(self.header) or max(map(len, self.cells), default=0)
 
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the text."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the first line says that the points were computed, not measured."""
+        return self.text.partition("\n")[0].strip(' \t\r,;"').lower() == SIMULATED
+
+
+def numbers_of(cells: Sequence[str], decimal: str = ".") -> Array:
+    """(m,) numbers, NaN where a cell is empty or holds none."""
+    given = [cell.replace(",", ".") for cell in cells] if decimal == "," else list(cells)
+    with suppress(ValueError):
+        if not any("_" in cell for cell in given):  # 1_000 is a number to Python only
+            return np.array([cell or "nan" for cell in given], dtype=float)
+    return np.array([number_of(cell) for cell in given], dtype=float)
+
+
+def number_of(cell: str) -> float:
+    """One number, NaN where the cell holds none."""
+    try:
+        return float(cell if "_" not in cell else "nan")
+    except ValueError:
+        return np.nan
+
 
 def open_text(path: Path | str) -> Sheet:
     """A text file, not yet cut into rows and columns.  Raises DataError."""
     path = Path(path)
-    text, encoding = (text_of_workbook(path), WORKBOOK) if is_workbook(path) else decoded(path)
+    return sheet_of(
+        path, *((text_of_workbook(path), WORKBOOK) if is_workbook(path) else decoded(path))
+    )
+
+
+def sheet_of(path: Path | str, text: str, encoding: str = "utf-8") -> Sheet:
+    """A text that is, or shall be, in a file.  Raises DataError where it is none."""
+    if "\0" in text:
+        raise DataError(f"{path}: is not a text file; expected rows of numbers")
     if not text.strip():
         raise DataError(f"{path}: is empty")
-    return Sheet(path, text, encoding, "", "", (), np.empty(0, dtype=int), ())
+    return Sheet(Path(path), text, encoding, "", "", (), np.empty(0, dtype=int), ())
 
 
-def cut(sheet: Sheet, decimal: str = "", *, most_torn: float = 0.0) -> Sheet:
+def cut(
+    sheet: Sheet,
+    decimal: str = "",
+    *,
+    most_torn: float = 0.0,
+    remarks: bool = True,
+    alone: str = "",
+) -> Sheet:
     """The rows and columns of a text, by the delimiter and decimal sign found.  Raises DataError.
 
     decimal: the sign, where the user gives it.  most_torn: share of rows that may be left out
-    because they have fewer or more cells than the others.
+    because they have fewer or more cells than the others.  remarks: whether there may be some below
+    the table.  alone: the delimiter of a table of one column.
     """
-    path, text = sheet.path, sheet.text
-    numbered = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip(" \t,;")]
-    notes = [(n, line) for n, line in numbered if line.lstrip().startswith(COMMENTS)]
-    numbered = [row for row in numbered if row not in notes] if notes else numbered
+    path, lines = sheet.path, sheet.text.split("\n")
+    notes = {n: line for n, line in enumerate(lines, 1) if line.lstrip().startswith(COMMENTS)}
+    if notes:
+        lines = ["" if n in notes else line for n, line in enumerate(lines, 1)]
     delimiter = "\t" if sheet.encoding == WORKBOOK else ""
-    delimiter = delimiter or delimiter_of([line for _, line in numbered[:LOOKED_AT]])
+    delimiter = delimiter or delimiter_of([line for line in lines if line.strip(BLANK)][:LOOKED_AT])
+    delimiter = delimiter or alone
     if not delimiter:
         raise DataError(f"{path}: has no columns that commas, semicolons, tabs or spaces separate")
-    rows = [(number, cells_of(path, number, line, delimiter)) for number, line in numbered]
+    rows = rows_of(path, lines, delimiter)
+    if not rows:
+        raise DataError(f"{path}: is empty")
     above = [] if most_torn else above_table([row for _, row in rows])
-    below = [] if most_torn else below_table([row for _, row in rows], sheet.encoding == WORKBOOK)
+    below = (
+        []
+        if most_torn or not remarks
+        else below_table([row for _, row in rows], sheet.encoding == WORKBOOK)
+    )
     above, below = [[rows[i][0] for i in some] for some in (above, below)]
     rows = rows[len(above) : len(rows) - len(below)]
     header, rows = split_header(rows)
     if not header and not most_torn:
-        header = noted_header([line for n, line in notes if n < rows[0][0]], delimiter, rows)
+        header = noted_header(
+            [line for n, line in notes.items() if n < rows[0][0]], delimiter, rows
+        )
     if not rows:
         raise DataError(f"{path}: holds a header but no rows")
     width = len(header) or Counter(len(trimmed(row)) for _, row in rows).most_common(1)[0][0]
@@ -181,18 +244,17 @@ def units_in(row: list[str], width: int) -> list[str]:
 
 
 def decoded(path: Path) -> tuple[str, str]:
-    """The text and the name of its encoding."""
+    """The text, its lines ended alike, and the name of its encoding.  Raises DataError."""
     raw = read_raw(path, kind=DataError)
-    check_table(raw, path, kind=DataError)
-    for mark, name in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
-        if raw.startswith(mark):
-            return raw.decode(name, errors="replace"), name
-    if b"\0" in raw:
-        raise DataError(f"{path}: is not a text file; expected rows of numbers")
-    for name, codec in (("utf-8", "utf-8-sig"), ("gb2312", "gb2312")):
-        with suppress(UnicodeDecodeError):
-            return raw.decode(codec), name
-    return raw.decode("latin-1"), "latin-1"
+    if raw.startswith(PACKED):
+        raise DataError(f"{path}: is a spreadsheet, not text; save it as CSV")
+    for name, codec in ENCODINGS:
+        with suppress(UnicodeError):
+            text = raw.decode(codec)
+            if name == "utf-16" and not raw.startswith(MARKS):
+                continue
+            return text.replace("\r\n", "\n").replace("\r", "\n"), name
+    raise DataError(f"{path}: is not a text file; expected rows of numbers")
 
 
 def split_line(line: str, delimiter: str) -> list[str]:
@@ -205,13 +267,22 @@ def split_line(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in row]
 
 
-def cells_of(path: Path, number: int, line: str, delimiter: str) -> list[str]:
-    """The cells of a line of a file.  Raises DataError."""
+def rows_of(path: Path, lines: Sequence[str], delimiter: str) -> list[NumberedRow]:
+    """The rows that hold something, each with the line on which it ends.  Raises DataError."""
+    if delimiter == " " or not any('"' in line for line in lines):
+        cut_lines = ((n, split_line(line, delimiter)) for n, line in enumerate(lines, 1))
+        return [row for row in cut_lines if any(row[1])]
+    text = io.StringIO("\n".join(lines), newline="")
+    reader = csv.reader(text, delimiter=delimiter, skipinitialspace=True, strict=True)
+    rows, begun = [], 0
     try:
-        return split_line(line, delimiter)
+        for row in reader:
+            begun = reader.line_num
+            rows.append((begun, [cell.strip() for cell in row]))
     except csv.Error:
         what = "has a quotation mark without its pair; delete it"
-        raise DataError(f"{path}:{number}: {what}") from None
+        raise DataError(f"{path}:{begun + 1}: {what}") from None
+    return [row for row in rows if any(row[1])]
 
 
 def trimmed(row: list[str]) -> list[str]:
@@ -237,7 +308,7 @@ def is_header(row: list[str]) -> bool:
 
 
 def delimiter_of(lines: list[str]) -> str:
-    """The delimiter that cuts most lines into the same count of mostly numbers, or ''."""
+    """The delimiter that cuts most lines into one count, with most digits in numbers, or ''."""
     best, most = "", 0.0
     for delimiter in DELIMITERS:
         rows: list[list[str]] = []
@@ -249,8 +320,8 @@ def delimiter_of(lines: list[str]) -> str:
         count, times = Counter(map(len, rows)).most_common(1)[0]
         if count < 2 or 2 * times < len(rows):
             continue
-        body = [cell for row in rows[1:] or rows for cell in row if cell]
-        score = sum(map(is_number, body)) / max(len(body), 1)
+        body = rows[1:] or rows
+        score = times * sum(len(cell) for row in body for cell in row if is_number(cell))
         if score > most or not best:
             best, most = delimiter, score
     return best
@@ -273,7 +344,8 @@ def decimal_of(
                 point = f"column {name} of line {number}: {cell}"
     if comma and point:
         raise DataError(
-            f"{comma} has a decimal comma, but {point} has a decimal point; use one of them"
+            f"{comma} has a decimal comma, but {point} has a decimal point; use a decimal point in "
+            "all, or a comma"
         )
     if comma and not proven:
         raise DataError(

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from minimax_cal.measuring.importers.names import folded
-
 ANGLES = {"rad": 1.0, "deg": np.pi / 180.0, "mrad": 1e-3}
 LENGTHS = {"mm": 1e-3, "m": 1.0, "um": 1e-6, "cm": 1e-2, "in": 0.0254}
 TIMES = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
@@ -74,6 +72,12 @@ WORDS = {  # plain names that mean the same in any file
     "set_aside": ("set_aside",),
 }  # fmt: skip
 PLAIN = {word: meaning for meaning, words in WORDS.items() for word in words}
+
+
+def folded(text: str) -> str:
+    """Small letters without accents, in one width."""
+    wide = unicodedata.normalize("NFKD", text.strip().lower())
+    return unicodedata.normalize("NFC", "".join(c for c in wide if not unicodedata.combining(c)))
 
 
 def unit_name(text: str) -> str:

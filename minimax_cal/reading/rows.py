@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import difflib
-import hashlib
-import io
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.ground.files import check_table, read_raw, text_of
-from minimax_cal.measuring.spreadsheet import csv_of_workbook, is_workbook
+from minimax_cal.reading.sheet import COMMA, Sheet, cut, numbers_of, open_text, sheet_of
 
 UNITS = {"rad": 1.0, "deg": np.pi / 180.0, "m": 1.0, "mm": 1e-3}
 MOST = 1e5  # of a joint: 16,000 turns, or 100 km [rad, m]
@@ -44,7 +40,6 @@ OPTIONAL = {
         "base": r"base\d+_[xyz]_(mm|m)",
     }.items()
 }
-SIMULATED = "# simulated"  # first line of a file whose points were computed, not measured
 TEXT = {"session", "group", "pose", "split", "set_aside", "tool"}  # never computed with
 OF_JOINT = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
 OF_PAYLOAD = re.compile(r"payload_[xyz]_(?:mm|m)")
@@ -93,55 +88,25 @@ class Rows:
 
 
 def read_rows(path: Path | str) -> Rows:
-    """Read a CSV file.  Raises DataError where it is none."""
-    if is_workbook(path):
-        return rows_in(csv_of_workbook(path), path)
-    raw = read_raw(path, kind=DataError)
-    check_table(raw, path, kind=DataError)
-    return rows_in(text_of(raw, path, kind=DataError), path)
-
-
-def is_simulated(text: str) -> bool:
-    """Whether the first line of a file says that its points were computed, not measured."""
-    return text.lstrip("\ufeff").partition("\n")[0].strip(' \t\r,;"').lower() == SIMULATED
+    """The columns of a file.  Raises DataError where it is no table."""
+    return rows_of(open_text(path))
 
 
 def rows_in(text: str, path: Path | str) -> Rows:
-    """The rows of CSV that is, or shall be, in a file.  Raises DataError where it is none."""
-    digest = hashlib.sha256(text.encode()).hexdigest()
-    if "\0" in text:
-        raise DataError(f"{path}: is not a text file; expected CSV")
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    try:
-        lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
-    except csv.Error as error:
-        raise DataError(f"{path}:{reader.line_num}: is not CSV ({error})") from error
-    simulated = is_simulated(text)
-    rows = [(number, row) for number, row in lines[simulated:] if any(row)]
-    if not rows:
-        raise DataError(f"{path}: is empty")
-    (_, header), *body = rows
-    while header and not header[-1]:  # a trailing comma
-        header.pop()
-    return Rows(
-        path,
-        tuple(header),
-        tuple(tuple(row) for _, row in body),
-        np.array([number for number, _ in body], dtype=int),
-        digest,
-        simulated,
-    )
+    """The columns of a text that is, or shall be, in a file.  Raises DataError."""
+    return rows_of(sheet_of(path, text))
 
 
-def whole_rows(file: Rows) -> Rows:
-    """The file with every row as long as its header.  Raises DataError; also without any row."""
-    if not file.rows:
-        raise DataError(f"{file.path}: holds a header but no rows")
-    length = len(file.header)
-    for at, row in zip(file.line, file.rows, strict=True):
-        if len(row) < length or any(row[length:]):
-            raise DataError(f"{file.path}:{at}: {len(row)} cells, but the header has {length}")
-    return replace(file, rows=tuple(row[:length] for row in file.rows))
+def rows_of(sheet: Sheet) -> Rows:
+    """The columns of a text.  Raises DataError."""
+    table = cut(sheet, remarks=False, alone=",")
+    rows = table.cells
+    if table.decimal == ",":
+        rows = tuple(
+            tuple(c.replace(",", ".") if COMMA.fullmatch(c) else c for c in row) for row in rows
+        )
+    header = table.header or rows[0]
+    return Rows(sheet.path, header, rows, table.line, sheet.digest, sheet.simulated)
 
 
 def header_check(path: Path | str, header: Sequence[str]) -> None:
@@ -206,19 +171,17 @@ def useless(header: Sequence[str]) -> dict[str, str]:
 
 def numbers(path: Path | str, name: str, cells: list[str], line: Array, *, empty: bool) -> Array:
     """One column as floats; an empty cell is NaN where that is allowed.  Raises DataError."""
-    out = np.full(len(cells), np.nan)
-    for i, cell in enumerate(cells):
+    out = numbers_of(cells)
+    for i in np.flatnonzero(~np.isfinite(out)):
+        cell = cells[i]
         if not cell and empty:
             continue
-        try:
-            out[i] = float(cell if "_" not in cell else "no number")
-        except ValueError:
-            what = f"{cell!r} is not a number" if cell else "is empty"
-            comma = "; use a decimal point" if re.fullmatch(r"[-+]?\d+,\d+", cell) else ""
-            raise DataError(f"{path}:{line[i]}: column {name}: {what}{comma}") from None
-        if not np.isfinite(out[i]):
+        where = f"{path}:{line[i]}: column {name}: "
+        if cell and (np.isinf(out[i]) or cell.lower().strip("+-") == "nan"):
             mend = "; leave the cell empty where it was not measured" if empty else ""
-            raise DataError(f"{path}:{line[i]}: column {name}: {cell} is not a finite number{mend}")
+            raise DataError(f"{where}{cell} is not a finite number{mend}")
+        comma = "; use a decimal point" if COMMA.fullmatch(cell) else ""
+        raise DataError(f"{where}{f'{cell!r} is not a number' if cell else 'is empty'}{comma}")
     return out
 
 
