@@ -14,33 +14,29 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import csv_text, write_whole
 from minimax_cal.ground.words import name_first, one_line
 from minimax_cal.measuring.aside import SetAside
+from minimax_cal.reading.formats import OWN, kind_of
 from minimax_cal.reading.rows import (
-    JOINT,
+    NOTHING,
     TARGET,
-    TEXT,
+    UNITS,
     Rows,
     header_check,
-    near,
-    optional_kind,
     read_rows,
-    useless,
 )
 from minimax_cal.reading.sheet import SIMULATED
 
 APPROACH = re.compile(r"approach\d+")
 FARTHEST = 1e5  # no instrument measures farther [m]
-PLAUSIBLE = {  # column: its header, least and largest value in SI, what a header's unit is in SI
-    "temperature": ("temperature_C", -273.15, 1000.0, 1.0),
-    "payload": ("payload_kg", 0.0, 3e3, 1.0),  # the strongest arms carry 2.3 t
-    "u95": ("u95_mm", 0.0, 1.0, 1e3),
+PLAUSIBLE = {  # least and largest value in SI of columns of a kind
+    "temperature": (-273.15, 1000.0),
+    "payload": (0.0, 3e3),  # the strongest arms carry 2.3 t
+    "u95": (0.0, 1.0),
+    "payload centre": (-10.0, 10.0),  # from the flange
+    "tau": (-1e5, 1e5),  # the strongest joints hold some 1e4 N m
+    "base": (-FARTHEST, FARTHEST),
+    "qread": (-1e3, 1e3),
 }
-OF_PAYLOAD = ("{}_mm", -10.0, 10.0, 1e3)  # of its centre, from the flange
-OF_EACH = {  # the same of columns that joints or targets have each, by what stands before a number
-    "tau": ("{}_Nm", -1e5, 1e5, 1.0),  # the strongest joints hold some 1e4 N m
-    "base": ("{}_mm", -FARTHEST, FARTHEST, 1e3),
-    "qread": ("{}", -1e3, 1e3, 1.0),
-}
-NUMBERED = re.compile(r"(tau|base|qread)\d+(?:_[xyz])?")
+U95 = re.compile(OWN["u95"].pattern)
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,16 +242,18 @@ def check_finite(data: Measurements) -> Measurements:
 
 def check_columns(data: Measurements) -> Measurements:
     """The data, if their optional columns can be.  Raises DataError."""
-    each = {found[0]: OF_EACH[found[1]] for found in map(NUMBERED.fullmatch, data.columns) if found}
-    each |= {name: OF_PAYLOAD for name in data.columns if re.fullmatch(r"payload_[xyz]", name)}
-    for name, (header, low, high, scale) in (PLAUSIBLE | each).items():
-        values = np.asarray(data.columns.get(name, np.zeros(0)), dtype=float)
+    for stem, column in data.columns.items():
+        kind = kind_of(stem)
+        if kind not in PLAUSIBLE:
+            continue
+        low, high = PLAUSIBLE[kind]
+        values = np.asarray(column, dtype=float)
         odd = (values < low) | (values > high)
         if odd.any():
             row = int(np.argmax(odd))
+            name, scale = (stem, 1.0) if kind == "qread" else file_column(stem)  # an angle, or not
             raise DataError(
-                f"{data.source}:{data.line[row]}: column {header.format(name)}: "
-                f"{scale * values[row]:g} cannot "
+                f"{data.source}:{data.line[row]}: column {name}: {scale * values[row]:g} cannot "
                 f"be; expected {scale * low:g} to {scale * high:g}, or an empty cell"
             )
     for name in filter(APPROACH.fullmatch, data.columns):
@@ -328,23 +326,9 @@ def measurements_in(file: Rows) -> Measurements:
             y[:, found.index(int(m[1])), "xyz".index(m[2])] = file.number(
                 name, unit=m[3], empty=True
             )
-    columns: dict[str, Array] = {}
-    unknown: dict[str, Array] = {}
-    idle = useless(header)
-    for name in header:
-        kind, match = optional_kind(name)
-        if name in idle:
-            unknown[name] = np.array(file.text(name))
-        elif kind in TEXT:
-            columns[name] = np.array(file.text(name))
-        elif match:
-            unit = match[1] if match.re.groups else ""
-            stem = name.removesuffix(f"_{unit}")
-            columns[stem] = file.number(name, unit=unit, empty=True)
-        elif not JOINT.fullmatch(name) and not TARGET.fullmatch(name):
-            unknown[name] = np.array(file.text(name))
-    why = {name: f": {idle[name]}" if name in idle else near(name) for name in unknown}
-    notices = [f"{path}: column {name} is not used{why[name]}" for name in unknown]
+    columns, unused = file.optional(NOTHING, U95)
+    unknown = {name: np.array(file.text(name)) for name in unused}
+    notices = [f"{path}: column {name} is not used{why}" for name, why in unused.items()]
     data = Measurements(
         q=q,
         y=y,
@@ -444,11 +428,8 @@ def measurements_text(data: Measurements) -> str:
 
 def file_column(stem: str) -> tuple[str, float]:
     """Name with its unit, and the factor from SI, of an optional column."""
-    exact = {"time": "_s", "temperature": "_C", "payload": "_kg"}
-    if stem == "u95" or re.fullmatch(r"base\d+_[xyz]|payload_[xyz]", stem):
-        return f"{stem}_mm", 1e3
-    if re.fullmatch(r"tau\d+", stem):
-        return f"{stem}_Nm", 1.0
-    if re.fullmatch(r"qread\d+|rotation_u95", stem):
+    if stem == "rotation_u95":
         return f"{stem}_rad", 1.0
-    return stem + exact.get(stem, ""), 1.0
+    for unit in OWN[kind].units[:1] if (kind := kind_of(stem)) else ():
+        return f"{stem}_{unit}", 1.0 / UNITS.get(unit, 1.0)
+    return stem, 1.0

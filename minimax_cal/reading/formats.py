@@ -2,12 +2,54 @@
 
 from __future__ import annotations
 
+import difflib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-LENGTH = {"m", "mm"}
-Q = "(?P<unit>rad|deg|mm|m)"
+ANY = ("rad", "deg", "mm", "m")
+SIZES = ("mm", "m")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What this project calls columns of one kind, without the unit, and the units they may have.
+
+    The first is the one that is written.  text: whether cells are labels, never computed with.
+    """
+
+    stem: str
+    units: tuple[str, ...] = ()
+    text: bool = False
+
+    @property
+    def pattern(self) -> str:
+        """Of the whole name, its last group the unit."""
+        return f"{self.stem}_({'|'.join(self.units)})" if self.units else self.stem
+
+
+OWN = {  # columns of measurements, by kind
+    "q": Kind(r"q(\d+)", ANY),
+    "smr": Kind(r"smr(\d+)_([xyz])", SIZES),
+    "order": Kind("order"),
+    "time": Kind("time", ("s",)),
+    "temperature": Kind("temperature", ("C",)),
+    "payload": Kind("payload", ("kg",)),
+    "payload centre": Kind("payload_[xyz]", SIZES),
+    "tool": Kind("tool", text=True),
+    "tau": Kind(r"tau\d+", ("Nm",)),
+    "approach": Kind(r"approach\d+"),
+    "session": Kind("session", text=True),
+    "group": Kind("group", text=True),
+    "u95": Kind("u95", SIZES),
+    "pose": Kind("pose", text=True),
+    "split": Kind("split", text=True),
+    "set_aside": Kind("set_aside", text=True),
+    "qread": Kind(r"qread\d+", ANY),
+    "base": Kind(r"base\d+_[xyz]", SIZES),
+}
+OPTIONAL = tuple(kind for kind in OWN if kind not in ("q", "smr"))
+Q = f"(?P<unit>{'|'.join(ANY)})"
 JOINT = r"(?P<joint>\d+)"
 INDEX = rf"(?:[.\[]?{JOINT}\]?)?"
 
@@ -114,6 +156,28 @@ FORMATS = (  # tried in this order
         units={"tau": "Nm", "i": "A"},
     ),
 )
+
+
+def own_kind(name: str) -> tuple[str, str, str]:
+    """The kind of one of this project's columns, its name without the unit, and the unit; or ''."""
+    for kind, own in OWN.items():
+        if found := re.fullmatch(own.pattern, name):
+            unit = found[found.re.groups] if own.units else ""
+            return kind, name.removesuffix(f"_{unit}"), unit
+    return "", name, ""
+
+
+def kind_of(stem: str) -> str:
+    """The kind of one of this project's columns, by its name without the unit; or ''."""
+    return next((kind for kind, own in OWN.items() if re.fullmatch(own.stem, stem)), "")
+
+
+def near(name: str, known: Iterable[str]) -> str:
+    """A hint when a column's name is close to one that would be used; a 1 stands for any number."""
+    numbers = {str(i) for i in range(1, 10)}
+    every = [k.replace("1", i, 1) for k in known for i in (numbers if "1" in k else "1")]
+    match = difflib.get_close_matches(name, sorted(every), 1, cutoff=0.75)
+    return f" (did you mean {match[0]}?)" if match else ""
 
 
 def place_of(form: Format, name: str) -> Place | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,35 +11,17 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.reading.formats import OPTIONAL, OWN, near, own_kind
 from minimax_cal.reading.sheet import COMMA, Sheet, cut, numbers_of, open_text, sheet_of
 
 UNITS = {"rad": 1.0, "deg": np.pi / 180.0, "m": 1.0, "mm": 1e-3}
 MOST = 1e5  # of a joint: 16,000 turns, or 100 km [rad, m]
-JOINT = re.compile(r"q(\d+)_(rad|deg|mm|m)")
-TARGET = re.compile(r"smr(\d+)_([xyz])_(mm|m)")
-# Optional columns that some part of the project understands: pattern, factor to SI by unit.
-OPTIONAL = {
-    name: re.compile(pattern)
-    for name, pattern in {
-        "order": r"order",
-        "time": r"time_(s)",
-        "temperature": r"temperature_(C)",
-        "payload": r"payload_(kg)",
-        "payload centre": r"payload_[xyz]_(mm|m)",
-        "tool": r"tool",
-        "tau": r"tau\d+_(Nm)",
-        "approach": r"approach\d+",
-        "session": r"session",
-        "group": r"group",
-        "u95": r"u95_(mm|m)",
-        "pose": r"pose",
-        "split": r"split",
-        "set_aside": r"set_aside",
-        "qread": r"qread\d+_(rad|deg|mm|m)",
-        "base": r"base\d+_[xyz]_(mm|m)",
-    }.items()
-}
-TEXT = {"session", "group", "pose", "split", "set_aside", "tool"}  # never computed with
+JOINT, TARGET = (re.compile(OWN[kind].pattern) for kind in ("q", "smr"))
+TEXT = {kind for kind, own in OWN.items() if own.text}
+KNOWN = ("order", "time_s", "temperature_C", "payload_kg", "session", "group", "u95_mm", "pose",
+         "split", "set_aside", "tool", "payload_x_mm", "q1_rad", "q1_deg",
+         *(f"smr1_{axis}_mm" for axis in "xyz"))  # fmt: skip
+NOTHING = re.compile(r"(?!)")
 OF_JOINT = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
 OF_PAYLOAD = re.compile(r"payload_[xyz]_(?:mm|m)")
 OF_FOOT = re.compile(r"(base\d+_)([xyz])(_\w+)")
@@ -70,6 +51,35 @@ class Rows:
         return numbers(self.path, name, self.text(name), self.line, empty=empty) * UNITS.get(
             unit, 1.0
         )
+
+    def optional(
+        self, own: re.Pattern[str] = NOTHING, doubts: re.Pattern[str] = NOTHING
+    ) -> tuple[dict[str, Array], dict[str, str]]:
+        """The optional columns by name, in SI, and columns that are not used, with why.
+
+        own: names of columns that the caller reads.  doubts: of the instrument's accuracy, with the
+        unit as their group; others have no use there.
+        """
+        columns: dict[str, Array] = {}
+        unused = {
+            name: f": {why}"
+            for name, why in useless(self.header).items()
+            if not own.fullmatch(name)
+        }
+        for name in self.header:
+            kind, stem, unit = own_kind(name)
+            if name in unused or own.fullmatch(name) or kind in ("q", "smr"):
+                continue
+            if doubt := doubts.fullmatch(name):
+                unit = doubt[1]
+                stem = name.removesuffix(f"_{unit}")
+            if kind in TEXT:
+                columns[name] = np.array(self.text(name))
+            elif doubt or kind not in ("", "u95"):
+                columns[stem] = self.number(name, unit=unit, empty=True)
+            else:
+                unused[name] = "" if kind else near(name, KNOWN)
+        return columns, unused
 
     def joints(self) -> tuple[Array, Array]:
         """Joint values (m, n) [rad, m], and (n,) True where a column has a unit of length."""
@@ -140,8 +150,7 @@ def header_check(path: Path | str, header: Sequence[str]) -> None:
                 raise DataError(f"{path}:1: column smr{number}_{axis}_{unit} {fault}")
     stems: dict[str, str] = {}
     for name in header:
-        _, match = optional_kind(name)
-        stem = name.removesuffix(f"_{match[1]}") if match and match.re.groups else name
+        _, stem, _ = own_kind(name)
         if stems.setdefault(stem, name) != name:
             raise DataError(f"{path}:1: {stems[stem]} and {name} are one column; keep one unit")
 
@@ -151,7 +160,7 @@ def useless(header: Sequence[str]) -> dict[str, str]:
     joints = max((int(m[1]) for name in header if (m := JOINT.fullmatch(name))), default=0)
     out = {}
     for name in header:
-        if not optional_kind(name)[0]:
+        if own_kind(name)[0] not in OPTIONAL:
             continue
         if m := OF_JOINT.fullmatch(name):
             if not 1 <= int(m[1]) <= joints:
@@ -183,21 +192,3 @@ def numbers(path: Path | str, name: str, cells: list[str], line: Array, *, empty
         comma = "; use a decimal point" if COMMA.fullmatch(cell) else ""
         raise DataError(f"{where}{f'{cell!r} is not a number' if cell else 'is empty'}{comma}")
     return out
-
-
-def optional_kind(name: str) -> tuple[str, re.Match[str] | None]:
-    """Which optional column a name is, or ''."""
-    for kind, pattern in OPTIONAL.items():
-        if match := pattern.fullmatch(name):
-            return kind, match
-    return "", None
-
-
-def near(name: str) -> str:
-    """A hint when a column's name is close to one that would be used."""
-    known = ["order", "time_s", "temperature_C", "payload_kg", "session", "group", "u95_mm"]
-    known += ["pose", "split", "set_aside", "tool", "payload_x_mm"]
-    known += [f"q{i}_{unit}" for i in range(1, 10) for unit in ("rad", "deg")]
-    known += [f"smr{i}_{axis}_mm" for i in (1, 2, 3) for axis in "xyz"]
-    match = difflib.get_close_matches(name, known, 1, cutoff=0.75)
-    return f" (did you mean {match[0]}?)" if match else ""

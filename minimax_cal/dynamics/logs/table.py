@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,10 +13,11 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.reading.formats import (
     FORMATS,
-    LENGTH,
+    SIZES,
     Format,
     Place,
     format_of,
+    near,
 )
 from minimax_cal.reading.sheet import Sheet, cut, numbers_of, open_text
 
@@ -30,6 +30,8 @@ FACTORS = {"rad": 1.0, "deg": np.pi / 180.0, "m": 1.0, "mm": 1e-3, "mA": 1e-3}
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 WORDS = ("name", "run")  # columns of text
 SINGLE = ("t", "sec", "nanosec", "payload")  # kinds of which a file has one column
+KNOWN = ("t_s", "payload_kg", "run", "q1_rad", "q1_deg", "qd1_rad_s", "qdd1_rad_s2", "tau1_Nm",
+         "i1_A", "q1_cmd_rad", "tau1_cmd_Nm", "temperature1_C")  # fmt: skip
 SHOWN = 3  # lines or names that a notice gives
 
 
@@ -56,7 +58,7 @@ class Log:
     @property
     def sliding(self) -> Array:
         """(n,) True where a joint's column has a unit of length."""
-        return np.array([unit in LENGTH for unit in self.units["q"]])
+        return np.array([unit in SIZES for unit in self.units["q"]])
 
     def taking(self, order: Sequence[int]) -> Log:
         """The log of some joints, in an order."""
@@ -282,17 +284,8 @@ def unused(sheet: Sheet, form: Format, places: Mapping[int, Place]) -> list[str]
     """Notices of columns that look like those of the format but are not."""
     if not form.strict:
         return []
-    known = ["t_s", "payload_kg", "run"]
-    for j in range(1, 10):
-        known += [f"q{j}_rad", f"q{j}_deg", f"qd{j}_rad_s", f"qdd{j}_rad_s2", f"tau{j}_Nm"]
-        known += [f"i{j}_A", f"q{j}_cmd_rad", f"tau{j}_cmd_Nm", f"temperature{j}_C"]
-    out = []
-    for i, name in enumerate(sheet.header):
-        if i not in places:
-            near = difflib.get_close_matches(name, known, 1, cutoff=0.75)
-            hint = f" (did you mean {near[0]}?)" if near else ""
-            out.append(f"{sheet.path}: column {name} is not used{hint}")
-    return out
+    left = [name for i, name in enumerate(sheet.header) if i not in places]
+    return [f"{sheet.path}: column {name} is not used{near(name, KNOWN)}" for name in left]
 
 
 @dataclass(frozen=True, eq=False)
