@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,6 +22,8 @@ def is_workbook(path: Path | str) -> bool:
 
 def text_of_workbook(path: Path) -> str:
     """The first sheet with numbers, a line a row, cells with a tab between.  Raises DataError."""
+    import subprocess  # few tables are workbooks
+
     if find_spec(LIBRARY) is None:
         raise DataError(
             f'{path}: workbooks need "{LIBRARY}": pip install minimax-cal[xlsx]; or save it as CSV'

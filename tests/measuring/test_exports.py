@@ -312,3 +312,33 @@ def test_a_workbook_is_measurements(truth: mc.Measurements, tmp_path: Path) -> N
     data = mc.read_measurements(path)
     assert_allclose(data.q, truth.q, rtol=0, atol=1e-15)
     assert set(data.columns["session"]) == {"may"}
+
+
+def test_a_workbook_is_a_robot(tmp_path: Path) -> None:
+    rows = [["Robot", "KR 10"], ["Konvention", "modifiziert"],
+            ["Gelenk", "a [mm]", "alpha [°]", "d [mm]", "theta [°]"],
+            [1, 0, 0, 660.5, 0], [2, 0, -90, 0, 90], [3, 432, 0, 149, 0]]  # fmt: skip
+    path = tmp_path / "Datenblatt.xlsx"
+    path.write_bytes(workbook(rows))
+    robot = mc.load_robot(path)
+    assert robot.name == "KR 10"
+    assert_allclose(robot.mdh[:, :2], [[0, 0.6605], [0.432, 0], [0, 0.149]], rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("part", "old", "new"),
+    [
+        ("xl/worksheets/sheet1.xml", "<c><v>6", '<c r="XFD1048576"><v>6'),
+        ("xl/sharedStrings.xml", "", '<sst count="99999999999" uniqueCount="99999999999"></sst>'),
+    ],
+)
+def test_a_workbook_that_asks_for_any_memory(part: str, old: str, new: str, tmp_path: Path) -> None:
+    path, packed = tmp_path / "bomb.xlsx", io.BytesIO(workbook([[1, 2, 3], [4, 5, 6]]))
+    with zipfile.ZipFile(packed) as source, zipfile.ZipFile(path, "w") as bomb:
+        for name in source.namelist():
+            text = source.read(name).decode()
+            bomb.writestr(name, text.replace(old, new) if name == part and old else text)
+        if not old:
+            bomb.writestr(part, new)
+    with pytest.raises(mc.DataError, match=r"bomb\.xlsx: asks for more memory"):
+        mc.read_measurements(path)
