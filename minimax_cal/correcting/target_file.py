@@ -28,7 +28,7 @@ class TargetFile:
 
     def corrected(self, found: Compensation) -> str:
         """The same file with other joints, and what remains at each target."""
-        rows = [[*self.file.header, *ADDED]]
+        rows = [[*self.file.given, *ADDED]]
         joints = {i: m for i, name in enumerate(self.file.header) if (m := JOINT.fullmatch(name))}
         for k, row in enumerate(self.file.rows):
             out = list(row)

@@ -24,6 +24,7 @@ from minimax_cal.reading.rows import (
     read_rows,
 )
 from minimax_cal.reading.sheet import SIMULATED
+from minimax_cal.reading.words import joints_of, stems_of
 
 APPROACH = re.compile(r"approach\d+")
 FARTHEST = 1e5  # no instrument measures farther [m]
@@ -288,7 +289,7 @@ def check_u95(data: Measurements) -> Measurements:
 
 
 def read_measurements(path: Measurements | Path | str) -> Measurements:
-    """Measurements of a CSV file whose columns tell their units.
+    """Measurements of a file: of this project's CSV, or as a tracker or controller wrote it.
 
     Parameters
     ----------
@@ -317,6 +318,14 @@ def read_measurements(path: Measurements | Path | str) -> Measurements:
 def measurements_in(file: Rows) -> Measurements:
     """The measurements in a file's rows.  Raises DataError."""
     path, header = file.path, file.header
+    if not file.own:
+        from minimax_cal.measuring.importers import import_files  # which makes measurements itself
+
+        try:
+            return import_files([path]).understood()
+        except DataError as error:
+            if joints_of(stems_of(file.given)):
+                raise DataError(f"{error}; the command import takes that") from error
     header_check(path, header)
     q, sliding = file.joints()
     found = sorted({int(m[1]) for name in header if (m := TARGET.fullmatch(name))})
@@ -342,15 +351,22 @@ def measurements_in(file: Rows) -> Measurements:
         simulated=file.simulated,
     )
     data = check_finite(data)
-    blind = np.asarray(~data.seen.any(axis=1))
-    if blind.any():
-        notices.append(f"{path}: {blind.sum()} rows hold no measured target and are left out")
-    again, said = pasted(file, ~blind)
-    data = replace(data.take(~blind & ~again), notices=(*data.notices, *notices, *said))
+    again, said = pasted(file, np.asarray(data.seen.any(axis=1)))
+    data = without_blind(replace(data, notices=(*data.notices, *notices)), again)
+    data = replace(data, notices=(*data.notices, *said))
     from minimax_cal.measuring.set_aside import from_column  # which makes measurements itself
     from minimax_cal.measuring.tools import by_tool
 
     return from_column(by_tool(data))
+
+
+def without_blind(data: Measurements, again: Array) -> Measurements:
+    """The rows that hold a measured target, without others.  again: (m,) those others."""
+    blind = np.asarray(~data.seen.any(axis=1))
+    if blind.any():
+        said = f"{data.source}: {blind.sum()} rows hold no measured target and are left out"
+        data = replace(data, notices=(*data.notices, said))
+    return data.take(~blind & ~again)
 
 
 def pasted(file: Rows, kept: Array) -> tuple[Array, list[str]]:

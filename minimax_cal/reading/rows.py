@@ -13,6 +13,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.reading.formats import OPTIONAL, OWN, near, own_kind
 from minimax_cal.reading.sheet import COMMA, Sheet, cut, numbers_of, open_text, sheet_of
+from minimax_cal.reading.words import in_own_words, joint_number, stems_of
 
 UNITS = {"rad": 1.0, "deg": np.pi / 180.0, "m": 1.0, "mm": 1e-3}
 MOST = 1e5  # of a joint: 16,000 turns, or 100 km [rad, m]
@@ -29,9 +30,10 @@ OF_FOOT = re.compile(r"(base\d+_)([xyz])(_\w+)")
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """A CSV file as text: header, rows, and the line on which each row ends.
+    """A table as text: header, rows, and the line on which each row ends.
 
-    digest: SHA-256 of the file.  simulated: whether its first line says `SIMULATED`.
+    header: names as this project has them.  given: as the file has them.  digest: SHA-256 of the
+    file.  simulated: whether its first line says `SIMULATED`.
     """
 
     path: Path | str
@@ -40,6 +42,12 @@ class Rows:
     line: Array
     digest: str
     simulated: bool = False
+    given: tuple[str, ...] = ()
+
+    @property
+    def own(self) -> bool:
+        """Whether joints or targets have this project's names in the file."""
+        return any(own_kind(name)[0] in ("q", "smr") for name in self.given)
 
     def text(self, name: str) -> list[str]:
         """The cells of a column."""
@@ -48,9 +56,10 @@ class Rows:
 
     def number(self, name: str, *, unit: str = "", empty: bool = False) -> Array:
         """A column as floats, in SI.  empty: whether empty cells, NaN, are allowed."""
-        return numbers(self.path, name, self.text(name), self.line, empty=empty) * UNITS.get(
-            unit, 1.0
-        )
+        at = self.header.index(name)
+        called = self.given[at]
+        values = numbers(self.path, called, [row[at] for row in self.rows], self.line, empty=empty)
+        return values * UNITS.get(unit, 1.0)
 
     def optional(
         self, own: re.Pattern[str] = NOTHING, doubts: re.Pattern[str] = NOTHING
@@ -115,8 +124,9 @@ def rows_of(sheet: Sheet) -> Rows:
         rows = tuple(
             tuple(c.replace(",", ".") if COMMA.fullmatch(c) else c for c in row) for row in rows
         )
-    header = table.header or rows[0]
-    return Rows(sheet.path, header, rows, table.line, sheet.digest, sheet.simulated)
+    given = table.header or rows[0]
+    header = in_own_words(given)
+    return Rows(sheet.path, header, rows, table.line, sheet.digest, sheet.simulated, given)
 
 
 def header_check(path: Path | str, header: Sequence[str]) -> None:
@@ -127,7 +137,8 @@ def header_check(path: Path | str, header: Sequence[str]) -> None:
     if twice:
         raise DataError(f"{path}:1: column {twice[0] or '(without a name)'} stands twice")
     if not joints:
-        hint = "; is it separated by ';'? save it with commas" if ";" in header[0] else ""
+        bare = [n for n, stem in zip(header, stems_of(header), strict=True) if joint_number(stem)]
+        hint = f"; {bare[0]} has no unit: write {bare[0]} [deg], or [rad]" if bare else ""
         raise DataError(
             f"{path}:1: no joint columns; name them q1_rad (or q1_deg, q1_mm), q2_rad, ...{hint}"
         )

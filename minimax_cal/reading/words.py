@@ -8,11 +8,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from minimax_cal.reading.formats import OWN, kind_of, own_kind
+
 ANGLES = {"rad": 1.0, "deg": np.pi / 180.0, "mrad": 1e-3}
 LENGTHS = {"mm": 1e-3, "m": 1.0, "um": 1e-6, "cm": 1e-2, "in": 0.0254}
 TIMES = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 TEMPERATURES = ("C", "K", "F")
-OTHERS = ("kg", "Nm")
+OTHERS = ("kg", "Nm", "px")
 ALIASES = {"°": "deg", "º": "deg", "µm": "um", "μm": "um", "inch": "in", "°C": "C", "°F": "F"}
 ALIASES |= dict.fromkeys(("Grad", "grad", "grados", "degr\u00e9s", "\u5ea6"), "deg")
 ALIASES |= {"\u5f27\u5ea6": "rad", "\u6beb\u7c73": "mm", "\u7c73": "m", "\u79d2": "s"}
@@ -65,12 +67,16 @@ WORDS = {  # plain names that mean the same in any file
              "punto", "nombre", "nombre del punto", "posicion", "\u70b9", "\u70b9\u540d",
              "\u70b9\u53f7", "\u6d4b\u70b9", "\u5e8f\u53f7", "\u540d\u79f0"),
     "tool": ("tool", "werkzeug", "outil", "herramienta", "adapter", "\u5de5\u5177"),
+    "camera": ("camera", "kamera", "camara", "\u76f8\u673a"),
+    "u": ("u",),
+    "v": ("v",),
     "order": ("order",),
     "session": ("session",),
     "group": ("group",),
     "split": ("split",),
     "set_aside": ("set_aside",),
 }  # fmt: skip
+SURE = ("tool", "temperature", "time")  # what means the same also beside names of this project
 PLAIN = {word: meaning for meaning, words in WORDS.items() for word in words}
 
 
@@ -159,3 +165,22 @@ def is_understood(names: Sequence[str]) -> bool:
     stems = stems_of(names)
     known = {*joints_of(stems), *points_of(stems)} | {stem for stem in stems if plain(stem)}
     return 2 * sum(stem in known for stem in stems) >= len(stems)
+
+
+def in_own_words(header: Sequence[str]) -> tuple[str, ...]:
+    """A header with this project's names in place of others that mean the same.
+
+    Beside its own joints or targets only what cannot mean anything else.
+    """
+    stems = stems_of(header)
+    own = any(own_kind(name)[0] in ("q", "smr") for name in header)
+    found = {} if own else joints_of(stems)
+    found |= points_of(stems) if found else {axis: axis for axis in "xyz"}
+    out = list(header)
+    for i, (name, stem) in enumerate(zip(header, stems, strict=True)):
+        what, unit = found.get(stem, "" if own_kind(name)[0] else plain(stem)), split_unit(name)[1]
+        units = OWN[kind].units if (kind := kind_of(what)) else (unit,)
+        new = f"{what}_{unit}" if unit else what
+        if what and (unit in units or not units) and new not in out and (not own or what in SURE):
+            out[i] = new
+    return tuple(out)
