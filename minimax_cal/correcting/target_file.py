@@ -11,8 +11,8 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import csv_text
 from minimax_cal.measuring.joint_rows import joint_rows
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.reading.formats import OWN
 from minimax_cal.reading.rows import JOINT, UNITS, Rows, read_rows
+from minimax_cal.reading.words import OWN
 
 ADDED = ("residual_mm", "residual_mrad", "status")
 USED = ("q", "order", "temperature", "payload", "tau", "approach", "session")

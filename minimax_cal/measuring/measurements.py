@@ -14,7 +14,6 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import csv_text, write_whole
 from minimax_cal.ground.words import name_first, one_line
 from minimax_cal.measuring.aside import SetAside
-from minimax_cal.reading.formats import OWN, kind_of
 from minimax_cal.reading.rows import (
     NOTHING,
     TARGET,
@@ -24,7 +23,7 @@ from minimax_cal.reading.rows import (
     read_rows,
 )
 from minimax_cal.reading.sheet import SIMULATED
-from minimax_cal.reading.words import joints_of, stems_of
+from minimax_cal.reading.words import OWN, joints_of, kind_of, stems_of
 
 APPROACH = re.compile(r"approach\d+")
 FARTHEST = 1e5  # no instrument measures farther [m]

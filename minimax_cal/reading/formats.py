@@ -2,55 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
-ANY = ("rad", "deg", "mm", "m")
-SIZES = ("mm", "m")
+from minimax_cal.reading.words import ANY, JOINTS, WORDS, folded, split_unit
 
-
-@dataclass(frozen=True)
-class Kind:
-    """What this project calls columns of one kind, without the unit, and the units they may have.
-
-    The first is the one that is written.  text: whether cells are labels, never computed with.
-    """
-
-    stem: str
-    units: tuple[str, ...] = ()
-    text: bool = False
-
-    @property
-    def pattern(self) -> str:
-        """Of the whole name, its last group the unit."""
-        return f"{self.stem}_({'|'.join(self.units)})" if self.units else self.stem
-
-
-OWN = {  # columns of measurements, by kind
-    "q": Kind(r"q(\d+)", ANY),
-    "smr": Kind(r"smr(\d+)_([xyz])", SIZES),
-    "order": Kind("order"),
-    "time": Kind("time", ("s",)),
-    "temperature": Kind("temperature", ("C",)),
-    "payload": Kind("payload", ("kg",)),
-    "payload centre": Kind("payload_[xyz]", SIZES),
-    "tool": Kind("tool", text=True),
-    "tau": Kind(r"tau\d+", ("Nm",)),
-    "approach": Kind(r"approach\d+"),
-    "session": Kind("session", text=True),
-    "group": Kind("group", text=True),
-    "u95": Kind("u95", SIZES),
-    "pose": Kind("pose", text=True),
-    "split": Kind("split", text=True),
-    "set_aside": Kind("set_aside", text=True),
-    "qread": Kind(r"qread\d+", ANY),
-    "base": Kind(r"base\d+_[xyz]", SIZES),
-}
-OPTIONAL = tuple(kind for kind in OWN if kind not in ("q", "smr"))
 Q = f"(?P<unit>{'|'.join(ANY)})"
 JOINT = r"(?P<joint>\d+)"
+OF_MOTION = re.compile(r"(.*?)[ _]*[\[(]?\b(N ?m|N|mA|A|(?:rad|deg|\u00b0)/s)[\])]?")
+MOTIONS = {"N m": "Nm", "rad/s": "rad", "deg/s": "deg", "\u00b0/s": "deg"}
 INDEX = rf"(?:[.\[]?{JOINT}\]?)?"
 
 
@@ -60,7 +21,8 @@ class Format:
 
     names: patterns by kind, of which the first that fits counts; `joint` is the joint's number or
     name, `unit` the unit.  first: number of the first joint.  units: by kind, where names have
-    none.  strict: whether a column that nothing uses is worth a notice.
+    none.  strict: whether a column that nothing uses is worth a notice.  words: whether patterns
+    are of folded names without units, and joints may be numbered from 0 too.
     """
 
     title: str
@@ -68,6 +30,7 @@ class Format:
     first: int = 1
     units: Mapping[str, str] = field(default_factory=dict)
     strict: bool = False
+    words: bool = False
 
 
 @dataclass(frozen=True)
@@ -155,38 +118,36 @@ FORMATS = (  # tried in this order
         first=0,
         units={"tau": "Nm", "i": "A"},
     ),
+    Format(
+        "table in words",
+        {
+            "t": ("t", *map(re.escape, WORDS["time"])),
+            "q": (rf"(?:{JOINTS})[ _.-]?{JOINT}",),
+            "qd": (rf"(?:qd|dq|qdot|velocity|vel|speed|geschwindigkeit|vitesse)[ _.-]?{JOINT}",),
+            "tau": (rf"(?:tau|torque|moment|drehmoment|effort|couple)[ _.-]?{JOINT}",),
+            "i": (rf"(?:i|current|strom|courant|corriente)[ _.-]?{JOINT}",),
+            "payload": ("payload|traglast|last",),
+            "run": ("run|fahrt|lauf",),
+        },
+        units={"tau": "Nm", "i": "A"},
+        strict=True,
+        words=True,
+    ),
 )
-
-
-def own_kind(name: str) -> tuple[str, str, str]:
-    """The kind of one of this project's columns, its name without the unit, and the unit; or ''."""
-    for kind, own in OWN.items():
-        if found := re.fullmatch(own.pattern, name):
-            unit = found[found.re.groups] if own.units else ""
-            return kind, name.removesuffix(f"_{unit}"), unit
-    return "", name, ""
-
-
-def kind_of(stem: str) -> str:
-    """The kind of one of this project's columns, by its name without the unit; or ''."""
-    return next((kind for kind, own in OWN.items() if re.fullmatch(own.stem, stem)), "")
-
-
-def near(name: str, known: Iterable[str]) -> str:
-    """A hint when a column's name is close to one that would be used; a 1 stands for any number."""
-    numbers = {str(i) for i in range(1, 10)}
-    every = [k.replace("1", i, 1) for k in known for i in (numbers if "1" in k else "1")]
-    match = difflib.get_close_matches(name, sorted(every), 1, cutoff=0.75)
-    return f" (did you mean {match[0]}?)" if match else ""
 
 
 def place_of(form: Format, name: str) -> Place | None:
     """What a column of a format holds, or None."""
+    told = ""
+    if form.words:
+        found = OF_MOTION.fullmatch(name.strip())
+        name, told = (found[1], found[2]) if found else split_unit(name)
+        name = folded(name)
     for kind, patterns in form.names.items():
         for pattern in patterns:
             if found := re.fullmatch(pattern, name, re.ASCII):
                 groups = found.groupdict()
-                unit = groups.get("unit") or form.units.get(kind, "")
+                unit = groups.get("unit") or MOTIONS.get(told, told) or form.units.get(kind, "")
                 return Place(kind, groups.get("joint") or "", unit)
     return None
 
@@ -201,16 +162,17 @@ def format_of(header: Sequence[str]) -> tuple[Format, dict[int, Place]] | None:
     """The first format with joint columns in a header, and what its columns hold."""
     for form in FORMATS:
         places = places_of(form, header)
-        if any(place.kind == "q" for place in places.values()):
-            return form, places
+        joints = [place.joint for place in places.values() if place.kind == "q"]
+        if joints:
+            return replace(form, first=0) if form.words and "0" in joints else form, places
     return None
 
 
 def is_log(header: Sequence[str]) -> bool:
-    """Whether a header is of a log: joints in time, with torques or currents, and no points."""
+    """Whether a header is of a log: joints with torques, currents or time, and no points."""
     found = format_of(header)
     if not found:
         return False
     kinds = {place.kind for place in found[1].values()}
     points = any(re.match(r"smr\d+_", name) for name in header)
-    return not points and ("t_s" in header or bool(kinds & {"tau", "i"} and kinds & {"t", "sec"}))
+    return not points and ("t_s" in header or bool(kinds & {"tau", "i"}))

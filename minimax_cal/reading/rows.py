@@ -11,9 +11,16 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.reading.formats import OPTIONAL, OWN, near, own_kind
 from minimax_cal.reading.sheet import COMMA, Sheet, cut, numbers_of, open_text, sheet_of
-from minimax_cal.reading.words import in_own_words, joint_number, stems_of
+from minimax_cal.reading.words import (
+    OPTIONAL,
+    OWN,
+    in_own_words,
+    joint_number,
+    near,
+    own_kind,
+    stems_of,
+)
 
 UNITS = {"rad": 1.0, "deg": np.pi / 180.0, "m": 1.0, "mm": 1e-3}
 MOST = 1e5  # of a joint: 16,000 turns, or 100 km [rad, m]

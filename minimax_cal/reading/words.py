@@ -2,14 +2,56 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from minimax_cal.reading.formats import OWN, kind_of, own_kind
+ANY = ("rad", "deg", "mm", "m")
+SIZES = ("mm", "m")
 
+
+@dataclass(frozen=True)
+class Kind:
+    """What this project calls columns of one kind, without the unit, and the units they may have.
+
+    The first is the one that is written.  text: whether cells are labels, never computed with.
+    """
+
+    stem: str
+    units: tuple[str, ...] = ()
+    text: bool = False
+
+    @property
+    def pattern(self) -> str:
+        """Of the whole name, its last group the unit."""
+        return f"{self.stem}_({'|'.join(self.units)})" if self.units else self.stem
+
+
+OWN = {  # columns of measurements, by kind
+    "q": Kind(r"q(\d+)", ANY),
+    "smr": Kind(r"smr(\d+)_([xyz])", SIZES),
+    "order": Kind("order"),
+    "time": Kind("time", ("s",)),
+    "temperature": Kind("temperature", ("C",)),
+    "payload": Kind("payload", ("kg",)),
+    "payload centre": Kind("payload_[xyz]", SIZES),
+    "tool": Kind("tool", text=True),
+    "tau": Kind(r"tau\d+", ("Nm",)),
+    "approach": Kind(r"approach\d+"),
+    "session": Kind("session", text=True),
+    "group": Kind("group", text=True),
+    "u95": Kind("u95", SIZES),
+    "pose": Kind("pose", text=True),
+    "split": Kind("split", text=True),
+    "set_aside": Kind("set_aside", text=True),
+    "qread": Kind(r"qread\d+", ANY),
+    "base": Kind(r"base\d+_[xyz]", SIZES),
+}
+OPTIONAL = tuple(kind for kind in OWN if kind not in ("q", "smr"))
 ANGLES = {"rad": 1.0, "deg": np.pi / 180.0, "mrad": 1e-3}
 LENGTHS = {"mm": 1e-3, "m": 1.0, "um": 1e-6, "cm": 1e-2, "in": 0.0254}
 TIMES = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
@@ -25,9 +67,10 @@ ALIASES |= dict.fromkeys(
 )
 ALIASES |= dict.fromkeys(("IN", "inches"), "in")
 KNOWN = {*ANGLES, *LENGTHS, *TIMES, *TEMPERATURES, *OTHERS}
+JOINTS = ("q|j|a|ax|axis|joint|theta|achse|achswert|gelenk|axe|articulation|eje|articulacion"
+          "|\u5173\u8282|\u8f74")  # fmt: skip
 JOINT = re.compile(  # of folded names
-    "(?:q|j|a|ax|axis|joint|theta|achse|achswert|gelenk|axe|articulation|eje|articulacion"
-    "|\u5173\u8282|\u8f74)[ _.-]?(\\d+)"
+    f"(?:{JOINTS})[ _.-]?(\\d+)"
     "(?:[ _.-]?(?:angle|winkel|ist|actual|position|pos|wert|value|angulo|\u89d2\u5ea6|\u89d2))?"
     "|\u7b2c?(\\d+)(?:\u8f74|\u5173\u8282)(?:\u89d2\u5ea6|\u89d2)?"
 )
@@ -78,6 +121,28 @@ WORDS = {  # plain names that mean the same in any file
 }  # fmt: skip
 SURE = ("tool", "temperature", "time")  # what means the same also beside names of this project
 PLAIN = {word: meaning for meaning, words in WORDS.items() for word in words}
+
+
+def own_kind(name: str) -> tuple[str, str, str]:
+    """The kind of one of this project's columns, its name without the unit, and the unit; or ''."""
+    for kind, own in OWN.items():
+        if found := re.fullmatch(own.pattern, name):
+            unit = found[found.re.groups] if own.units else ""
+            return kind, name.removesuffix(f"_{unit}"), unit
+    return "", name, ""
+
+
+def kind_of(stem: str) -> str:
+    """The kind of one of this project's columns, by its name without the unit; or ''."""
+    return next((kind for kind, own in OWN.items() if re.fullmatch(own.stem, stem)), "")
+
+
+def near(name: str, known: Iterable[str]) -> str:
+    """A hint when a column's name is close to one that would be used; a 1 stands for any number."""
+    numbers = {str(i) for i in range(1, 10)}
+    every = [k.replace("1", i, 1) for k in known for i in (numbers if "1" in k else "1")]
+    match = difflib.get_close_matches(name, sorted(every), 1, cutoff=0.75)
+    return f" (did you mean {match[0]}?)" if match else ""
 
 
 def folded(text: str) -> str:

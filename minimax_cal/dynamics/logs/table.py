@@ -11,15 +11,9 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.reading.formats import (
-    FORMATS,
-    SIZES,
-    Format,
-    Place,
-    format_of,
-    near,
-)
+from minimax_cal.reading.formats import FORMATS, Format, Place, format_of
 from minimax_cal.reading.sheet import Sheet, cut, numbers_of, open_text
+from minimax_cal.reading.words import SIZES, near
 
 MOST_TORN = 0.01  # share of rows that a log may lose to torn lines
 MOST_JOINTS = 100  # of any machine; guards against a number that is none of a joint
@@ -141,11 +135,11 @@ def of_format(
         at = [] if kind in WORDS else columns_of(sheet, kind, places, joints)
         if not at:
             continue
-        blocks = [reading.block(i) for i in at]
+        most = MOST_TIME if kind in ("t", "sec", "nanosec") else MOST
+        blocks = [reading.block(i, most) for i in at]
         units_of = [unit_of(sheet, i, places[i], units) for i in at]
         wide = [block.shape[1] for block in blocks]
         own[kind] = tuple(np.repeat(units_of, wide).tolist())
-        check_sizes(sheet, kind, at, blocks)
         block = np.concatenate(blocks, axis=1) * [FACTORS.get(unit, 1.0) for unit in own[kind]]
         names = [sheet.header[i] for i in at]
         of_list = tuple(f"{names[0]}[{j}]" for j in range(wide[0]))
@@ -168,19 +162,6 @@ def of_format(
         notices=(*reading.notices(), *unused(sheet, form, places)),
         simulated=sheet.simulated,
     )
-
-
-def check_sizes(sheet: Sheet, kind: str, at: Sequence[int], blocks: Sequence[Array]) -> None:
-    """Raise DataError for a number that no arm has."""
-    most = MOST_TIME if kind in ("t", "sec", "nanosec") else MOST
-    for i, block in zip(at, blocks, strict=True):
-        odd = (np.abs(block) > most).any(axis=1)
-        if odd.any():
-            row = int(np.argmax(odd))
-            raise DataError(
-                f"{sheet.path}:{sheet.line[row]}: column {sheet.header[i]}: "
-                f"{sheet.cells[row][i][:40]} cannot be; check the number and its unit"
-            )
 
 
 def unit_of(sheet: Sheet, at: int, place: Place, units: Mapping[str, str]) -> str:
@@ -295,31 +276,34 @@ class Cells:
     sheet: Sheet
     broken: dict[int, str] = field(default_factory=dict)
 
-    def block(self, at: int) -> Array:
-        """(m, 1) numbers of a column, or (m, k) of one that holds a list in each cell."""
+    def block(self, at: int, most: float) -> Array:
+        """(m, 1) numbers of a column, or (m, k) of one that holds a list in each cell.
+
+        most: size that no number has.
+        """
         cells = [row[at] for row in self.sheet.cells]
-        if any(cell.startswith("[") for cell in cells[:SHOWN]):
-            return self.lists(at, cells)
-        return self.numbers(at, cells)[:, None]
-
-    def numbers(self, at: int, cells: Sequence[str]) -> Array:
-        """(m,) numbers, NaN where there is none."""
-        out = numbers_of(cells, self.sheet.decimal)
-        for row in np.flatnonzero(np.isnan(out)).tolist():
-            if cells[row] and cells[row].lower().strip("+-") != "nan":
-                self.broken.setdefault(row, f"column {self.sheet.header[at]}: {cells[row]!r}")
-        return np.where(np.isfinite(out), out, np.nan)
-
-    def lists(self, at: int, cells: list[str]) -> Array:
-        """(m, k) numbers of cells like [1, 2, 3] or [1 2 3]."""
+        if not any(cell.startswith("[") for cell in cells[:SHOWN]):
+            return self.numbers(at, cells, most)[:, None]
         rows = [cell.strip("[]").replace(",", " ").split() for cell in cells]
         k = max(map(len, rows))
-        for row, parts in enumerate(rows):
-            if len(parts) != k:
-                self.broken.setdefault(row, f"column {self.sheet.header[at]}: {cells[row][:40]!r}")
-        even = [parts if len(parts) == k else [""] * k for parts in rows]
-        columns = [self.numbers(at, [parts[j] for parts in even]) for j in range(k)]
-        return np.stack(columns, axis=1)
+        whole = [parts if len(parts) == k else [cell or "[]"] * k
+                 for parts, cell in zip(rows, cells, strict=True)]  # fmt: skip
+        each = [self.numbers(at, [parts[j] for parts in whole], most) for j in range(k)]
+        return np.stack(each, axis=1)
+
+    def numbers(self, at: int, cells: Sequence[str], most: float) -> Array:
+        """(m,) numbers, NaN where there is none."""
+        out = numbers_of(cells, self.sheet.decimal)
+        wild = np.abs(out) > most
+        for row in np.flatnonzero(np.isnan(out) | wild).tolist():
+            cell, called = cells[row], f"column {self.sheet.header[at]}: "
+            if wild[row]:
+                what = f"{called}{cell[:40]} cannot be; check the number and its unit"
+                self.broken.setdefault(row, what)
+            elif cell and cell.lower().strip("+-") != "nan":
+                what = f"{called}{cell[:40]!r} is no number; mend it or delete the row"
+                self.broken.setdefault(row, what)
+        return np.where(np.isfinite(out), out, np.nan)
 
     def time(self, values: Mapping[str, Array], unit: str) -> Array:
         """(m,) seconds since the first row.  Raises DataError."""
@@ -346,7 +330,7 @@ class Cells:
         path, line = self.sheet.path, self.sheet.line
         if len(self.broken) > max(1.0, MOST_TORN * len(line)):
             row, what = next(iter(sorted(self.broken.items())))
-            raise DataError(f"{path}:{line[row]}: {what} is no number; mend it or delete the row")
+            raise DataError(f"{path}:{line[row]}: {what}")
         lines = sorted({*self.sheet.torn, *(int(line[row]) for row in self.broken)})
         if not lines:
             return []

@@ -6,9 +6,8 @@ import re
 
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring.importers.reading import Column, Given, Reading, checked
-from minimax_cal.reading.formats import kind_of
 from minimax_cal.reading.sheet import Sheet
-from minimax_cal.reading.words import plain, split_unit
+from minimax_cal.reading.words import kind_of, plain, split_unit
 
 TITLE = "columns as mapped"
 SKIP = re.compile(r"(?:-|skip)(?:\*(\d+))?")

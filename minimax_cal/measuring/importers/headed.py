@@ -14,13 +14,13 @@ from minimax_cal.measuring.importers.reading import (
     checked,
     family_of,
 )
-from minimax_cal.reading.formats import kind_of
 from minimax_cal.reading.sheet import Sheet, is_number
 from minimax_cal.reading.words import (
     WORDS,
     along_arm,
     joint_number,
     joints_of,
+    kind_of,
     plain,
     points_of,
     split_unit,
