@@ -81,7 +81,7 @@ def numbers_of(cells: Sequence[str], decimal: str = ".") -> Array:
     """(m,) numbers, NaN where a cell is empty or holds none."""
     given = [cell.replace(",", ".") for cell in cells] if decimal == "," else list(cells)
     with suppress(ValueError):
-        if not any("_" in cell for cell in given):  # 1_000 is a number to Python only
+        if "_" not in "".join(given):  # 1_000 is a number to Python only
             return np.array([cell or "nan" for cell in given], dtype=float)
     return np.array([number_of(cell) for cell in given], dtype=float)
 
@@ -166,7 +166,8 @@ def cut(
     line = np.array([number for number, _ in rows], dtype=int)
     cells = tuple(tuple(row[:width]) for _, row in rows)
     names = header or tuple(f"column {i + 1}" for i in range(width))
-    sign = decimal or decimal_of(path, names, line, cells)
+    plain = delimiter == "," and '"' not in sheet.text
+    sign = decimal or ("." if plain else decimal_of(path, names, line, cells))
     found = replace(sheet, delimiter=delimiter, decimal=sign, header=header, line=line, cells=cells)
     return replace(found, torn=lost, above=tuple(above), below=tuple(below))
 
@@ -269,11 +270,15 @@ def split_line(line: str, delimiter: str) -> list[str]:
 
 def rows_of(path: Path, lines: Sequence[str], delimiter: str) -> list[NumberedRow]:
     """The rows that hold something, each with the line on which it ends.  Raises DataError."""
-    if delimiter == " " or not any('"' in line for line in lines):
-        cut_lines = ((n, split_line(line, delimiter)) for n, line in enumerate(lines, 1))
-        return [row for row in cut_lines if any(row[1])]
-    text = io.StringIO("\n".join(lines), newline="")
-    reader = csv.reader(text, delimiter=delimiter, skipinitialspace=True, strict=True)
+    text = "\n".join(lines)
+    if delimiter == " " or '"' not in text:
+        told = [(n, line) for n, line in enumerate(lines, 1) if line.strip(BLANK)]
+        if delimiter == " " or " " in text or "\t" in text:
+            return [(n, split_line(line, delimiter)) for n, line in told]
+        return [(n, line.split(delimiter)) for n, line in told]
+    reader = csv.reader(
+        io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True, strict=True
+    )
     rows, begun = [], 0
     try:
         for row in reader:
