@@ -15,7 +15,6 @@ from minimax_cal.ground.files import csv_text, write_whole
 from minimax_cal.ground.words import name_first, one_line
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.reading.rows import (
-    NOTHING,
     TARGET,
     UNITS,
     Rows,
@@ -36,6 +35,7 @@ PLAUSIBLE = {  # least and largest value in SI of columns of a kind
     "base": (-FARTHEST, FARTHEST),
     "qread": (-1e3, 1e3),
 }
+NAMED = re.compile(r"smr\d+_target")  # what the tracker calls it
 U95 = re.compile(OWN["u95"].pattern)
 
 
@@ -334,8 +334,9 @@ def measurements_in(file: Rows) -> Measurements:
             y[:, found.index(int(m[1])), "xyz".index(m[2])] = file.number(
                 name, unit=m[3], empty=True
             )
-    columns, unused = file.optional(NOTHING, U95)
-    unknown = {name: np.array(file.text(name)) for name in unused}
+    columns, unused = file.optional(NAMED, U95)
+    named = [name for name in header if NAMED.fullmatch(name)]  # by import
+    unknown = {name: np.array(file.text(name)) for name in (*unused, *named)}
     notices = [f"{path}: column {name} is not used{why}" for name, why in unused.items()]
     data = Measurements(
         q=q,

@@ -302,6 +302,24 @@ def test_patterns_of_names(
     assert (match.pose, match.label) == (pose, label)
 
 
+def test_a_pose_keeps_its_name(truth: mc.Measurements, tmp_path: Path, capsys: Any) -> None:
+    """What the file of joints calls a pose, whatever the tracker calls its points."""
+    points = ["name,X [mm],Y [mm],Z [mm]"]
+    points += [f"P{i + 1:03d}_{k + 1},{','.join(f'{1e3 * v:.6f}' for v in truth.y[i, k])}"
+               for i in range(POSES) for k in range(2)]  # fmt: skip
+    joints = ["name," + ",".join(f"J{j} [rad]" for j in range(1, 7))]
+    joints += [f"P{i + 1:03d},{','.join(f'{v:.9f}' for v in truth.q[i])}" for i in range(POSES)]
+    for name, lines in (("points.csv", points), ("joints.csv", joints)):
+        (tmp_path / name).write_text("\n".join(lines))
+    data = mc.read_campaigns([tmp_path / "points.csv", tmp_path / "joints.csv"])
+    assert data.called(data.line[4]) == "pose P005"
+    out = tmp_path / "out.csv"
+    assert run("import", tmp_path / "points.csv", tmp_path / "joints.csv", "-o", out) == 0
+    again = mc.read_measurements(out)
+    assert again.columns["pose"][4] == "P005"
+    assert again.notices == ()
+
+
 def test_a_workbook_is_measurements(truth: mc.Measurements, tmp_path: Path) -> None:
     head: list[object] = [*(f"q{i + 1}_rad" for i in range(6)), "smr1_x_mm", "smr1_y_mm"]
     rows: list[list[object]] = [[*head, "smr1_z_mm", "session"]]
