@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -138,39 +138,39 @@ def rows_of(sheet: Sheet) -> Rows:
 
 def header_check(path: Path | str, header: Sequence[str]) -> None:
     """Raise DataError for a header that cannot be understood."""
-    joints = [m for name in header if (m := JOINT.fullmatch(name))]
-    targets = [m for name in header if (m := TARGET.fullmatch(name))]
-    twice = sorted({name for name in header if header.count(name) > 1})
-    if twice:
-        raise DataError(f"{path}:1: column {twice[0] or '(without a name)'} stands twice")
-    if not joints:
+    kinds = [own_kind(name) for name in header]
+    stems: dict[str, str] = {}
+    for name, (_, stem, _) in zip(header, kinds, strict=True):
+        if (first := stems.get(stem)) is not None:
+            twice = f"column {name or '(without a name)'} stands twice"
+            other = f"{first} and {name} are one column; keep one unit"
+            raise DataError(f"{path}:1: {twice if first == name else other}")
+        stems[stem] = name
+    units = {kind: {unit for one, _, unit in kinds if one == kind} for kind in ("q", "smr")}
+    if not units["q"]:
         bare = [n for n, stem in zip(header, stems_of(header), strict=True) if joint_number(stem)]
         hint = f"; {bare[0]} has no unit: write {bare[0]} [deg], or [rad]" if bare else ""
         raise DataError(
             f"{path}:1: no joint columns; name them q1_rad (or q1_deg, q1_mm), q2_rad, ...{hint}"
         )
-    numbers_found = sorted(int(m[1]) for m in joints)
-    missing = sorted(set(range(1, numbers_found[-1] + 1)) - set(numbers_found))
-    if missing:
-        raise DataError(f"{path}:1: column q{missing[0]}_{joints[0][2]} is missing")
-    if len(set(numbers_found)) < len(numbers_found):
-        raise DataError(f"{path}:1: a joint has two columns; keep one unit for each joint")
-    if {"rad", "deg"} <= {m[2] for m in joints}:
+    if {"rad", "deg"} <= units["q"]:
         raise DataError(f"{path}:1: joint columns mix _rad and _deg; use one of them")
-    if not targets:
+    if not units["smr"]:
         raise DataError(f"{path}:1: no target columns; name them smr1_x_mm, smr1_y_mm, smr1_z_mm")
-    for number in sorted({int(m[1]) for m in targets}):
-        axes = [m[2] for m in targets if int(m[1]) == number]
-        unit = next(m[3] for m in targets if int(m[1]) == number)
-        for axis in "xyz":
-            if axes.count(axis) != 1:
-                fault = "is missing" if axis not in axes else "is given in two units"
-                raise DataError(f"{path}:1: column smr{number}_{axis}_{unit} {fault}")
-    stems: dict[str, str] = {}
-    for name in header:
-        _, stem, _ = own_kind(name)
-        if stems.setdefault(stem, name) != name:
-            raise DataError(f"{path}:1: {stems[stem]} and {name} are one column; keep one unit")
+    if lost := lacking([stem for kind, stem, _ in kinds if kind]):
+        beside = lost[:-1] if "_" in lost else "q"
+        unit = next(unit for _, stem, unit in kinds if stem.startswith(beside) and unit)
+        raise DataError(f"{path}:1: column {lost}_{unit} is missing")
+
+
+def lacking(stems: Collection[str]) -> str:
+    """The first joint before the last, or axis of a target, without a column; or ''."""
+    joints = [int(m[1]) for stem in stems if (m := re.fullmatch(OWN["q"].stem, stem))]
+    targets = {int(m[1]) for stem in stems if (m := re.fullmatch(OWN["smr"].stem, stem))}
+    last = max(joints, default=0)
+    wanted = [f"q{i}" for i in range(1, last + 1)] if last <= len(stems) else [f"q{last - 1}"]
+    wanted += [f"smr{number}_{axis}" for number in sorted(targets) for axis in "xyz"]
+    return next((stem for stem in wanted if stem not in stems), "")
 
 
 def useless(header: Sequence[str]) -> dict[str, str]:
