@@ -324,7 +324,8 @@ def measurements_in(file: Rows) -> Measurements:
             return import_files([path]).understood()
         except DataError as error:
             if joints_of(stems_of(file.given)):
-                raise DataError(f"{error}; the command import takes that") from error
+                taken = "; the command import takes that" if "='" in str(error) else ""
+                raise DataError(f"{error}{taken}") from error
     header_check(path, header)
     q, sliding = file.joints()
     found = sorted({int(m[1]) for name in header if (m := TARGET.fullmatch(name))})

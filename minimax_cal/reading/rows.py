@@ -13,8 +13,8 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.reading.sheet import COMMA, Sheet, cut, numbers_of, open_text, sheet_of
 from minimax_cal.reading.words import (
-    OPTIONAL,
     OWN,
+    SIZES,
     in_own_words,
     joint_number,
     near,
@@ -31,8 +31,6 @@ KNOWN = ("order", "time_s", "temperature_C", "payload_kg", "session", "group", "
          *(f"smr1_{axis}_mm" for axis in "xyz"))  # fmt: skip
 NOTHING = re.compile(r"(?!)")
 OF_JOINT = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
-OF_PAYLOAD = re.compile(r"payload_[xyz]_(?:mm|m)")
-OF_FOOT = re.compile(r"(base\d+_)([xyz])(_\w+)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,23 +174,20 @@ def lacking(stems: Collection[str]) -> str:
 def useless(header: Sequence[str]) -> dict[str, str]:
     """Optional columns that say nothing of this arm, and why."""
     joints = max((int(m[1]) for name in header if (m := JOINT.fullmatch(name))), default=0)
+    names = {*header}
     out = {}
     for name in header:
-        if own_kind(name)[0] not in OPTIONAL:
-            continue
-        if m := OF_JOINT.fullmatch(name):
-            if not 1 <= int(m[1]) <= joints:
-                out[name] = f"the file has no joint {m[1]}"
-        elif OF_PAYLOAD.fullmatch(name):
-            given = {other[8] for other in header if OF_PAYLOAD.fullmatch(other)}
-            if "payload_kg" not in header:
-                out[name] = "the file has no column payload_kg"
-            elif len(given) < 3:
-                out[name] = "the payload's centre needs x, y and z"
-        elif m := OF_FOOT.fullmatch(name):
-            axes = [o[2] for other in header if (o := OF_FOOT.fullmatch(other)) and o[1] == m[1]]
-            if lost := [f"{m[1]}{axis}{m[3]}" for axis in "xyz" if axis not in axes]:
-                out[name] = f"{lost[0]} is missing"
+        kind, stem, unit = own_kind(name)
+        beside = [f"{stem[:-1]}{axis}" for axis in "xyz"]
+        lost = [one for one in beside if not names & {f"{one}_{size}" for size in SIZES}]
+        if (m := OF_JOINT.fullmatch(name)) and not 1 <= int(m[1]) <= joints:
+            out[name] = f"the file has no joint {m[1]}"
+        elif kind == "payload centre" and "payload_kg" not in names:
+            out[name] = "the file has no column payload_kg"
+        elif kind == "payload centre" and lost:
+            out[name] = "the payload's centre needs x, y and z"
+        elif kind == "base" and lost:
+            out[name] = f"{lost[0]}_{unit} is missing"
     return out
 
 

@@ -36,6 +36,7 @@ PACKED = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how spreadsheets begin
 WORKBOOK = "workbook"
 COORDINATES = 3  # of a point
 BLANK = " \t,;"
+MOST_COLUMNS = 1 << 14  # as of workbooks
 LOOKED_AT = 200  # rows that decide the delimiter
 NumberedRow = tuple[int, list[str]]  # the line of the file, and its cells
 
@@ -153,6 +154,8 @@ def cut(
     if not rows:
         raise DataError(f"{path}: holds a header but no rows")
     width = len(header) or Counter(len(trimmed(row)) for _, row in rows).most_common(1)[0][0]
+    if width > MOST_COLUMNS:
+        raise DataError(f"{path}: has {width} columns; a table has at most {MOST_COLUMNS}")
     torn = [(number, row) for number, row in rows if len(row) < width or any(row[width:])]
     if len(torn) > (max(1.0, most_torn * len(rows)) if most_torn else 0.0):
         number, row = torn[0]

@@ -51,7 +51,6 @@ OWN = {  # columns of measurements, by kind
     "qread": Kind(r"qread\d+", ANY),
     "base": Kind(r"base\d+_[xyz]", SIZES),
 }
-OPTIONAL = tuple(kind for kind in OWN if kind not in ("q", "smr"))
 ANGLES = {"rad": 1.0, "deg": np.pi / 180.0, "mrad": 1e-3}
 LENGTHS = {"mm": 1e-3, "m": 1.0, "um": 1e-6, "cm": 1e-2, "in": 0.0254}
 TIMES = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
@@ -241,11 +240,12 @@ def in_own_words(header: Sequence[str]) -> tuple[str, ...]:
     own = any(own_kind(name)[0] in ("q", "smr") for name in header)
     found = {} if own else joints_of(stems)
     found |= points_of(stems) if found else {axis: axis for axis in "xyz"}
-    out = list(header)
+    out, taken = list(header), {*header}
     for i, (name, stem) in enumerate(zip(header, stems, strict=True)):
         what, unit = found.get(stem, "" if own_kind(name)[0] else plain(stem)), split_unit(name)[1]
         units = OWN[kind].units if (kind := kind_of(what)) else (unit,)
         new = f"{what}_{unit}" if unit else what
-        if what and (unit in units or not units) and new not in out and (not own or what in SURE):
+        if what and (unit in units or not units) and new not in taken and (not own or what in SURE):
             out[i] = new
+            taken.add(new)
     return tuple(out)
