@@ -38,7 +38,8 @@ COORDINATES = 3  # of a point
 BLANK = " \t,;"
 MOST_COLUMNS = 1 << 14  # as of workbooks
 LOOKED_AT = 200  # rows that decide the delimiter
-NumberedRow = tuple[int, list[str]]  # the line of the file, and its cells
+Row = tuple[str, ...]
+NumberedRow = tuple[int, Row]  # the line of the file, and its cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,16 +127,8 @@ def cut(
     because they have fewer or more cells than the others.  remarks: whether there may be some below
     the table.  alone: the delimiter of a table of one column.
     """
-    path, lines = sheet.path, sheet.text.split("\n")
-    notes = {n: line for n, line in enumerate(lines, 1) if line.lstrip().startswith(COMMENTS)}
-    if notes:
-        lines = ["" if n in notes else line for n, line in enumerate(lines, 1)]
-    delimiter = "\t" if sheet.encoding == WORKBOOK else ""
-    delimiter = delimiter or delimiter_of([line for line in lines if line.strip(BLANK)][:LOOKED_AT])
-    delimiter = delimiter or alone
-    if not delimiter:
-        raise DataError(f"{path}: has no columns that commas, semicolons, tabs or spaces separate")
-    rows = rows_of(path, lines, delimiter)
+    path = sheet.path
+    delimiter, notes, rows = split(sheet, alone)
     if not rows:
         raise DataError(f"{path}: is empty")
     above = [] if most_torn else above_table([row for _, row in rows])
@@ -167,7 +160,7 @@ def cut(
     lost = tuple(number for number, _ in torn)
     rows = [(number, row) for number, row in rows if number not in lost] if lost else rows
     line = np.array([number for number, _ in rows], dtype=int)
-    cells = tuple(tuple(row[:width]) for _, row in rows)
+    cells = tuple(row[:width] for _, row in rows)
     names = header or tuple(f"column {i + 1}" for i in range(width))
     plain = delimiter == "," and '"' not in sheet.text
     sign = decimal or ("." if plain else decimal_of(path, names, line, cells))
@@ -175,7 +168,22 @@ def cut(
     return replace(found, torn=lost, above=tuple(above), below=tuple(below))
 
 
-def above_table(rows: list[list[str]]) -> range:
+def split(sheet: Sheet, alone: str) -> tuple[str, dict[int, str], list[NumberedRow]]:
+    """The delimiter of a text, its comments by their line, and its rows.  Raises DataError."""
+    lines = sheet.text.split("\n")
+    notes = {n: line for n, line in enumerate(lines, 1) if line.lstrip().startswith(COMMENTS)}
+    for n in notes:
+        lines[n - 1] = ""
+    some = [line for line in lines if line.strip(BLANK)][:LOOKED_AT]
+    delimiter = "\t" if sheet.encoding == WORKBOOK else delimiter_of(some) or alone
+    if not delimiter:
+        raise DataError(
+            f"{sheet.path}: has no columns that commas, semicolons, tabs or spaces separate"
+        )
+    return delimiter, notes, rows_of(sheet.path, lines, delimiter)
+
+
+def above_table(rows: list[Row]) -> range:
     """Rows above the table that say something else: they are half as long, or shorter."""
     lengths = [len(trimmed(row)) for row in rows]
     width = Counter(lengths).most_common(1)[0][0]
@@ -183,7 +191,7 @@ def above_table(rows: list[list[str]]) -> range:
     return range(first if first < len(rows) - 1 else 0)
 
 
-def below_table(rows: list[list[str]], padded: bool) -> range:
+def below_table(rows: list[Row], padded: bool) -> range:
     """Rows below the table: half as long, or shorter, with words, too few numbers for a point.
 
     padded: whether all rows have cells up to the last column.
@@ -196,7 +204,7 @@ def below_table(rows: list[list[str]], padded: bool) -> range:
     return range(last, len(rows))
 
 
-def is_remark(row: list[str]) -> bool:
+def is_remark(row: Row) -> bool:
     """Whether a row holds words, and too few numbers for a point."""
     filled = sum(map(bool, row))
     return numbers_in(row) < min(filled, COORDINATES)
@@ -210,7 +218,7 @@ def split_header(rows: list[NumberedRow]) -> tuple[tuple[str, ...], list[Numbere
     """
     if not is_header(rows[0][1]):
         return (), rows
-    names, rows = trimmed(rows[0][1]), rows[1:]
+    names, rows = [*trimmed(rows[0][1])], rows[1:]
     if "" in names and len(rows) > 1 and not any(map(is_number, rows[0][1])):
         names, rows = grouped(names, rows[0][1]), rows[1:]
     if rows and (units := units_in(rows[0][1], len(names))):
@@ -219,9 +227,10 @@ def split_header(rows: list[NumberedRow]) -> tuple[tuple[str, ...], list[Numbere
     return tuple(names), rows
 
 
-def grouped(groups: list[str], names: list[str]) -> list[str]:
+def grouped(groups: Sequence[str], below: Row) -> list[str]:
     """The names below groups, each with that of its group where others are called alike."""
-    names = [*trimmed(names), *[""] * len(groups)][: max(len(groups), len(trimmed(names)))]
+    names = [*trimmed(below)]
+    names += [""] * (len(groups) - len(names))
     over: list[str] = []
     for group in [*groups, *[""] * len(names)][: len(names)]:
         over.append(group or (over[-1] if over else ""))
@@ -234,12 +243,12 @@ def grouped(groups: list[str], names: list[str]) -> list[str]:
 def noted_header(notes: list[str], delimiter: str, rows: list[NumberedRow]) -> tuple[str, ...]:
     """The names of a last comment above the rows that has one for each column, else nothing."""
     marks = "".join(COMMENTS)
-    names = split_line(notes[-1].strip().lstrip(marks), delimiter) if notes else []
+    names = split_line(notes[-1].strip().lstrip(marks), delimiter) if notes else ()
     right = len(names) == len(trimmed(rows[0][1])) and is_header(names)
     return tuple(names) if right and is_understood(names) else ()
 
 
-def units_in(row: list[str], width: int) -> list[str]:
+def units_in(row: Row, width: int) -> list[str]:
     """The units of a row that holds nothing else, below the header; else nothing."""
     cells = [cell.strip("[]() ") for cell in (*row, *[""] * width)][:width]
     filled = [cell for cell in cells if cell and cell != "-"]
@@ -261,39 +270,35 @@ def decoded(path: Path) -> tuple[str, str]:
     raise DataError(f"{path}: is not a text file; expected rows of numbers")
 
 
-def split_line(line: str, delimiter: str) -> list[str]:
+def split_line(line: str, delimiter: str) -> Row:
     """The cells of a line."""
     if delimiter == " ":
-        return line.split()
+        return tuple(line.split())
     if '"' not in line:
-        return [cell.strip() for cell in line.split(delimiter)]
+        return tuple(map(str.strip, line.split(delimiter)))
     row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True, strict=True))
-    return [cell.strip() for cell in row]
+    return tuple(map(str.strip, row))
 
 
 def rows_of(path: Path, lines: Sequence[str], delimiter: str) -> list[NumberedRow]:
     """The rows that hold something, each with the line on which it ends.  Raises DataError."""
-    text = "\n".join(lines)
-    if delimiter == " " or '"' not in text:
-        told = [(n, line) for n, line in enumerate(lines, 1) if line.strip(BLANK)]
-        if delimiter == " " or " " in text or "\t" in text:
-            return [(n, split_line(line, delimiter)) for n, line in told]
-        return [(n, line.split(delimiter)) for n, line in told]
-    reader = csv.reader(
-        io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True, strict=True
-    )
+    if delimiter == " " or not any('"' in line for line in lines):
+        return [(n, split_line(line, delimiter)) for n, line in enumerate(lines, 1)
+                if line.strip(BLANK)]  # fmt: skip
+    text = io.StringIO("\n".join(lines), newline="")
+    reader = csv.reader(text, delimiter=delimiter, skipinitialspace=True, strict=True)
     rows, begun = [], 0
     try:
         for row in reader:
             begun = reader.line_num
-            rows.append((begun, [cell.strip() for cell in row]))
+            rows.append((begun, tuple(map(str.strip, row))))
     except csv.Error:
         what = "has a quotation mark without its pair; delete it"
         raise DataError(f"{path}:{begun + 1}: {what}") from None
     return [row for row in rows if any(row[1])]
 
 
-def trimmed(row: list[str]) -> list[str]:
+def trimmed(row: Row) -> Row:
     """A row without empty cells at its end."""
     end = max((i + 1 for i, cell in enumerate(row) if cell), default=0)
     return row[:end]
@@ -304,12 +309,12 @@ def is_number(cell: str) -> bool:
     return bool(POINT.fullmatch(cell) or COMMA.fullmatch(cell))
 
 
-def numbers_in(row: list[str]) -> int:
+def numbers_in(row: Row) -> int:
     """How many cells of a row are numbers."""
     return sum(map(is_number, row))
 
 
-def is_header(row: list[str]) -> bool:
+def is_header(row: Row) -> bool:
     """Whether most cells of a row are words."""
     filled = [cell for cell in row if cell]
     return 2 * sum(not is_number(cell) for cell in filled) > len(filled)
@@ -319,7 +324,7 @@ def delimiter_of(lines: list[str]) -> str:
     """The delimiter that cuts most lines into one count, with most digits in numbers, or ''."""
     best, most = "", 0.0
     for delimiter in DELIMITERS:
-        rows: list[list[str]] = []
+        rows: list[Row] = []
         for line in lines:
             with suppress(csv.Error):
                 rows.append(split_line(line, delimiter))
