@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from minimax_cal.reading.rows import (
     header_check,
     read_rows,
 )
-from minimax_cal.reading.sheet import SIMULATED
+from minimax_cal.reading.sheet import SIMULATED, Lines
 from minimax_cal.reading.words import OWN, joints_of, kind_of, stems_of
 
 APPROACH = re.compile(r"approach\d+")
@@ -376,13 +376,14 @@ def pasted(file: Rows, kept: Array) -> tuple[Array, list[str]]:
     Nothing is measured twice to the last digit; as repeats they would tell of no noise at all.
     kept: (m,) rows that count.
     """
-    first: dict[tuple[str, ...], int] = {}
-    source = np.array([first.setdefault(row, i) for i, row in enumerate(file.rows)])
+    first: dict[Sequence[str], int] = {}
+    rows = file.rows.lines if isinstance(file.rows, Lines) else file.rows
+    source = np.array([first.setdefault(row, i) for i, row in enumerate(rows)])
     again = (source < np.arange(len(source))) & kept
-    rows = np.flatnonzero(again)
-    if not len(rows):
+    at = np.flatnonzero(again)
+    if not len(at):
         return again, []
-    runs = np.split(rows, 1 + np.flatnonzero((np.diff(rows) != 1) | (np.diff(source[rows]) != 1)))
+    runs = np.split(at, 1 + np.flatnonzero((np.diff(at) != 1) | (np.diff(source[at]) != 1)))
     told = [repeated(file, run, source[run]) for run in runs[:5]]
     more = f", and {len(runs) - 5} more places" if len(runs) > 5 else ""
     return again, [

@@ -37,17 +37,19 @@ OF_JOINT = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
 class Rows:
     """A table as text: header, rows, and the line on which each row ends.
 
-    header: names as this project has them.  given: as the file has them.  digest: SHA-256 of the
+    header: names as this project has them.  given: as the file has them.  block: the
+    rows as numbers, where all cells are.  digest: SHA-256 of the
     file.  simulated: whether its first line says `SIMULATED`.
     """
 
     path: Path | str
     header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    rows: Sequence[tuple[str, ...]]
     line: Array
     digest: str
     simulated: bool = False
     given: tuple[str, ...] = ()
+    block: Array | None = None
 
     @property
     def own(self) -> bool:
@@ -62,6 +64,8 @@ class Rows:
     def number(self, name: str, *, unit: str = "", empty: bool = False) -> Array:
         """A column as floats, in SI.  empty: whether empty cells, NaN, are allowed."""
         at = self.header.index(name)
+        if self.block is not None:
+            return self.block[:, at] * UNITS.get(unit, 1.0)
         called = self.given[at]
         values = numbers(self.path, called, [row[at] for row in self.rows], self.line, empty=empty)
         return values * UNITS.get(unit, 1.0)
@@ -131,7 +135,9 @@ def rows_of(sheet: Sheet) -> Rows:
         )
     given = table.header or rows[0]
     header = in_own_words(given)
-    return Rows(sheet.path, header, rows, table.line, sheet.digest, sheet.simulated, given)
+    return Rows(
+        sheet.path, header, rows, table.line, sheet.digest, sheet.simulated, given, table.block
+    )
 
 
 def header_check(path: Path | str, header: Sequence[str]) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 
@@ -37,9 +38,32 @@ WORKBOOK = "workbook"
 COORDINATES = 3  # of a point
 BLANK = " \t,;"
 MOST_COLUMNS = 1 << 14  # as of workbooks
+NUMERIC = b"0123456789+-.eE, "  # letters of numbers
+AT_ONCE = 1 << 13  # rows that are made numbers at once
 LOOKED_AT = 200  # rows that decide the delimiter
 Row = tuple[str, ...]
 NumberedRow = tuple[int, Row]  # the line of the file, and its cells
+
+
+@dataclass(frozen=True, eq=False)
+class Lines(Sequence[Row]):
+    """Lines as rows of cells, each cut when it is asked for."""
+
+    lines: Sequence[str]
+    delimiter: str
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    @overload
+    def __getitem__(self, at: int) -> Row: ...
+    @overload
+    def __getitem__(self, at: slice) -> Lines: ...
+    def __getitem__(self, at: int | slice) -> Row | Lines:
+        some = self.lines[at]
+        return (
+            split_line(some, self.delimiter) if isinstance(some, str) else replace(self, lines=some)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +73,7 @@ class Sheet:
     header: names, or empty.  line: (m,) line of the file of each row.  cells: m rows of text.
     delimiter, decimal: empty where the text has no columns.  above, below: lines that are not of
     the table.  torn: lines that have fewer or more cells, where they were left out.
+    block: (m, width) the cells as numbers, where all are.
     """
 
     path: Path
@@ -58,10 +83,11 @@ class Sheet:
     decimal: str
     header: tuple[str, ...]
     line: Array
-    cells: tuple[tuple[str, ...], ...]
+    cells: Sequence[Row]
     torn: tuple[int, ...] = ()
     above: tuple[int, ...] = ()
     below: tuple[int, ...] = ()
+    block: Array | None = None
 
     @property
     def width(self) -> int:
@@ -128,7 +154,10 @@ def cut(
     the table.  alone: the delimiter of a table of one column.
     """
     path = sheet.path
-    delimiter, notes, rows = split(sheet, alone)
+    delimiter, notes, lines = split(sheet, alone)
+    if (found := of_numbers(sheet, delimiter, lines)) is not None:
+        return replace(found, decimal=decimal or ".")
+    rows = rows_of(path, lines, delimiter)
     if not rows:
         raise DataError(f"{path}: is empty")
     above = [] if most_torn else above_table([row for _, row in rows])
@@ -168,8 +197,8 @@ def cut(
     return replace(found, torn=lost, above=tuple(above), below=tuple(below))
 
 
-def split(sheet: Sheet, alone: str) -> tuple[str, dict[int, str], list[NumberedRow]]:
-    """The delimiter of a text, its comments by their line, and its rows.  Raises DataError."""
+def split(sheet: Sheet, alone: str) -> tuple[str, dict[int, str], list[str]]:
+    """The delimiter of a text, its comments by line, and its other lines.  Raises DataError."""
     lines = sheet.text.split("\n")
     notes = {n: line for n, line in enumerate(lines, 1) if line.lstrip().startswith(COMMENTS)}
     for n in notes:
@@ -180,7 +209,39 @@ def split(sheet: Sheet, alone: str) -> tuple[str, dict[int, str], list[NumberedR
         raise DataError(
             f"{sheet.path}: has no columns that commas, semicolons, tabs or spaces separate"
         )
-    return delimiter, notes, rows_of(sheet.path, lines, delimiter)
+    return delimiter, notes, lines
+
+
+def of_numbers(sheet: Sheet, delimiter: str, lines: list[str]) -> Sheet | None:
+    """The table of a text that holds a header and below it numbers with points alone; else None.
+
+    Read as JSON, whose numbers are rounded as Python's.
+    """
+    from pydantic_core import from_json
+
+    told = [n for n, line in enumerate(lines) if line.strip(BLANK)]
+    body = [lines[n] for n in told[1:]]
+    head = trimmed(split_line(lines[told[0]], delimiter)) if body and delimiter != " " else ()
+    if '"' in "".join(head) or not is_header(head):
+        return None
+    if any(line.count(delimiter) != len(head) - 1 for line in body):
+        return None
+    block = np.empty((len(body), len(head)))
+    for first in range(0, len(body), AT_ONCE):
+        some = body[first : first + AT_ONCE]
+        raw = delimiter.join(some).replace(delimiter, ",").encode()
+        if raw.translate(None, NUMERIC):
+            return None
+        try:
+            values = np.array(from_json(b"[" + raw + b"]"), dtype=float)
+            block[first : first + AT_ONCE] = values.reshape(len(some), len(head))
+        except ValueError:
+            return None
+    if not np.isfinite(block).all():
+        return None
+    line = np.array(told[1:]) + 1
+    return replace(sheet, delimiter=delimiter, header=head, line=line,
+                   cells=Lines(body, delimiter), block=block)  # fmt: skip
 
 
 def above_table(rows: list[Row]) -> range:

@@ -157,7 +157,7 @@ class Columns:
             values[kind] = block[:, 0] if single else block
         values["t"] = self.time(values, units.get("t", ("",))[0])
         run, sheet = self.of_kind("run"), self.sheet
-        whole = [row for row in range(len(sheet.line)) if row not in self.broken]
+        whole = np.setdiff1d(np.arange(len(sheet.line)), list(self.broken))
         return Log(
             source=str(sheet.path),
             title=self.form.title,
@@ -273,6 +273,10 @@ class Columns:
 
     def block(self, at: int) -> Array:
         """(m, 1) numbers of a column, or (m, k) of one that holds a list in each cell."""
+        if self.sheet.block is not None:
+            values = self.sheet.block[:, [at]]
+            if (np.abs(values) <= self.most(at)).all():
+                return values
         cells = [row[at] for row in self.sheet.cells]
         if not any(cell.startswith("[") for cell in cells[:SHOWN]):
             return self.numbers(at, cells)[:, None]
@@ -282,10 +286,14 @@ class Columns:
                  for parts, cell in zip(rows, cells, strict=True)]  # fmt: skip
         return np.stack([self.numbers(at, [row[j] for row in whole]) for j in range(k)], axis=1)
 
+    def most(self, at: int) -> float:
+        """The size that no number of a column has."""
+        return MOST_TIME if self.places[at].kind in CLOCKS else MOST
+
     def numbers(self, at: int, cells: Sequence[str]) -> Array:
         """(m,) numbers, NaN where there is none."""
         out = numbers_of(cells, self.sheet.decimal)
-        wild = np.abs(out) > (MOST_TIME if self.places[at].kind in CLOCKS else MOST)
+        wild = np.abs(out) > self.most(at)
         for row in np.flatnonzero(np.isnan(out) | wild).tolist():
             cell = cells[row][:40]
             if wild[row] or cell.lower().strip("+-") not in ("", "nan"):
