@@ -221,8 +221,10 @@ def of_numbers(sheet: Sheet, delimiter: str, lines: list[str]) -> Sheet | None:
 
     told = [n for n, line in enumerate(lines) if line.strip(BLANK)]
     body = [lines[n] for n in told[1:]]
-    head = trimmed(split_line(lines[told[0]], delimiter)) if body and delimiter != " " else ()
-    if '"' in "".join(head) or not is_header(head):
+    if not body or delimiter == " " or '"' in lines[told[0]]:
+        return None
+    head = trimmed(split_line(lines[told[0]], delimiter))
+    if not is_header(head):
         return None
     if any(line.count(delimiter) != len(head) - 1 for line in body):
         return None
@@ -304,7 +306,9 @@ def grouped(groups: Sequence[str], below: Row) -> list[str]:
 def noted_header(notes: list[str], delimiter: str, rows: list[NumberedRow]) -> tuple[str, ...]:
     """The names of a last comment above the rows that has one for each column, else nothing."""
     marks = "".join(COMMENTS)
-    names = split_line(notes[-1].strip().lstrip(marks), delimiter) if notes else ()
+    names = (
+        () if not notes or '"' in notes[-1] else split_line(notes[-1].strip(marks + " "), delimiter)
+    )
     right = len(names) == len(trimmed(rows[0][1])) and is_header(names)
     return tuple(names) if right and is_understood(names) else ()
 
