@@ -10,6 +10,7 @@ from minimax_cal.modelling.effects import EFFECTS
 ROOT = Path(__file__).parent.parent
 FOLDERS = (
     "ground",
+    "reading",
     "solvers",
     "evidence",
     "robots",

@@ -21,6 +21,7 @@ from minimax_cal.cli.options import (
     options_from,
     plain_option,
     record_of,
+    refuse,
     result_options,
 )
 from minimax_cal.fitting.calibrate import calibrate
@@ -37,6 +38,7 @@ from minimax_cal.solvers.status import Status
 if TYPE_CHECKING:
     from minimax_cal.judging.bootstrap import Bootstrap
 
+CAMERAS = {f.name for f in fields(PixelOptions)} - {f.name for f in fields(Options)}
 BRIEF = 1000  # poses that one fit needs no compiled kernels for
 
 
@@ -81,6 +83,7 @@ def calibrate_command(
         raise click.UsageError(
             "Missing argument 'DATA...', or --pixels with --joints and --camera."
         )
+    refuse(CAMERAS, "is about what cameras see, with pixels=, joints= and camera=")
     asked = {one.name: chosen[one.name] for one in fields(Options) if one.name in chosen}
     given = measured(data, in_rows)
     with work(brief=replicates is None and given.poses <= BRIEF), to.stages() as progress:
@@ -112,9 +115,9 @@ def by_cameras(
         raise OptionError(
             f"{data[0]}: DATA and pixels are one fit in minimax-cal relative; give one of them here"
         )
-    own = {name: chosen[name] for name in on_command_line() & chosen.keys()}
-    for name in sorted(own.keys() - {field.name for field in fields(PixelOptions)}):
-        raise OptionError(f"{name}= is not for pixels: leave it out")
+    known = {field.name for field in fields(PixelOptions)}
+    refuse({*chosen, "replicates", "in_rows", "without"} - known, "is not for pixels")
+    own = {name: chosen[name] for name in on_command_line() & known}
     fit = to.work(calibrate_pixels, robot, *files.paths(), **own)
     return to.finish(fit, status=fit.status, reason=fit.reason)
 

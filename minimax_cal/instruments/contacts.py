@@ -31,8 +31,8 @@ from minimax_cal.instruments.instrument import (
 from minimax_cal.instruments.options import InstrumentOptions
 from minimax_cal.instruments.protocol import Arm, FlangePoses, ResidualRows
 from minimax_cal.instruments.shapes import PLANE, SPHERE, Shapes, Surface, placed_best
-from minimax_cal.measuring.columns import Rows
 from minimax_cal.measuring.joint_rows import joint_rows
+from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.kinematics import hat, right_jacobian
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_joints

@@ -12,8 +12,8 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import csv_text, write_whole
 from minimax_cal.instruments.instrument import Columns, Instrument, checked
 from minimax_cal.instruments.table import INSTRUMENTS, instrument
-from minimax_cal.measuring.columns import read_rows
 from minimax_cal.measuring.measurements import file_column
+from minimax_cal.reading.rows import read_rows
 
 
 def columns_of(path: Path | str, header: Sequence[str]) -> Columns:

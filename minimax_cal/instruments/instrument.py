@@ -17,9 +17,9 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.options import InstrumentOptions
 from minimax_cal.instruments.protocol import Arm, FlangePoses, ResidualRows
-from minimax_cal.measuring.columns import Rows
 from minimax_cal.measuring.grouping import groups, held_out
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_joints
 

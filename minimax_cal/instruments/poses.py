@@ -25,11 +25,11 @@ from minimax_cal.instruments.options import InstrumentOptions
 from minimax_cal.instruments.protocol import FlangePoses
 from minimax_cal.instruments.reflectors import LEVER, posed, reflectors, spots_of
 from minimax_cal.instruments.tracker import Points
-from minimax_cal.measuring.columns import Rows
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.joint_rows import joint_rows
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
 from minimax_cal.modelling.cell import pose_to_dict
+from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.kinematics import hat, rotation_vector
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import transform

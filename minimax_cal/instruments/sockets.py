@@ -27,10 +27,10 @@ from minimax_cal.instruments.instrument import (
 )
 from minimax_cal.instruments.options import InstrumentOptions, Known, known_text
 from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
-from minimax_cal.measuring.columns import Rows
 from minimax_cal.measuring.grouping import groups, held_out
 from minimax_cal.measuring.joint_rows import joint_rows
 from minimax_cal.measuring.measurements import FARTHEST
+from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.robot import Robot
 
 SOCKET = re.compile("socket")

@@ -19,12 +19,12 @@ from minimax_cal.instruments.instrument import (
 )
 from minimax_cal.instruments.options import InstrumentOptions
 from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
-from minimax_cal.measuring.columns import TARGET, Rows
 from minimax_cal.measuring.measurements import Measurements, measurements_in
 from minimax_cal.modelling.cell import pose_to_dict
 from minimax_cal.modelling.model import model_of, point_weights
 from minimax_cal.modelling.parameters import BASE_NAMES, State
 from minimax_cal.modelling.start import fit_base
+from minimax_cal.reading.rows import TARGET, Rows
 from minimax_cal.robots.kinematics import right_jacobian, rotation
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import transform

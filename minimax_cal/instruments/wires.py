@@ -26,9 +26,9 @@ from minimax_cal.instruments.instrument import (
 )
 from minimax_cal.instruments.options import InstrumentOptions
 from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
-from minimax_cal.measuring.columns import Rows
 from minimax_cal.measuring.joint_rows import joint_rows
 from minimax_cal.measuring.measurements import FARTHEST
+from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.robot import Robot
 
 WIRE = re.compile(r"wire(\d+)_(mm|m)")

@@ -2,19 +2,60 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from minimax_cal.measuring.importers.names import folded
+ANY = ("rad", "deg", "mm", "m")
+SIZES = ("mm", "m")
 
+
+@dataclass(frozen=True)
+class Kind:
+    """What this project calls columns of one kind, without the unit, and the units they may have.
+
+    The first is the one that is written.  text: whether cells are labels, never computed with.
+    """
+
+    stem: str
+    units: tuple[str, ...] = ()
+    text: bool = False
+
+    @property
+    def pattern(self) -> str:
+        """Of the whole name, its last group the unit."""
+        return f"{self.stem}_({'|'.join(self.units)})" if self.units else self.stem
+
+
+OWN = {  # columns of measurements, by kind
+    "q": Kind(r"q(\d+)", ANY),
+    "smr": Kind(r"smr(\d+)_([xyz])", SIZES),
+    "order": Kind("order"),
+    "time": Kind("time", ("s",)),
+    "temperature": Kind("temperature", ("C",)),
+    "payload": Kind("payload", ("kg",)),
+    "payload centre": Kind("payload_[xyz]", SIZES),
+    "tool": Kind("tool", text=True),
+    "tau": Kind(r"tau\d+", ("Nm",)),
+    "approach": Kind(r"approach\d+"),
+    "session": Kind("session", text=True),
+    "group": Kind("group", text=True),
+    "u95": Kind("u95", SIZES),
+    "pose": Kind("pose", text=True),
+    "split": Kind("split", text=True),
+    "set_aside": Kind("set_aside", text=True),
+    "qread": Kind(r"qread\d+", ANY),
+    "base": Kind(r"base\d+_[xyz]", SIZES),
+}
 ANGLES = {"rad": 1.0, "deg": np.pi / 180.0, "mrad": 1e-3}
 LENGTHS = {"mm": 1e-3, "m": 1.0, "um": 1e-6, "cm": 1e-2, "in": 0.0254}
 TIMES = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 TEMPERATURES = ("C", "K", "F")
-OTHERS = ("kg", "Nm")
+OTHERS = ("kg", "Nm", "px")
 ALIASES = {"°": "deg", "º": "deg", "µm": "um", "μm": "um", "inch": "in", "°C": "C", "°F": "F"}
 ALIASES |= dict.fromkeys(("Grad", "grad", "grados", "degr\u00e9s", "\u5ea6"), "deg")
 ALIASES |= {"\u5f27\u5ea6": "rad", "\u6beb\u7c73": "mm", "\u7c73": "m", "\u79d2": "s"}
@@ -25,9 +66,10 @@ ALIASES |= dict.fromkeys(
 )
 ALIASES |= dict.fromkeys(("IN", "inches"), "in")
 KNOWN = {*ANGLES, *LENGTHS, *TIMES, *TEMPERATURES, *OTHERS}
+JOINTS = ("q|j|a|ax|axis|joint|theta|achse|achswert|gelenk|axe|articulation|eje|articulacion"
+          "|\u5173\u8282|\u8f74")  # fmt: skip
 JOINT = re.compile(  # of folded names
-    "(?:q|j|a|ax|axis|joint|theta|achse|achswert|gelenk|axe|articulation|eje|articulacion"
-    "|\u5173\u8282|\u8f74)[ _.-]?(\\d+)"
+    f"(?:{JOINTS})[ _.-]?(\\d+)"
     "(?:[ _.-]?(?:angle|winkel|ist|actual|position|pos|wert|value|angulo|\u89d2\u5ea6|\u89d2))?"
     "|\u7b2c?(\\d+)(?:\u8f74|\u5173\u8282)(?:\u89d2\u5ea6|\u89d2)?"
 )
@@ -67,13 +109,45 @@ WORDS = {  # plain names that mean the same in any file
              "punto", "nombre", "nombre del punto", "posicion", "\u70b9", "\u70b9\u540d",
              "\u70b9\u53f7", "\u6d4b\u70b9", "\u5e8f\u53f7", "\u540d\u79f0"),
     "tool": ("tool", "werkzeug", "outil", "herramienta", "adapter", "\u5de5\u5177"),
+    "camera": ("camera", "kamera", "camara", "\u76f8\u673a"),
+    "u": ("u",),
+    "v": ("v",),
     "order": ("order",),
     "session": ("session",),
     "group": ("group",),
     "split": ("split",),
     "set_aside": ("set_aside",),
 }  # fmt: skip
+SURE = ("tool", "temperature", "time")  # what means the same also beside names of this project
 PLAIN = {word: meaning for meaning, words in WORDS.items() for word in words}
+
+
+def own_kind(name: str) -> tuple[str, str, str]:
+    """The kind of one of this project's columns, its name without the unit, and the unit; or ''."""
+    for kind, own in OWN.items():
+        if found := re.fullmatch(own.pattern, name):
+            unit = found[found.re.groups] if own.units else ""
+            return kind, name.removesuffix(f"_{unit}"), unit
+    return "", name, ""
+
+
+def kind_of(stem: str) -> str:
+    """The kind of one of this project's columns, by its name without the unit; or ''."""
+    return next((kind for kind, own in OWN.items() if re.fullmatch(own.stem, stem)), "")
+
+
+def near(name: str, known: Iterable[str]) -> str:
+    """A hint when a column's name is close to one that would be used; a 1 stands for any number."""
+    numbers = {str(i) for i in range(1, 10)}
+    every = [k.replace("1", i, 1) for k in known for i in (numbers if "1" in k else "1")]
+    match = difflib.get_close_matches(name, sorted(every), 1, cutoff=0.75)
+    return f" (did you mean {match[0]}?)" if match else ""
+
+
+def folded(text: str) -> str:
+    """Small letters without accents, in one width."""
+    wide = unicodedata.normalize("NFKD", text.strip().lower())
+    return unicodedata.normalize("NFC", "".join(c for c in wide if not unicodedata.combining(c)))
 
 
 def unit_name(text: str) -> str:
@@ -155,3 +229,23 @@ def is_understood(names: Sequence[str]) -> bool:
     stems = stems_of(names)
     known = {*joints_of(stems), *points_of(stems)} | {stem for stem in stems if plain(stem)}
     return 2 * sum(stem in known for stem in stems) >= len(stems)
+
+
+def in_own_words(header: Sequence[str]) -> tuple[str, ...]:
+    """A header with this project's names in place of others that mean the same.
+
+    Beside its own joints or targets only what cannot mean anything else.
+    """
+    stems = stems_of(header)
+    own = any(own_kind(name)[0] in ("q", "smr") for name in header)
+    found = {} if own else joints_of(stems)
+    found |= points_of(stems) if found else {axis: axis for axis in "xyz"}
+    out, taken = list(header), {*header}
+    for i, (name, stem) in enumerate(zip(header, stems, strict=True)):
+        what, unit = found.get(stem, "" if own_kind(name)[0] else plain(stem)), split_unit(name)[1]
+        units = OWN[kind].units if (kind := kind_of(what)) else (unit,)
+        new = f"{what}_{unit}" if unit else what
+        if what and (unit in units or not units) and new not in taken and (not own or what in SURE):
+            out[i] = new
+            taken.add(new)
+    return tuple(out)

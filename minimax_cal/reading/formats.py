@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-LENGTH = {"m", "mm"}
-Q = "(?P<unit>rad|deg|mm|m)"
+from minimax_cal.reading.words import ANY, JOINTS, WORDS, folded, split_unit
+
+Q = f"(?P<unit>{'|'.join(ANY)})"
 JOINT = r"(?P<joint>\d+)"
+OF_MOTION = re.compile(r"(.*?)[ _]*[\[(]?\b(N ?m|N|mA|A|(?:rad|deg|\u00b0)/s)[\])]?")
+MOTIONS = {"N m": "Nm", "rad/s": "rad", "deg/s": "deg", "\u00b0/s": "deg"}
 INDEX = rf"(?:[.\[]?{JOINT}\]?)?"
 
 
@@ -18,7 +21,8 @@ class Format:
 
     names: patterns by kind, of which the first that fits counts; `joint` is the joint's number or
     name, `unit` the unit.  first: number of the first joint.  units: by kind, where names have
-    none.  strict: whether a column that nothing uses is worth a notice.
+    none.  strict: whether a column that nothing uses is worth a notice.  words: whether patterns
+    are of folded names without units, and joints may be numbered from 0 too.
     """
 
     title: str
@@ -26,6 +30,7 @@ class Format:
     first: int = 1
     units: Mapping[str, str] = field(default_factory=dict)
     strict: bool = False
+    words: bool = False
 
 
 @dataclass(frozen=True)
@@ -113,16 +118,36 @@ FORMATS = (  # tried in this order
         first=0,
         units={"tau": "Nm", "i": "A"},
     ),
+    Format(
+        "table in words",
+        {
+            "t": ("t", *map(re.escape, WORDS["time"])),
+            "q": (rf"(?:{JOINTS})[ _.-]?{JOINT}",),
+            "qd": (rf"(?:qd|dq|qdot|velocity|vel|speed|geschwindigkeit|vitesse)[ _.-]?{JOINT}",),
+            "tau": (rf"(?:tau|torque|moment|drehmoment|effort|couple)[ _.-]?{JOINT}",),
+            "i": (rf"(?:i|current|strom|courant|corriente)[ _.-]?{JOINT}",),
+            "payload": ("payload|traglast|last",),
+            "run": ("run|fahrt|lauf",),
+        },
+        units={"tau": "Nm", "i": "A"},
+        strict=True,
+        words=True,
+    ),
 )
 
 
 def place_of(form: Format, name: str) -> Place | None:
     """What a column of a format holds, or None."""
+    told = ""
+    if form.words:
+        found = OF_MOTION.fullmatch(name.strip())
+        name, told = (found[1], found[2]) if found else split_unit(name)
+        name = folded(name)
     for kind, patterns in form.names.items():
         for pattern in patterns:
             if found := re.fullmatch(pattern, name, re.ASCII):
                 groups = found.groupdict()
-                unit = groups.get("unit") or form.units.get(kind, "")
+                unit = groups.get("unit") or MOTIONS.get(told, told) or form.units.get(kind, "")
                 return Place(kind, groups.get("joint") or "", unit)
     return None
 
@@ -137,16 +162,17 @@ def format_of(header: Sequence[str]) -> tuple[Format, dict[int, Place]] | None:
     """The first format with joint columns in a header, and what its columns hold."""
     for form in FORMATS:
         places = places_of(form, header)
-        if any(place.kind == "q" for place in places.values()):
-            return form, places
+        joints = [place.joint for place in places.values() if place.kind == "q"]
+        if joints:
+            return replace(form, first=0) if form.words and "0" in joints else form, places
     return None
 
 
 def is_log(header: Sequence[str]) -> bool:
-    """Whether a header is of a log: joints in time, with torques or currents, and no points."""
+    """Whether a header is of a log: joints with torques, currents or time, and no points."""
     found = format_of(header)
     if not found:
         return False
     kinds = {place.kind for place in found[1].values()}
     points = any(re.match(r"smr\d+_", name) for name in header)
-    return not points and ("t_s" in header or bool(kinds & {"tau", "i"} and kinds & {"t", "sec"}))
+    return not points and ("t_s" in header or bool(kinds & {"tau", "i"}))
