@@ -199,7 +199,8 @@ class Task:
         kept, gram, scale = identify.determined(model, state, order, *asked)
         if kept.active.sum() <= known.active.sum() or not kept.active[known.active].all():
             return None
-        return kept.identification(gram, scale, model.names.target_names, identify.TOGETHER)
+        told = identify.with_priors(gram, sure)
+        return kept.identification(told, scale, model.names.target_names, identify.TOGETHER)
 
     def squares(self, model: Model, begin: State) -> tuple[Model, LeastSquares[State]]:
         """Least squares; with priors, weighed against the noise that remains."""
