@@ -4,6 +4,7 @@ Lengths of wires and closures know no base frame, closures no length either: wha
 a fit says with the parameters, by name and reason.
 """
 
+from minimax_cal.instruments.check import check_instrument
 from minimax_cal.instruments.contacts import contacts
 from minimax_cal.instruments.file import read_relative, write_relative
 from minimax_cal.instruments.instrument import Instrument
@@ -16,6 +17,7 @@ from minimax_cal.instruments.wires import distances
 __all__ = [
     "Instrument",
     "Surface",
+    "check_instrument",
     "closures",
     "contacts",
     "distances",

@@ -169,7 +169,14 @@ class Instrument:
         return int(self.numbers[~held].sum()), int(self.numbers[held].sum())
 
     def check(self) -> None:
-        """Raise DataError where no fit can make sense of them."""
+        """Raise DataError where no fit can make sense of them: for fields that are no numbers."""
+        for name in self.by_row:
+            values = np.asarray(getattr(self, name))
+            if len(values) != self.poses:
+                raise DataError(f"{name} has {len(values)} entries; there are {self.poses} poses")
+            if values.dtype.kind == "f" and not np.isfinite(values).all():
+                raise DataError(f"{self.says(int(np.argwhere(~np.isfinite(values))[0][0]))}: "
+                                f"{name} is not a finite number")  # fmt: skip
 
     def check_training(self) -> None:
         """Raise DataError where they are too few to be fitted."""

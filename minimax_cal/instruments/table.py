@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.instruments.instrument import Instrument
 
 INSTRUMENTS: dict[str, str | type[Instrument]] = {  # name: where its class is, or the class
@@ -39,9 +40,23 @@ def register_instrument(kind: type[Instrument]) -> type[Instrument]:
     type
         The same.
 
+    Raises
+    ------
+    OptionError
+        Where it has no kind of its own.
+
     Examples
     --------
     >>> mc.register_instrument(DrawWire)
     """
-    INSTRUMENTS[kind.kind] = kind
+    name = getattr(kind, "kind", "")
+    if not name or isinstance(INSTRUMENTS.get(name), str):
+        what = f"{name!r} is built in" if name else "it has none"
+        raise OptionError(f"{kind.__name__}: give it a kind of its own: {what}")
+    INSTRUMENTS[name] = kind
     return kind
+
+
+def is_registered(one: Instrument) -> bool:
+    """Whether an instrument is none of the built-in ones."""
+    return not isinstance(INSTRUMENTS.get(one.kind), str)

@@ -1,6 +1,7 @@
 """Calibration without coordinates, against simulation with known truth and plain models."""
 
-from dataclasses import replace
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
+import minimax_cal.instruments as mc_instruments
 from experiments.relative import (
     SIMULATORS,
     SPOT,
@@ -31,7 +33,9 @@ from minimax_cal.fitting.several.stack import Block, Stack, own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments import closures, distances, flange_poses, poses_as_targets
 from minimax_cal.instruments.closing import closing_poses, reach
+from minimax_cal.instruments.instrument import Words, bare
 from minimax_cal.instruments.options import known_of
+from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
 from minimax_cal.instruments.reflectors import spots_of
 from minimax_cal.instruments.sockets import free_numbers, misclosures
 from minimax_cal.instruments.tracker import Points
@@ -648,3 +652,63 @@ def test_sockets_by_arrays_and_labels_that_are_numbers() -> None:
     fit = relative(arm.robot, closures(seen.data.at.q, number))
     same = relative(arm.robot, seen.data)
     assert_allclose(fit.robot.mdh, same.robot.mdh, rtol=0, atol=1e-9)
+
+
+# ---- of one's own ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Height(mc_instruments.Instrument):
+    """How high a point of the flange stands above a floor.  wrong: a fault that is put in."""
+
+    height: Array
+    wrong: str = ""
+
+    kind = "height"
+    words = Words(quantity="height")
+    by_row = ("height",)
+    names = ("target_x", "target_y", "target_z", "floor")
+
+    def starts(self, arm: FlangePoses, free: Array) -> list[Array]:
+        return [np.array([0.1, 0.0, 0.1, 0.0][: 3 if self.wrong == "start" else 4])]
+
+    def read(self, arm: FlangePoses, own: Array) -> ResidualRows:
+        up, m = np.array([0.0, 0.0, 1.0]), self.poses
+        point, sign = arm.place(own[:3]), -1.0 if self.wrong == "sign" else 1.0
+        by_own = np.column_stack([arm.rotation[:, 2], np.full(m, -sign)])
+        along = np.tile(-up if self.wrong == "point" else up, (m, 1))
+        error = self.height - point[:, 2] + own[3]
+        return ResidualRows(error, np.arange(m), point, along, np.zeros((m, 3)), by_own)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("", ""),
+        ("start", r"a start has the shape \(3,\), not \(4,\)"),
+        ("sign", "by_own for floor of row .* is 1, but the prediction, .* changes by -1"),
+        ("point", "by_point .* of row "),
+    ],
+)
+def test_an_instrument_that_does_not_read_as_it_says_is_named(
+    robot: mc.Robot, wrong: str, said: str
+) -> None:
+    q = random_poses(robot, 40, np.random.default_rng(0))
+    made = Height(bare(q, {}), place(robot, q, SPOT)[:, 2], wrong)
+    with pytest.raises(mc.DataError, match=f"height: {said}") if wrong else nullcontext():
+        mc_instruments.check_instrument(made, robot)
+
+
+def test_a_kind_of_its_own_is_asked_for() -> None:
+    with pytest.raises(mc.OptionError, match="give it a kind of its own: 'distances' is built in"):
+        mc.register_instrument(type("Mine", (Height,), {"kind": "distances"}))
+    with pytest.raises(mc.OptionError, match="it has none"):
+        mc.register_instrument(type("Mine", (mc_instruments.Instrument,), {}))
+
+
+def test_readings_that_are_no_numbers_are_named(robot: mc.Robot) -> None:
+    q = random_poses(robot, 40, np.random.default_rng(0))
+    with pytest.raises(mc.DataError, match="height has 39 entries; there are 40 poses"):
+        mc.relative(robot, Height(bare(q, {}), np.zeros(39)))
+    with pytest.raises(mc.DataError, match="height is not a finite number"):
+        mc.relative(robot, Height(bare(q, {}), np.full(40, np.nan)))

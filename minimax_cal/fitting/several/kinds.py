@@ -34,8 +34,10 @@ from minimax_cal.fitting.several.result import (
 )
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.options import takes
+from minimax_cal.instruments.check import check_instrument
 from minimax_cal.instruments.file import read_relative
-from minimax_cal.instruments.instrument import Instrument
+from minimax_cal.instruments.instrument import Instrument, checked
+from minimax_cal.instruments.table import is_registered
 from minimax_cal.instruments.tracker import points
 from minimax_cal.measuring.accuracy import HELD
 from minimax_cal.measuring.campaigns import session_names
@@ -148,6 +150,8 @@ def asked_of(
     check_options(every, options)
     every = [replace(each, at=with_history(check_joints(robot, each.at))) for each in every]
     check_noises(labels_of(every), every, options)
+    for each in filter(is_registered, every):
+        check_instrument(checked(each), robot, options)
     for each in every:
         plausible.check_slips(robot, each, options)
     splits = [each.held_back(options) for each in every]

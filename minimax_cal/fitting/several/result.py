@@ -145,7 +145,9 @@ class Measured:
     def fields_of(content: Mapping[str, Any], at: str) -> dict[str, Any]:
         """Fields that are `APART`, without the errors of single rows.  Raises ValueError."""
         if content["measured"] not in (*INSTRUMENTS, SEVERAL):
-            raise ValueError(f"{at}measured: should be one of {', '.join((*INSTRUMENTS, SEVERAL))}")
+            known = ", ".join((*INSTRUMENTS, SEVERAL))
+            raise ValueError(f"{at}measured: should be one of {known}; where it is an instrument "
+                             "of your own, import the module that registers it")  # fmt: skip
         told = {key: read(Scores, content["accuracy"][key], f"{at}accuracy.{key}") for key in HELD}
         turns = {
             key: (1e-3 * each.rms_mrad, 1e-3 * each.max_mrad)
