@@ -26,7 +26,8 @@ def joint_rows(
     header_check(file.path, [*bare, *ANY_TARGET])
     q, sliding = file.joints()
     columns, left = file.optional(own, doubts)
-    notices = tuple(f"{file.path}: column {name} {unused}{why}" for name, why in left.items())
+    idle = (f"{file.path}: column {name} {unused}{why}" for name, why in left.items())
+    notices = (*file.notices, *idle)
     at = Measurements(
         q, np.zeros((len(q), 0, 3)), (), sliding, file.line, columns, {}, notices, str(file.path),
         file.digest,

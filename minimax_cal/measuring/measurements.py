@@ -338,7 +338,8 @@ def measurements_in(file: Rows) -> Measurements:
     columns, unused = file.optional(NAMED, U95)
     named = [name for name in header if NAMED.fullmatch(name)]  # by import
     unknown = {name: np.array(file.text(name)) for name in (*unused, *named)}
-    notices = [f"{path}: column {name} is not used{why}" for name, why in unused.items()]
+    idle = (f"{path}: column {name} is not used{why}" for name, why in unused.items())
+    notices = [*file.notices, *idle]
     data = Measurements(
         q=q,
         y=y,

@@ -50,6 +50,7 @@ class Rows:
     simulated: bool = False
     given: tuple[str, ...] = ()
     block: Array | None = None
+    notices: tuple[str, ...] = ()
 
     @property
     def own(self) -> bool:
@@ -135,9 +136,10 @@ def rows_of(sheet: Sheet) -> Rows:
         )
     given = table.header or rows[0]
     header = in_own_words(given)
-    return Rows(
-        sheet.path, header, rows, table.line, sheet.digest, sheet.simulated, given, table.block
-    )
+    above = ", ".join(map(str, table.above))
+    said = (f"{sheet.path}: above the table, and left out: line {above}",) if above else ()
+    told = (sheet.digest, sheet.simulated, given, table.block, said)
+    return Rows(sheet.path, header, rows, table.line, *told)
 
 
 def header_check(path: Path | str, header: Sequence[str]) -> None:

@@ -48,6 +48,7 @@ def test_a_german_spreadsheets_csv_is_read(codec: str, tmp_path: Path) -> None:
     data = read(text.replace("\n", "\r\n").encode(codec), tmp_path)
     assert_array_equal(data.q, read(GOOD, tmp_path).q)
     assert_array_equal(data.line, [3, 4])
+    assert data.notices == (f"{data.source}: above the table, and left out: line 1",)
 
 
 def test_other_words_are_read_with_a_line_that_says_how(tmp_path: Path) -> None:
