@@ -11,10 +11,22 @@ from functools import partial
 import numpy as np
 
 from minimax_cal.dynamics.diagnose import MATTERS
-from minimax_cal.dynamics.laws import CURVE as SPEED_CURVE
-from minimax_cal.dynamics.laws import LAWS, Term
-from minimax_cal.dynamics.result import (
+from minimax_cal.dynamics.laws import (
+    ARMATURE,
+    BRISTLES,
+    CURVE,
+    DELAY,
+    FRICTION,
+    GAIN,
+    LAWS,
+    LEVELLED,
+    MASSES,
+    MODULE,
+    SPRINGS,
     WORDS,
+    Term,
+)
+from minimax_cal.dynamics.result import (
     MotionDiagnosis,
     MotionEffect,
     best_worth,
@@ -25,21 +37,9 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress
 from minimax_cal.simulators.chain import driven
 from minimax_cal.simulators.motion.bristles import fit_bristles
-from minimax_cal.simulators.motion.fit import (
-    ARMATURE,
-    BRISTLES,
-    CURVE,
-    DELAY,
-    FRICTION,
-    GAIN,
-    MASSES,
-    SPRINGS,
-    Asked,
-    Study,
-    fit_numbers,
-)
+from minimax_cal.simulators.motion.fit import Asked, Study, fit_numbers
 from minimax_cal.simulators.motion.judge import Judge, Missed
-from minimax_cal.simulators.motion.module import HELD, installed, module_text
+from minimax_cal.simulators.motion.module import installed, module_text
 from minimax_cal.simulators.motion.numbers import Numbers, has_powers
 from minimax_cal.simulators.motion.opened import Opened
 from minimax_cal.simulators.motion.result import MotionRung, WrittenElement
@@ -49,24 +49,14 @@ ATTRIBUTES = {  # of the elements, in the order in which they are shown
     FRICTION: "frictionloss, damping",
     MASSES: "inertial",
     ARMATURE: "armature",
-    CURVE: "damping of v, v|v|, v^3",
+    LEVELLED: "damping of v, v|v|, v^3",
     SPRINGS: "stiffness, springref",
     GAIN: "gear",
     DELAY: "delay",
     BRISTLES: "frictionloss, dcmotor with lugre",
 }
 STAYS = 1e-3  # fall of the mean log RMS torque by which an element stays
-MODULE = 0.01  # the same, for a module beside the file, and of all rows for friction at rest
-LEVELS = ("degressive", "stribeck")  # laws that damping of higher powers comes near to
-SPRUNG, GEARED = ("cable",), ("drive_gain",)
-IN_FILE = frozenset({"armature", "delay", *LEVELS, *SPRUNG})
-WHY = {  # laws that a model does not hold
-    "torque_offset": "the torque is read with an offset, which is none of the arm's",
-    "drive_gain": "scales what is logged, and no motor of the model holds it: give drive_gain=",
-    "payload": "changes between the runs; the model carries one load",
-    "joint_flexibility": "give a static calibration (fit=), whose springs a model holds",
-}
-NO_ELEMENT = "a model has no element for it"
+BESIDE = 0.01  # the same, for a module beside the file, and of all rows for friction at rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,20 +192,19 @@ def asked_of(found: MotionDiagnosis, bench: Bench) -> tuple[Asked, tuple[Term, .
         late = 0.0
     chain = bench.opened.chain
     motors = [driven(model, joint) and chain.servo(joint) < 0 for joint in chain.joints]
-    geared = tuple(j for j in joints(terms, GEARED) if motors[j])
-    curved = joints(terms, LEVELS) if has_powers(model) else ()
+    geared = tuple(j for j in held_at(terms, GAIN) if motors[j])
+    curved = held_at(terms, LEVELLED) if has_powers(model) else ()
     elements = {FRICTION, MASSES, ARMATURE}
-    for name, some in ((CURVE, curved), (SPRINGS, joints(terms, SPRUNG)),
-                       (GAIN, geared), (DELAY, (0,) if late else ())):  # fmt: skip
-        elements |= {name} if some else set()
-    asked = Asked(frozenset(elements), link, curved, joints(terms, SPRUNG), geared,
-                  late=late)  # fmt: skip
-    return asked, tuple(term for term in terms if term.effect in HELD)
+    sprung = held_at(terms, SPRINGS)
+    some = {LEVELLED: curved, SPRINGS: sprung, GAIN: geared, DELAY: late}
+    elements |= {name for name, where in some.items() if where}
+    asked = Asked(frozenset(elements), link, curved, sprung, geared, late=late)
+    return asked, tuple(term for term in terms if MODULE in term.law.held)
 
 
-def joints(terms: Sequence[Term], effects: Sequence[str]) -> tuple[int, ...]:
-    """Joints at which some effects are."""
-    return tuple(sorted({term.joint for term in terms if term.effect in effects}))
+def held_at(terms: Sequence[Term], element: str) -> tuple[int, ...]:
+    """Joints at which an element may hold a law."""
+    return tuple(sorted({term.joint for term in terms if element in term.law.held}))
 
 
 def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Corrected:
@@ -224,7 +213,7 @@ def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Correct
     progress("fitting the elements of the model")
     full = without_idle(bench, first_choice(bench, whole, laws))
     plain = without_idle(bench, by_elements(bench, full, whole))
-    if bench.beside(plain, full.asked.laws).score > plain.score - MODULE:
+    if bench.beside(plain, full.asked.laws).score > plain.score - BESIDE:
         full = plain
     if bench.bristled:
         plain, full = at_rest(bench, plain, full)
@@ -240,8 +229,8 @@ def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Correct
 
 def first_choice(bench: Bench, whole: Asked, laws: tuple[Term, ...]) -> Candidate:
     """All elements and laws: with the masses of all links or of the one that changed."""
-    if any(term.law.family == SPEED_CURVE for term in laws):
-        whole = replace(whole, elements=whole.elements - {CURVE})  # the laws say it better
+    if any(term.law.family == CURVE for term in laws):
+        whole = replace(whole, elements=whole.elements - {LEVELLED})  # the laws say it better
     whole = replace(whole, laws=laws)
     best = bench.candidate(replace(whole, link=-1))
     if whole.link >= 0:
@@ -254,7 +243,7 @@ def by_elements(bench: Bench, full: Candidate, whole: Asked) -> Candidate:
     """Elements alone, with the masses that belong to the laws that none holds."""
     if not full.asked.laws:
         return full
-    elements = full.asked.elements | (whole.elements & {CURVE, FRICTION})
+    elements = full.asked.elements | (whole.elements & {LEVELLED, FRICTION})
     asked = replace(full.asked, elements=elements, laws=(), behind=full.asked.laws)
     return bench.candidate(asked)
 
@@ -283,7 +272,7 @@ def at_rest(bench: Bench, plain: Candidate, full: Candidate) -> tuple[Candidate,
     """Both with the same bristles, if all rows gain by them, and more than moving ones lose."""
     more = bench.candidate(full.asked.adding(BRISTLES))
     gain = mean_log(full.missed.whole) - mean_log(more.missed.whole)
-    helps = gain > MODULE + max(0.0, more.score - full.score)
+    helps = gain > BESIDE + max(0.0, more.score - full.score)
     if not helps or bench.tracking(more) > bench.tracking(full) + STAYS:
         return plain, full
     if full is plain:
@@ -351,13 +340,12 @@ def left_out(found: MotionDiagnosis, geared: Sequence[int]) -> Iterator[str]:
     geared: joints whose drive gain the file holds.
     """
     for one in found.effects:
-        held = one.effect in IN_FILE.union(HELD)
-        if one.effect in GEARED:
-            held = int(one.place[1:]) - 1 in geared
-        if one.effect in LAWS and not held and not is_body(one):
+        law = LAWS.get(one.effect)
+        held = law and law.held and (law.held != (GAIN,) or int(one.place[1:]) - 1 in geared)
+        if law and not held and not is_body(one):
             joint, (without, with_it) = best_worth(one)
             cost = f"{joint} {without:.3g} in place of {with_it:.3g} {found.unit}"
-            yield f"{one.words}: {WHY.get(one.effect, NO_ELEMENT)} (costs {cost})"
+            yield f"{one.words}: {law.why} (costs {cost})"
     for rest in (one for one in found.unexplained if one.share > MATTERS):
         size = f"{rest.size:.3g} {found.unit}"
         yield f"{size} at {rest.place} follow the {rest.follows} and have no name"

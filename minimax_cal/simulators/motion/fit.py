@@ -13,7 +13,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from minimax_cal.dynamics.laws import Term
+from minimax_cal.dynamics.laws import (
+    ARMATURE,
+    DELAY,
+    FRICTION,
+    GAIN,
+    LEVELLED,
+    MASSES,
+    SPRINGS,
+    Term,
+)
 from minimax_cal.dynamics.regressor import PER_LINK
 from minimax_cal.dynamics.rows import Logs, Whitening, whitening
 from minimax_cal.dynamics.scene import Arm, Scene
@@ -33,11 +42,6 @@ FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-9  # of the normal matrix with a unit di
 CLOSE = 1e-7  # relative fall of the squares that ends a fit
 IMPEDANCES = (1e-4, 0.9999)  # least and largest that MuJoCo takes [mjMINIMP, mjMAXIMP]
 LEAST_FRICTION = 1e-6  # of a joint's largest torque: a smaller one has no say
-DRY = ("degressive", "stribeck", "presliding", "load_friction", "angle_friction")  # with its sense
-
-FRICTION, MASSES, ARMATURE = "friction", "masses", "armature"
-CURVE, SPRINGS, GAIN, DELAY = "friction curve", "springs", "drive gain", "delay"
-BRISTLES = "friction at rest"
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +172,7 @@ def columns_of(study: Study, scene: Scene, asked: Asked) -> Iterator[Column]:
         if FRICTION in asked.elements:
             yield Column("friction", j, scene.sense[:, j] / unit[j])
             yield Column("damping", j, qd / unit[j])
-        if CURVE in asked.elements and j in asked.curved:
+        if LEVELLED in asked.elements and j in asked.curved:
             for share in LEVELS_OFF:
                 powers = levelling(share * scene.arm.fastest[j])
                 yield Column(f"curve {share}", j, speeds(qd) @ powers / unit[j])
@@ -411,7 +415,7 @@ def sense_of(study: Study, scene: Scene, numbers: Numbers) -> Array:
     sliding = scene.with_body(scene.rigid, scene.friction)
     vars(sliding)["sense"] = np.ones_like(motion.q)
     for term, value in zip(numbers.laws, numbers.value, strict=True):
-        if term.effect in DRY and len(value):
+        if term.law.dry and len(value):
             amount = (term.columns(sliding) @ value) * scene.divisor[term.joint]
             whole[:, term.joint] = np.maximum(whole[:, term.joint] + amount, least[term.joint])
     stiffness, rate = softness(study.chain, numbers)
