@@ -24,7 +24,7 @@ from minimax_cal.dynamics.given import MotionKnown, runs_of
 from minimax_cal.dynamics.laws import ANGLE, CURVE, LAWS, USUAL, Term, terms_of
 from minimax_cal.dynamics.links import LinkChange, body_as_given, carried, weighing
 from minimax_cal.dynamics.logs.with_robot import LEAST_SCALE, MOST_SCALE
-from minimax_cal.dynamics.model import FRICTION, RIGID, Body, Normal, TorqueModel, first_body
+from minimax_cal.dynamics.model import Body, Normal, TorqueModel, first_body
 from minimax_cal.dynamics.probes import Unexplained, unexplained
 from minimax_cal.dynamics.result import (
     Alternative,
@@ -43,7 +43,7 @@ from minimax_cal.dynamics.result import (
 from minimax_cal.dynamics.rows import ROW_HZ, Logs, prepare, whitening
 from minimax_cal.dynamics.run import CURRENT, Run
 from minimax_cal.dynamics.scene import Arm, Scene, sense_of
-from minimax_cal.dynamics.search import Columns, dictionary_of, generous
+from minimax_cal.dynamics.search import FRICTION, RIGID, Columns, dictionary_of, generous
 from minimax_cal.dynamics.softness import softened
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Library
@@ -216,7 +216,7 @@ def fitted(found: Found, columns: Columns) -> Normal:
 def helpful(found: Found) -> Found:
     """What was found, less the laws that harm the joints of runs left out more than they help."""
     logs = found.columns.scene.logs
-    normal, known = fitted(found, found.columns), found.columns.error()
+    normal, known = fitted(found, found.columns), found.columns.error
     fold = by_loads(folds_of(logs, FOLD, ()), logs, found.terms)
     kept = without_harmful(LeftOut.of(normal, known, known, fold), found.terms)
     choice = replace(found.choice, found=tuple(
@@ -273,7 +273,7 @@ def examined(
         columns = Columns(found.context.scene(arm, logs))
     normal = fitted(found, columns)
     fold, whole = by_loads(fold, logs, found.terms), fold
-    known = columns.error()
+    known = columns.error
     before = known + (early.y - logs.y).T
     judge = LeftOut.of(normal, known, before, fold)
     again = frequencies(found.choice)
@@ -550,7 +550,7 @@ def held_run(judge: LeftOut, logs: Logs, parts: Sequence[str]) -> HeldRun:
 def curves(found: Found, normal: Normal, judge: LeftOut) -> Iterator[FrictionCurve]:
     """Friction over the speed of each joint, and its spread over fits without each fold."""
     arm, every = normal.columns.scene.arm, parts_of(found.terms)
-    values = np.array([normal.solve(every), *judge.values(every)])
+    values = np.array([normal.solve(every), *judge.values(normal.index(every))])
     for j in range(arm.robot.joints):
         v = np.linspace(-1.0, 1.0, CURVE_POINTS) * arm.fastest[j]
         sense = sense_of(v, arm.soft[j])

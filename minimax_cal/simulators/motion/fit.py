@@ -26,7 +26,7 @@ from minimax_cal.dynamics.laws import (
 from minimax_cal.dynamics.regressor import PER_LINK
 from minimax_cal.dynamics.rows import Logs, Whitening, whitening
 from minimax_cal.dynamics.scene import Arm, Scene
-from minimax_cal.dynamics.search import Columns, generous
+from minimax_cal.dynamics.search import Columns, generous, solve_scaled
 from minimax_cal.ground.arrays import Array
 from minimax_cal.simulators.chain import Chain, mujoco
 from minimax_cal.simulators.motion.bodies import Bodies, inertial, physical
@@ -108,25 +108,19 @@ class Study:
     def of(chain: Chain, arm: Arm, logs: Logs, terms: tuple[Term, ...], inertia: Array,
            *, assumed: bool) -> Study:  # fmt: skip
         """Of the logs to learn from.  terms: the laws of a diagnosis."""
-        bodies = Bodies.of(chain)
-        given = given_numbers(chain, bodies)
-        scene = Scene.of(arm, logs)
-        scene = scene.with_body(of_all(bodies.links(given.bodies)), scene.friction)
-        white = whitening(logs, generous(Columns(scene), terms))
-        rows = np.moveaxis(logs.filtered(scene.regressor), 1, 0)
-        return Study(chain, bodies, given, scene, white, white.white(rows[white.kept]), inertia,
-                     PRIOR_ASSUMED if assumed else PRIOR)  # fmt: skip
+        bodies, given, columns = begun(chain, arm, logs)
+        white = whitening(logs, generous(columns, terms))
+        links = white.white(columns.links[white.kept])
+        prior = PRIOR_ASSUMED if assumed else PRIOR
+        return Study(chain, bodies, given, columns.scene, white, links, inertia, prior)
 
     def of_file(self, chain: Chain, gain: Array) -> Study:
         """The same logs, for a written model.  gain: (n,) of its drives over those of the logs."""
-        bodies = Bodies.of(chain)
-        given = given_numbers(chain, bodies)
         arm = replace(self.scene.arm, gain=self.scene.arm.gain / gain)
-        scene = Scene.of(arm, self.scene.logs)
-        scene = scene.with_body(of_all(bodies.links(given.bodies)), self.scene.friction)
-        rows = np.moveaxis(scene.logs.filtered(scene.regressor), 1, 0)
-        links = self.white.white(rows[self.white.kept])
-        return replace(self, chain=chain, bodies=bodies, given=given, scene=scene, links=links)
+        bodies, given, columns = begun(chain, arm, self.scene.logs)
+        links = self.white.white(columns.links[self.white.kept])
+        return replace(self, chain=chain, bodies=bodies, given=given, scene=columns.scene,
+                       links=links)  # fmt: skip
 
     def error(self, late: float) -> Array:
         """(N,) whitened torques less those of a known payload; so much earlier [s]."""
@@ -141,6 +135,14 @@ class Study:
         given = self.given.put(bodies=own, armature=found.armature)
         scene = self.scene.with_body(of_all(bodies.links(own)), self.scene.friction)
         return replace(self, bodies=bodies, given=given, scene=scene)
+
+
+def begun(chain: Chain, arm: Arm, logs: Logs) -> tuple[Bodies, Numbers, Columns]:
+    """What a model has, and columns of logs of its arm with its masses."""
+    bodies = Bodies.of(chain)
+    given, scene = given_numbers(chain, bodies), Scene.of(arm, logs)
+    rigid = of_all(bodies.links(given.bodies))
+    return bodies, given, Columns(scene.with_body(rigid, scene.friction))
 
 
 def of_all(links: Array) -> Array:
@@ -321,11 +323,7 @@ def damped_step(gram: Array, pull: Array, damping: float, free: Array) -> Array:
     """(p,) step of the free ones; 0 of the others."""
     out = np.zeros(len(pull))
     if free.any():
-        part = gram[np.ix_(free, free)]
-        scale = np.sqrt(np.maximum(np.diag(part), 1e-300))
-        unit = part / np.outer(scale, scale)
-        unit[np.diag_indices_from(unit)] += damping
-        out[free] = -np.linalg.solve(unit, pull[free] / scale) / scale
+        out[free] = -solve_scaled(gram[np.ix_(free, free)], pull[free], damping)
     return out
 
 
