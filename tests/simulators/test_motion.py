@@ -16,7 +16,7 @@ from minimax_cal.dynamics.logs import runs_text
 from minimax_cal.dynamics.regressor import link_parameters
 from minimax_cal.dynamics.run import Run
 from tests.conftest import run
-from tests.dynamics.motions import three_joints
+from tests.dynamics.motions import run_of, three_joints
 from tests.problems_mjcf import drive_alone
 from tests.simulators.test_mjcf import in_base
 
@@ -32,6 +32,7 @@ from experiments.driven_arms import (  # noqa: E402
     with_motors,
 )
 from minimax_cal.simulators.motion import bodies  # noqa: E402
+from minimax_cal.simulators.motion.driven import follow_commands  # noqa: E402
 from minimax_cal.simulators.motion.fit import least_within, levelling, speeds  # noqa: E402
 from minimax_cal.simulators.motion.judge import Judge  # noqa: E402
 from minimax_cal.simulators.motion.module import installed, loaded  # noqa: E402
@@ -275,6 +276,19 @@ def test_logged_commands_drive_the_servos_of_the_model(tmp_path: Path) -> None:
     assert gap.drives == "its position servos and the logged commands"
     first, last = (np.array(r.tracking_rms_mrad) for r in (gap.rungs[0], gap.rungs[-1]))
     assert (last < 0.1 * first).all()
+
+
+@pytest.mark.skipif(not hasattr(mujoco, "mj_initCtrlHistory"), reason="no delays in this MuJoCo")
+def test_a_delayed_servo_at_its_command_stays_there(tmp_path: Path) -> None:
+    """MuJoCo fills the history of a delayed command with 0: the arm would jump towards it."""
+    servo = '<position kp="2000" kv="200" delay="0.02" nsample="14" '
+    path, q = tmp_path / "late.xml", np.array([0.4, -0.3, 0.5])
+    path.write_text(with_motors(three_joints()).decode().replace("<motor ", servo))
+    chain, time = open_model(path, 3).chain, np.arange(0.0, 0.5, 0.01)
+    chain.model.opt.gravity[:] = 0.0
+    still = np.broadcast_to(q, (len(time), 3))
+    log = run_of("still", time, still, 0.0 * still)
+    assert_allclose(follow_commands(chain, log, still, str(path)), still, atol=1e-9)
 
 
 def test_no_link_grows_in_place_of_a_rotor(tmp_path: Path) -> None:

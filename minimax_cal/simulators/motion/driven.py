@@ -14,7 +14,7 @@ from minimax_cal.dynamics.rows import EDGE_S, Logs
 from minimax_cal.dynamics.run import Run
 from minimax_cal.dynamics.scene import bent_bristles
 from minimax_cal.ground.arrays import Array
-from minimax_cal.simulators.chain import Chain, mujoco
+from minimax_cal.simulators.chain import Chain, fill_history, mujoco
 from minimax_cal.simulators.drive import check_stable
 from minimax_cal.simulators.motion.numbers import FRICTION, bristles_in, given_bristles
 
@@ -60,6 +60,8 @@ def follow_commands(chain: Chain, run: Run, commands: Array, source: str) -> Arr
 
     def drive(data: Any, now: int) -> None:
         data.ctrl[servos] = path[now]
+        if not now:
+            fill_history(chain.model, data)
 
     path = on_steps(run.time, commands, chain)
     return stepped(chain, run, drive, source)
