@@ -41,6 +41,8 @@ ADDED: dict[str, str] = {}
 CHANGED: dict[str, str] = {
     "import leica/stdout*": "a table breaks no path",
     "import wrong/stdout*": "a table breaks no path",
+    "gap logs/files/driven.gap.json/notices": "what other simulators leave out of a file is said",
+    "gap logs/stderr*": "what other simulators leave out of a file is said",
     "*/files/*_friction.py/*": "laws of the module are written from their one statement",
 }
 RENAMED: dict[str, str] = {}  # keys of before by what they are called now

@@ -15,6 +15,7 @@ from minimax_cal.dynamics.given import MotionKnown, Payload, read_logs
 from minimax_cal.dynamics.logs import runs_text
 from minimax_cal.dynamics.regressor import link_parameters
 from minimax_cal.dynamics.run import Run
+from minimax_cal.ground.errors import OptionError
 from tests.conftest import run
 from tests.dynamics.motions import run_of, three_joints
 from tests.problems_mjcf import drive_alone
@@ -131,6 +132,44 @@ def test_the_ladder_says_so(made: SimpleNamespace) -> None:
         e.worth.values(), key=lambda ends: ends[0] / ends[1])])  # fmt: skip
     assert made.figure.read_bytes().startswith(b"\x89PNG")
     assert any(text.startswith("not in the file") for text in gap.sentences())
+
+
+def test_a_plain_file_has_nothing_that_others_leave_out(made: SimpleNamespace,
+                                                       tmp_path: Path) -> None:  # fmt: skip
+    out = tmp_path / "plain.xml"
+    gap = mc.motion_gap(made.model, made.logs, write=out, plain=True, driven=False)
+    assert not gap.module
+    assert not [text for text in gap.notices if "leave out" in text]
+    assert any(
+        "simulators but MuJoCo leave out what no element" in text for text in made.gap.notices
+    )
+    model, bent = mujoco.MjModel.from_xml_path(str(out)), ("dof_dampingpoly", "jnt_stiffnesspoly")
+    assert not any(np.any(getattr(model, name, 0.0)) for name in bent)
+    assert_allclose(
+        reached(out, "", read_logs(made.model, made.logs)), gap.rungs[-1].torque_rms, rtol=1e-4
+    )
+    with pytest.raises(OptionError, match="leave plain or friction"):
+        mc.motion_gap(made.model, made.logs, plain=True, friction="dcmotor")
+
+
+def test_a_plain_file_moves_alike_in_every_simulator(made: SimpleNamespace, tmp_path: Path) -> None:
+    """MuJoCo in C, in JAX and in Warp: 50 steps from a start at speed, in single precision."""
+    mjx = pytest.importorskip("mujoco.mjx", reason="needs pip install minimax-cal[rl]")
+    jax = pytest.importorskip("jax", reason="needs pip install minimax-cal[rl]")
+    warp = pytest.importorskip("mujoco_warp", reason="needs pip install minimax-cal[rl]")
+    out, speed = tmp_path / "plain.xml", [1.0, -0.5, 2.0]
+    mc.motion_gap(made.model, made.logs, write=out, plain=True, driven=False)
+    model = mujoco.MjModel.from_xml_path(str(out))
+    data = mujoco.MjData(model)
+    data.qvel[:] = speed
+    in_jax, in_warp = mjx.put_data(model, data), warp.put_data(model, data)
+    jax_model, warp_model, step = mjx.put_model(model), warp.put_model(model), jax.jit(mjx.step)
+    for _ in range(50):
+        mujoco.mj_step(model, data)
+        in_jax = step(jax_model, in_jax)
+        warp.step(warp_model, in_warp)
+    assert_allclose(in_jax.qpos, data.qpos, atol=1e-4)
+    assert_allclose(in_warp.qpos.numpy()[0], data.qpos, atol=1e-4)
 
 
 def reached(path: Path, module: str, runs: list[Run], payload: Payload | None = None) -> np.ndarray:

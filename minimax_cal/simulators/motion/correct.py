@@ -40,7 +40,7 @@ from minimax_cal.simulators.motion.bristles import fit_bristles
 from minimax_cal.simulators.motion.fit import Asked, Study, fit_numbers
 from minimax_cal.simulators.motion.judge import Judge, Missed
 from minimax_cal.simulators.motion.module import installed, module_text
-from minimax_cal.simulators.motion.numbers import Numbers, has_powers
+from minimax_cal.simulators.motion.numbers import POWERS, Numbers, has_powers
 from minimax_cal.simulators.motion.opened import Opened
 from minimax_cal.simulators.motion.result import MotionRung, WrittenElement
 from minimax_cal.simulators.motion.written import SHORTEST, stiffen, unwritten, write_numbers
@@ -56,6 +56,13 @@ ATTRIBUTES = {  # of the elements, in the order in which they are shown
     BRISTLES: "frictionloss, dcmotor with lugre",
 }
 STAYS = 1e-3  # fall of the mean log RMS torque by which an element stays
+LOST = {  # of an element, what readers of the file leave out, and which
+    LEVELLED: ("all but the first number of `damping`", "MJX, USD and SDF"),
+    SPRINGS: ("all but the first number of `stiffness`", "MJX, USD and SDF"),
+    DELAY: ("`delay`", "MJX, USD and SDF"),
+    BRISTLES: ("`dcmotor`, with which MJX loads no file", "USD and SDF"),
+    MODULE: ("what no element holds", "all simulators but MuJoCo"),
+}
 BESIDE = 0.01  # the same, for a module beside the file, and of all rows for friction at rest
 
 
@@ -84,13 +91,15 @@ def mean_log(values: Array) -> float:
 class Bench:
     """Where candidates are fitted and judged; each once.
 
-    bristled: whether motors without input may hold friction at rest.
+    bristled: whether motors without input may hold friction at rest.  plain: whether the file may
+    have nothing that other simulators leave out.
     """
 
     judge: Judge
     opened: Opened
     study: Study
     bristled: bool = False
+    plain: bool = False
     made: dict[Asked, Candidate] = field(default_factory=dict)
     followed: dict[Asked, float] = field(default_factory=dict)
 
@@ -198,7 +207,10 @@ def asked_of(found: MotionDiagnosis, bench: Bench) -> tuple[Asked, tuple[Term, .
     sprung = held_at(terms, SPRINGS)
     some = {LEVELLED: curved, SPRINGS: sprung, GAIN: geared, DELAY: late}
     elements |= {name for name, where in some.items() if where}
-    asked = Asked(frozenset(elements), link, curved, sprung, geared, late=late)
+    if bench.plain:
+        elements -= {LEVELLED, DELAY}
+    bent = 1 if bench.plain else POWERS - 1
+    asked = Asked(frozenset(elements), link, curved, sprung, geared, late=late, bent=bent)
     return asked, tuple(term for term in terms if MODULE in term.law.held)
 
 
@@ -213,7 +225,7 @@ def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Correct
     progress("fitting the elements of the model")
     full = without_idle(bench, first_choice(bench, whole, laws))
     plain = without_idle(bench, by_elements(bench, full, whole))
-    if bench.beside(plain, full.asked.laws).score > plain.score - BESIDE:
+    if bench.plain or bench.beside(plain, full.asked.laws).score > plain.score - BESIDE:
         full = plain
     if bench.bristled:
         plain, full = at_rest(bench, plain, full)
@@ -332,6 +344,23 @@ def law_worths(bench: Bench, plain: Candidate, full: Candidate) -> Iterator[Writ
         where = ", ".join(t.place for t in full.asked.laws if t.effect == effect)
         worth = changed_joints(worth_by_joint(bare.missed.moving, full.missed.moving))
         yield WrittenElement(WORDS[effect], "module", f"at {where}", worth)
+
+
+def lost(made: Corrected) -> Iterator[str]:
+    """What other simulators leave out of the file, for people."""
+    numbers, elements = made.plain.numbers, made.plain.asked.elements
+    held = {
+        LEVELLED: numbers.damping[:, 1:].any(),
+        SPRINGS: numbers.stiffness[:, 1:].any(),
+        DELAY: DELAY in elements,
+        BRISTLES: numbers.bristles.any(),
+        MODULE: made.full.module,
+    }
+    for name, is_there in held.items():
+        if is_there:
+            yield f"{LOST[name][1]} leave out {LOST[name][0]} ({name}); see plain="
+    if DELAY in elements and numbers.late < 0.0:
+        yield "MuJoCo begins with 0 in the history of delayed commands: call mj_initCtrlHistory"
 
 
 def left_out(found: MotionDiagnosis, geared: Sequence[int]) -> Iterator[str]:

@@ -51,7 +51,7 @@ class Asked:
     elements: of those above.  link: the only one whose masses change, -1 for all.
     behind: laws with which masses and armature are fitted first, and kept.
     curved: joints whose damping levels off.  sprung, geared: joints with a spring, or whose drive
-    gain is off.  laws: that no element holds.
+    gain is off.  laws: that no element holds.  bent: powers of the angle in a spring's torque.
     """
 
     elements: frozenset[str]
@@ -62,6 +62,7 @@ class Asked:
     laws: tuple[Term, ...] = ()
     behind: tuple[Term, ...] = ()
     late: float = 0.0
+    bent: int = POWERS - 1
 
     def adding(self, element: str) -> Asked:
         """With one element more."""
@@ -183,7 +184,7 @@ def columns_of(study: Study, scene: Scene, asked: Asked) -> Iterator[Column]:
             doubt = max(given.armature[j], ROTOR * study.inertia[j], ROTOR * whole)
             yield Column("armature", j, qdd / unit[j], mean=given.armature[j], sd=doubt)
         if SPRINGS in asked.elements and j in asked.sprung:
-            for power in range(POWERS):
+            for power in range(asked.bent + 1):
                 yield Column(f"spring {power}", j, motion.q[:, j] ** power / unit[j], -np.inf)
         if GAIN in asked.elements and j in asked.geared:
             yield Column("gain", j, scene.load[:, j], -np.inf)
