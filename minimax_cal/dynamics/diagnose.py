@@ -270,7 +270,7 @@ def examined(
     found = helpful(found)
     columns = found.columns
     if len(learning) < len(logs.names):
-        columns = Columns(found.context.scene(arm, logs))
+        columns = Columns(found.context.in_scene(Scene.of(arm, logs)))
     normal = fitted(found, columns)
     fold, whole = by_loads(fold, logs, found.terms), fold
     known = columns.error

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from minimax_cal.dynamics.laws import Term
-from minimax_cal.dynamics.rows import Logs, Whitening
+from minimax_cal.dynamics.rows import Whitening
 from minimax_cal.dynamics.scene import YIELD, Arm, Scene
 from minimax_cal.dynamics.search import (
     FRICTION,
@@ -40,10 +40,6 @@ class Body:
         each = rigid.reshape(-1, arm.base.shape[1])
         near = arm.drawn + (each - arm.base.T @ arm.drawn) @ arm.base.T
         return Body(near, usual.reshape(-1, 2))
-
-    def scene(self, arm: Arm, logs: Logs) -> Scene:
-        """The scene of some logs, with this load and friction."""
-        return self.in_scene(Scene.of(arm, logs))
 
     def in_scene(self, scene: Scene) -> Scene:
         """A scene with this load and friction."""
