@@ -20,9 +20,9 @@ import numpy as np
 from experiments import sweep
 from experiments.convergence import SAME, STEP, Setting, problem_of, starts_of
 from experiments.sweep import Study, study_options
-from minimax_cal.fitting.start import fit_base, search
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.modelling.model import Model, SumOfSquares
+from minimax_cal.modelling.start import fit_base, search
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares

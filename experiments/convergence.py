@@ -30,7 +30,6 @@ from experiments import pseudo_inverse, sweep
 from experiments.pseudo_inverse import ROUNDING
 from experiments.speed import identified
 from experiments.sweep import Study, study_options
-from minimax_cal.fitting.start import search
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell, Table
@@ -38,6 +37,7 @@ from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.model import Model, SumOfSquares
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.modelling.start import search
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers import least_squares

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from minimax_cal.dynamics.run import TORQUE, Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.gravity import tubes
+from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.robots.robot import Robot, load_robot
-from minimax_cal.simulators.chain import mujoco
 from minimax_cal.simulators.mjcf import text_of
 from minimax_cal.simulators.motion.written import new_model
 

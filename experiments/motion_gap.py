@@ -29,7 +29,7 @@ from experiments.real import SHARED, here
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
-from minimax_cal.simulators.chain import mujoco
+from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.simulators.motion.ladder import MOTOR
 from minimax_cal.simulators.motion.module import loaded
 

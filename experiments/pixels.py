@@ -38,18 +38,18 @@ from experiments.pixel_cells import (
     taken,
 )
 from experiments.sweep import Study, study_options
-from minimax_cal.fitting.instruments import flange_poses
-from minimax_cal.fitting.instruments.pixel_calibration import fitted
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.fit import ANY, by_depths, fit_drawn, known_of, reprojected
 from minimax_cal.fitting.pixels.identify import identified
 from minimax_cal.fitting.pixels.model import PixelModel
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import directions, from_far, poses_of_images, start_scene
+from minimax_cal.fitting.several.pixel_calibration import fitted
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.stages import silent
 from minimax_cal.ground.tables import Table
+from minimax_cal.instruments import flange_poses
 from minimax_cal.measuring.grouping import held_out
 from minimax_cal.planning.camera_options import CameraOptions
 from minimax_cal.planning.cameras import planned_images

@@ -25,24 +25,17 @@ from experiments import sweep
 from experiments.real import here, real
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
-from minimax_cal.fitting.instruments import (
-    RelativeCalibration,
-    RelativeData,
-    closures,
-    distances,
-    flange_poses,
-    relative,
-)
-from minimax_cal.fitting.instruments.closing import CLOSED, reach
-from minimax_cal.fitting.instruments.identify import position_sigma
-from minimax_cal.fitting.instruments.poses import FlangePoses
-from minimax_cal.fitting.instruments.visits import Visits
-from minimax_cal.fitting.instruments.wires import Lengths, wire_names
+from minimax_cal.fitting.positions import position_sigma
+from minimax_cal.fitting.several import RelativeCalibration, relative
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.instruments import Instrument, closures, distances, flange_poses
+from minimax_cal.instruments.closing import CLOSED, reach
+from minimax_cal.instruments.poses import WholePoses
+from minimax_cal.instruments.sockets import Visits
+from minimax_cal.instruments.wires import Lengths, wire_names
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.measurements import Measurements, measurements
-from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.simulate import gravity
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.sampling import random_poses
@@ -111,7 +104,7 @@ def place(robot: Robot, q: Array, spot: Array) -> Array:
 class Measured:
     """data: of an instrument.  known: distances between sockets, as `RelativeOptions` has them."""
 
-    data: RelativeData
+    data: Instrument
     known: tuple[tuple[str, str, float], ...] = ()
 
 
@@ -283,7 +276,7 @@ def rank_of(arm: Arm, measured: Measured) -> int:
     """Rank of the plain model of a measurement, the sockets' places not counted."""
     data = measured.data
     q = arm.bent(data.at.q)
-    if isinstance(data, FlangePoses):
+    if isinstance(data, WholePoses):
         return rank_by_differences(arm, q, np.zeros(9), seen_poses)
     if isinstance(data, Lengths):
         anchors = arm.real.reach() * np.random.default_rng(0).normal(size=(len(data.wires), 3))
@@ -366,8 +359,7 @@ def tracked(arm: Arm, rng: np.random.Generator, checks: Array, nominal: Array) -
     y = arm.place(q) + NOISE * rng.normal(size=(POSES, 3))
     fit = calibrate(arm.robot, measurements(q, y), objective="sum")
     found, shape = true_errors(arm, fit.robot, fit.cell.target_positions[0], checks)
-    cell, model = fit.cell, model_of(arm.robot, fit.data)
-    state = cell.state
+    state = fit.cell.state
     return Outcome(
         numbers=3 * fit.accuracy["train"].poses,
         parameters=len(fit.parameters),
@@ -377,7 +369,7 @@ def tracked(arm: Arm, rng: np.random.Generator, checks: Array, nominal: Array) -
         true_mm=(rms_mm(nominal), rms_mm(found)),
         shape_mm=rms_mm(shape),
         worst_mm=float(1e3 * found.max()),
-        sigma_mm=1e3 * position_sigma(arm.robot, model, state, fit.covariance),
+        sigma_mm=1e3 * position_sigma(arm.robot, state.mdh, state.target_positions, fit.covariance),
         converged=fit.status == "converged",
     )
 

@@ -19,7 +19,7 @@ from experiments import sweep
 from experiments.relative import LENGTH, NOISE, SIMULATORS, Arm, Measured
 from experiments.sweep import Study, study_options
 from minimax_cal.diagnosing.instruments import diagnose_relative
-from minimax_cal.fitting.instruments.kinds import Given, labels_of, loaded
+from minimax_cal.fitting.several.kinds import Given, labels_of, loaded
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.measurements import measurements

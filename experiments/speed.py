@@ -34,7 +34,7 @@ import minimax_cal as mc
 from experiments import speed_peers, sweep
 from experiments.speed_peers import Raw
 from experiments.sweep import Study, study_options
-from minimax_cal.fitting import identify, start
+from minimax_cal.fitting import identify
 from minimax_cal.fitting.minimax_problem import (
     Distances,
     MinimaxProblem,
@@ -46,6 +46,7 @@ from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling import start
 from minimax_cal.modelling.effects.table import Fitted, Term
 from minimax_cal.modelling.model import Model, SumOfSquares, model_of
 from minimax_cal.modelling.near import nearby

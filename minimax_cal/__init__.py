@@ -23,10 +23,10 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.dynamics.run import Run
     from minimax_cal.fitting.calibrate import calibrate
     from minimax_cal.fitting.fit import Fit, load_fit
-    from minimax_cal.fitting.instruments.kinds import relative
-    from minimax_cal.fitting.instruments.pixel_calibration import calibrate_pixels
     from minimax_cal.fitting.many import calibrate_many
     from minimax_cal.fitting.options import Options
+    from minimax_cal.fitting.several.kinds import relative
+    from minimax_cal.fitting.several.pixel_calibration import calibrate_pixels
     from minimax_cal.ground.errors import (
         CalibrationError,
         CalibrationWarning,
@@ -34,6 +34,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
         OptionError,
         RobotError,
     )
+    from minimax_cal.instruments.table import register_instrument
     from minimax_cal.judging.bootstrap import bootstrap
     from minimax_cal.judging.saved import evaluate
     from minimax_cal.judging.standard import iso9283
@@ -125,6 +126,7 @@ __all__ = [
     "read_measurements",
     "read_runs",
     "register",
+    "register_instrument",
     "register_law",
     "relative",
     "report",
@@ -154,6 +156,7 @@ MODULES = {  # name: where it is defined
     "load_cell": "modelling.cell",
     "EFFECTS": "modelling.effects.table",
     "register": "modelling.effects.table",
+    "register_instrument": "instruments.table",
     "Simulation": "modelling.simulate",
     "Truth": "modelling.simulate",
     "simulate": "modelling.simulate",
@@ -162,8 +165,8 @@ MODULES = {  # name: where it is defined
     "Options": "fitting.options",
     "calibrate": "fitting.calibrate",
     "calibrate_many": "fitting.many",
-    "calibrate_pixels": "fitting.instruments.pixel_calibration",
-    "relative": "fitting.instruments.kinds",
+    "calibrate_pixels": "fitting.several.pixel_calibration",
+    "relative": "fitting.several.kinds",
     "bootstrap": "judging.bootstrap",
     "evaluate": "judging.saved",
     "check": "judging.watching.health",

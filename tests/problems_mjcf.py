@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from minimax_cal.robots.gravity import tubes
+from minimax_cal.robots.mjcf import numbers
 from minimax_cal.robots.transforms import inverse, transform
-from minimax_cal.simulators.elements import frames, numbers
+from minimax_cal.simulators.elements import frames
 
 GAINS = (2000.0, 2000.0, 2000.0, 500.0, 500.0, 500.0)  # of the size that published arms have
 TETRAHEDRON = """v 0 0 0

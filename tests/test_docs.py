@@ -14,6 +14,7 @@ import pytest
 from conftest import ROOT, run
 from test_folders import FOLDERS
 
+from minimax_cal.instruments.table import INSTRUMENTS
 from minimax_cal.modelling.effects import EFFECTS
 from qp_backends import registry
 
@@ -103,10 +104,11 @@ def test_what_is_to_be_copied_and_entered_is_there() -> None:
 def own_registries(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """What a page registers is forgotten after it."""
     monkeypatch.setattr(registry, "_registered", dict(registry._registered))
-    before = dict(EFFECTS)
+    before = [(known, dict(known)) for known in (EFFECTS, INSTRUMENTS)]
     yield
-    EFFECTS.clear()
-    EFFECTS.update(before)
+    for known, names in before:
+        known.clear()
+        known.update(names)
 
 
 def blocks(page: Path) -> Iterator[tuple[str, str]]:
@@ -168,7 +170,7 @@ def chunks(text: str) -> Iterator[list[str]]:
 PLAIN = {"mm", "deg", "mrad", "um"}  # units
 RUN = [
     "index.md", "tutorial.md", "backends.md", "own_effect.md", "from_matlab.md",
-    "several_instruments.md",
+    "several_instruments.md", "own_instrument.md", "mjcf_to_mjcf.md", "controller_pose.md",
 ]  # fmt: skip
 
 
@@ -181,6 +183,8 @@ def test_pages_print_what_they_say(
     own_registries: None,
 ) -> None:
     pytest.importorskip("matplotlib", reason="pictures need pip install minimax-cal[plot]")
+    if name == "mjcf_to_mjcf.md":
+        pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     scope: dict[str, object] = {}

@@ -10,11 +10,13 @@ from minimax_cal.modelling.effects import EFFECTS
 ROOT = Path(__file__).parent.parent
 FOLDERS = (
     "ground",
+    "reading",
     "solvers",
     "evidence",
     "robots",
     "measuring",
     "modelling",
+    "instruments",
     "fitting",
     "judging",
     "diagnosing",

@@ -66,6 +66,8 @@ def test_the_command_line_calls_arguments_by_its_options(
          "q=3"),
     ):  # fmt: skip
         assert in_flags(said, plan) == shown
+    mend = "minimax-cal import a.csv --mend joints=1:3:2:4:5:6 -o b.csv"
+    assert in_flags(mend, cli.commands["import"]) == mend
     with pytest.raises(mc.OptionError, match=r"^candidates=5: "):
         mc.plan("irb120", 8, candidates=5)
     assert run("plan", "irb120", "--poses", 8, "--candidates", 5) == 2

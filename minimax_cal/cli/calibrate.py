@@ -21,6 +21,7 @@ from minimax_cal.cli.options import (
     options_from,
     plain_option,
     record_of,
+    refuse,
     result_options,
 )
 from minimax_cal.fitting.calibrate import calibrate
@@ -31,11 +32,13 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text, plain
 from minimax_cal.reporting.plots.figures import save_errors
 from minimax_cal.robots.kernels.choice import work
+from minimax_cal.robots.urdf import ends_of, has_links, is_urdf
 from minimax_cal.solvers.status import Status
 
 if TYPE_CHECKING:
     from minimax_cal.judging.bootstrap import Bootstrap
 
+CAMERAS = {f.name for f in fields(PixelOptions)} - {f.name for f in fields(Options)}
 BRIEF = 1000  # poses that one fit needs no compiled kernels for
 
 
@@ -80,6 +83,7 @@ def calibrate_command(
         raise click.UsageError(
             "Missing argument 'DATA...', or --pixels with --joints and --camera."
         )
+    refuse(CAMERAS, "is about what cameras see, with pixels=, joints= and camera=")
     asked = {one.name: chosen[one.name] for one in fields(Options) if one.name in chosen}
     given = measured(data, in_rows)
     with work(brief=replicates is None and given.poses <= BRIEF), to.stages() as progress:
@@ -105,15 +109,15 @@ def by_cameras(
     robot: str, data: tuple[Path, ...], files: PixelFiles, to: Output, chosen: dict[str, Any]
 ) -> int:
     """Calibrate from pixels.  Raises OptionError for what they do not know."""
-    from minimax_cal.fitting.instruments.pixel_calibration import calibrate_pixels
+    from minimax_cal.fitting.several.pixel_calibration import calibrate_pixels
 
     if data:
         raise OptionError(
             f"{data[0]}: DATA and pixels are one fit in minimax-cal relative; give one of them here"
         )
-    own = {name: chosen[name] for name in on_command_line() & chosen.keys()}
-    for name in sorted(own.keys() - {field.name for field in fields(PixelOptions)}):
-        raise OptionError(f"{name}= is not for pixels: leave it out")
+    known = {field.name for field in fields(PixelOptions)}
+    refuse({*chosen, "replicates", "in_rows", "without"} - known, "is not for pixels")
+    own = {name: chosen[name] for name in on_command_line() & known}
     fit = to.work(calibrate_pixels, robot, *files.paths(), **own)
     return to.finish(fit, status=fit.status, reason=fit.reason)
 
@@ -130,8 +134,14 @@ def advice(
         alone = "" if fit.cell.effects.terms else " by geometry alone"
         correct = f"minimax-cal compensate {written} targets.csv -o corrected.csv"
         yield f"To correct joint targets, or a program, for the controller{alone}", correct
-        write = f"minimax-cal export {written} --to mjcf -o arm.xml"
-        yield f"To write a file for MuJoCo, or --to urdf, dh-csv and others{alone}", write
+        write, file = "To write a file for MuJoCo, or --to urdf, dh-csv and others", "--to mjcf"
+        out = "arm.xml"
+        if has_links(robot):
+            name, tip = ends_of(robot)
+            kind = "urdf" if is_urdf(robot) else "mjcf"
+            write, out = f"To correct a copy of {name}", f"calibrated{Path(name).suffix}"
+            file = f"--to {kind} --{kind} {name}" + f" --tip {tip}" * bool(tip)
+        yield f"{write}{alone}", f"minimax-cal export {written} {file} -o {out}"
         yield "To see every parameter and table", "add --details"
     else:
         yield "To keep the result, and to see every table", "add -o fit.json --details"

@@ -19,17 +19,17 @@ from minimax_cal.cli.options import (
     options_of,
     output,
     plain_option,
+    refuse,
     show,
     with_output,
 )
 from minimax_cal.dynamics.logs import LogFiles, are_logs, import_logs
-from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text, plain
 from minimax_cal.ground.options import Option
 from minimax_cal.ground.tables import Table
-from minimax_cal.measuring.columns import rows_in
 from minimax_cal.measuring.importers import Imported, import_files
 from minimax_cal.measuring.measurements import measurements_in
+from minimax_cal.reading.rows import rows_in
 
 TOLD = "What the files do not tell"
 
@@ -98,9 +98,8 @@ def import_command(
     Without -o nothing is written.
     """
     if not chosen["joints"] and not chosen["columns"] and are_logs(files):
-        for name, value in {"leave_out": leave_out, **chosen}.items():
-            if value and name != "units":
-                raise OptionError(f"{name}= is about measured points, and {files[0]} is a log")
+        idle = {*chosen, "leave_out", "mend", "preview"} - {"units"}
+        refuse(idle, f"is about measured points, and {files[0]} is a log")
         logs = import_logs(files, units=chosen["units"])
         return finish(logs, to, lambda: to.cells(logs.csv(), safe_cells), logs.table())
     found = import_files(files, **chosen).put_right(mend, leave_out)

@@ -117,6 +117,12 @@ def on_command_line() -> set[str]:
     return {name for name in at.params if at.get_parameter_source(name) is given}
 
 
+def refuse(names: Iterable[str], why: str) -> None:
+    """Raise OptionError for an option on the command line that has no use, saying why."""
+    for name in sorted(on_command_line() & {*names}):
+        raise OptionError(f"{name}= {why}: leave it out")
+
+
 def options_of(verb: Callable[..., object], group: str = "", /, **told: Option) -> Decorator:
     """Options of a command from arguments of a function, whose defaults are theirs, in SI.
 
@@ -229,6 +235,8 @@ def command(made: Command) -> click.Command:
 
 NAMED = re.compile(r"(?<![\w-])(\w+)=(?:True\b|'([^']*)')?(?=(\S?))")
 
+VALUED = re.compile(r"--[\w-]+ \Z")  # what follows is the value of an option
+
 
 def in_flags(text: str, command: click.Command) -> str:
     """A message of Python, which calls an argument name=, with the command's --name."""
@@ -236,7 +244,7 @@ def in_flags(text: str, command: click.Command) -> str:
 
     def in_flag(found: re.Match[str]) -> str:
         flag, value = flags.get(found[1]), found[2]
-        if flag is None:
+        if flag is None or VALUED.search(text, 0, found.start()):
             return found[0]
         return flag if value is None and found[3] in ",.;:)" else f"{flag} {value or ''}"
 

@@ -15,15 +15,17 @@ from minimax_cal.cli.options import (
     options_from,
     plain_option,
     record_of,
+    refuse,
     result_options,
 )
-from minimax_cal.fitting.instruments import RelativeOptions, relative
-from minimax_cal.fitting.instruments.kinds import Given
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.pixels.options import PixelFiles, PixelOptions
+from minimax_cal.fitting.several import RelativeOptions, relative
+from minimax_cal.fitting.several.kinds import Given
 from minimax_cal.ground.errors import OptionError
 
 SOUGHT = "What is sought"
+CAMERAS = ("camera_on", "fix_camera", "camera_prior")
 
 
 @command
@@ -32,7 +34,7 @@ SOUGHT = "What is sought"
 @options_from(Options, "holdout", "seed", "fix", "free", "priors", "effects")
 @options_from(RelativeOptions)
 @options_from(PixelFiles)
-@options_from(PixelOptions, "camera_on", "fix_camera", "camera_prior")
+@options_from(PixelOptions, *CAMERAS)
 @options_from(Options, "method")
 @plain_option(
     SOUGHT,
@@ -72,9 +74,11 @@ def relative_command(
     """
     files, every = record_of(PixelFiles, chosen), list[Given](data)
     if files.given:
-        from minimax_cal.fitting.instruments.cameras import detected
+        from minimax_cal.fitting.several.cameras import detected
 
         every.append(detected(*files.paths()))
+    else:
+        refuse(CAMERAS, "is about what cameras see, with pixels=, joints= and camera=")
     if exclude and not diagnose:
         raise OptionError("--without is of --diagnose; give both, or neither")
     verb: Callable[..., Any] = relative

@@ -11,8 +11,8 @@ import click
 KINDS = {  # by name the class that reads such a file
     "robot": "robots.robot.RobotSchema",
     "calibration": "fitting.fit.Fit",
-    "relative": "fitting.instruments.result.RelativeCalibration",
-    "pixels": "fitting.instruments.pixel_result.PixelCalibration",
+    "relative": "fitting.several.result.RelativeCalibration",
+    "pixels": "fitting.several.pixel_result.PixelCalibration",
     "diagnosis": "diagnosing.result.Diagnosis",
     "simulator_gap": "simulators.result.SimulatorGap",
     "motion_gap": "simulators.motion.result.MotionGap",

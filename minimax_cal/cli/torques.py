@@ -31,8 +31,8 @@ def model_of(name: str, runs: Sequence[Run]) -> Robot | str:
     """The arm of a model: a robot file or URDF as it is, an MJCF through MuJoCo."""
     if Path(name).suffix.lower() not in MODELS:
         return name
+    from minimax_cal.robots.mjcf import read_model
     from minimax_cal.simulators.chain import chain_of
-    from minimax_cal.simulators.given import read_model
 
     return chain_of(read_model(name).compiled(), runs[0].joints, name).robot
 

@@ -28,12 +28,12 @@ from minimax_cal.diagnosing.what_remains import NOTHING, left_over, motions
 from minimax_cal.evidence.limits import HELPS, MAX_JOINT_JITTER, MINOR
 from minimax_cal.evidence.remains import Remains
 from minimax_cal.evidence.selection import Choice, select
-from minimax_cal.fitting.instruments.fit import InstrumentFit, remaining
-from minimax_cal.fitting.instruments.kinds import READ, Asked, Given, asked_of, result_of
-from minimax_cal.fitting.instruments.laws import is_shared
-from minimax_cal.fitting.instruments.linear import StackRows, rows_of_all, scene_of_all
-from minimax_cal.fitting.instruments.options import Progress, RelativeOptions, silent
-from minimax_cal.fitting.instruments.result import RelativeCalibration
+from minimax_cal.fitting.several.fit import InstrumentFit, remaining
+from minimax_cal.fitting.several.kinds import READ, Asked, Given, asked_of, result_of
+from minimax_cal.fitting.several.laws import is_shared
+from minimax_cal.fitting.several.linear import StackRows, rows_of_all, scene_of_all
+from minimax_cal.fitting.several.options import Progress, RelativeOptions, silent
+from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.options import check_left_out, takes
@@ -168,7 +168,7 @@ def causes_of(asked: Asked, fit: InstrumentFit, exclude: tuple[str, ...]) -> tup
 
 def not_testable(robot: Robot, fit: InstrumentFit) -> Iterator[tuple[str, str]]:
     """Effects that these instruments together cannot test, and what they lack."""
-    scenes = fit.stack.scenes(robot, [train.data for train in fit.trains], fit.state)
+    scenes = fit.stack.scenes(robot, fit.state)
     for name, effect in EFFECTS.items():
         if effect.is_map:
             continue
@@ -235,7 +235,7 @@ def budget_of(asked: Asked, fit: InstrumentFit, effects: Sequence[Finding]) -> B
 def missed(result: RelativeCalibration, fit: InstrumentFit, noise: Array) -> float:
     """RMS of the held-out errors, each file's relative to its noise (b,) [m]."""
     files = result.instruments or (result,)
-    rough = noise / [block.row_noise for block in fit.stack.blocks]
+    rough = noise / [one.row_noise for one in fit.stack.instruments]
     square = [
         np.nansum((one.errors["holdout"] / r) ** 2) for one, r in zip(files, rough, strict=True)
     ]
@@ -278,12 +278,12 @@ def known_noise(scene: Scene, fit: InstrumentFit) -> tuple[Known, str]:
     cost, spare = remaining(fit.problem, fit.state)
     looks = rows_of_all(scene, fit.stiff or fit).looks
     worst, file = NOT_KNOWN, ""
-    for i, (block, look) in enumerate(zip(stack.blocks, looks, strict=True)):
+    for i, (one, look) in enumerate(zip(stack.instruments, looks, strict=True)):
         if not np.isfinite(stack.given[i]):
             continue
-        arm = look.of(scene.jacobian[:, : len(block.model.y), :, look.poses])
+        arm = look.of(scene.jacobian[:, : look.targets, :, look.poses])
         own = (arm**2).sum(axis=0).mean() / (fit.stiff or fit).stack.precision[i]
-        unit = 1e3 / block.row_noise
+        unit = 1e3 / one.row_noise
         low = float(np.sqrt(cost[i] / chdtri(spare[i], 0.05)))
         most = float(np.sqrt(stack.given[i] + MAX_JOINT_JITTER**2 * own))
         if not worst.remaining / worst.highest > low / most:

@@ -18,7 +18,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import grouped, number, numbers
 from minimax_cal.robots.robot import Robot
-from minimax_cal.robots.urdf import is_urdf, load_urdf
+from minimax_cal.robots.urdf import has_links, load_urdf
 
 HEAVIEST, FARTHEST = 1e4, 10.0  # payload of the largest arms, several times over [kg, m]
 LARGEST = 1e6  # a gear ratio, or a torque for one ampere [N m/A], and 1 / the least
@@ -135,8 +135,8 @@ class MotionKnown:
 
 
 def joint_names(robot: Robot | str | Path) -> tuple[str, ...]:
-    """Names of the joints, of a URDF."""
-    if isinstance(robot, Robot) or not is_urdf(robot):
+    """Names of the joints, of a URDF or MJCF."""
+    if isinstance(robot, Robot) or not has_links(robot):
         return ()
     return tuple(joint.name for joint in load_urdf(robot).chain if joint.moves)
 

@@ -26,7 +26,6 @@ from minimax_cal.fitting.options import (
     usable,
 )
 from minimax_cal.fitting.solve import LEAST_POSES, fit_cell
-from minimax_cal.fitting.start import EVERYWHERE
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning
@@ -42,6 +41,7 @@ from minimax_cal.measuring.set_aside import set_aside
 from minimax_cal.measuring.stations import seen_from
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.time import SESSION_JUMP
+from minimax_cal.modelling.start import EVERYWHERE
 from minimax_cal.robots.robot import Robot, load_robot
 
 JUMP = (SESSION_JUMP.name, f"{SESSION_JUMP.name}:frame")  # without its moment

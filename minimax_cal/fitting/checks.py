@@ -6,7 +6,6 @@ import numpy as np
 import scipy
 
 from minimax_cal.fitting.common_scale import LEAST_SHARE, scale_of, with_links
-from minimax_cal.fitting.start import BaseFit, fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.checks import best_orders, swapped
@@ -24,6 +23,7 @@ from minimax_cal.measuring.slips import (
 )
 from minimax_cal.modelling.model import Model, in_base, model_of
 from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.start import BaseFit, fit_base
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kernels.choice import work
 from minimax_cal.robots.robot import Robot

@@ -7,15 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 
+from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.fitting.beyond import Beyond, left_out, not_claimed
 from minimax_cal.fitting.crossed import MIN_HELD_POSES, crossed
+from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.positions import lacking, positions_by
 from minimax_cal.fitting.solve import Solved
 from minimax_cal.fitting.stations import steps_of
 from minimax_cal.fitting.suspects import MIN_POINTS_LEFT, Suspect, aside, held_suspects
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import name_first
+from minimax_cal.instruments.protocol import corners
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.floor import known_floor
 from minimax_cal.measuring.grouping import clusters, grouped, parts
@@ -32,6 +36,7 @@ MAX_MISS_OF_REACH = 0.01  # of the reach: a fit that misses by more contradicts 
 MAX_MISS_OF_FLOOR = 50.0  # times the floor, likewise
 YIELDS = 0.001  # of the reach: so much a sound arm may bend, however well it comes back
 MAX_NAMED = 5  # poses that a notice names
+WEAK = 3.0  # times what the reflectors miss by: points that are known worse are weakly told
 
 
 def unseen_suspects(
@@ -56,6 +61,34 @@ def bad_rows(suspects: Sequence[Suspect], data: Measurements) -> Iterator[str]:
         yield (
             f"{data.source}: outliers among the held-out points: {name_first(named, MAX_NAMED)}; "
             "they count in the held-out accuracy, which is also given without them"
+        )
+
+
+def other_points(robot: Robot, solved: Solved, error: Array) -> Iterator[str]:
+    """Notice where other points of the tool are known far worse than these targets.
+
+    A tool's offset is measured wherever it is put to work, as a base is.  error: (k, m, 3) [m].
+    """
+    known, n, spots = solved.identification, 5 * robot.joints, solved.state.target_positions
+    if len(spots) > 2:  # they tell the whole flange
+        return
+    names = solved.names.all[:n]
+    fixed = [name in known.reasons and known.reasons[name].kind is Because.FIXED for name in names]
+    rest = []
+    for spot in corners(spots.mean(axis=0)):
+        motion = positions_by(robot, solved.state.mdh, spot[None])
+        tool = orthonormal(motion[:, n + 6 :])
+        rest.append(motion[:, :n] - tool @ (tool.T @ motion[:, :n]))
+    whole = np.concatenate(rest)
+    untold = np.flatnonzero(lacking(whole, known.active[:n], ~np.array(fixed)))
+    sigma = np.sqrt(3.0 * ((whole @ solved.uncertainty.root[:n]) ** 2).sum() / len(whole))
+    missed = np.sqrt(np.nanmean((error**2).sum(axis=-1)))
+    if len(untold) or sigma > WEAK * missed:
+        depend = f"depend on {name_first([names[i] for i in untold])}, not determined here"
+        known_to = f"are known to {1e3 * sigma:.3g} mm by the sigmas alone"
+        yield (
+            f"other points of the tool {depend if len(untold) else known_to}: the accuracy is that "
+            "of the reflector's place; measure one away from the last axis"
         )
 
 

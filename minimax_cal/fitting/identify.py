@@ -193,9 +193,7 @@ def identify(
     relative singular value that counts as not measured.
     """
     kept, gram, scale = determined(model, state, order, allowed, reference, known, resolution)
-    held = known & ~geometric(model.names)  # a prior holds curves
-    curves = gram + np.diag(np.where(held, np.diag(gram), 0.0))
-    return kept.identification(curves, scale, model.names.target_names, TOGETHER)
+    return kept.identification(with_priors(gram, known), scale, model.names.target_names, TOGETHER)
 
 
 def determined(
@@ -217,11 +215,28 @@ def determined(
     kept = kept.without(kept.active & (scale <= 1e-12), Because.NO_MOTION)
     plain = gram_of(reference, replace(state, effects=np.zeros(0)))
     plain = np.pad(plain, (0, names.count - len(plain)))
+    order = doubted_last(order, names, known)
     gone = redundant(plain, kept.active & geometric(names), order, RANK_TOLERANCE)
-    kept = kept.without(gone, Because.SAME_MOTION)
-    told = gram + np.diag(np.where(known, np.diag(gram), 0.0))
-    gone = redundant(told, kept.active, order, resolution)
+    kept = kept.without([i for i in gone if not known[i]], Because.SAME_MOTION)
+    gone = redundant(with_priors(gram, known), kept.active, order, resolution)
     return kept.without(gone, Because.NOT_TOLD), gram, scale
+
+
+def doubted_last(order: Array, names: Names, known: Array) -> Array:
+    """The order with links that have a prior behind the other links.
+
+    A prior tells how far a link may be from its drawing, so that of those that move points alike
+    the ones without keep to it.  order: indices.  known: (p,) mask.
+    """
+    doubted = (known & names.links)[order]
+    last = int(np.flatnonzero(names.links[order])[-1]) + 1
+    before, after = order[:last], order[last:]
+    return np.concatenate([before[~doubted[:last]], before[doubted[:last]], after])
+
+
+def with_priors(gram: Array, known: Array) -> Array:
+    """A Gram matrix where a prior tells a parameter as well as the poses do.  known: (p,) mask."""
+    return np.asarray(gram + np.diag(np.where(known, np.diag(gram), 0.0)))
 
 
 def geometric(names: Names) -> Array:

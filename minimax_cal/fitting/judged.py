@@ -18,6 +18,7 @@ from minimax_cal.fitting.claims import (
     crossed_of,
     drawn_crossed_of,
     is_crossed,
+    other_points,
     unjudged,
     unseen_suspects,
 )
@@ -38,7 +39,6 @@ from minimax_cal.fitting.same_arm import wild
 from minimax_cal.fitting.second_visits import contradictions
 from minimax_cal.fitting.set_aside import judged_with
 from minimax_cal.fitting.solve import PER, Solved
-from minimax_cal.fitting.start import EVERYWHERE
 from minimax_cal.fitting.stations import jumps
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.ground.arrays import Array
@@ -49,6 +49,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Frames
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.parameters import State, links_of
+from minimax_cal.modelling.start import EVERYWHERE
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.least_squares import name_of
 from minimax_cal.solvers.status import Status
@@ -184,6 +185,7 @@ class Judged:
             *self.alarming,
             *bad_rows(self.suspects, data),
             *unjudged(data, self.crossed[1]),
+            *other_points(self.robot, self.solved, after),
             *([said_of_exchanged(data, self.swapped)] if swapped else []),
             *([said_without(better, rms_of(*self.unseen))] if better and better.wrong else []),
             *filter(None, [self.ending[1]]),

@@ -16,7 +16,6 @@ import numpy as np
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options, read_options
-from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.stations import MIN_FRAME_POINTS, moving
 from minimax_cal.fitting.told_poses import measured_poses
 from minimax_cal.fitting.uncertainty import Uncertainty
@@ -34,6 +33,7 @@ from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.near import nearby
+from minimax_cal.modelling.start import fit_base
 from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.solvers.status import Status
 

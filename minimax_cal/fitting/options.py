@@ -44,6 +44,7 @@ QpSolver = str | QpFunction
 T = TypeVar("T")
 
 
+LOOSE = 3.0  # no arm is so far off its drawing [m, rad]
 LEAST_SIGMA, MOST_SIGMA = 1e-12, 1e6  # of a prior that says something [m, rad]
 
 
@@ -270,14 +271,15 @@ def freed(names: Names, free: Sequence[str], allowed: Array) -> Array:
 def known_within(names: Names, priors: Mapping[str, float], others: str) -> Array:
     """(p,) sigma of each parameter's prior, infinite where nothing is known.  Raises OptionError.
 
-    priors: sigma by name or pattern [SI].  others: what is no link, in a message.
+    priors: sigma by name or pattern [SI], of which one of `LOOSE` or more says nothing.  others:
+    what is no link, in a message.
     """
     sigma = np.full(names.count, np.inf)
     for pattern, value in priors.items():
         chosen = names.match([pattern], "prior")
         if (chosen & ~names.links).any():
             raise OptionError(f"prior {pattern}: {others} have no nominal value to keep to")
-        sigma[chosen] = value
+        sigma[chosen] = value if value < LOOSE else np.inf
     return sigma
 
 

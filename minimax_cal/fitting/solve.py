@@ -7,7 +7,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from minimax_cal.fitting import identify, start
+from minimax_cal.fitting import identify
 from minimax_cal.fitting.certificate import Certificate, certify
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.identify import MAX_NAMED, Because, Identification, Reason
@@ -23,7 +23,6 @@ from minimax_cal.fitting.options import (
     solver_of,
 )
 from minimax_cal.fitting.robust import Robust, flatness, robust_fit
-from minimax_cal.fitting.start import BaseFit
 from minimax_cal.fitting.stations import steps_of, turned_in
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, point_share, uncertainty_of
 from minimax_cal.ground.arrays import Array
@@ -34,6 +33,7 @@ from minimax_cal.measuring.grouping import clusters, groups
 from minimax_cal.measuring.history import Clock
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Frames, Sessions, seen_from
+from minimax_cal.modelling import start
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.bounds import at_bounds, bounds, settled
 from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term, names_of, of_sessions
@@ -50,6 +50,7 @@ from minimax_cal.modelling.model import (
 from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import Names, State, zero_positions
 from minimax_cal.modelling.rows import linearised
+from minimax_cal.modelling.start import BaseFit
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.least_squares import LeastSquares, solve_normal
@@ -198,7 +199,8 @@ class Task:
         kept, gram, scale = identify.determined(model, state, order, *asked)
         if kept.active.sum() <= known.active.sum() or not kept.active[known.active].all():
             return None
-        return kept.identification(gram, scale, model.names.target_names, identify.TOGETHER)
+        told = identify.with_priors(gram, sure)
+        return kept.identification(told, scale, model.names.target_names, identify.TOGETHER)
 
     def squares(self, model: Model, begin: State) -> tuple[Model, LeastSquares[State]]:
         """Least squares; with priors, weighed against the noise that remains."""

@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.measurements import Measurements
@@ -19,6 +18,7 @@ from minimax_cal.measuring.stations import Frames, labels, seen_from
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.start import fit_base
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import rotation_vector
 from minimax_cal.robots.robot import Robot

@@ -10,12 +10,12 @@ import numpy as np
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Progress, silent
-from minimax_cal.fitting.start import search
 from minimax_cal.fitting.sweeps import Axis, axes_of, lacking_sweeps, links_of_axes
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.start import search
 from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.robots.transforms import link
 from minimax_cal.solvers.status import Status

@@ -262,12 +262,6 @@ def saved_content(path: Path | str) -> Mapping[str, Any]:
     return content
 
 
-def check_table(raw: bytes, path: Path | str, *, kind: type[CalibrationError]) -> None:
-    """Raise an error of a kind for a file that should be a table in text and is a spreadsheet."""
-    if raw.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
-        raise kind(f"{path}: is a spreadsheet, not text; save it as CSV")
-
-
 def read_toml(path: Path | str) -> dict[str, Any]:
     """The content of a TOML file.  Raises OptionError."""
     text = read_text(path, kind=OptionError)

@@ -14,7 +14,6 @@ from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.opened import Opened, open_result
 from minimax_cal.fitting.opened import Result as Given
 from minimax_cal.fitting.set_aside import aside_sentence, errors_of, with_them
-from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError
@@ -29,6 +28,7 @@ from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.measuring.spans import Span, narrow, outside, spans_in_words
 from minimax_cal.modelling.cell import Cell, strangers
 from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.start import fit_base
 from minimax_cal.robots.robot import load_robot
 
 BEFORE, AFTER = "before", "after"

@@ -11,8 +11,8 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.columns import TEXT
 from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.reading.rows import TEXT
 
 MOST_FILES = 100
 LABELS = ("pose", "group")  # which mean something in their own file only
@@ -44,8 +44,26 @@ def read_campaigns(paths: Sequence[Path | str]) -> Measurements:
         raise DataError("no file of measurements is given")
     if len(paths) > MOST_FILES:
         raise DataError(f"{len(paths)} files of measurements; give at most {MOST_FILES}")
+    if len(paths) > 1 and (whole := apart(paths)):
+        return whole
     parts = [read_measurements(path) for path in paths]
     return parts[0] if len(parts) == 1 else campaigns(parts, session_names(paths))
+
+
+def apart(paths: Sequence[Path | str]) -> Measurements | None:
+    """Measurements whose points and joints lie in files of their own; None where none does.
+
+    Raises DataError.
+    """
+    from minimax_cal.measuring import importers  # few lie apart
+
+    try:
+        readings = [importers.read_any(path, importers.Given()) for path in paths]
+    except DataError:
+        return None  # the reader of each says what is wrong
+    if all(reading.smrs and reading.joints for reading in readings):
+        return None
+    return importers.import_files(paths).understood()
 
 
 def measured(data: Measurements | Path | str | Sequence[Path | str]) -> Measurements:

@@ -11,9 +11,9 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import name_first
-from minimax_cal.measuring.columns import OF_JOINT
 from minimax_cal.measuring.grouping import mislabelled
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.reading.rows import OF_JOINT
 from minimax_cal.robots.couplings import whole
 from minimax_cal.robots.robot import Robot
 

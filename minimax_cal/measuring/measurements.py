@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -14,34 +14,29 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import csv_text, write_whole
 from minimax_cal.ground.words import name_first, one_line
 from minimax_cal.measuring.aside import SetAside
-from minimax_cal.measuring.columns import (
-    JOINT,
-    SIMULATED,
+from minimax_cal.reading.rows import (
     TARGET,
-    TEXT,
+    UNITS,
     Rows,
     header_check,
-    near,
-    optional_kind,
     read_rows,
-    useless,
-    whole_rows,
 )
+from minimax_cal.reading.sheet import SIMULATED, Lines
+from minimax_cal.reading.words import OWN, joints_of, kind_of, stems_of
 
 APPROACH = re.compile(r"approach\d+")
 FARTHEST = 1e5  # no instrument measures farther [m]
-PLAUSIBLE = {  # column: its header, least and largest value in SI, what a header's unit is in SI
-    "temperature": ("temperature_C", -273.15, 1000.0, 1.0),
-    "payload": ("payload_kg", 0.0, 3e3, 1.0),  # the strongest arms carry 2.3 t
-    "u95": ("u95_mm", 0.0, 1.0, 1e3),
+PLAUSIBLE = {  # least and largest value in SI of columns of a kind
+    "temperature": (-273.15, 1000.0),
+    "payload": (0.0, 3e3),  # the strongest arms carry 2.3 t
+    "u95": (0.0, 1.0),
+    "payload centre": (-10.0, 10.0),  # from the flange
+    "tau": (-1e5, 1e5),  # the strongest joints hold some 1e4 N m
+    "base": (-FARTHEST, FARTHEST),
+    "qread": (-1e3, 1e3),
 }
-OF_PAYLOAD = ("{}_mm", -10.0, 10.0, 1e3)  # of its centre, from the flange
-OF_EACH = {  # the same of columns that joints or targets have each, by what stands before a number
-    "tau": ("{}_Nm", -1e5, 1e5, 1.0),  # the strongest joints hold some 1e4 N m
-    "base": ("{}_mm", -FARTHEST, FARTHEST, 1e3),
-    "qread": ("{}", -1e3, 1e3, 1.0),
-}
-NUMBERED = re.compile(r"(tau|base|qread)\d+(?:_[xyz])?")
+NAMED = re.compile(r"smr\d+_target")  # what the tracker calls it
+U95 = re.compile(OWN["u95"].pattern)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,16 +242,18 @@ def check_finite(data: Measurements) -> Measurements:
 
 def check_columns(data: Measurements) -> Measurements:
     """The data, if their optional columns can be.  Raises DataError."""
-    each = {found[0]: OF_EACH[found[1]] for found in map(NUMBERED.fullmatch, data.columns) if found}
-    each |= {name: OF_PAYLOAD for name in data.columns if re.fullmatch(r"payload_[xyz]", name)}
-    for name, (header, low, high, scale) in (PLAUSIBLE | each).items():
-        values = np.asarray(data.columns.get(name, np.zeros(0)), dtype=float)
+    for stem, column in data.columns.items():
+        kind = kind_of(stem)
+        if kind not in PLAUSIBLE:
+            continue
+        low, high = PLAUSIBLE[kind]
+        values = np.asarray(column, dtype=float)
         odd = (values < low) | (values > high)
         if odd.any():
             row = int(np.argmax(odd))
+            name, scale = (stem, 1.0) if kind == "qread" else file_column(stem)  # an angle, or not
             raise DataError(
-                f"{data.source}:{data.line[row]}: column {header.format(name)}: "
-                f"{scale * values[row]:g} cannot "
+                f"{data.source}:{data.line[row]}: column {name}: {scale * values[row]:g} cannot "
                 f"be; expected {scale * low:g} to {scale * high:g}, or an empty cell"
             )
     for name in filter(APPROACH.fullmatch, data.columns):
@@ -291,7 +288,7 @@ def check_u95(data: Measurements) -> Measurements:
 
 
 def read_measurements(path: Measurements | Path | str) -> Measurements:
-    """Measurements of a CSV file whose columns tell their units.
+    """Measurements of a file: of this project's CSV, or as a tracker or controller wrote it.
 
     Parameters
     ----------
@@ -320,8 +317,17 @@ def read_measurements(path: Measurements | Path | str) -> Measurements:
 def measurements_in(file: Rows) -> Measurements:
     """The measurements in a file's rows.  Raises DataError."""
     path, header = file.path, file.header
+    if not file.own:
+        from minimax_cal.measuring.importers import import_files  # which makes measurements itself
+
+        try:
+            return import_files([path]).understood()
+        except DataError as error:
+            if joints_of(stems_of(file.given)):
+                taken = "; the command import takes that" if "='" in str(error) else ""
+                raise DataError(f"{error}{taken}") from error
     header_check(path, header)
-    q, sliding = whole_rows(file).joints()
+    q, sliding = file.joints()
     found = sorted({int(m[1]) for name in header if (m := TARGET.fullmatch(name))})
     y = np.full((len(q), len(found), 3), np.nan)
     for name in header:
@@ -329,23 +335,10 @@ def measurements_in(file: Rows) -> Measurements:
             y[:, found.index(int(m[1])), "xyz".index(m[2])] = file.number(
                 name, unit=m[3], empty=True
             )
-    columns: dict[str, Array] = {}
-    unknown: dict[str, Array] = {}
-    idle = useless(header)
-    for name in header:
-        kind, match = optional_kind(name)
-        if name in idle:
-            unknown[name] = np.array(file.text(name))
-        elif kind in TEXT:
-            columns[name] = np.array(file.text(name))
-        elif match:
-            unit = match[1] if match.re.groups else ""
-            stem = name.removesuffix(f"_{unit}")
-            columns[stem] = file.number(name, unit=unit, empty=True)
-        elif not JOINT.fullmatch(name) and not TARGET.fullmatch(name):
-            unknown[name] = np.array(file.text(name))
-    why = {name: f": {idle[name]}" if name in idle else near(name) for name in unknown}
-    notices = [f"{path}: column {name} is not used{why[name]}" for name in unknown]
+    columns, unused = file.optional(NAMED, U95)
+    named = [name for name in header if NAMED.fullmatch(name)]  # by import
+    unknown = {name: np.array(file.text(name)) for name in (*unused, *named)}
+    notices = [f"{path}: column {name} is not used{why}" for name, why in unused.items()]
     data = Measurements(
         q=q,
         y=y,
@@ -359,15 +352,22 @@ def measurements_in(file: Rows) -> Measurements:
         simulated=file.simulated,
     )
     data = check_finite(data)
-    blind = np.asarray(~data.seen.any(axis=1))
-    if blind.any():
-        notices.append(f"{path}: {blind.sum()} rows hold no measured target and are left out")
-    again, said = pasted(file, ~blind)
-    data = replace(data.take(~blind & ~again), notices=(*data.notices, *notices, *said))
+    again, said = pasted(file, np.asarray(data.seen.any(axis=1)))
+    data = without_blind(replace(data, notices=(*data.notices, *notices)), again)
+    data = replace(data, notices=(*data.notices, *said))
     from minimax_cal.measuring.set_aside import from_column  # which makes measurements itself
     from minimax_cal.measuring.tools import by_tool
 
     return from_column(by_tool(data))
+
+
+def without_blind(data: Measurements, again: Array) -> Measurements:
+    """The rows that hold a measured target, without others.  again: (m,) those others."""
+    blind = np.asarray(~data.seen.any(axis=1))
+    if blind.any():
+        said = f"{data.source}: {blind.sum()} rows hold no measured target and are left out"
+        data = replace(data, notices=(*data.notices, said))
+    return data.take(~blind & ~again)
 
 
 def pasted(file: Rows, kept: Array) -> tuple[Array, list[str]]:
@@ -376,13 +376,14 @@ def pasted(file: Rows, kept: Array) -> tuple[Array, list[str]]:
     Nothing is measured twice to the last digit; as repeats they would tell of no noise at all.
     kept: (m,) rows that count.
     """
-    first: dict[tuple[str, ...], int] = {}
-    source = np.array([first.setdefault(row, i) for i, row in enumerate(file.rows)])
+    first: dict[Sequence[str], int] = {}
+    rows = file.rows.lines if isinstance(file.rows, Lines) else file.rows
+    source = np.array([first.setdefault(row, i) for i, row in enumerate(rows)])
     again = (source < np.arange(len(source))) & kept
-    rows = np.flatnonzero(again)
-    if not len(rows):
+    at = np.flatnonzero(again)
+    if not len(at):
         return again, []
-    runs = np.split(rows, 1 + np.flatnonzero((np.diff(rows) != 1) | (np.diff(source[rows]) != 1)))
+    runs = np.split(at, 1 + np.flatnonzero((np.diff(at) != 1) | (np.diff(source[at]) != 1)))
     told = [repeated(file, run, source[run]) for run in runs[:5]]
     more = f", and {len(runs) - 5} more places" if len(runs) > 5 else ""
     return again, [
@@ -445,11 +446,8 @@ def measurements_text(data: Measurements) -> str:
 
 def file_column(stem: str) -> tuple[str, float]:
     """Name with its unit, and the factor from SI, of an optional column."""
-    exact = {"time": "_s", "temperature": "_C", "payload": "_kg"}
-    if stem == "u95" or re.fullmatch(r"base\d+_[xyz]|payload_[xyz]", stem):
-        return f"{stem}_mm", 1e3
-    if re.fullmatch(r"tau\d+", stem):
-        return f"{stem}_Nm", 1.0
-    if re.fullmatch(r"qread\d+|rotation_u95", stem):
+    if stem == "rotation_u95":
         return f"{stem}_rad", 1.0
-    return stem + exact.get(stem, ""), 1.0
+    for unit in OWN[kind].units[:1] if (kind := kind_of(stem)) else ():
+        return f"{stem}_{unit}", 1.0 / UNITS.get(unit, 1.0)
+    return stem, 1.0

@@ -13,8 +13,8 @@ from minimax_cal.ground.errors import DataError, said
 from minimax_cal.ground.files import numbers, plain
 from minimax_cal.measuring.history import numbered, visits
 from minimax_cal.measuring.measurements import Measurements, measurements
+from minimax_cal.reading.rows import TEXT
 
-LABELS = ("pose", "session", "group")  # columns of text; all others hold numbers, in SI
 TOLD = ("split", "order")  # columns that stand under names of their own
 
 
@@ -26,7 +26,7 @@ def pose_rows(data: Measurements, held: Array, errors: Mapping[str, Array]) -> d
     place = np.empty(data.poses, dtype=int)
     place[visits(data)] = np.arange(1, data.poses + 1)
     columns = {
-        name: column if name in LABELS else column.astype(float)
+        name: column if name in TEXT else column.astype(float)
         for name, column in data.columns.items()
         if name not in TOLD
     }
@@ -51,7 +51,7 @@ def read_poses(content: Mapping[str, Any], source: str) -> tuple[Measurements, A
     """Measurements and (m,) which are held out, from `pose_rows`.  Raises DataError."""
     try:
         columns = {
-            name: np.array(column) if name in LABELS else numbers(column)
+            name: np.array(column) if name in TEXT else numbers(column)
             for name, column in content["columns"].items()
         }
         if content.get("visits_told", True):

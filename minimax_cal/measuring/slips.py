@@ -22,6 +22,21 @@ INCH = 25.4
 LATE = {1: "one row", 2: "two rows", 3: "three rows"}
 NAMED = 12  # lines that a message names
 STILL = 0.01  # a flange that moved farther leaves no point where it was [m]
+DEGREE = np.pi / 180.0
+OF_ROBOT = "(or the robot file gives {} under the unit {})"
+INCHES = "the points look like inches given as {}: minimax-cal import {{}} --units smr=in -o "
+SCALED = (  # what to say, and by what to multiply turning joints and points
+    ("the joint values look like degrees; name the columns q1_deg, q2_deg, ...", DEGREE, 1.0),
+    ("the joint values look like radians; name the columns q1_rad, q2_rad, ...", 1 / DEGREE, 1.0),
+    ("the points look like millimetres given as metres: name the columns smr1_x_mm, ... "
+     + OF_ROBOT.format("metres", "mm"), 1.0, 1e-3),
+    ("the points look like metres given as millimetres: name the columns smr1_x_m, ... "
+     + OF_ROBOT.format("millimetres", "m"), 1.0, 1e3),
+    (INCHES.format("mm") + "mended.csv", 1.0, INCH),
+    (INCHES.format("m") + "mended.csv", 1.0, 1e-3 * INCH),
+    ("the lengths of the robot file look like inches given as mm: multiply them by 25.4",
+     1.0, 1.0 / INCH),
+)  # fmt: skip
 DIGITS = {  # of joint values with so few, the step in rad and what to say
     "whole degrees": np.pi / 180.0,
     "tenths of a degree": np.pi / 1800.0,
@@ -94,35 +109,9 @@ def left_out_by(data: Measurements, rows: Array) -> str:
 
 def of_units(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:
     """Angles and lengths in another unit than they say."""
-    turning, factor = ~robot.prismatic, np.pi / 180.0
-    yield (
-        "the joint values look like degrees; name the columns q1_deg, q2_deg, ...",
-        replace(data, q=np.where(turning, data.q * factor, data.q)),
-    )
-    yield (
-        "the joint values look like radians; name the columns q1_rad, q2_rad, ...",
-        replace(data, q=np.where(turning, data.q / factor, data.q)),
-    )
-    yield (
-        "the points look like millimetres given as metres: name the columns smr1_x_mm, ... (or the "
-        "robot file gives metres under the unit mm)",
-        data.with_y(data.y * 1e-3),
-    )
-    yield (
-        "the points look like metres given as millimetres: name the columns smr1_x_m, ... (or the "
-        "robot file gives millimetres under the unit m)",
-        data.with_y(data.y * 1e3),
-    )
-    for power, unit in ((INCH, "mm"), (1e-3 * INCH, "m")):
-        yield (
-            f"the points look like inches given as {unit}: "
-            f"minimax-cal import {data.source} --units smr=in -o mended.csv",
-            data.with_y(data.y * power),
-        )
-    yield (
-        "the lengths of the robot file look like inches given as mm: multiply them by 25.4",
-        data.with_y(data.y / INCH),
-    )
+    for text, turned, scaled in SCALED:
+        q = np.where(robot.prismatic, data.q, data.q * turned)
+        yield text.format(data.source), replace(data, q=q, y=data.y * scaled)
 
 
 def of_rows(data: Measurements) -> Iterator[tuple[str, Measurements]]:
@@ -144,22 +133,21 @@ def of_rows(data: Measurements) -> Iterator[tuple[str, Measurements]]:
 
 def of_columns(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:
     """Joint columns that stand under each other's names."""
-    n = robot.joints
+    joints = list(range(robot.joints))
     orders = []
-    for i, j in combinations(range(n), 2):
-        order = list(range(n))
+    for i, j in combinations(joints, 2):
+        order = joints.copy()
         order[i], order[j] = j, i
         orders.append((f"columns of joints {i + 1} and {j + 1} look swapped", order))
-    if n > 3:
-        orders.append(("joint columns look like those of the joints in reverse order",
-                       list(range(n))[::-1]))  # fmt: skip
+    if len(joints) > 3:
+        orders.append(
+            ("joint columns look like those of the joints in reverse order", joints[::-1])
+        )
     for text, order in orders:
         if np.array_equal(data.sliding[order], data.sliding):
             names = ":".join(str(i + 1) for i in order)
-            yield (
-                f"the {text}; {mend_by(data, f'joints={names}')}",
-                with_joints_ordered(data, order),
-            )
+            mended = with_joints_ordered(data, order)
+            yield f"the {text}; {mend_by(data, f'joints={names}')}", mended
 
 
 def in_other_convention(robot: Robot) -> Robot | None:

@@ -44,7 +44,7 @@ def by_pose(robot: Robot, q: Array, arm: Array) -> tuple[Array, Array]:
         own = angle[:, j, None]
         waves = [own * np.arange(1, OWN + 1), others, others + own, others - own]
         phase = np.concatenate(waves, axis=1)
-        pull = load[:, j, None] / size if size > 0.0 else np.zeros((len(q), 0))
+        pull = load[:, j, None] / (size or 1.0)
         functions = np.concatenate([np.sin(phase), np.cos(phase), pull], axis=1)
         columns.append(UNIT * unit[j] * arm[:, :, j, None] * functions[:, None, :])
         driven = np.repeat([OF_ITSELF, *[OF_OTHERS] * 3], [part.shape[1] for part in waves])

@@ -26,7 +26,7 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.least_squares import solve_normal
 
 HEAVIEST = 100.0  # no u95 counts as more than so many times better than the typical one
-TARGET = "target"  # the one point on the flange of `arm_at`
+TARGET = "target"  # the one point on the flange of an arm that has no other
 BLOCK = 768  # points a block: its Jacobian then fits the second-level cache
 
 
@@ -514,17 +514,8 @@ class Columns:
 
 
 def model_of(robot: Robot, data: Measurements) -> Model:
-    """The model of a robot at the measured poses, all parameters free, no prior.
-
-    Points are weighted by (typical u95 / u95)^2 where the data have a `u95` column.
-    """
+    """The model of a robot at the measured poses, all parameters free, no prior."""
     seen = data.seen.T
-    weight = seen.astype(float)
-    if "u95" in data.columns:
-        u95 = data.columns["u95"]
-        usual = np.nanmedian(u95)
-        least = usual / HEAVIEST  # a slip of the pen must not turn the fit into one pose's
-        weight = weight * np.where(np.isfinite(u95), (usual / np.maximum(u95, least)) ** 2, 1.0)
     names = Names.of(robot, data.target_names)
     mean = np.zeros(names.count)
     mean[names.links] = links_of(robot.mdh)
@@ -532,27 +523,25 @@ def model_of(robot: Robot, data: Measurements) -> Model:
         q=robot.turned(data.q),
         prismatic=robot.prismatic,
         y=np.where(seen[:, None], np.moveaxis(data.y, 0, 2), 0.0),
-        weight=weight,
+        weight=point_weights(data),
         names=names,
         active=np.ones(names.count, dtype=bool),
         prior=Prior(mean, np.zeros(names.count)),
     )
 
 
-def arm_at(robot: Robot, q: Array) -> Model:
-    """The arm with one point on its flange at joint values (m, n), as the controller gives them."""
-    names = Names.of(robot, (TARGET,))
-    mean = np.zeros(names.count)
-    mean[names.links] = links_of(robot.mdh)
-    return Model(
-        q=robot.turned(q),
-        prismatic=robot.prismatic,
-        y=np.zeros((1, 3, len(q))),
-        weight=np.ones((1, len(q))),
-        names=names,
-        active=np.ones(names.count, dtype=bool),
-        prior=Prior(mean, np.zeros(names.count)),
-    )
+def point_weights(data: Measurements) -> Array:
+    """(k, m) weights of points, (typical u95 / u95)^2 where the data have a `u95` column.
+
+    0 where a target was not measured.
+    """
+    weight = data.seen.T.astype(float)
+    if "u95" not in data.columns:
+        return weight
+    u95 = data.columns["u95"]
+    usual = np.nanmedian(u95)
+    least = usual / HEAVIEST  # a slip of the pen must not turn the fit into one pose's
+    return weight * np.where(np.isfinite(u95), (usual / np.maximum(u95, least)) ** 2, 1.0)
 
 
 def pose_weights(data: Measurements, lever: float | None = None) -> Array:

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.instruments.pixel_result import PixelCalibration
 from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, Camera, read_camera
 from minimax_cal.fitting.pixels.data import read_board
 from minimax_cal.fitting.pixels.judge import everywhere
 from minimax_cal.fitting.pixels.options import PixelOptions
+from minimax_cal.fitting.several.pixel_result import PixelCalibration
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import plain, saved_content

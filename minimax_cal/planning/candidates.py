@@ -17,6 +17,9 @@ from minimax_cal.robots.ranges import SLIDE, near_zero
 from minimax_cal.robots.robot import Robot
 
 Conditions = Mapping[str, Condition]
+# kept free at a limit of the robot [rad, m], at most that share of the range: corrected targets and
+# the arm that is not as drawn go beyond the pose that was planned
+MARGIN_TURN, MARGIN_SLIDE, MARGIN_SHARE = np.radians(2.0), 0.005, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +63,8 @@ def limits_of(
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """(n,) lower and upper limits [rad, m], and a notice where the robot file has none.
 
-    A joint turns at most once round; one without limits as far as it went in the poses at hand.
+    A joint turns at most once round, and keeps a margin to the robot's limits; one without limits
+    goes as far as it went in the poses at hand.
     narrow: limits by joint index that cut these.  measured: poses at hand.  Raises OptionError.
     """
     most = np.where(robot.prismatic, SLIDE, np.pi)
@@ -72,6 +76,10 @@ def limits_of(
     lower = np.where(np.isfinite(robot.lower), robot.lower, np.where(went, least, -most))
     upper = np.where(np.isfinite(robot.upper), robot.upper, np.where(went, largest, most))
     lower, upper = near_zero(lower, upper, np.where(known & ~robot.prismatic, np.pi, np.inf))
+    margin = np.where(robot.prismatic, MARGIN_SLIDE, MARGIN_TURN)
+    margin = np.minimum(margin, MARGIN_SHARE * (upper - lower))
+    lower = np.maximum(lower, robot.lower + margin)
+    upper = np.minimum(upper, robot.upper - margin)
     for joint, (low, high) in narrow.items():
         lower[joint], upper[joint] = max(lower[joint], low), min(upper[joint], high)
         if not lower[joint] < upper[joint]:

@@ -1,89 +1,87 @@
-"""A robot's data sheet as CSV: a row a joint, units in the header, as the file schema has it.
+"""A robot's data sheet as a table: a row a joint, units in the header, as the file schema has it.
 
-The convention is in a column `convention`, in a comment above the header (``# convention:
-modified``), or in Craig's own names (``a_i-1``, ``alpha(i-1)``): what it is cannot be guessed.
+The convention is in a column `convention`, in a line above the header (``# convention: modified``),
+or in Craig's own names (``a_i-1``, ``alpha(i-1)``): what it is cannot be guessed.
 """
 
 from __future__ import annotations
 
-import csv
 import difflib
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from minimax_cal.ground.errors import RobotError
+from minimax_cal.ground.errors import DataError, RobotError
+from minimax_cal.reading.sheet import cut, number_of, open_text
+from minimax_cal.reading.words import folded, split_unit
 
 LENGTHS, ANGLES = ("mm", "m"), ("deg", "rad")
-UNITS = {"mm": "mm", "m": "m", "deg": "deg", "°": "deg", "degree": "deg", "rad": "rad"}
-NAMES = {  # of a header's cell, small letters: the schema's key
-    "angle offset": "offset",
-    "min": "lower", "max": "upper", "type": "type", "joint type": "type", "name": "name",
-    "joint": "", "i": "", "link": "", "axis": "", "no": "", "no.": "", "j": "", "convention": "",
+COLUMNS = ("convention", "konvention")  # that say it in each row
+COUNTED = ("joint", "i", "link", "axis", "no", "no.", "j", "gelenk", "achse", "nr", "nr.", "glied",
+           "axe", "articulation", "eje", "articulacion", "\u5173\u8282", "\u8f74")  # fmt: skip
+NAMES = dict.fromkeys((*COUNTED, *COLUMNS), "") | {  # of a header's cell, folded: the schema's key
+    "angle offset": "offset", "versatz": "offset", "vorzeichen": "sign", "mass": "mass_kg",
+    "min": "lower", "max": "upper", "untergrenze": "lower", "obergrenze": "upper",
+    "joint type": "type", "typ": "type", "bezeichnung": "name", "masse": "mass_kg",
 }  # fmt: skip
 KEYS = ("a", "d", "theta", "alpha", "beta", "offset", "sign", "lower", "upper", "ratio", "mass_kg")
 TYPES = {"r": "revolute", "rotation": "revolute", "rotary": "revolute", "p": "prismatic"}
 TYPES |= {"linear": "prismatic", "revolute": "revolute", "prismatic": "prismatic"}
-STATED = re.compile(r"[#%]\s*convention\s*[:=]\s*(\w+)", re.IGNORECASE)
+STATED = r"[#%]?\s*(?:{})\s*[:=;,\t]\s*(.*\w[.)]*)"  # of a line above the header
+CONVENTION, NAME = (re.compile(STATED.format(w), re.I) for w in ("[ck]onvention", "name|robot"))
 GREEK = str.maketrans({"\u03b1": "alpha", "\u03b2": "beta", "\u03b8": "theta"})
 BEFORE = re.compile(r"(a|alpha)\s*[_ ]?[({\[]?\s*i\s*-\s*1\s*[)}\]]?")  # Craig's a_(i-1)
 OF_ROW = re.compile(r"(a|d|theta|alpha)\s*[_ ]?[({\[]?\s*i\s*[)}\]]?")
 
 
-def content_of(path: Path, text: str) -> dict[str, Any]:
+def content_of(path: Path) -> dict[str, Any]:
     """The robot in the file schema.  Raises RobotError."""
-    lines = list(enumerate(text.lstrip("\ufeff").splitlines(), 1))
-    stated = [found[1] for _, line in lines if (found := STATED.match(line.strip()))]
-    rows = [(n, line) for n, line in lines if line.strip(" ,;\t") and line.strip()[0] not in "#%"]
-    if len(rows) < 2:
-        raise RobotError(f"{path}: holds no links; expected a header and a row for each joint")
-    header = rows[0][1]
-    mark = next((m for m in (";", "\t") if m in header), ",")
-    names = [cell.strip() for cell in next(csv.reader([header], delimiter=mark))]
-    known = [key_of(path, name) for name in names]
-    twice = [key for key, *_ in known if key and [k for k, *_ in known].count(key) > 1]
-    if twice:
-        raise RobotError(f"{path}:{rows[0][0]}: column {twice[0]} stands twice; keep one of them")
-    lacking = [key for key in ("a", "d", "theta", "alpha") if key not in [k for k, *_ in known]]
-    if lacking:
+    try:
+        sheet = cut(open_text(path), remarks=False)
+    except DataError as error:
+        raise RobotError(str(error)) from error
+    known = [key_of(path, name) for name in sheet.header]
+    keys = [key for key, *_ in known]
+    if twice := [key for key in keys if key and keys.count(key) > 1]:
+        raise RobotError(f"{path}: column {twice[0]} stands twice; keep one of them")
+    if lacking := [key for key in ("a", "d", "theta", "alpha") if key not in keys]:
         raise RobotError(
-            f"{path}:{rows[0][0]}: no column {lacking[0]}; expected a_mm, d_mm, theta_deg, "
-            "alpha_deg, one row a joint"
+            f"{path}: no column {lacking[0]}; expected a_mm, d_mm, theta_deg, alpha_deg, one row a "
+            "joint"
         )
-    units = {
-        "length": unit_of(path, known, LENGTHS, ("a", "d")),
-        "angle": unit_of(path, known, ANGLES, ("theta", "alpha", "beta")),
-    }
-    joints, told = [], list(stated)
-    for number, line in rows[1:]:
-        cells = [cell.strip() for cell in next(csv.reader([line], delimiter=mark))]
-        if len(cells) < len(names):
-            raise RobotError(f"{path}:{number}: {len(cells)} cells, the header has {len(names)}")
-        joint = {}
-        for name, (key, *_), cell in zip(names, known, cells, strict=False):
-            if name.lower() == "convention" and cell:
-                told.append(cell)
-            elif key and cell:
-                joint[key] = value_of(path, number, key, cell, decimal_comma=mark != ",")
-        joints.append(joint)
+    above = [line.strip() for line in sheet.text.splitlines()[: int(sheet.line[0]) - 1]]
+    told, names = ([m[1] for line in above if (m := p.match(line))] for p in (CONVENTION, NAME))
+    at = [i for i, name in enumerate(sheet.header) if folded(name) in COLUMNS]
+    told += [row[i] for row in sheet.cells for i in at if row[i]]
     told += ["modified"] * any(craig for *_, craig in known)
-    return {"name": path.stem, "convention": one_of(path, told), "units": units, "joints": joints}
+    return {
+        "name": names[0] if names else path.stem,
+        "convention": one_of(path, told),
+        "units": {
+            "length": unit_of(path, known, LENGTHS, ("a", "d")),
+            "angle": unit_of(path, known, ANGLES, ("theta", "alpha", "beta")),
+        },
+        "joints": [
+            {
+                key: value_of(f"{path}:{line}: ", key, cell, sheet.decimal)
+                for key, cell in zip(keys, row, strict=True)
+                if key and cell
+            }
+            for line, row in zip(sheet.line, sheet.cells, strict=True)
+        ],
+    }
 
 
 def key_of(path: Path, name: str) -> tuple[str, str, bool]:
     """The schema's key of a header's cell, its unit, and whether it is one of Craig's names."""
-    stem, unit = name.strip().lower().translate(GREEK), ""
-    if found := re.fullmatch(r"(.*?)[\s_]*[\[(]([^\])]*)[\])]", stem):
-        if found[2] in UNITS:
-            stem, unit = found[1].strip(), UNITS[found[2]]
-    elif (found := re.fullmatch(r"(.+)[\s_](\S+)", stem)) and found[2] in UNITS:
-        stem, unit = found[1].strip(), UNITS[found[2]]
+    stem, unit = split_unit(name)
+    stem = folded(stem.translate(GREEK))
     craig = bool(found := BEFORE.fullmatch(stem))
     if found or (found := OF_ROW.fullmatch(stem)):
         stem = found[1]
     key = NAMES.get(stem, stem)
-    if key and key not in (*KEYS, "type", "name"):
+    if unit not in ("", "kg", *LENGTHS, *ANGLES) or (key and key not in (*KEYS, "type", "name")):
         (near,) = difflib.get_close_matches(key, KEYS, 1, cutoff=0.0)
         raise RobotError(f"{path}: unknown column {name!r}; did you mean {near}?")
     return key, unit, craig
@@ -100,24 +98,23 @@ def unit_of(
     raise RobotError(f"{path}: one unit for {' and '.join(keys[:2])}, please: {example}")
 
 
-def value_of(path: Path, line: int, key: str, cell: str, *, decimal_comma: bool) -> object:
+def value_of(where: str, key: str, cell: str, decimal: str) -> object:
     """A cell as the schema has it.  Raises RobotError."""
     if key == "name":
         return cell
     if key == "type":
         if cell.lower() not in TYPES:
-            raise RobotError(f"{path}:{line}: type {cell!r}; write revolute or prismatic")
+            raise RobotError(f"{where}type {cell!r}; write revolute or prismatic")
         return TYPES[cell.lower()]
-    try:
-        value = float(cell.replace(",", ".") if decimal_comma else cell)
-    except ValueError:
-        raise RobotError(f"{path}:{line}: column {key}: {cell!r} is not a number") from None
+    value = number_of(cell.replace(decimal, "."))
+    if value != value:
+        raise RobotError(f"{where}column {key}: {cell!r} is not a number")
     return int(value) if key == "sign" and value in (1.0, -1.0) else value
 
 
 def one_of(path: Path, told: Sequence[str]) -> str:
     """The convention, if the file says one.  Raises RobotError."""
-    found = list(dict.fromkeys(word.lower() for word in told))
+    found = list(dict.fromkeys(folded(word).replace("modifiziert", "modified") for word in told))
     if len(found) == 1:
         return found[0]
     if found:

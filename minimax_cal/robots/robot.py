@@ -1,4 +1,4 @@
-"""A robot: nominal or calibrated geometry, limits, masses; JSON, TOML, YAML, URDF in, JSON out."""
+"""A robot: nominal or calibrated geometry, limits, masses; a table, URDF or MJCF in, JSON out."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning, RobotError
 from minimax_cal.ground.files import json_text, once, read_text, write_whole
 from minimax_cal.ground.units import in_mm
+from minimax_cal.reading.workbook import SUFFIXES
 from minimax_cal.robots import couplings, kinematics, notation
 from minimax_cal.robots.angle_units import check_angles, check_limits
 from minimax_cal.robots.inverse import NEAR, at_poses, missing, nearest
@@ -549,12 +550,13 @@ PARSERS: dict[str, tuple[Callable[[str], Any], type[Exception]]] = {
 
 
 def load_robot(source: Robot | Path | str) -> Robot:
-    """A built-in robot by name, or a robot file (.json, .toml, .yaml, .csv, .urdf).
+    """A built-in robot by name, or a file (.json, .toml, .yaml, .csv, .xlsx, .urdf, MJCF .xml).
 
     Parameters
     ----------
     source
-        Name or path; ``robot.urdf#link`` names the last link of a chain.  A robot stays as it is.
+        Name or path; ``robot.urdf#tip`` or ``robot.xml#root:tip`` name the ends of a chain.  A
+        robot stays as it is.
 
     Returns
     -------
@@ -573,17 +575,18 @@ def load_robot(source: Robot | Path | str) -> Robot:
     if isinstance(source, Robot) or str(source) in builtin_robots():
         return source if isinstance(source, Robot) else builtin_robot(str(source))
     path = Path(source)
-    from minimax_cal.robots.urdf import is_urdf, load_urdf  # not for a built-in robot
+    from minimax_cal.robots.urdf import has_links, load_urdf  # not for a built-in robot
 
-    if is_urdf(source):
+    if has_links(source):
         return robot_from_dict(load_urdf(source).content, str(source))
-    if path.suffix.lower() == ".csv":
+    if path.suffix.lower() in (".csv", *SUFFIXES):
         from minimax_cal.robots.data_sheet import content_of  # few robots come as one
 
-        return robot_from_dict(content_of(path, read_text(path, kind=RobotError)), str(path))
+        return robot_from_dict(content_of(path), str(path))
     if path.suffix.lower() not in PARSERS:
         if len(str(source)) < 200 and path.exists():
-            raise RobotError(f"{path}: not a robot file; use {', '.join(PARSERS)}, .csv, .urdf")
+            use = ", ".join((*PARSERS, ".csv, .xlsx, .urdf, .xml"))
+            raise RobotError(f"{path}: not a robot file; use {use}")
         near = difflib.get_close_matches(str(source), builtin_robots(), 1)
         hint = f"did you mean {near[0]!r}?" if near else f"built in: {', '.join(builtin_robots())}"
         raise RobotError(f"no robot called {str(source)[:60]!r}; {hint}, or give a robot file")

@@ -1,4 +1,4 @@
-"""URDF in: any serial chain of it, as links ``Rz Tz Tx Rx Ry`` of our convention."""
+"""URDF and MJCF in: any serial chain of it, as links ``Rz Tz Tx Rx Ry`` of our convention."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
+from minimax_cal.ground.files import read_raw
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.ranges import near_zero
 from minimax_cal.robots.transforms import (
@@ -23,10 +24,10 @@ from minimax_cal.robots.transforms import (
     link_to_tip,
     transform,
 )
-from minimax_cal.robots.urdf_file import Joint, Urdf, read_urdf
+from minimax_cal.robots.urdf_file import MOVING, Joint, Urdf, parse_xml, read_urdf
 
 EXACT = 1e-9  # forward kinematics must agree to this [m, rad]
-TIPS = ("tool0", "flange")  # of several frames on the last moving body, the one that is meant
+TIPS = ("tool0", "flange", "attachment_site")  # how the frame that is meant ends, of several
 MODELS = (".xml", ".mjcf")  # files of a simulator's own model
 
 
@@ -48,41 +49,77 @@ class UrdfRobot:
 
 
 def chain_to(urdf: Urdf, tip: str = "") -> tuple[Joint, ...]:
-    """The joints from the root to the tip, or to the only end there is.  Raises RobotError.
+    """The joints to the tip, or to the only end there is; ``root:tip`` names both ends.
 
-    Ends on a body that carries a longer chain do not count (a camera at the elbow).  Several ends
-    on one moving body differ by a constant: `tool0` or `flange` is taken, else the body's link.
+    Without a root, from the last joint before the tip that floats, else from the file's root.
+    Raises RobotError.
     """
     links = {urdf.root, *(joint.child for joint in urdf.joints)}
-    leaves = [name for name in sorted(links) if not urdf.from_link(name)]
-    if tip and tip not in links:
-        raise RobotError(f"{urdf.source}: no link {tip!r}; its ends are {', '.join(leaves)}")
-    ends = {leaf: [j for j in urdf.to_link(leaf) if j.moves] for leaf in leaves}
-    inner = [moving[:i] for moving in ends.values() for i in range(len(moving))]
-    ends = {leaf: moving for leaf, moving in ends.items() if moving not in inner and moving}
-    if not ends:
-        raise RobotError(f"{urdf.source}: has no revolute, continuous or prismatic joint")
-    if not tip:
-        bodies = {moving[-1].child for moving in ends.values()}
-        if len(bodies) > 1:
-            raise RobotError(
-                f"{urdf.source}: several chains: they end in {', '.join(ends)}; name the last "
-                f"link, as {Path(urdf.source).name}#{next(iter(ends))} or with tip="
-            )
-        named = [name for name in TIPS if name in links and len(urdf.to_link(name)) and
-                 [j for j in urdf.to_link(name) if j.moves] in list(ends.values())]  # fmt: skip
-        tip = next(iter(ends)) if len(ends) == 1 else [*named, *bodies][0]
-    chain = urdf.to_link(tip)
+    root, _, last = ("", "", tip) if tip in links else tip.rpartition(":")
+    for name in (root, last):
+        if name and name not in links:
+            leaves = sorted(name for name in links if not urdf.from_link(name))
+            raise RobotError(f"{urdf.source}: no link {name!r}; its ends are {', '.join(leaves)}")
+    last = last or only_tip(urdf, sorted(links), root)
+    chain = urdf.to_link(last)
+    starts = [joint.parent for joint in chain]
+    if root and root not in starts:
+        raise RobotError(f"{urdf.source}: link {last!r} does not hang on {root!r}")
+    behind = [i + 1 for i, joint in enumerate(chain) if joint.kind not in (*MOVING, "fixed")]
+    chain = chain[starts.index(root) if root else max(behind, default=0) :]
     for joint in chain:
-        if joint.kind in ("floating", "planar"):
+        if joint.kind not in (*MOVING, "fixed"):
             raise RobotError(
-                f"{urdf.source}:{joint.element.line}: joint {joint.name!r} on the way to {tip!r} "
+                f"{urdf.source}:{joint.element.line}: joint {joint.name!r} on the way to {last!r} "
                 f"is {joint.kind}; only revolute, continuous, prismatic and fixed joints are "
                 "supported"
             )
     if not any(joint.moves for joint in chain):
-        raise RobotError(f"{urdf.source}: no moving joint leads to {tip!r}")
+        raise RobotError(f"{urdf.source}: no moving joint leads to {last!r}")
     return chain
+
+
+def only_tip(urdf: Urdf, links: Sequence[str], root: str) -> str:
+    """The end of the only chain, beyond a root if one is named.  Raises RobotError for several.
+
+    Ends on a body that carries a longer chain do not count (a camera at the elbow), nor what hangs
+    on more joints in common with another end than of its own (a gripper's finger).  Of several
+    links on the last moving body, `tool0` or `flange` is taken, else the one where they part.
+    """
+    ways = {name: urdf.to_link(name) for name in links}
+    if root:
+        ways = {name: way for name, way in ways.items() if root in [j.parent for j in way]}
+    moving = {name: [j.name for j in way if j.moves] for name, way in ways.items()}
+    leaves = [name for name in ways if not urdf.from_link(name)]
+    ends = {leaf: without_fingers(moving[leaf], [moving[one] for one in leaves]) for leaf in leaves}
+    inner = [end[:i] for end in ends.values() for i in range(len(end))]
+    tips: list[str] = []
+    for end in {tuple(end): end for end in ends.values() if end and end not in inner}.values():
+        beyond = [ways[leaf] for leaf in leaves if moving[leaf][: len(end)] == end]
+        shared = [same[0].child for same in zip(*beyond, strict=False) if len(set(same)) == 1]
+        named = [n for word in TIPS for n in ways if n.endswith(word) and moving[n] == end]
+        tips.append(shared[-1] if len(beyond) == 1 else [*named, shared[-1]][0])
+    tips.sort(key=lambda name: not name.endswith(TIPS))
+    if len(tips) > 1:
+        raise RobotError(
+            f"{urdf.source}: several chains: they end in {', '.join(tips)}; name the last "
+            f"link, as {Path(urdf.source).name}#{tips[0]} or with tip="
+        )
+    if not tips:
+        held = [j for j in urdf.joints if j.kind != j.element.attributes.get("type", j.kind)]
+        only = " that its limits (lower = upper) do not hold" if held else ""
+        raise RobotError(f"{urdf.source}: has no revolute, continuous or prismatic joint{only}")
+    return tips[0]
+
+
+def without_fingers(end: list[str], others: Sequence[list[str]]) -> list[str]:
+    """The moving joints to an end, to where a gripper begins if it is a finger of one."""
+    cuts = [len(end)]
+    for other in others:
+        same = [one == two for one, two in zip(end, other, strict=False)]
+        if not all(same) and 2 * same.index(False) > len(end):
+            cuts.append(same.index(False))
+    return end[: min(cuts)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +190,8 @@ def random_joints(lower: Array, upper: Array, count: int = 60) -> Array:
 def to_robot(urdf: Urdf, tip: str = "") -> UrdfRobot:
     """A chain of a URDF as a robot, checked by forward kinematics.  Raises RobotError."""
     chain = chain_to(urdf, tip)
-    frames = rest_frames(urdf, urdf.root, np.eye(4), moving=True)
+    start = rest_frames(urdf, urdf.root, np.eye(4), moving=True)[chain[0].parent]
+    frames = rest_frames(urdf, chain[0].parent, np.eye(4), moving=True)
     moving = [joint for joint in chain if joint.moves]
     sign = np.array([-1.0 if joint.axis[np.abs(joint.axis).argmax()] < 0 else 1.0
                      for joint in moving])  # fmt: skip
@@ -196,7 +234,7 @@ def to_robot(urdf: Urdf, tip: str = "") -> UrdfRobot:
     content = {
         "name": urdf.name,
         "units": {"length": "m", "angle": "rad"},
-        "up": base[2, :3].tolist(),
+        "up": (base[:3, :3].T @ start[:3, :3].T @ urdf.up).tolist(),
         "joints": joints,
         **({"coupling": follow.ratio.tolist()} if any(j.mimic for j in moving) else {}),
     }
@@ -251,7 +289,9 @@ def joint_content(
 
 def left_out(urdf: Urdf, chain: tuple[Joint, ...], base: Array, tool: Array) -> tuple[str, ...]:
     """What the robot does not hold, for people."""
-    out = []
+    out = [*urdf.notices]
+    if chain[0].parent != urdf.root:
+        out.append(f"{urdf.source}: the chain begins at {chain[0].parent!r}")
     for what, pose in (("base, in the root link", base), ("tip, in the last frame", tool)):
         if difference(pose, np.eye(4)) > SAME:
             at = ", ".join(f"{1e3 * v:.6g}" for v in pose[:3, 3])
@@ -266,13 +306,30 @@ def left_out(urdf: Urdf, chain: tuple[Joint, ...], base: Array, tool: Array) -> 
 
 
 def load_urdf(source: Path | str) -> UrdfRobot:
-    """A robot of a URDF file; ``robot.urdf#link`` names the last link.  Raises RobotError."""
+    """A robot of a URDF or MJCF; ``FILE#tip`` names the last link, ``FILE#root:tip`` both ends.
+
+    Raises RobotError.
+    """
+    name, tip = ends_of(source)
+    is_plain = name.lower().endswith(".urdf")
+    if not is_plain and parse_xml(read_raw(name, kind=RobotError), name).tag != "robot":
+        from minimax_cal.robots.mjcf import read_mjcf  # few robots come as one
+
+        return to_robot(read_mjcf(name), tip)
+    return to_robot(read_urdf(name), tip)
+
+
+def ends_of(source: Path | str) -> tuple[str, str]:
+    """The file and the links that a robot's name means."""
     name, mark, tip = str(source).rpartition("#")
-    plain = not mark or Path(source).exists()
-    return to_robot(read_urdf(source)) if plain else to_robot(read_urdf(name), tip)
+    return (name, tip) if mark and not Path(source).exists() else (str(source), "")
 
 
 def is_urdf(source: Path | str) -> bool:
     """Whether a robot's name means a URDF file."""
-    name, mark, _ = str(source).rpartition("#")
-    return (name if mark else str(source)).lower().endswith(".urdf")
+    return ends_of(source)[0].lower().endswith(".urdf")
+
+
+def has_links(source: Path | str) -> bool:
+    """Whether a robot's name means a file of links and joints, a URDF or MJCF."""
+    return ends_of(source)[0].lower().endswith((".urdf", *MODELS))

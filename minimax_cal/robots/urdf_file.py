@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from xml.parsers import expat
 
@@ -22,6 +22,7 @@ from minimax_cal.robots.transforms import from_rpy, transform
 
 ASSUMED = "assumed"  # attribute of an <inertial> of ours whose mass nobody told
 MOVING = ("revolute", "continuous", "prismatic")
+UPRIGHT: Array = np.array([0.0, 0.0, 1.0])
 ATTRIBUTE = re.compile(rb"""([^\s=<>"']+)\s*=\s*("[^"]*"|'[^']*')""")
 
 
@@ -66,7 +67,7 @@ class Joint:
     lower: float
     upper: float
     mimic: Mimic | None
-    element: Element
+    element: Element = Element("joint", {}, 0, 0, 0)
 
     @property
     def moves(self) -> bool:
@@ -85,7 +86,7 @@ class Urdf:
     """A file.  masses: kg and centre of gravity in the link's frame [m], of links that have any.
 
     inertias: (3, 3) about the centre of gravity in the link's axes, of links that have any
-    [kg m^2].
+    [kg m^2].  up: (3,) vertical in the root.  notices: what of the file is not in it.
     """
 
     source: str
@@ -95,6 +96,8 @@ class Urdf:
     joints: tuple[Joint, ...]
     masses: Mapping[str, tuple[float, Array]]
     inertias: Mapping[str, Array] = field(default_factory=dict)
+    up: Array = field(default_factory=UPRIGHT.copy)
+    notices: tuple[str, ...] = ()
 
     def from_link(self, name: str) -> list[Joint]:
         """The joints that hang on a link."""
@@ -218,7 +221,7 @@ def numbers(
 
 
 def joint_of(element: Element, name: str, source: str) -> Joint:
-    """A <joint>."""
+    """A <joint>; one whose limits are the same number is fixed there."""
     where, ends = f"joint {name!r}", []
     for tag in ("parent", "child"):
         end = element.child(tag)
@@ -242,9 +245,9 @@ def joint_of(element: Element, name: str, source: str) -> Joint:
     if given and kind in ("revolute", "prismatic"):
         lower, upper = (float(numbers(limit, n, (0.0,), where, source)[0])
                         for n in ("lower", "upper"))  # fmt: skip
-        if lower >= upper:
-            raise RobotError(f"{source}:{element.line}: {where}: limit lower is not below upper")
-    return Joint(
+        if lower > upper:
+            raise RobotError(f"{source}:{element.line}: {where}: limit lower is above upper")
+    joint = Joint(
         name=name,
         kind=kind,
         parent=ends[0],
@@ -256,6 +259,10 @@ def joint_of(element: Element, name: str, source: str) -> Joint:
         mimic=mimic_of(element.child("mimic"), where, source),
         element=element,
     )
+    if lower < upper:
+        return joint
+    held = joint.motion(np.array([lower]))[0]
+    return replace(joint, kind="fixed", origin=origin @ held, mimic=None)
 
 
 def mimic_of(element: Element | None, where: str, source: str) -> Mimic | None:
@@ -310,6 +317,8 @@ def root_of(links: Mapping[str, Element], joints: tuple[Joint, ...], source: str
                 "closed chains are not supported"
             )
         parents[joint.child] = joint.parent
+    if not links:
+        raise RobotError(f"{source}: holds no <link>, so no robot")
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
         said = ", ".join(roots[:6]) or "none: the joints form a ring"

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,26 +14,15 @@ from minimax_cal.correcting.exporters.correct import match
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError, RobotError
 from minimax_cal.ground.files import json_of
-from minimax_cal.ground.optional import optional
+from minimax_cal.robots.mjcf import body_name, drives, is_driven, mujoco, tree_of, way_to
 from minimax_cal.robots.robot import Robot, robot_from_dict
-from minimax_cal.robots.transforms import inverse, transform
+from minimax_cal.robots.transforms import transform
 from minimax_cal.robots.urdf import UrdfRobot, to_robot
-from minimax_cal.robots.urdf_file import Element, Joint, Urdf
 
 ROBOT = "minimax_cal_robot"  # the text under which a file of ours holds its robot whole
-DRIVES_TENDON = 3  # mjTRN_TENDON
 SAME_ROBOT = 1e-6  # a file's own robot may differ from its bodies by no more [m, rad]
 Bodies = Sequence[int]
 SHORTEST = 1e-5  # timestep with which an arm comes to rest in seconds [s]
-LOG = logging.getLogger("minimax_cal")
-
-
-def mujoco() -> Any:
-    """The package, whose warnings would go to a file.  Raises OptionError without it."""
-    found = optional("mujoco", "a simulator's model", "minimax-cal[mujoco]")
-    if found.get_mju_user_warning() is None:
-        found.set_mju_user_warning(LOG.info)
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +101,8 @@ def chain_along(
     model: Any, joints: tuple[int, ...], source: str, *, unknown: bool = False
 ) -> Chain:
     """The arm of some joints (n,) of a model, by their ids from the foot.  Raises RobotError."""
-    seen = as_urdf(model, joints, source)
+    tip = body_name(model, int(model.jnt_bodyid[joints[-1]]))
+    seen = to_robot(tree_of(model, source, joints), tip)
     down = np.array(model.opt.gravity)
     size = float(np.linalg.norm(down))
     robot = robot_from_dict(seen.content, source)
@@ -151,18 +139,21 @@ def joints_of(model: Any, count: int, source: str, tip: str) -> tuple[int, ...]:
     Where more lie on the way, those that an actuator drives; of several the driven arm.
     """
     found: dict[tuple[int, ...], list[str]] = {}
+    tip = tip.rpartition(":")[2]
+    sites = {model.site(i).name: int(model.site_bodyid[i]) for i in range(model.nsite)}
+    tip = model.body(sites[tip]).name if tip in sites else tip
     for body in range(1, model.nbody):
         name = model.body(body).name
         if tip and name != tip:
             continue
         way = way_to(model, body)
         if len(way) > count:
-            way = tuple(j for j in way if driven(model, j))
+            way = tuple(j for j in way if is_driven(model, j))
         if len(way) == count:
             found.setdefault(way, []).append(name)
     if tip and not any(model.body(i).name == tip for i in range(model.nbody)):
         raise RobotError(f"{source}: has no body {tip!r}")
-    actuated = [way for way in found if all(driven(model, joint) for joint in way)]
+    actuated = [way for way in found if all(is_driven(model, joint) for joint in way)]
     if len(found) == 1 or len(actuated) == 1:
         return actuated[0] if actuated else next(iter(found))
     if not found:
@@ -173,31 +164,6 @@ def joints_of(model: Any, count: int, source: str, tip: str) -> tuple[int, ...]:
         )
     ends = ", ".join(names[0] or "a body without a name" for names in found.values())
     raise RobotError(f"{source}: several arms of {count} joints ({ends}); name a body as tip=")
-
-
-def way_to(model: Any, body: int) -> tuple[int, ...]:
-    """Ids of the hinges and slides from the world to a body."""
-    out: list[int] = []
-    while body > 0:
-        first, number = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-        own = [j for j in range(first, first + number) if model.jnt_type[j] in (2, 3)]
-        out = [*own, *out]
-        body = int(model.body_parentid[body])
-    return tuple(out)
-
-
-def driven(model: Any, joint: int) -> bool:
-    """Whether an actuator drives a joint."""
-    return any(drives(model, i, joint) for i in range(model.nu))
-
-
-def drives(model: Any, actuator: int, joint: int) -> bool:
-    """Whether an actuator drives a joint, itself or by a tendon of ours."""
-    kind, number = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
-    if kind == DRIVES_TENDON:
-        name = model.joint(joint).name
-        return bool(name) and bool(model.tendon(number).name == f"{name}_drive")
-    return kind == 0 and number == joint
 
 
 def braked(model: Any) -> Array:
@@ -245,53 +211,6 @@ def at_zero(model: Any, joints: Sequence[int]) -> Any:
     return data
 
 
-def body_pose(data: Any, body: int) -> Array:
-    """(4, 4) of a body in the world [m]."""
-    return transform(np.array(data.xmat[body]).reshape(3, 3), np.array(data.xpos[body]))
-
-
-def shifted(point: Array) -> Array:
-    """A translation (4, 4)."""
-    return transform(np.eye(3), np.asarray(point, dtype=float))
-
-
-def as_urdf(model: Any, joints: Sequence[int], source: str) -> UrdfRobot:
-    """The chain as a URDF would hold it, world to the last body."""
-    data = at_zero(model, joints)
-    bodies = [int(model.jnt_bodyid[j]) for j in joints]
-    poses = [body_pose(data, b) @ shifted(model.jnt_pos[j])
-             for b, j in zip(bodies, joints, strict=True)]  # fmt: skip
-    nothing, parts = Element("joint", {}, 0, 0, 0), []
-    before, parent = np.eye(4), "world"
-    for i, (joint, pose) in enumerate(zip(joints, poses, strict=True)):
-        slides = model.jnt_type[joint] == 2
-        limited = bool(model.jnt_limited[joint])
-        low, high = model.jnt_range[joint] if limited else (-np.inf, np.inf)
-        parts.append(
-            Joint(
-                name=model.joint(joint).name or f"joint {i + 1}",
-                kind="prismatic" if slides else "revolute" if limited else "continuous",
-                parent=parent,
-                child=f"link_{i + 1}",
-                origin=inverse(before) @ pose,
-                axis=np.array(model.jnt_axis[joint]),
-                lower=float(low),
-                upper=float(high),
-                mimic=None,
-                element=nothing,
-            )
-        )
-        before, parent = pose, f"link_{i + 1}"
-    end = inverse(before) @ body_pose(data, bodies[-1])
-    parts.append(
-        Joint("tip", "fixed", parent, "tip", end, np.array([0.0, 0.0, 1.0]), -np.inf, np.inf,
-              None, nothing)
-    )  # fmt: skip
-    name = Path(source).stem
-    urdf = Urdf(source, b"", name, "world", tuple(parts), *masses(model, data, bodies, poses))
-    return to_robot(urdf)
-
-
 def holders(model: Any, bodies: Bodies) -> Array:
     """(nbody,) which joint, from 0, alone carries a body; -1 for none."""
     holder = np.full(model.nbody, -1)
@@ -299,31 +218,6 @@ def holders(model: Any, bodies: Bodies) -> Array:
         own = bodies.index(body) if body in bodies else -1
         holder[body] = max(own, int(holder[model.body_parentid[body]]))
     return holder
-
-
-def masses(
-    model: Any, data: Any, bodies: Bodies, poses: Sequence[Array]
-) -> tuple[dict[str, tuple[float, Array]], dict[str, Array]]:
-    """What each joint alone carries, in its link's frame.
-
-    Mass [kg] and centre of gravity [m]; inertia (3, 3) about that [kg m^2], where there is some.
-    """
-    holder, weights, inertias = holders(model, bodies), {}, {}
-    for i, pose in enumerate(poses):
-        mine = np.flatnonzero(holder == i)
-        total = float(model.body_mass[mine].sum())
-        if total <= 0.0:
-            continue
-        centre = (model.body_mass[mine, None] * data.xipos[mine]).sum(axis=0) / total
-        weights[f"link_{i + 1}"] = total, inverse(pose)[:3, :3] @ (centre - pose[:3, 3])
-        whole = np.zeros((3, 3))
-        for body in mine:
-            turn, arm = data.ximat[body].reshape(3, 3), data.xipos[body] - centre
-            whole += turn @ np.diag(model.body_inertia[body]) @ turn.T
-            whole += model.body_mass[body] * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-        if whole.any():
-            inertias[f"link_{i + 1}"] = pose[:3, :3].T @ whole @ pose[:3, :3]
-    return weights, inertias
 
 
 def own_pose(attributes: dict[str, str], compiler: dict[str, str]) -> Array:

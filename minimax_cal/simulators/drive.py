@@ -18,15 +18,8 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
-from minimax_cal.simulators.chain import (
-    Chain,
-    body_pose,
-    carrier,
-    fill_history,
-    holders,
-    mujoco,
-    way_to,
-)
+from minimax_cal.robots.mjcf import body_pose, mujoco, way_to
+from minimax_cal.simulators.chain import Chain, carrier, fill_history, holders
 
 MOVE, REST = 2.0, 1.5  # a move lasts at least, and a rest after it [s]
 FASTEST, FASTEST_SLIDE = 1.0, 0.25  # no joint is commanded faster [rad/s, m/s]

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.gravity import G
+from minimax_cal.robots.mjcf import numbers
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import head, inverse, level_to, link, shift, tail
 from minimax_cal.simulators.arm import Arm
@@ -61,11 +61,6 @@ class Layout:
     axes: Array
     drives: Drives
     degrees: bool = False
-
-
-def numbers(values: ArrayLike) -> str:
-    """Numbers as they are read back."""
-    return " ".join(repr(float(v) + 0.0) for v in np.ravel(values))
 
 
 def part(parent: ET.Element, tag: str, **attributes: object) -> ET.Element:

@@ -12,15 +12,10 @@ from minimax_cal.correcting.exporters.urdf import assumptions
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
+from minimax_cal.robots.mjcf import mujoco, read_model
 from minimax_cal.simulators.arm import arm_of, assumed, held_terms, sample
-from minimax_cal.simulators.chain import chain_of, mujoco
-from minimax_cal.simulators.given import (
-    check_limits,
-    content_for,
-    corrected,
-    read_model,
-    told_masses,
-)
+from minimax_cal.simulators.chain import chain_of
+from minimax_cal.simulators.given import check_limits, content_for, corrected, told_masses
 from minimax_cal.simulators.mjcf import beside, new_tree, text_of, told
 from minimax_cal.simulators.standing import Written
 

@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -20,166 +20,20 @@ import numpy as np
 from minimax_cal.correcting.exporters.correct import NOTED, laid, match, seated
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
-from minimax_cal.ground.files import read_raw
+from minimax_cal.robots.document import Document
 from minimax_cal.robots.gravity import LEAST_MASS, G, masses_of
+from minimax_cal.robots.mjcf import Given, body_pose, find_assets, mujoco, numbers, shifted
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_joints
 from minimax_cal.robots.transforms import SAME, difference, head, inverse
-from minimax_cal.robots.urdf_file import ASSUMED, parse_xml, walk
 from minimax_cal.simulators.arm import Arm, assumed, stiff
-from minimax_cal.simulators.chain import (
-    ROBOT,
-    Chain,
-    at_zero,
-    body_pose,
-    braked,
-    mujoco,
-    own_pose,
-    shifted,
-)
-from minimax_cal.simulators.document import NESTED, NESTED_TOO_DEEP, Document, read_document
-from minimax_cal.simulators.elements import Layout, equip, numbers, quaternion, targets
+from minimax_cal.simulators.chain import ROBOT, Chain, at_zero, braked, own_pose
+from minimax_cal.simulators.elements import Layout, equip, quaternion, targets
 from minimax_cal.simulators.mjcf import text_of, weigh
 from minimax_cal.simulators.servos import SAMPLES, Drives
 
 ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 IMPLICIT = (2, 3)  # mjINT_IMPLICIT, mjINT_IMPLICITFAST
-MOST = {  # what a model of an arm and its cell may hold, and what it is called
-    "elements": (10_000.0, "elements, replicated ones too"),
-    "body": (1_000.0, "bodies"),
-    "freejoint": (50.0, "bodies that float freely"),
-    "hfield": (4e6, "<hfield>: cells"),
-    "texture": (2e7, "<texture>: pixels"),
-    "size": (1e5, "<size>: numbers set aside"),
-}
-
-
-@dataclass(frozen=True, eq=False)
-class Given:
-    """A model's file.  document: with all that it includes.  folder: where its assets are.
-
-    assumed: whether it says itself that its masses are.
-    """
-
-    source: str
-    document: Document
-    folder: Path
-    assumed: bool = False
-
-    def compiled(self, tree: ET.Element | None = None) -> Any:
-        """The model as MuJoCo sees it.  Raises RobotError."""
-        text = ET.tostring(
-            assets_from(self.document.root if tree is None else tree, self.folder.resolve())
-        )
-        try:
-            return mujoco().MjModel.from_xml_string(text.decode())
-        except (ValueError, RuntimeError) as error:
-            raise RobotError(f"{self.source}: MuJoCo refuses it: {one(error)}") from error
-
-
-def one(error: Exception) -> str:
-    """A message in one line."""
-    return " ".join(str(error).split())
-
-
-def read_model(path: Path | str) -> Given:
-    """An MJCF, or a URDF as MuJoCo takes it.  Raises RobotError."""
-    path = Path(path)
-    raw = read_raw(path, kind=RobotError)
-    top = parse_xml(raw, str(path))
-    if top.tag == "robot":
-        marked = any(ASSUMED in element.attributes for element in walk(top))
-        tree = from_urdf(path, with_limits=not marked)
-        return Given(str(path), Document(tree), path.parent, marked)
-    if top.tag != "mujoco":
-        raise RobotError(f"{path}: is neither MJCF nor URDF: its root is <{top.tag}>")
-    document = read_document(path)
-    check_size(document.root, str(path))
-    return Given(str(path), document, path.parent)
-
-
-def check_size(tree: ET.Element, source: str) -> None:
-    """Raise RobotError for what fills any memory, or never ends, once MuJoCo makes it.
-
-    Elements count as often as what they stand in is replicated.
-    """
-    kinds, stack = dict.fromkeys(MOST, 0.0), [(tree, 1.0, 0)]
-    while stack:
-        element, times, depth = stack.pop()
-        tag = str(element.tag)
-        if depth > NESTED:
-            raise RobotError(f"{source}: {NESTED_TOO_DEEP}")
-        times *= product(element.get("count"))
-        told = {"elements": times, tag: times}
-        if tag == "joint" and element.get("type") == "free":
-            told["freejoint"] = times
-        if tag == "hfield":
-            told[tag] = product(element.get("nrow")) * product(element.get("ncol"))
-        if tag == "texture":
-            told[tag] = product(element.get("width")) * product(element.get("height"))
-        if tag == "size":
-            told[tag] = max([1.0, *(product(v) for k, v in element.items() if k != "memory")])
-        for kind, amount in told.items():
-            if kind in kinds:
-                kinds[kind] += amount
-        stack += [(child, times, depth + 1) for child in element]
-    for kind, amount in kinds.items():
-        if not amount <= MOST[kind][0]:
-            what, most = MOST[kind][1], MOST[kind][0]
-            raise RobotError(f"{source}: {what}: {amount:.3g}, at most {most:g} are taken")
-
-
-def product(text: str | None) -> float:
-    """Of the numbers of an attribute; 1 without it, or where MuJoCo will refuse it."""
-    try:
-        return float(np.prod([abs(float(word)) for word in (text or "1").split()]))
-    except ValueError:
-        return 1.0
-
-
-def from_urdf(path: Path, *, with_limits: bool) -> ET.Element:
-    """A URDF as MJCF, its bodies with all the digits that MuJoCo's own writer leaves out.
-
-    with_limits: whether its limits of effort are any; beside assumed masses they are not.
-    """
-    try:
-        spec = mujoco().MjSpec.from_file(str(path))
-        model = spec.compile()
-        root = ET.fromstring(spec.to_xml())
-    except (ValueError, RuntimeError) as error:
-        raise RobotError(f"{path}: MuJoCo refuses it: {one(error)}") from error
-    for element in root.iter("body"):
-        body = model.body(element.get("name"))
-        element.set("pos", numbers(model.body_pos[body.id]))
-        element.set("quat", numbers(model.body_quat[body.id]))
-    for element in root.iter("joint"):
-        if element.get("name"):
-            joint = model.joint(element.get("name")).id
-            element.set("axis", numbers(model.jnt_axis[joint]))
-        if not with_limits:
-            element.attrib.pop("actuatorfrcrange", None)
-    return root
-
-
-def assets_from(tree: ET.Element, folder: Path) -> ET.Element:
-    """A copy whose assets are looked for where the given file had them."""
-    tree = deepcopy(tree)
-    find_assets(tree, folder)
-    return tree
-
-
-def find_assets(tree: ET.Element, folder: Path) -> None:
-    """Tell a tree where its assets are."""
-    compilers = [c for c in tree if c.tag == "compiler"]
-    if not compilers:
-        compilers = [ET.Element("compiler")]
-        tree.insert(0, compilers[0])
-    shared = next((c.get("assetdir") for c in compilers if c.get("assetdir")), "")
-    for name in ("meshdir", "texturedir"):
-        told = [c.get(name) for c in compilers if c.get(name)]
-        place = os.path.join(folder, (told[-1] if told else shared) or "")
-        for compiler in compilers:
-            compiler.set(name, place)
 
 
 def content_for(document: Document, source: Path, path: Path | None) -> bytes:

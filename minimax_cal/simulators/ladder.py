@@ -22,22 +22,16 @@ from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.words import name_effect, name_step
+from minimax_cal.robots.document import Document
+from minimax_cal.robots.mjcf import Given, mujoco, read_model
 from minimax_cal.robots.transforms import inverse
 from minimax_cal.robots.urdf import MODELS
 from minimax_cal.simulators.arm import Arm, arm_of, assumed, unheld
 from minimax_cal.simulators.causes import Causes, causes_of
-from minimax_cal.simulators.chain import Chain, chain_of, mujoco
+from minimax_cal.simulators.chain import Chain, chain_of
 from minimax_cal.simulators.commands import Commands
-from minimax_cal.simulators.document import Document
 from minimax_cal.simulators.drive import Driven, drive, touching
-from minimax_cal.simulators.given import (
-    Given,
-    check_limits,
-    content_for,
-    corrected,
-    read_model,
-    told_masses,
-)
+from minimax_cal.simulators.given import check_limits, content_for, corrected, told_masses
 from minimax_cal.simulators.mjcf import beside, told
 from minimax_cal.simulators.placing import placed_error
 from minimax_cal.simulators.result import Rung, SimulatorGap

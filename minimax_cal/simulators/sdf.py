@@ -18,11 +18,10 @@ from minimax_cal.correcting.exporters.urdf import assumptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
 from minimax_cal.modelling.cell import Cell
+from minimax_cal.robots.mjcf import mujoco, numbers, read_model
 from minimax_cal.robots.transforms import to_rpy, transform
 from minimax_cal.simulators.arm import arm_of
-from minimax_cal.simulators.chain import braked, mujoco
-from minimax_cal.simulators.elements import numbers
-from minimax_cal.simulators.given import read_model
+from minimax_cal.simulators.chain import braked
 from minimax_cal.simulators.mjcf import new_tree, text_of
 
 VERSION = "1.9"

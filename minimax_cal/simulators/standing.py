@@ -10,9 +10,10 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
+from minimax_cal.robots.mjcf import mujoco, way_to
 from minimax_cal.robots.transforms import inverse
 from minimax_cal.simulators.arm import Arm
-from minimax_cal.simulators.chain import Chain, fill_history, mujoco, way_to
+from minimax_cal.simulators.chain import Chain, fill_history
 from minimax_cal.simulators.commands import Commands
 from minimax_cal.simulators.drive import plays
 

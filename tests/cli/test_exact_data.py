@@ -12,9 +12,10 @@ import pytest
 from conftest import run
 
 import minimax_cal as mc
-from minimax_cal.fitting.instruments import write_relative
-from minimax_cal.fitting.instruments.sockets import Closures
-from minimax_cal.fitting.instruments.wires import Wires
+from minimax_cal.fitting.several.stack import Block
+from minimax_cal.instruments import write_relative
+from minimax_cal.instruments.sockets import Visits
+from minimax_cal.instruments.wires import Lengths
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.simulate import Truth, simulate
@@ -41,7 +42,7 @@ def exact() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for owner, name in [
             (Cell, "error"), (Model, "error"), (Model, "error_of"),
-            *((block, name) for block in (Wires, Closures) for name in ("rows", "errors")),
+            (Block, "rows"), (Lengths, "errors"), (Visits, "errors"),
         ]:  # fmt: skip
             patch.setattr(owner, name, rounded(getattr(owner, name)))
         yield

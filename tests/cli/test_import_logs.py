@@ -56,6 +56,8 @@ def test_what_is_wrong_ends_with_2(tmp_path: Path, capsys: pytest.CaptureFixture
     path = rtde(tmp_path / "a.csv", 1)
     assert run("import", path, "--leave-out", "3") == 2
     assert "--leave-out is about measured points" in capsys.readouterr().err
+    assert run("import", path, "--mend", "shift=2") == 2
+    assert "--mend is about measured points" in capsys.readouterr().err
     rows = ["t_s,q1_deg,q2_deg", *(f"{0.01 * i},{i},{2 * i}" for i in range(300))]
     (tmp_path / "plan.csv").write_text("\n".join(rows))
     assert run("import", tmp_path / "plan.csv") == 2

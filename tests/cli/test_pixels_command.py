@@ -120,3 +120,11 @@ def test_wrong_input_is_one_line(
     assert out == ""
     assert said in err
     assert len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", ["calibrate", "relative"])
+def test_options_of_cameras_without_any(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(command, "irb120", tmp_path / "data.csv", "--camera-prior", "f 1%") == 2
+    assert "--camera-prior is about what cameras see, with --pixels" in capsys.readouterr().err

@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.diagnosing.result import load_diagnosis
-from minimax_cal.fitting.instruments import flange_poses, write_relative
 from minimax_cal.fitting.opened import open_result
+from minimax_cal.instruments import flange_poses, write_relative
 from minimax_cal.modelling.simulate import Truth, simulate
 
 MM = 1e-6  # of numbers that went through a file in mm

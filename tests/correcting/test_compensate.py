@@ -479,6 +479,17 @@ def test_command_keeps_the_file_and_corrects_the_joints(saved: Path, tmp_path: P
     assert run(saved, out)[0] == 2  # corrected already
 
 
+def test_targets_in_german_come_back_under_their_names(saved: Path, tmp_path: Path) -> None:
+    head = "Name;" + ";".join(f"Achse {i} [°]" for i in range(1, 7)) + ";Werkzeug"
+    german, out = tmp_path / "Ziele.csv", tmp_path / "out.csv"
+    german.write_bytes(f"{head}\r\nGreifpunkt ä;10;20,5;-15;30;40;50;A\r\n".encode("cp1252"))
+    same = write(tmp_path / "t.csv", DEGREES, "pick,10,20.5,-15,30,40,50,0,v")
+    assert_allclose(read_targets(german).data.q, read_targets(same).data.q, rtol=0, atol=0)
+    assert run(saved, german, "-o", out)[0] == 0
+    with out.open() as stream:
+        assert next(csv.reader(stream)) == [*head.split(";"), *ADDED]
+
+
 def test_command_says_which_targets_are_missed(saved: Path, tmp_path: Path) -> None:
     header = ",".join(f"q{i}_rad" for i in range(1, 7))
     far = write(tmp_path / "far.csv", header, "0.1,0.2,0.3,0.4,0.8,0", "0.1,0.2,0.3,0.4,0,0")
@@ -503,7 +514,8 @@ def test_command_says_which_targets_are_missed(saved: Path, tmp_path: Path) -> N
         (DEGREES.replace("speed", "temperature_C"), "a,1,2,3,4,50,6,0,-300", "-300 cannot be"),
         (DEGREES.replace("_deg", "_rad"), "a,10,20,30,40,50,60,0,v", "degrees?"),
         (DEGREES.replace("q3_deg", "q3_mm"), "a,1,2,3,4,5,6,0,v", "joint 3"),
-        ("q1_rad;q2_rad", "0;0", "commas"),
+        ("q1_rad;q2_rad", "0;0", "2 joint columns"),
+        ("Achse 1,Achse 2", "0,0", "Achse 1 has no unit: write Achse 1 [deg], or [rad]"),
     ],
 )
 def test_command_tells_slips(saved: Path, tmp_path: Path, header: str, row: str, word: str) -> None:

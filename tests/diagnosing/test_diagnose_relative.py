@@ -14,8 +14,8 @@ from experiments.relative import NOISE
 from experiments.relative_gap import CAUSES, SETS, Imperfect, Job, arm_of, seen
 from minimax_cal.diagnosing.instruments import diagnose_relative
 from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
-from minimax_cal.fitting.instruments import relative
 from minimax_cal.fitting.opened import open_result
+from minimax_cal.fitting.several import relative
 from minimax_cal.ground.arrays import Array
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from conftest import SHARED
 from dynamics.motions import fourier
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
 from minimax_cal.dynamics.given import runs_of
@@ -297,7 +297,7 @@ def same_column(c: Columns) -> None:
 
 
 def huge(c: Columns) -> None:
-    c["tau1_Nm"][10] = 1e300
+    c["tau1_Nm"][10:] = 1e300
 
 
 REFUSED: list[tuple[Change, str]] = [
@@ -410,6 +410,42 @@ def test_faults_that_are_mended_or_said(tmp_path: Path, change: Change, message:
     if change is wrapped:
         turns = (run.q - before.q) / (2.0 * np.pi)
         assert_allclose(turns, np.broadcast_to(np.round(turns[0]), turns.shape), atol=1e-5)
+
+
+def test_a_wild_line_is_set_aside_with_its_number(tmp_path: Path) -> None:
+    columns = house(motion())
+    columns["tau1_Nm"][10] = 1e300
+    (run,) = read_runs(write(tmp_path / "x.csv", columns))
+    assert run.notices == (f"{tmp_path}/x.csv: 1 torn line is left out (12)",)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize(
+    ("q", "tau", "time"),
+    [("q_{}", "tau_{}", "time"), ("Achse {} [rad]", "Drehmoment {} [Nm]", "Zeit [s]"),
+     ("joint{} (rad)", "Torque {} (N m)", "t")],
+)  # fmt: skip
+def test_logs_in_words(tmp_path: Path, first: int, q: str, tau: str, time: str) -> None:
+    columns = house(motion())
+    (run,) = read_runs(write(tmp_path / "x.csv", columns))
+    names = {}
+    for name in columns:
+        joint = "".join(filter(str.isdigit, name)) or "1"
+        said = {"q": q, "tau": tau, "t": time}.get(name.partition("_")[0].rstrip("0123456789"))
+        names[name] = said.format(int(joint) - 1 + first) if said else ""
+    named = {names[name]: column for name, column in columns.items() if names[name]}
+    (again,) = read_runs(write(tmp_path / "y.csv", named), units="q=rad")
+    assert_array_equal(again.q, run.q)
+    assert_array_equal(again.torque, run.torque)
+
+
+def test_a_log_without_time_asks_for_it(tmp_path: Path) -> None:
+    columns = house(motion())
+    del columns["t_s"]
+    path = write(tmp_path / "x.csv", columns)
+    assert are_logs([path])
+    with pytest.raises(mc.DataError, match="no column of time; name it t_s"):
+        read_runs(path)
 
 
 def test_torn_lines(tmp_path: Path) -> None:

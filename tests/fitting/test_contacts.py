@@ -13,22 +13,13 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from experiments.relative import NOISE, SPOT, Arm, inside, position_errors
-from minimax_cal.fitting.instruments import (
-    RelativeCalibration,
-    RelativeData,
-    Surface,
-    contacts,
-    read_relative,
-    relative,
-    write_relative,
-)
-from minimax_cal.fitting.instruments.closing import reach
-from minimax_cal.fitting.instruments.options import RelativeOptions
-from minimax_cal.fitting.instruments.probe import Contacts
-from minimax_cal.fitting.instruments.rows import own_state
-from minimax_cal.fitting.instruments.shapes import fit_plane, fit_sphere
-from minimax_cal.fitting.instruments.stack import Stack
+from minimax_cal.fitting.several import RelativeCalibration, relative
+from minimax_cal.fitting.several.options import RelativeOptions
+from minimax_cal.fitting.several.stack import Block, Stack, own_state
 from minimax_cal.ground.arrays import Array
+from minimax_cal.instruments import Instrument, Surface, contacts, read_relative, write_relative
+from minimax_cal.instruments.closing import reach
+from minimax_cal.instruments.shapes import fit_plane, fit_sphere
 from minimax_cal.robots.kinematics import forward, hat
 from minimax_cal.robots.sampling import random_poses
 
@@ -73,13 +64,13 @@ def dome(centre: Array) -> Places:
 def contacts_with(
     arm: Arm, rng: np.random.Generator, shapes: list[tuple[Surface, Places]], noise: float,
     ball: float = np.nan,
-) -> RelativeData:  # fmt: skip
+) -> Instrument:  # fmt: skip
     q = [touched(arm, rng, places, 30, noise) for _, places in shapes]
     labels = np.repeat([surface.label for surface, _ in shapes], 30)
     return contacts(np.concatenate(q), labels, [surface for surface, _ in shapes], ball)
 
 
-def planes(arm: Arm, seed: int, noise: float) -> RelativeData:
+def planes(arm: Arm, seed: int, noise: float) -> Instrument:
     size, rng = arm.robot.reach(), np.random.default_rng([seed, 3])
     specs = [([0, 0, 1], [0.45, 0, 0.1]), ([-1, 0.1, 0], [0.6, 0, 0.4]),
              ([0, 1, 0.2], [0.3, -0.4, 0.35]), ([0.5, 0.5, 0.7], [-0.1, 0.4, 0.3])]  # fmt: skip
@@ -87,7 +78,7 @@ def planes(arm: Arm, seed: int, noise: float) -> RelativeData:
     return contacts_with(arm, rng, [(Surface(f"B{i}"), b) for i, b in enumerate(boards)], noise)
 
 
-def spheres(arm: Arm, seed: int, noise: float, *, known: bool = True) -> RelativeData:
+def spheres(arm: Arm, seed: int, noise: float, *, known: bool = True) -> Instrument:
     size, rng = arm.robot.reach(), np.random.default_rng([seed, 4])
     centres = size * np.array([[0.45, 0.1, 0.25], [0.1, 0.5, 0.4], [-0.3, -0.4, 0.2]])
     radius, ball = (RADIUS, BALL) if known else (np.nan, np.nan)
@@ -95,7 +86,7 @@ def spheres(arm: Arm, seed: int, noise: float, *, known: bool = True) -> Relativ
     return contacts_with(arm, rng, shapes, noise, ball)
 
 
-def cube(arm: Arm, seed: int, noise: float) -> RelativeData:
+def cube(arm: Arm, seed: int, noise: float) -> Instrument:
     rng, turn = np.random.default_rng([seed, 5]), Rotation.from_rotvec([0.2, -0.1, 0.5]).as_matrix()
     origin = arm.robot.reach() * np.array([0.45, 0.1, 0.3])
     shapes = [
@@ -126,16 +117,16 @@ def off(arm: Arm, fit: RelativeCalibration, *, scaled: bool) -> float:
 # ---- the rows ----------------------------------------------------------------------------------
 
 
-def plain_gaps(block: Contacts, robot: mc.Robot, x: Array) -> Array:
+def plain_gaps(block: Block, robot: mc.Robot, x: Array) -> Array:
     """The gaps at parameters x of a stack, by matrices alone: any dtype."""
-    n, shapes = robot.joints, block.shapes
-    pose = forward(x[: 5 * n].reshape(5, n).T, block.model.q, robot.prismatic)
+    n, shapes, touched = robot.joints, block.instrument.shapes, block.instrument.touched
+    pose = forward(x[: 5 * n].reshape(5, n).T, block.arm.q, robot.prismatic)
     own = x[5 * n + 6 :]
     p = pose[:, :3, :3] @ own[:3] + pose[:, :3, 3]
     out = np.zeros(len(p), dtype=x.dtype)
     body = shapes.turn @ expm(hat(own[-4:-1].real) + 1j * hat(own[-4:-1].imag))
     for at, slot in enumerate(shapes.slots()):
-        here, surface, values = block.touched == at, shapes.surfaces[at], own[slot]
+        here, surface, values = touched == at, shapes.surfaces[at], own[slot]
         if surface.kind == "sphere":
             distance = np.sqrt(((p[here] - values[:3]) ** 2).sum(axis=1))
         elif surface.is_face:
@@ -154,9 +145,10 @@ def test_slopes_are_the_derivative_by_complex_step(name: str, rng: np.random.Gen
     surfaces = [Surface("A"), Surface("B", "sphere"), Surface("C", "plane", 0.1, FACES[0]),
                 Surface("D", "plane", np.nan, FACES[2]), Surface("E", "sphere", 0.3)]  # fmt: skip
     q, labels = random_poses(robot, 40, rng), [s.label for s in surfaces] * 8
-    block = Contacts.of(robot, contacts(q, labels, surfaces), RelativeOptions())
-    stack = Stack.of(robot, [block], [""])
-    x = own_state(robot.mdh, 0.5 * rng.normal(size=len(block.own)))
+    probe = contacts(q, labels, surfaces).ready(robot, RelativeOptions())
+    stack = Stack.of(robot, [probe], [""])
+    block = stack.blocks[0]
+    x = own_state(robot.mdh, 0.5 * rng.normal(size=len(probe.names)))
     error, jacobian = stack.rows(x, stack.movable)
     values = np.concatenate([x.mdh.T.reshape(-1), np.zeros(6), x.effects]).astype(complex)
     assert_allclose(-error, plain_gaps(block, robot, values).real, rtol=0, atol=1e-13)

@@ -3,8 +3,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.fitting import identify, start
+from minimax_cal.fitting import identify
 from minimax_cal.fitting.identify import Because
+from minimax_cal.modelling import start
 from minimax_cal.modelling.model import SumOfSquares, model_of
 from minimax_cal.modelling.simulate import Simulation, simulate
 from minimax_cal.solvers import least_squares

@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.fitting.instruments import (
-    RelativeData,
+from minimax_cal.instruments import (
+    Instrument,
     closures,
     distances,
     flange_poses,
@@ -27,7 +27,7 @@ def poses(count: int, rng: np.random.Generator) -> np.ndarray:
     return out
 
 
-def examples(rng: np.random.Generator) -> dict[str, RelativeData]:
+def examples(rng: np.random.Generator) -> dict[str, Instrument]:
     q = rng.uniform(-2, 2, (12, 3))
     length = rng.uniform(0.5, 2, (12, 2))
     length[0, 1] = length[3, 0] = np.nan

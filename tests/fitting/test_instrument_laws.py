@@ -12,17 +12,13 @@ from scipy.spatial.transform import Rotation
 import minimax_cal as mc
 from experiments.relative import NOISE, SIMULATORS, Arm
 from minimax_cal.evidence.noise import restricted
-from minimax_cal.fitting.instruments import (
-    RelativeData,
-    Surface,
-    contacts,
-    relative,
-)
-from minimax_cal.fitting.instruments.fit import InstrumentFit, Train, fit_instruments, laws_of
-from minimax_cal.fitting.instruments.kinds import loaded
-from minimax_cal.fitting.instruments.linear import rows_of_all, scene_of_all
-from minimax_cal.fitting.instruments.options import RelativeOptions, silent
 from minimax_cal.fitting.opened import open_result
+from minimax_cal.fitting.several import relative
+from minimax_cal.fitting.several.fit import InstrumentFit, Train, fit_instruments, laws_of
+from minimax_cal.fitting.several.kinds import loaded
+from minimax_cal.fitting.several.linear import rows_of_all, scene_of_all
+from minimax_cal.fitting.several.options import RelativeOptions, silent
+from minimax_cal.instruments import Instrument, Surface, contacts
 from minimax_cal.measuring.history import with_history
 from minimax_cal.robots.gravity import tubes
 from minimax_cal.robots.sampling import random_poses
@@ -39,14 +35,14 @@ def arm_of(seed: int) -> Arm:
     return Arm(TOLD, TOLD.with_mdh(Arm.of("irb2600", seed, 0.0).real.mdh), COMPLIANCE)
 
 
-def tracker(arm: Arm, rng: np.random.Generator, poses: int) -> RelativeData:
+def tracker(arm: Arm, rng: np.random.Generator, poses: int) -> Instrument:
     q = random_poses(arm.robot, poses, rng)
     turn, shift = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
     y = arm.place(q) @ turn.T + shift + NOISE * rng.normal(size=(poses, 3))
     return loaded(mc.measurements(q, y))
 
 
-def plates(arm: Arm, rng: np.random.Generator, count: int) -> RelativeData:
+def plates(arm: Arm, rng: np.random.Generator, count: int) -> Instrument:
     """Contacts with four planes that stand where the ball happened to be: no pose is special."""
     q, labels = random_poses(arm.robot, 4 * count, rng), np.repeat(list("ABCD"), count)
     return contacts(q, labels, [Surface(label) for label in "ABCD"])
@@ -56,7 +52,7 @@ KINDS = ("tracker", "wires_3", "closures_known", "poses")
 
 
 @cache
-def measured(seed: int, kinds: tuple[str, ...]) -> tuple[Arm, tuple[RelativeData, ...], tuple]:
+def measured(seed: int, kinds: tuple[str, ...]) -> tuple[Arm, tuple[Instrument, ...], tuple]:
     arm, rng = arm_of(seed), np.random.default_rng([seed, 5])
     data, known = [], ()
     for kind in kinds:
@@ -93,7 +89,7 @@ def test_the_rows_of_an_arm_that_gives_way_have_its_derivative(kind: str) -> Non
         arm, fit = fitted((kind,))
         train = fit.trains[0]
     laws = laws_of(arm.robot, fit, SEVERAL)
-    stack, x = fit.stack.bent(arm.robot, [train.data], laws, fit.state)
+    stack, x = fit.stack.bent(arm.robot, laws, fit.state)
     first = stack.names.geometric
     turns = [name.startswith("base_r") for name in stack.names.all]
     active = stack.movable & ~np.array(turns)
@@ -110,13 +106,14 @@ def test_the_rows_of_an_arm_that_gives_way_have_its_derivative(kind: str) -> Non
 
 
 def test_an_arm_at_other_poses_gives_way_by_the_same_laws() -> None:
-    """At the training poses `model_at` predicts what the rows do."""
+    """At the training poses `at_rows_of` predicts what the rows do."""
     for kind in KINDS:
         arm, fit = fitted((kind,), ASKED)
         data = fit.trains[0].data
         stack, x = fit.stack, fit.stack.part(fit.state, 0)
-        model = stack.model_at(arm.robot, 0, data, fit.state)
-        error = stack.blocks[0].errors(model, x, data, np.zeros(data.poses, dtype=bool))
+        block = stack.blocks[0].at_rows_of(arm.robot, data, stack.laws, x)
+        held = np.zeros(data.poses, dtype=bool)
+        error = block.instrument.errors(block.flange(x), block.own(x), held)
         assert 0.5 * NOISE < np.sqrt(np.nanmean(error**2)) < 2.0 * NOISE
 
 
@@ -172,9 +169,9 @@ def test_the_rows_of_evidence_estimate_what_the_fit_does(kinds: tuple[str, ...])
     columns = rows.of(field)
     clear = columns - rows.basis @ (rows.basis.T @ columns)
     value = np.linalg.lstsq(clear, rows.error, rcond=None)[0]
-    stack, x = fit.stack.bent(arm.robot, [t.data for t in fit.trains], found, fit.state)
+    stack, x = fit.stack.bent(arm.robot, found, fit.state)
     active = np.pad(fit.identification.active, (0, 2), constant_values=True)
-    weight = np.sqrt(stack.weights)  # a known distance counts as a coordinate in evidence
+    weight = np.sqrt(stack.weights(x))  # a known distance counts as a coordinate in evidence
     error, slope = stack.rows(x, active)
     step = np.linalg.lstsq((slope / weight).T, error / weight, rcond=1e-12)[0]
     assert_allclose(value, step[-2:], rtol=1e-6)
@@ -191,7 +188,9 @@ def test_the_rows_of_a_stiff_arm_have_the_noise_of_their_instruments(
     assert noise.variance == pytest.approx(float(fit.noise.min()) ** 2, rel=0.2)
     assert noise.jitter < 5e-6
     numbers = sum(
-        6 * len(b.model.q) if b.kind == "poses" else len(b.weights) for b in fit.stack.blocks
+        6 * one.poses if one.kind == "poses" else len(fit.stack.blocks[i].read(part).weights)
+        for i, one in enumerate(fit.stack.instruments)
+        for part in [fit.stack.part(fit.state, i)]
     )
     assert rows.count == numbers
 

@@ -11,10 +11,11 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.cli.running import outcome
-from minimax_cal.fitting.instruments import closures, distances, flange_poses
-from minimax_cal.fitting.instruments.closing import reach
-from minimax_cal.fitting.instruments.data import RelativeData
-from minimax_cal.fitting.instruments.result import RelativeCalibration
+from minimax_cal.fitting.several.result import RelativeCalibration
+from minimax_cal.instruments import closures, distances, flange_poses
+from minimax_cal.instruments.closing import reach
+from minimax_cal.instruments.instrument import Instrument
+from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.robot import robot_from_dict
 
 QUARTER = np.pi / 2
@@ -101,7 +102,7 @@ def test_a_firm_prior_keeps_the_drawing() -> None:
             assert 0.0 < p.sigma < 2e-9
 
 
-def wires() -> tuple[mc.Simulation, RelativeData]:
+def wires() -> tuple[mc.Simulation, Instrument]:
     made = mc.simulate("irb2600", 60, 1, 2)
     point = made.cell.predict(made.data.q)[:, 0]
     anchors = np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 1.0], [-1.0, -1.0, 2.0]])
@@ -155,3 +156,31 @@ def test_the_command_takes_priors(tmp_path: Path, capsys: pytest.CaptureFixture[
     files = [str(tmp_path / "panda.json"), str(tmp_path / "sockets.csv")]
     assert outcome(["relative", *files, *given, *priors]) == 0
     assert "converged" in capsys.readouterr().out
+
+
+# ---- priors of links that points tell together alone -------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seen", ["tracker", "poses"])
+def test_of_links_that_move_alike_priors_tell_each(seen: str, seed: int) -> None:
+    """d2 and d3 of parallel axes: their sum is measured, their difference is what priors say.
+
+    With equal priors s each gets half of the sum, and the sigma s / sqrt(2).
+    """
+    prior = {"d2": "0.4mm", "d3": "0.4mm"}
+    truth = Truth(compliance=0.0, length=0.4e-3)
+    robot = mc.load_robot("irb2600")
+    made = simulate(robot, poses=60, targets=2, seed=seed, truth=truth)
+    if seen == "tracker":
+        fit = mc.calibrate(robot, made.data, objective="sum", priors=prior)
+    else:
+        pose = made.cell.robot.pose(made.data.q)
+        pose[:, :3, 3] += 15e-6 * np.random.default_rng(seed).normal(size=(60, 3))
+        fit = mc.relative(robot, flange_poses(made.data.q, pose), priors=prior)
+    one, other = (next(p for p in fit.parameters if p.name == name) for name in prior)
+    off = [p.value - p.nominal for p in (one, other)]
+    true = made.cell.robot.mdh[1:3, 1] - robot.mdh[1:3, 1]
+    assert_allclose(off[0], off[1], atol=2e-6)
+    assert_allclose([one.sigma, other.sigma], 0.4e-3 / np.sqrt(2.0), rtol=0.02)
+    assert np.abs(off - true).max() < 4.0 * one.sigma

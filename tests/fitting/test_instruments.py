@@ -25,24 +25,16 @@ from experiments.relative import (
     spot_of,
 )
 from minimax_cal.fitting.identify import Because
-from minimax_cal.fitting.instruments import (
-    RelativeCalibration,
-    closures,
-    distances,
-    flange_poses,
-    poses_as_targets,
-    relative,
-)
-from minimax_cal.fitting.instruments.closing import closing_poses, reach
-from minimax_cal.fitting.instruments.options import RelativeOptions, known_of
-from minimax_cal.fitting.instruments.points import Points
-from minimax_cal.fitting.instruments.rows import own_state
-from minimax_cal.fitting.instruments.sockets import Closures
-from minimax_cal.fitting.instruments.stack import Stack
-from minimax_cal.fitting.instruments.visits import free_numbers, misclosures
-from minimax_cal.fitting.instruments.wires import Wires
-from minimax_cal.fitting.reflectors import spots_of
+from minimax_cal.fitting.several import RelativeCalibration, relative
+from minimax_cal.fitting.several.options import RelativeOptions
+from minimax_cal.fitting.several.stack import Block, Stack, own_state
 from minimax_cal.ground.arrays import Array
+from minimax_cal.instruments import closures, distances, flange_poses, poses_as_targets
+from minimax_cal.instruments.closing import closing_poses, reach
+from minimax_cal.instruments.options import known_of
+from minimax_cal.instruments.reflectors import spots_of
+from minimax_cal.instruments.sockets import free_numbers, misclosures
+from minimax_cal.instruments.tracker import Points
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.sampling import random_poses
@@ -79,30 +71,32 @@ def wires(robot: mc.Robot, rng: np.random.Generator) -> tuple[Stack, State]:
     length[rng.uniform(size=length.shape) < 0.3] = np.nan
     x = own_state(robot.mdh, np.append(SPOT, rng.normal(size=12)))
     data = replace(distances(q, length), wires=("wire1", "wire2", "wire7"))
-    return Stack.of(robot, [Wires.of(robot, data, RelativeOptions())], ["w"]), x
+    return Stack.of(robot, [data], ["w"]), x
 
 
 def sockets(robot: mc.Robot, rng: np.random.Generator) -> tuple[Stack, State]:
     q, socket = random_poses(robot, 15, rng), rng.permutation(np.arange(15) % 4)
-    pairs, length = np.array([[0, 2], [3, 1]]), np.array([0.7, 1.1])
-    block = Closures.of(robot, q, socket, pairs, length)
-    return Stack.of(robot, [block], ["s"]), own_state(robot.mdh, SPOT)
+    visits = replace(closures(q, socket), known=(("0", "2", 0.7), ("3", "1", 1.1)))
+    return Stack.of(robot, [visits], ["s"]), own_state(robot.mdh, SPOT)
 
 
 def seen(robot: mc.Robot, rng: np.random.Generator) -> tuple[Stack, State]:
     q, y = random_poses(robot, 15, rng), rng.normal(size=(15, 2, 3))
     y[rng.uniform(size=(15, 2)) < 0.3] = np.nan
-    block, x = Points.of(robot, mc.measurements(q, y)), own_state(robot.mdh, rng.normal(size=12))
+    tracker = Points(mc.measurements(q, y)).ready(robot, RelativeOptions())
+    x = own_state(robot.mdh, rng.normal(size=12))
     # errors turn with the base, rows do not: the same where the points are met
-    state = block.arm_state(x)
-    met = Cell.of(robot, state, ("smr1", "smr2")).predict(q)
-    model = replace(block.model, y=np.where(block.model.seen[:, None], np.moveaxis(met, 0, 2), 0.0))
-    return Stack.of(robot, [replace(block, model=model)], ["t"]), x
+    turn, origin = tracker.base(x.effects)
+    met = Cell.of(
+        robot, State(robot.mdh, turn, origin, tracker.targets(x.effects)), ("smr1", "smr2")
+    ).predict(q)
+    at = replace(tracker.at, y=np.where(np.isnan(y), np.nan, met))
+    return Stack.of(robot, [replace(tracker, at=at)], ["t"]), x
 
 
 def several(robot: mc.Robot, rng: np.random.Generator) -> tuple[Stack, State]:
     made = [make(robot, rng) for make in (seen, wires, sockets)]
-    stack = Stack.of(robot, [one.blocks[0] for one, _ in made], ["t", "w", "s"])
+    stack = Stack.of(robot, [one.instruments[0] for one, _ in made], ["t", "w", "s"])
     return replace(stack, precision=np.array([1.0, 0.3, 0.7])), stack.state(
         robot.mdh, [x.effects for _, x in made]
     )
@@ -150,9 +144,8 @@ def test_the_barycentre_is_the_best_place_of_a_socket(
 ) -> None:
     # the cost without the sockets is the least over all sockets' places, by explicit least squares
     q, socket = random_poses(robot, 20, rng), rng.permutation(np.arange(20) % 3)
-    instrument = Closures.of(robot, q, socket, np.zeros((0, 2), dtype=int), np.zeros(0))
-    x = own_state(robot.mdh, SPOT)
-    error, _ = instrument.rows(x, np.zeros(39, dtype=bool))
+    visits = Block.of(robot, closures(q, socket))
+    error, _ = visits.rows(own_state(robot.mdh, SPOT), np.zeros(39, dtype=bool))
     design = np.kron(np.eye(3)[socket], np.eye(3))
     _, cost, _, _ = np.linalg.lstsq(design, place(robot, q, SPOT).reshape(-1))
     assert_allclose(error @ error, cost[0], rtol=1e-12)
@@ -218,17 +211,17 @@ def test_scaling_all_lengths_changes_no_closure_but_a_known_distance(robot: mc.R
     q, socket = closing_poses(robot, SPOT, 4, 5, np.random.default_rng(0))
     _, socket = np.unique(socket, return_inverse=True)
     centres = [place(robot, q, SPOT)[socket == i].mean(axis=0) for i in (0, 1)]
-    pairs, length = np.array([[0, 1]]), np.array([np.linalg.norm(centres[0] - centres[1])])
+    length, visits = float(np.linalg.norm(centres[0] - centres[1])), closures(q, socket)
     none = np.zeros(30 + 9, dtype=bool)
     for factor in (1.0, 1.01, 2.0):
         mdh = robot.mdh * [factor, factor, 1, 1, 1]
         x = own_state(mdh, factor * SPOT)
-        alone, _ = Closures.of(robot, q, socket, pairs[:0], length[:0]).rows(x, none)
+        alone, _ = Block.of(robot, visits).rows(x, none)
         assert_allclose(alone, 0.0, atol=1e-8)
-        known = Closures.of(robot, q, socket, pairs, length)
-        told, _ = known.rows(x, none)
+        known = replace(visits, known=(("0", "1", length),))
+        told, _ = Block.of(robot, known).rows(x, none)
         root = np.sqrt(3 * len(q))  # weighs as all visits together
-        assert_allclose(told[-1] / root, (1.0 - factor) * length[0], rtol=1e-7, atol=1e-8)
+        assert_allclose(told[-1] / root, (1.0 - factor) * length, rtol=1e-7, atol=1e-8)
 
 
 @pytest.mark.parametrize("name", ["irb2600", "ur10", "meca500"])

@@ -4,9 +4,22 @@ import json
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
-from experiments.relative import NOISE, SIMULATORS, Arm, rms_mm, spot_of, true_errors
-from minimax_cal.fitting.instruments import RelativeCalibration, relative
+import minimax_cal as mc
+from experiments.relative import (
+    NOISE,
+    SIMULATORS,
+    SPOT,
+    Arm,
+    place,
+    rms_mm,
+    spot_of,
+    true_errors,
+)
+from minimax_cal.fitting.several import RelativeCalibration, relative
+from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.sampling import random_poses
 
 SCALE = {"irb2600": "d4", "ur10": "a2"}  # the longest length, kept as drawn where none is known
@@ -34,18 +47,41 @@ def test_where_nothing_is_open_the_sigma_holds_the_truth(name: str, kind: str) -
 
 @pytest.mark.parametrize("name", SCALE)
 def test_closures_without_a_length_leave_one_length_open(name: str) -> None:
-    ratios = []
     for seed in range(3):
-        fit, ratio = calibrated(name, "closures", seed)
-        ratios.append(ratio)
+        fit, _ = calibrated(name, "closures", seed)
         assert fit.positions_open == (SCALE[name],)
-    assert max(ratios) > 10.0  # no sigma holds what is kept as drawn
+        assert np.isnan(fit.position_sigma)  # no sigma holds what is kept as drawn
     assert f"do not determine {SCALE[name]}" in fit.headline()
     content = json.loads(fit.json())
     assert content["positions_open"] == [SCALE[name]]
+    assert content["position_sigma_mm"] is None
     assert RelativeCalibration.from_dict(content).headline() == fit.headline()
 
 
 def test_what_the_user_fixes_is_not_open() -> None:
     fit, _ = calibrated("ur10", "closures", 1, fix="a2")
     assert fit.positions_open == ()
+
+
+@pytest.mark.parametrize("name", ["irb2600", "ur10"])
+@pytest.mark.parametrize("on_axis", [True, False])
+def test_one_reflector_on_the_last_axis_does_not_speak_for_the_tool(
+    name: str, on_axis: bool
+) -> None:
+    """True errors of another point of the tool, whose offset and base are fitted by scipy."""
+    arm, rng = Arm.of(name, 1, 0.0), np.random.default_rng(1)
+    spot = np.array([0.0, 0.0, 0.1]) if on_axis else SPOT
+    q, new = (random_poses(arm.robot, count, rng) for count in (80, 200))
+    y = place(arm.real, q, spot) + NOISE * rng.normal(size=(80, 3))
+    fit = mc.calibrate(arm.robot, mc.measurements(q, y[:, None]), objective="sum")
+    said = [notice for notice in fit.notices if "other points of the tool" in notice]
+    other = np.array([0.1, -0.05, 0.05])
+    true = place(arm.real, new, other)
+
+    def missed(x: Array) -> Array:
+        here = place(fit.robot, new, x[6:])
+        return (here @ Rotation.from_rotvec(x[:3]).as_matrix().T + x[3:6] - true).ravel()
+
+    left = least_squares(missed, np.append(np.zeros(6), other)).fun.reshape(-1, 3)
+    off_mm = rms_mm(np.linalg.norm(left, axis=1))
+    assert bool(said) == on_axis == (off_mm > 3.0 * fit.accuracy["holdout"].rms_mm)

@@ -14,13 +14,13 @@ from minimax_cal.fitting.computed import FRACTION, least_noise
 from minimax_cal.fitting.improvement import compare_arms, improvement
 from minimax_cal.fitting.intervals import Interval, told
 from minimax_cal.fitting.same_arm import LARGE_LENGTH, too_changed
-from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.simulate import Simulation, Truth, gravity, simulate
+from minimax_cal.modelling.start import fit_base
 from minimax_cal.robots.robot import robot_from_dict
 from minimax_cal.robots.sampling import random_poses
 

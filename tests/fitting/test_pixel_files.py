@@ -68,6 +68,25 @@ def read(path: Path, names: tuple[str, ...] = ("left",), board: bool = True) -> 
     )
 
 
+def test_files_of_a_cell_in_german(tmp_path: Path) -> None:
+    german = {
+        "rows": ["Pose;Kamera;Ziel;u [px];v [px]", *ROWS[1:]],
+        "joints": ["Pose;" + ";".join(f"Achse {i} [rad]" for i in range(1, 7)), *JOINTS[1:]],
+        "board": ["Ziel;X [mm];Y [mm];Z [mm]", *BOARD[1:]],
+    }
+    there = folder_of(
+        tmp_path, **{k: [row.replace(",", ";").replace(".", ",") for row in v]
+                     for k, v in german.items()}
+    )  # fmt: skip
+    camera = read_camera("left", there / "left.yaml")
+    data = read_pixels(
+        there / "detections.csv", there / "joints.csv", [camera], there / "board.csv"
+    )
+    assert data.pixel[1].tolist() == [150.0, 201.0]
+    assert data.at.q[3].tolist() == [0.1, 0.3, 0.3, 0.4, 0.5, 0.6]
+    assert data.board[1].tolist() == [0.05, 0.0, 0.0]
+
+
 @pytest.mark.parametrize(
     "text", [OPENCV, VECTOR, ROS, MESSAGE], ids=["OpenCV", "vector", "ROS", "message"]
 )

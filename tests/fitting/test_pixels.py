@@ -20,8 +20,8 @@ from experiments.pixel_cells import (
     geared,
     make_cell,
     projected,
+    seen_by,
 )
-from minimax_cal.fitting.instruments.pixel_calibration import concluded, fitted
 from minimax_cal.fitting.pixels.camera import INTRINSICS, distorted, slopes, undistorted
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.determined import determined
@@ -30,7 +30,13 @@ from minimax_cal.fitting.pixels.judge import Claim
 from minimax_cal.fitting.pixels.model import PixelModel, Scene, Sight
 from minimax_cal.fitting.pixels.options import PixelOptions, check_options, doubts_of
 from minimax_cal.fitting.pixels.start import by_rotations, directions, merged, start_scene
+from minimax_cal.fitting.several.pixel_calibration import concluded, fitted
 from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.grouping import held_out
+from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.robots.transforms import transform
+from minimax_cal.robots.urdf import to_robot
+from minimax_cal.robots.urdf_file import parse_urdf
 from minimax_cal.solvers.status import Status
 
 LENS = np.array([2500, 2510, 1220, 1030, -0.1, 0.05, 1e-3, -2e-3, 0.01, 0.02, 0.01, 3e-3,
@@ -208,7 +214,7 @@ def test_corners_of_unknown_place_need_no_more_poses() -> None:
 @pytest.mark.parametrize("off", [1.001, pytest.param(0.999, marks=pytest.mark.slow)])
 def test_lenses_that_are_wrong_and_held_are_counted(cell: Cell, off: float) -> None:
     data = wrong_lens(data_of(cell), off)
-    fit = fitted(cell.drawn, data, PixelOptions(fix_camera=True))
+    fit = fitted(cell.drawn, data, PixelOptions(fix_camera=True, camera_prior="f 0.1%"))
     assert arm_error(cell, fit.robot) < 2.0 * 1e3 * fit.claim.sigma
     free = fitted(cell.drawn, data, PixelOptions())
     assert arm_error(cell, free.robot) < GIVEN_MM
@@ -232,6 +238,86 @@ def test_an_image_with_other_joints_is_named_whole(cell: Cell) -> None:
     fit = fitted(cell.drawn, replace(data, at=replace(data.at, q=q)), PixelOptions())
     assert any("whole images are outliers" in n and "pose P7 of" in n for n in fit.notices)
     assert arm_error(cell, fit.robot) < GIVEN_MM
+
+
+@pytest.mark.parametrize("kind", ["two images lost", "any order"])
+def test_images_of_other_poses_are_named(cell: Cell, kind: str) -> None:
+    data = data_of(cell)
+    m = data.at.poses
+    image = np.delete(np.arange(m), [8, 9])  # the image that stands where pose 0, 1, ... was
+    if kind == "any order":
+        image = np.random.default_rng(3).permutation(m)
+    place = np.full(m, -1)
+    place[image] = np.arange(len(image))
+    mixed = data.some(place[data.pose] >= 0)
+    mixed = replace(mixed, pose=place[mixed.pose])
+    with pytest.raises(mc.DataError, match="are paired with other poses: that of") as caught:
+        fitted(cell.drawn, mixed, PixelOptions(holdout=0.0))
+    named = re.search(
+        r"(\d+) of (\d+) images .* of pose P(\d+) is of pose P(\d+);", str(caught.value)
+    )
+    assert named is not None
+    first = int(np.argmax(image != np.arange(len(image))))
+    right = [np.count_nonzero(image != np.arange(len(image))), len(image), first, image[first]]
+    assert [int(each) for each in named.groups()] == right
+
+
+def test_what_judges_a_fit_is_not_set_aside_by_it(cell: Cell) -> None:
+    """Held-out images of an arm whose joint 2 has moved: all misses count, wrong corners do not."""
+    data, options = data_of(cell), PixelOptions()
+    before = fitted(cell.drawn, data, options)
+    held, _ = held_out(data.at, options.holdout, options.seed)
+    q = data.at.q.copy()
+    q[held, 1] += 0.01
+    rows = np.flatnonzero(held[data.pose])[::40]
+    pixel = data.pixel.copy()
+    pixel[rows] += 25.0
+    moved = replace(data, at=replace(data.at, q=q), pixel=pixel)
+    after = fitted(cell.drawn, moved, options)
+    assert {point.row for point in after.set_aside} == set(data.line[rows].tolist())
+    turned = cell.true.pose(data.at.q[held])[:, :3, 3] - cell.true.pose(q[held])[:, :3, 3]
+    assert after.pixels["holdout"][0] > 50.0 * before.pixels["holdout"][0]
+    far = np.sqrt((turned**2).sum(axis=1).mean())  # the flange's; a camera sees less, or a lever
+    assert 0.2 * far < 1e-3 * after.accuracy["holdout"].rms_mm < 3.0 * far
+
+
+def test_a_lens_that_is_held_is_known(ground: Cell) -> None:
+    """Its true focal length held tells more of the arm than the same length freed with a prior."""
+    held, freed, doubted = (
+        fitted(ground.drawn, data_of(ground), PixelOptions(**given))
+        for given in ({"fix_camera": True}, {}, {"fix_camera": True, "camera_prior": "f 0.1%"})
+    )
+    assert held.claim.sigma <= freed.claim.sigma < doubted.claim.sigma
+    assert arm_error(ground, held.robot) < 2.0 * 1e3 * held.claim.sigma
+    assert held.status is Status.CONVERGED
+
+
+def test_a_gantry_is_calibrated() -> None:
+    """Three slides and a wrist whose drawn links are all zero: no load has a lever as drawn."""
+    joints = "".join(
+        f'<joint name="j{i}" type="{kind}"><parent link="l{i}"/><child link="l{i + 1}"/>'
+        f'<axis xyz="{axis}"/><limit lower="-0.5" upper="0.5"/></joint>'
+        for i, (kind, axis) in enumerate(zip(["prismatic"] * 3 + ["revolute"] * 3,
+                                             ["1 0 0", "0 1 0", "0 0 1"] * 2, strict=True))
+    )  # fmt: skip
+    links = "".join(f'<link name="l{i}"/>' for i in range(7))
+    urdf = parse_urdf(f'<robot name="gantry">{links}{joints}</robot>'.encode())
+    drawn = robot_from_dict(to_robot(urdf).content, "gantry")
+    assert not drawn.mdh[:, :2].any()
+    rng = np.random.default_rng(2)
+    true = drawn.with_mdh(drawn.mdh + rng.normal(size=(6, 5)) * [3e-4, 3e-4, 1e-3, 1e-3, 0.0])
+    points, place = board_points(SMALL, WIDE), transform(np.eye(3), np.array([0.01, 0.0, 0.04]))
+    facing = transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+    view = View(drawn.pose(np.zeros(6)) @ place @ facing)
+    q = rng.uniform(-1, 1, (40, 6)) * [0.08, 0.08, 0.06, 0.4, 0.4, 0.4]
+    pixel = seen_by(view, true, q, points @ place[:3, :3].T + place[:3, 3], on_flange=False)
+    pixel = (pixel + rng.normal(size=pixel.shape) * 0.106)[None]
+    names = tuple(f"c{i}" for i in range(len(points)))
+    cell = Cell(drawn, true, False, (view,), points, place, q, pixel, names)
+    fit = fitted(drawn, data_of(cell), PixelOptions())
+    assert fit.status in (Status.CONVERGED, Status.NO_BETTER)
+    assert_allclose(fit.pixels["holdout"][0], 0.15, rtol=0.1)
+    assert arm_error(cell, fit.calibrated) < 2.0 * 1e3 * fit.claim.sigma
 
 
 # ---- the minimax -----------------------------------------------------------------------------

@@ -21,10 +21,11 @@ from experiments.pixel_cells import (
     make_cell,
     write_cell,
 )
-from minimax_cal.fitting.instruments.cameras import Pixels, as_instrument, detected
-from minimax_cal.fitting.instruments.pixel_calibration import fitted
-from minimax_cal.fitting.instruments.rows import own_state
 from minimax_cal.fitting.pixels.options import PixelOptions
+from minimax_cal.fitting.several.cameras import as_instrument, detected
+from minimax_cal.fitting.several.options import RelativeOptions
+from minimax_cal.fitting.several.pixel_calibration import fitted
+from minimax_cal.fitting.several.stack import Block, own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots.kinematics import rotation
@@ -90,15 +91,16 @@ def both_depths(cell: Cell) -> Array:
 def test_rows_are_the_derivatives(board: bool) -> None:
     cell = cell_of(1, points=board_points((3, 2), 0.08), poses=12)
     data = data_of(cell, board=board)
-    block = Pixels.of(cell.drawn, data, PixelOptions(camera_on="flange"))
+    images = as_instrument(data).ready(cell.drawn, RelativeOptions(camera_on="flange"))
+    block = Block.of(cell.drawn, images)
     rng = np.random.default_rng(0)
-    own = block.start(cell.drawn, np.ones(0, dtype=bool))
+    own = images.starts(block.arm.at(cell.drawn.mdh), np.ones(0, dtype=bool))[0]
     own = own + 1e-2 * rng.normal(size=own.size)
-    active = np.ones(len(block.seen.names.all), dtype=bool)
-    active[5 * cell.drawn.joints : block.seen.names.geometric] = False
+    active = np.ones(len(images.model.names.all), dtype=bool)
+    active[5 * cell.drawn.joints : images.model.names.geometric] = False
     mdh = cell.drawn.mdh + 1e-3 * rng.normal(size=cell.drawn.mdh.shape)
     _, slope = block.rows(own_state(mdh, own), active)
-    assert slope.shape == (active.sum(), len(block.weights))
+    assert slope.shape == (active.sum(), len(block.read(own_state(mdh, own)).weights))
     step, count = 1e-6, 5 * cell.drawn.joints
     for i, which in enumerate(np.flatnonzero(active)):
         move = np.zeros(len(active))
@@ -106,7 +108,7 @@ def test_rows_are_the_derivatives(board: bool) -> None:
         ends = []
         for sign in (1.0, -1.0):
             links = mdh + sign * move[:count].reshape(5, -1).T
-            state = own_state(links, own + sign * move[block.seen.names.geometric :])
+            state = own_state(links, own + sign * move[images.model.names.geometric :])
             ends.append(block.rows(state, active)[0])
         size = max(float(np.abs(slope[i]).max()), 1e-9)
         found = (ends[1] - ends[0]) / (2.0 * step)

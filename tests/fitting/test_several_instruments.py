@@ -11,16 +11,11 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from experiments.relative import NOISE, SIMULATORS, Arm
-from minimax_cal.fitting.instruments import (
-    RelativeCalibration,
-    closures,
-    read_relative,
-    relative,
-    write_relative,
-)
-from minimax_cal.fitting.start import fit_base
+from minimax_cal.fitting.several import RelativeCalibration, relative
 from minimax_cal.ground.arrays import Array
+from minimax_cal.instruments import closures, read_relative, write_relative
 from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.start import fit_base
 from minimax_cal.robots.kinematics import right_jacobian, rotation, rotation_vector
 from minimax_cal.robots.sampling import random_poses
 

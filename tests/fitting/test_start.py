@@ -8,10 +8,10 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.fitting import start
-from minimax_cal.fitting.start import CUBE, Turning, fit_base
+from minimax_cal.modelling import start
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.simulate import Simulation
+from minimax_cal.modelling.start import CUBE, Turning, fit_base
 from minimax_cal.robots.kernels import plain
 
 

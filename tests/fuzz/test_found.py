@@ -15,9 +15,9 @@ from conftest import run
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.fitting.instruments import read_relative
 from minimax_cal.fitting.pixels.data import read_board
 from minimax_cal.ground.files import json_of
+from minimax_cal.instruments import read_relative
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.reporting.plots.figures import new_figure, save
@@ -395,7 +395,7 @@ def test_a_simulator_keeps_no_log_beside_the_results(
 ) -> None:
     """MuJoCo wrote its warnings to a file in the folder where it was called."""
     pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
-    from minimax_cal.simulators.chain import mujoco
+    from minimax_cal.robots.mjcf import mujoco
 
     monkeypatch.chdir(tmp_path)
     found = mujoco()
@@ -411,7 +411,7 @@ def test_a_simulator_keeps_no_log_beside_the_results(
 def test_xml_in_another_encoding_than_it_says_is_refused(code: str, tmp_path: Path) -> None:
     """One of the two parsers that read a model did not mind."""
     pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
-    from minimax_cal.simulators.document import read_document
+    from minimax_cal.robots.document import read_document
 
     path = tmp_path / "arm.xml"
     other = "utf-8" if code == "utf-16" else "utf-16"

@@ -302,6 +302,24 @@ def test_patterns_of_names(
     assert (match.pose, match.label) == (pose, label)
 
 
+def test_a_pose_keeps_its_name(truth: mc.Measurements, tmp_path: Path, capsys: Any) -> None:
+    """What the file of joints calls a pose, whatever the tracker calls its points."""
+    points = ["name,X [mm],Y [mm],Z [mm]"]
+    points += [f"P{i + 1:03d}_{k + 1},{','.join(f'{1e3 * v:.6f}' for v in truth.y[i, k])}"
+               for i in range(POSES) for k in range(2)]  # fmt: skip
+    joints = ["name," + ",".join(f"J{j} [rad]" for j in range(1, 7))]
+    joints += [f"P{i + 1:03d},{','.join(f'{v:.9f}' for v in truth.q[i])}" for i in range(POSES)]
+    for name, lines in (("points.csv", points), ("joints.csv", joints)):
+        (tmp_path / name).write_text("\n".join(lines))
+    data = mc.read_campaigns([tmp_path / "points.csv", tmp_path / "joints.csv"])
+    assert data.called(data.line[4]) == "pose P005"
+    out = tmp_path / "out.csv"
+    assert run("import", tmp_path / "points.csv", tmp_path / "joints.csv", "-o", out) == 0
+    again = mc.read_measurements(out)
+    assert again.columns["pose"][4] == "P005"
+    assert again.notices == ()
+
+
 def test_a_workbook_is_measurements(truth: mc.Measurements, tmp_path: Path) -> None:
     head: list[object] = [*(f"q{i + 1}_rad" for i in range(6)), "smr1_x_mm", "smr1_y_mm"]
     rows: list[list[object]] = [[*head, "smr1_z_mm", "session"]]
@@ -312,3 +330,33 @@ def test_a_workbook_is_measurements(truth: mc.Measurements, tmp_path: Path) -> N
     data = mc.read_measurements(path)
     assert_allclose(data.q, truth.q, rtol=0, atol=1e-15)
     assert set(data.columns["session"]) == {"may"}
+
+
+def test_a_workbook_is_a_robot(tmp_path: Path) -> None:
+    rows = [["Robot", "KR 10"], ["Konvention", "modifiziert"],
+            ["Gelenk", "a [mm]", "alpha [°]", "d [mm]", "theta [°]"],
+            [1, 0, 0, 660.5, 0], [2, 0, -90, 0, 90], [3, 432, 0, 149, 0]]  # fmt: skip
+    path = tmp_path / "Datenblatt.xlsx"
+    path.write_bytes(workbook(rows))
+    robot = mc.load_robot(path)
+    assert robot.name == "KR 10"
+    assert_allclose(robot.mdh[:, :2], [[0, 0.6605], [0.432, 0], [0, 0.149]], rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("part", "old", "new"),
+    [
+        ("xl/worksheets/sheet1.xml", "<c><v>6", '<c r="XFD1048576"><v>6'),
+        ("xl/sharedStrings.xml", "", '<sst count="99999999999" uniqueCount="99999999999"></sst>'),
+    ],
+)
+def test_a_workbook_that_asks_for_any_memory(part: str, old: str, new: str, tmp_path: Path) -> None:
+    path, packed = tmp_path / "bomb.xlsx", io.BytesIO(workbook([[1, 2, 3], [4, 5, 6]]))
+    with zipfile.ZipFile(packed) as source, zipfile.ZipFile(path, "w") as bomb:
+        for name in source.namelist():
+            text = source.read(name).decode()
+            bomb.writestr(name, text.replace(old, new) if name == part and old else text)
+        if not old:
+            bomb.writestr(part, new)
+    with pytest.raises(mc.DataError, match=r"bomb\.xlsx: asks for more memory"):
+        mc.read_measurements(path)

@@ -378,6 +378,8 @@ def test_an_export_is_read_as_it_is(make: Maker, tmp_path: Path, rng: np.random.
     said = " ".join(found.notices)
     for words in export.says:
         assert words in said
+    files = [tmp_path / name for name in (*export.files, export.joints) if name]
+    assert_allclose(mc.read_campaigns(files).q, found.q[found.seen.any(axis=1)], rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,8 @@ import re
 
 import pytest
 
-from minimax_cal.measuring.importers import cmm, programs, words
+from minimax_cal.measuring.importers import cmm, programs
+from minimax_cal.reading import words
 
 TEXTS = (
     "9" * 200_000,

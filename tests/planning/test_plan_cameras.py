@@ -27,9 +27,9 @@ from experiments.pixel_cells import (
     taken,
     write_cell,
 )
-from minimax_cal.fitting.instruments.pixel_calibration import fitted
 from minimax_cal.fitting.pixels.determined import determined
 from minimax_cal.fitting.pixels.options import PixelOptions
+from minimax_cal.fitting.several.pixel_calibration import fitted
 from minimax_cal.ground.arrays import Array
 from minimax_cal.planning.camera_options import frame
 from minimax_cal.planning.result import Plan

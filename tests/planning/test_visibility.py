@@ -250,14 +250,19 @@ def test_limits_of_robots_without_any() -> None:
         limits_of(arm, {0: (2.0, 1.0)})
 
 
-def test_joints_turn_once_round_at_most(robot: mc.Robot) -> None:
+def test_joints_turn_once_round_at_most_and_keep_a_margin(robot: mc.Robot) -> None:
     lower, upper, _ = limits_of(robot, {})  # joint 6 of the file turns +-400 degrees
-    assert_allclose(upper - lower, np.minimum(robot.upper - robot.lower, 2.0 * np.pi))
+    inside = np.array([2.0] * 5 + [0.0]) * np.pi / 180.0
+    assert_allclose(lower, np.maximum(robot.lower + inside, -np.pi))
+    assert_allclose(upper, np.minimum(robot.upper - inside, np.pi))
     scara = mc.load_robot("scara_600")
     low, high, _ = limits_of(scara, {})
     slides = scara.prismatic
-    assert_allclose(low[slides], scara.lower[slides])
-    assert_allclose(high[slides], scara.upper[slides])
+    assert_allclose(low[slides], scara.lower[slides] + 0.005)
+    assert_allclose(high[slides], scara.upper[slides] - 0.005)
+    near = dataclasses.replace(scara, lower=scara.upper - 0.01)  # a range that is hardly any
+    assert_allclose(limits_of(near, {})[0], near.lower + 0.05 * 0.01)
+    assert_allclose(limits_of(scara, {0: (scara.lower[0], 0.0)})[0], low)  # of the robot's limits
 
 
 def test_the_workspace_is_not_what_is_seen(robot: mc.Robot, eye: Sight) -> None:

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from test_report import Seen
 
 import minimax_cal as mc
-from minimax_cal.fitting.instruments import RelativeCalibration, flange_poses, relative
+from minimax_cal.fitting.several import RelativeCalibration, relative
+from minimax_cal.instruments import flange_poses
 from minimax_cal.judging.bootstrap import bootstrap
 from minimax_cal.modelling.frames import frames_of, tables_of
 from minimax_cal.modelling.simulate import Simulation, simulate

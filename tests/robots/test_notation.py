@@ -319,6 +319,13 @@ def test_a_data_sheet_as_csv(tmp_path: Path, rng: np.random.Generator) -> None:
     q = rng.uniform(-1, 1, (5, 3))
     assert_allclose(robot.pose(q), flange(same, q), rtol=0, atol=1e-12)
     assert np.degrees(robot.upper) == pytest.approx([160, 110, 135])
+    german = (
+        SHEET.replace("joint;", "Gelenk;").replace("deg]", "\u00b0]").replace("_deg", " [\u00b0]")
+    )
+    german = german.replace("lower", "Untergrenze").replace("upper", "Obergrenze")
+    path.write_bytes(("Name;Puma 560\n" + german).encode("cp1252"))
+    assert mc.load_robot(path).name == "Puma 560"
+    assert_allclose(mc.load_robot(path).mdh, robot.mdh, rtol=0, atol=0)
     for content in (CRAIG, TURNED, arm(joint(1, 2, 3, 90), joint(4, 5, 6, 7))):
         out = tmp_path / "out.csv"
         written = robot_from_dict(content)
@@ -334,7 +341,7 @@ def test_a_data_sheet_as_csv(tmp_path: Path, rng: np.random.Generator) -> None:
         (("a_i-1 [mm]", "r"), "unknown column 'r'; did you mean"),
         (("432", "4e"), ":5: column a: '4e' is not a number"),
         (("alpha_i-1 [deg]", "alpha_i-1 [rad]"), "one unit for theta and alpha, please"),
-        (("3;432;0;149;0;0;-135;135", "3;432;0"), ":5: 3 cells, the header has 8"),
+        (("3;432;0;149;0;0;-135;135", "3;432;0"), ":5: 3 cells, but the header has 8"),
     ],
 )
 def test_what_a_data_sheet_cannot_say(change: tuple[str, str], said: str, tmp_path: Path) -> None:

@@ -171,12 +171,92 @@ def test_of_frames_on_one_body_tool0_is_meant() -> None:
     assert to_robot(parse_urdf(text.encode())).chain[-1].child == "tool0"
 
 
+def test_a_chain_between_two_links_and_grippers_left_out() -> None:
+    """A lifting torso with two arms, each with a flange, a camera and two fingers."""
+    pinocchio = pytest.importorskip("pinocchio")
+    lines = ['<robot name="cell"><link name="world"/><link name="torso"/>']
+
+    def joint(name: str, kind: str, parent: str, child: str, inside: str) -> None:
+        lines.append(
+            f'<link name="{child}"/><joint name="{name}" type="{kind}"><parent link="{parent}"/>'
+            f'<child link="{child}"/>{inside}'
+            '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+        )
+
+    lines.append(
+        '<joint name="lift" type="prismatic"><parent link="world"/><child link="torso"/>'
+        '<origin xyz="0 0 1" rpy="0 1 0"/><axis xyz="1 0 0"/>'
+        '<limit lower="0" upper="1" effort="1" velocity="1"/></joint>'
+    )
+    for side, y in (("left", 0.2), ("right", -0.2)):
+        above = "torso"
+        for i, turn in enumerate(("0 0 0", "1.5 0 0", "0 0 1", ".2 .3 .4")):
+            where = f'<origin xyz=".1 {y} .2" rpy="{turn}"/><axis xyz="0 .1 1"/>'
+            joint(f"{side}_{i}", "revolute", above, f"{side}_link{i}", where)
+            above = f"{side}_link{i}"
+        joint(f"{side}_f", "fixed", above, f"{side}_flange", '<origin xyz="0 0 .1"/>')
+        joint(f"{side}_h", "fixed", f"{side}_flange", f"{side}_hand", '<origin xyz="0 0 .1"/>')
+        for finger in "ab":
+            place = '<origin xyz="0 .02 .1"/>'
+            joint(f"{side}_{finger}", "prismatic", f"{side}_hand", f"{side}_finger_{finger}", place)
+        joint(f"{side}_c", "fixed", f"{side}_link1", f"{side}_camera", "")
+    text = "".join([*lines, "</robot>"])
+    urdf = parse_urdf(text.encode(), "cell.urdf")
+    with pytest.raises(mc.RobotError, match=r"left_flange, right_flange; .* cell.urdf#left_flange"):
+        to_robot(urdf)
+    theirs = pinocchio.buildModelFromXML(text)
+    data, q = theirs.createData(), pinocchio.randomConfiguration(theirs)
+    pinocchio.framesForwardKinematics(theirs, data, q)
+    there = {f.name: data.oMf[i].homogeneous for i, f in enumerate(theirs.frames)}
+    for spec in ("torso:right_flange", "right_link0:right_hand", "world:left_finger_a", "torso:"):
+        root, _, tip = spec.partition(":")
+        if not tip:
+            with pytest.raises(mc.RobotError, match="several chains"):
+                to_robot(urdf, spec)
+            continue
+        model = to_robot(urdf, spec)
+        own = [q[theirs.joints[theirs.getJointId(j.name)].idx_q] for j in model.chain if j.moves]
+        ours = model.base @ robot_from_dict(model.content).pose(np.array(own)) @ model.tool
+        assert_allclose(ours, np.linalg.inv(there[root]) @ there[tip], **EXACT)
+        up = model.base[:3, :3] @ robot_from_dict(model.content).up
+        if root == "torso":
+            assert_allclose(up, there["torso"][:3, :3].T @ [0, 0, 1], **EXACT)
+    assert to_robot(urdf, "right_link0:").chain[-1].child == "right_flange"
+
+
+@pytest.mark.dev
+def test_a_joint_whose_limits_are_one_number_is_fixed_there() -> None:
+    pinocchio = pytest.importorskip("pinocchio")
+    rows = [row for row in ARM if row[0] != "continuous"]
+    rows[1] = (*rows[1][:4], 'lower="0.3" upper="0.3"')
+    rows[3] = (*rows[3][:4], 'lower="-0.2" upper="-0.2"')
+    text = urdf_of(tuple(rows))
+    model = to_robot(parse_urdf(text.encode()))
+    robot = robot_from_dict(model.content)
+    theirs = pinocchio.buildModelFromXML(text)
+    data, frame = theirs.createData(), theirs.getFrameId(model.chain[-1].child)
+    assert robot.joints == theirs.nq - 2 == 2
+    for q in random_joints(robot.lower, robot.upper, 20):
+        pinocchio.framesForwardKinematics(theirs, data, np.array([0.3, -0.2, *q]))
+        ours = model.base @ robot.pose(q) @ model.tool
+        assert_allclose(ours, data.oMf[frame].homogeneous, **EXACT)
+
+
+ENDS = '<parent link="a"/><child link="b"/>'
 JOINT = '<joint name="j" type="revolute"><parent link="a"/><child link="b"/>{}</joint>'
 BROKEN = {
     "": r":1: is not XML \(no element found\)",
     "<robot><link": ":1: is not XML",
     "<html/>": "its root is <html>, expected <robot>",
-    "<robot/>": "expected one root link, found none",
+    "<robot/>": "holds no <link>, so no robot",
+    f'<robot><joint name="j" type="fixed">{ENDS}</joint></robot>': "no link 'a'",
+    "<robot>"
+    + "".join(
+        f'<link name="{a}"/><joint name="j{a}" type="fixed"><parent link="{a}"/>'
+        f'<child link="{b}"/></joint>'
+        for a, b in ("ab", "ba")
+    )
+    + "</robot>": "expected one root link, found none: the joints form a ring",
     '<robot><link name="a"/></robot>': "has no revolute, continuous or prismatic joint",
     "<robot><link/></robot>": "<link> has no name",
     '<robot><xacro:macro name="x"/></robot>': "this is xacro, not URDF; expand it first",
@@ -194,7 +274,8 @@ BROKEN = {
             '<origin xyz="1 nan 2"/>': "expected 3 numbers",
             '<origin rpy="0 ${pi} 0"/>': "is xacro; expand it first",
             '<axis xyz="0 0 0"/>': "its axis is a zero vector",
-            '<limit lower="1" upper="-1"/>': "limit lower is not below upper",
+            '<limit lower="1" upper="-1"/>': "limit lower is above upper",
+            '<limit lower="0" upper="0"/>': r"joint that its limits \(lower = upper\) do not hold",
             '<limit lower="one"/>': "expected a number",
             '<mimic joint="k"/>': "mimics 'k', no moving joint of this chain",
             '<mimic joint="j"/>': "mimics 'j', a ring",

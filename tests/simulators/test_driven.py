@@ -22,10 +22,10 @@ from tests.simulators.test_mjcf import cell_with, in_base, poses, robot_called, 
 mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
 
 from experiments import simulator_gap as study  # noqa: E402
+from minimax_cal.robots.document import read_document  # noqa: E402
+from minimax_cal.robots.mjcf import read_model  # noqa: E402
 from minimax_cal.simulators.chain import chain_of  # noqa: E402
-from minimax_cal.simulators.document import read_document  # noqa: E402
 from minimax_cal.simulators.drive import drive  # noqa: E402
-from minimax_cal.simulators.given import read_model  # noqa: E402
 
 HOLDS, HOLDS_MM = 0.1, 0.02  # of what an effect does, or [mm]
 STILL = 2e-3  # [rad/s]

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.modelling.cell import still
 from minimax_cal.modelling.effects.table import Fitted, terms
-from minimax_cal.simulators.given import read_model
+from minimax_cal.robots.mjcf import read_model
 from tests.problems_mjcf import published_like
 
 mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")

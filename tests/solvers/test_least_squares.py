@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from experiments.speed import identified
-from minimax_cal.fitting import start
+from minimax_cal.modelling import start
 from minimax_cal.modelling.model import SumOfSquares, model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate

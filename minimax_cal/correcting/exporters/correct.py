@@ -60,10 +60,10 @@ def correct(job: Job, urdf: Urdf) -> Export:
     targets = [pose @ x for pose, x in zip(placed, links, strict=False)]
     raw = rewritten(urdf, chain, targets, placed[-1] @ tool)
     q = random_joints(job.robot.lower, job.robot.upper)
-    written = tip_poses(to_robot(parse_urdf(raw, urdf.source), chain[-1].child).chain, q)
+    written = tip_poses(to_robot(parse_urdf(raw, urdf.source), job.tip or chain[-1].child).chain, q)
     if (worst := difference(written, base @ job.robot.pose(q) @ tool)) > EXACT:
         raise OptionError(f"{urdf.source}: cannot hold this geometry (off by {worst:.1e} m)")
-    notices = [*constants(base, tool, urdf.root, chain[-1].child)]
+    notices = [*constants(base, tool, chain[0].parent, chain[-1].child)]
     if misfit > NOTED:
         notices.append(
             f"{urdf.source} and the nominal robot differ by up to {1e3 * misfit:.3g} mm or mrad: "

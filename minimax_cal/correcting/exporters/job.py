@@ -18,7 +18,7 @@ from minimax_cal.modelling.effects.compliance import JOINT_COMPLIANCE, stiffens
 from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.transforms import SAME, head, tail
-from minimax_cal.robots.urdf import is_urdf, load_urdf
+from minimax_cal.robots.urdf import has_links, load_urdf
 from minimax_cal.robots.urdf_file import Urdf
 
 
@@ -85,7 +85,7 @@ def read_source(source: Result | Robot, rung: int | None = None) -> Opened | Job
             if {"targets_mm", "kind"} & set(saved_content(path)):
                 return open_result(path, rung)
     robot = load_robot(source)
-    notices = load_urdf(source).notices if is_urdf(source) else ()
+    notices = load_urdf(source).notices if has_links(source) else ()
     return Job(robot, robot, str(source), np.full(robot.joints, np.nan), notices=notices)
 
 

@@ -10,19 +10,20 @@ from typing import Any
 from minimax_cal.dynamics.logs.bags import is_bag, read_bag
 from minimax_cal.dynamics.logs.draft import Draft, drafts_of
 from minimax_cal.dynamics.logs.faults import checked
-from minimax_cal.dynamics.logs.formats import is_log
 from minimax_cal.dynamics.logs.repeats import check_repeats
-from minimax_cal.dynamics.logs.table import Log, read_table
+from minimax_cal.dynamics.logs.table import Log, log_sheet, read_table
 from minimax_cal.dynamics.logs.write import runs_text
 from minimax_cal.dynamics.run import Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.importers import units_of
-from minimax_cal.measuring.importers.sheet import cut, open_text
-from minimax_cal.measuring.importers.words import along_arm
+from minimax_cal.reading.formats import is_log
+from minimax_cal.reading.words import along_arm
 
 __all__ = ["LogFiles", "are_logs", "import_logs", "read_runs", "runs_text"]
+
+LOOKED_AT = 50  # lines that show whether a file is a log
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,15 +207,6 @@ def are_logs(paths: Sequence[Path | str]) -> bool:
 def looks_like_log(path: Path) -> bool:
     """Whether the header of a text file, or its lack, is that of a log."""
     try:
-        sheet = open_text(path)
-        head = "\n".join(sheet.text.lstrip("%").splitlines()[:50])
-        sheet = cut(replace(sheet, text=head), most_torn=1.0)
+        return is_log(log_sheet(path, LOOKED_AT).header)
     except DataError:
         return False
-    if sheet.header:
-        return is_log(sheet.header)
-    cells = sheet.cells[0] if sheet.cells else ()
-    words = sum(cell.replace("_", "a").isalpha() for cell in cells[3:])
-    return (
-        len(cells) > 3 and words > 0 and len(cells) in (3 + 2 * words, 3 + 3 * words, 3 + 4 * words)
-    )

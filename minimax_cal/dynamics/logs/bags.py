@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.dynamics.logs.formats import SI
 from minimax_cal.dynamics.logs.table import Log
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.optional import optional
+from minimax_cal.reading.formats import SI
 
 ENDINGS = (".bag", ".mcap", ".db3")
 METADATA = "metadata.yaml"  # in the folder of a ROS 2 bag

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -10,17 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.dynamics.logs.formats import (
-    FORMATS,
-    LENGTH,
-    Format,
-    Place,
-    format_of,
-)
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.columns import is_simulated
-from minimax_cal.measuring.importers.sheet import Sheet, cut, open_text
+from minimax_cal.reading.formats import FORMATS, Format, Place, format_of
+from minimax_cal.reading.sheet import Sheet, cut, numbers_of, open_text
+from minimax_cal.reading.words import SIZES, near
 
 MOST_TORN = 0.01  # share of rows that a log may lose to torn lines
 MOST_JOINTS = 100  # of any machine; guards against a number that is none of a joint
@@ -30,7 +23,10 @@ SHORTEST_STEP, LONGEST_STEP = 5e-5, 0.5  # between rows of any log of a motion [
 FACTORS = {"rad": 1.0, "deg": np.pi / 180.0, "m": 1.0, "mm": 1e-3, "mA": 1e-3}
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 WORDS = ("name", "run")  # columns of text
+CLOCKS = ("t", "sec", "nanosec")
 SINGLE = ("t", "sec", "nanosec", "payload")  # kinds of which a file has one column
+KNOWN = ("t_s", "payload_kg", "run", "q1_rad", "q1_deg", "qd1_rad_s", "qdd1_rad_s2", "tau1_Nm",
+         "i1_A", "q1_cmd_rad", "tau1_cmd_Nm", "temperature1_C")  # fmt: skip
 SHOWN = 3  # lines or names that a notice gives
 
 
@@ -57,7 +53,7 @@ class Log:
     @property
     def sliding(self) -> Array:
         """(n,) True where a joint's column has a unit of length."""
-        return np.array([unit in LENGTH for unit in self.units["q"]])
+        return np.array([unit in SIZES for unit in self.units["q"]])
 
     def taking(self, order: Sequence[int]) -> Log:
         """The log of some joints, in an order."""
@@ -78,268 +74,236 @@ class Log:
         )
 
 
+def log_sheet(path: Path, lines: int | None = None) -> Sheet:
+    """The rows of a log, with a header also where a recorder writes none.  Raises DataError.
+
+    lines: how many are looked at, torn or not; all unless given.
+    """
+    text = open_text(path)
+    body = text.text.lstrip("%")  # of rostopic echo -p, whose header is no comment
+    head = body if lines is None else "\n".join(body.splitlines()[:lines])
+    sheet = cut(replace(text, text=head), most_torn=MOST_TORN if lines is None else 1.0)
+    if sheet.header or not sheet.cells:
+        return sheet
+    return replace(sheet, header=topic_header(sheet.cells[0]))
+
+
+def topic_header(first: Sequence[str]) -> tuple[str, ...]:
+    """The names of what `ros2 topic echo --csv` writes of JointState, or nothing.
+
+    Stamp, frame, names, and up to three arrays.  first: the first row.
+    """
+    n = sum(bool(re.fullmatch(r"[A-Za-z]\w*", cell)) for cell in first[3:])
+    held = ("name", "position", "velocity", "effort")[: (len(first) - 3) // max(n, 1)]
+    if len(held) < 2 or len(first) != 3 + len(held) * n:
+        return ()
+    stamp = ("header.stamp.sec", "header.stamp.nanosec", "frame")
+    return (*stamp, *(f"{kind}[{i}]" for kind in held for i in range(n)))
+
+
 def read_table(path: Path, units: Mapping[str, str]) -> Log:
     """A text file's columns.  units: that the file does not tell, as {"q": "deg"}.
 
     Raises DataError.
     """
-    text = open_text(path)
-    if text.text.startswith("%"):  # rostopic echo -p, whose header is no comment
-        text = replace(text, text=text.text[1:])
-    sheet = cut(text, most_torn=MOST_TORN)
+    sheet = log_sheet(path)
     if not len(sheet.line):
         raise DataError(f"{path}: holds a header but no whole row")
     if not sheet.header:
-        return headless(sheet)
-    found = format_of(sheet.header)
-    if not found:
-        names = ", ".join(sheet.header[:6])
-        more = " ..." if len(sheet.header) > 6 else ""
         raise DataError(
-            f"{path}:1: no joint columns among {names}{more}; name them q1_rad (or q1_deg), "
-            f"q2_rad, ..., or as {', '.join(form.title for form in FORMATS[1:])} do"
+            f"{path}: has no header; name the columns t_s, q1_rad, ..., and tau1_Nm or i1_A"
         )
-    return of_format(sheet, *found, units)
-
-
-def headless(sheet: Sheet) -> Log:
-    """What `ros2 topic echo --csv` writes of JointState: stamp, frame, names, and three arrays.
-
-    Raises DataError.
-    """
-    first = sheet.cells[0]
-    names = [cell for cell in first[3:] if re.fullmatch(r"[A-Za-z]\w*", cell)]
-    n = len(names)
-    if not n or len(first) not in (3 + 2 * n, 3 + 3 * n, 3 + 4 * n):
-        raise DataError(
-            f"{sheet.path}: has no header; name the columns t_s, q1_rad, ..., and tau1_Nm or i1_A"
-        )
-    held = [
-        kind
-        for i, kind in enumerate(("position", "velocity", "effort"))
-        if len(first) > 3 + (i + 1) * n
-    ]
-    header = ["header.stamp.sec", "header.stamp.nanosec", "frame"]
-    header += [f"name[{i}]" for i in range(n)]
-    header += [f"{kind}[{i}]" for kind in held for i in range(n)]
-    found = format_of(header)
-    assert found
-    return of_format(replace(sheet, header=tuple(header)), *found, {})
-
-
-def of_format(
-    sheet: Sheet, form: Format, places: Mapping[int, Place], units: Mapping[str, str]
-) -> Log:
-    """The columns of a sheet whose format is known.  Raises DataError."""
-    reading = Cells(sheet)
-    joints = joint_keys(sheet, form, places)
-    values: dict[str, Array] = {}
-    headers: dict[str, tuple[str, ...]] = {}
-    own: dict[str, tuple[str, ...]] = {}
-    for kind in dict.fromkeys(place.kind for place in places.values()):
-        at = [] if kind in WORDS else columns_of(sheet, kind, places, joints)
-        if not at:
-            continue
-        blocks = [reading.block(i) for i in at]
-        units_of = [unit_of(sheet, i, places[i], units) for i in at]
-        wide = [block.shape[1] for block in blocks]
-        own[kind] = tuple(np.repeat(units_of, wide).tolist())
-        check_sizes(sheet, kind, at, blocks)
-        block = np.concatenate(blocks, axis=1) * [FACTORS.get(unit, 1.0) for unit in own[kind]]
-        names = [sheet.header[i] for i in at]
-        of_list = tuple(f"{names[0]}[{j}]" for j in range(wide[0]))
-        headers[kind] = of_list if wide[0] > 1 else tuple(names)
-        single = kind in SINGLE or (kind == "temperature" and not places[at[0]].joint)
-        values[kind] = block[:, 0] if single else block
-    values["t"] = reading.time(values, own.get("t", ("",))[0])
-    run = next((i for i, place in places.items() if place.kind == "run"), None)
-    whole = [row for row in range(len(sheet.line)) if row not in reading.broken]
-    values = same_width(sheet, values)
-    return Log(
-        source=str(sheet.path),
-        title=form.title,
-        line=sheet.line[whole],
-        values={kind: value[whole] for kind, value in values.items()},
-        headers=headers,
-        units=own,
-        joints=names_of(sheet, places, joints),
-        run=() if run is None else tuple(sheet.cells[row][run] for row in whole),
-        notices=(*reading.notices(), *unused(sheet, form, places)),
-        simulated=is_simulated(sheet.text),
+    if found := format_of(sheet.header):
+        return Columns(sheet, *found, units).log()
+    names = ", ".join(sheet.header[:6]) + (" ..." if len(sheet.header) > 6 else "")
+    raise DataError(
+        f"{path}:1: no joint columns among {names}; name them q1_rad (or q1_deg), q2_rad, ..., or "
+        f"as {', '.join(form.title for form in FORMATS[1:-1])} do"
     )
 
 
-def check_sizes(sheet: Sheet, kind: str, at: Sequence[int], blocks: Sequence[Array]) -> None:
-    """Raise DataError for a number that no arm has."""
-    most = MOST_TIME if kind in ("t", "sec", "nanosec") else MOST
-    for i, block in zip(at, blocks, strict=True):
-        odd = (np.abs(block) > most).any(axis=1)
-        if odd.any():
-            row = int(np.argmax(odd))
-            raise DataError(
-                f"{sheet.path}:{sheet.line[row]}: column {sheet.header[i]}: "
-                f"{sheet.cells[row][i][:40]} cannot be; check the number and its unit"
-            )
-
-
-def unit_of(sheet: Sheet, at: int, place: Place, units: Mapping[str, str]) -> str:
-    """The unit of a column.  Raises DataError where nobody tells it."""
-    kind = "q" if place.kind in ("q", "qd", "qdd", "q_cmd") else place.kind
-    unit = units.get(kind, "") or place.unit
-    if not unit and kind == "q":
-        raise DataError(
-            f"{sheet.path}: column {sheet.header[at]}: has no unit; add units='q=deg' or "
-            "units='q=rad'"
-        )
-    return unit
-
-
-def joint_keys(sheet: Sheet, form: Format, places: Mapping[int, Place]) -> list[str]:
-    """What tells the joints of a file apart, in order.  Raises DataError."""
-    keys = list(dict.fromkeys(p.joint for p in places.values() if p.kind == "q" and p.joint))
-    if not keys or not all(key.isdigit() for key in keys):
-        return keys
-    numbers = sorted(map(int, keys))
-    for expected, number in enumerate(numbers, form.first):
-        if number != expected or number > MOST_JOINTS:
-            example = next(
-                sheet.header[i]
-                for i, p in places.items()
-                if p.joint == str(numbers[-1]) and p.kind == "q"
-            )
-            raise DataError(
-                f"{sheet.path}:1: joint {expected} has no column, but {example} is there; number "
-                f"the joints from {form.first} on"
-            )
-    return [key for number in numbers for key in keys if int(key) == number]
-
-
-def columns_of(
-    sheet: Sheet, kind: str, places: Mapping[int, Place], joints: Sequence[str]
-) -> list[int]:
-    """The columns of a kind, in the joints' order; none where joints lack.  Raises DataError."""
-    mine = [i for i, place in places.items() if place.kind == kind]
-    if kind in SINGLE:
-        return mine[:1]
-    if kind == "temperature" and any(not places[i].joint for i in mine):
-        return [i for i in mine if not places[i].joint][:1]
-    if kind == "q" and {"rad", "deg"} <= {places[i].unit for i in mine}:
-        raise DataError(f"{sheet.path}:1: joint columns mix _rad and _deg; use one of them")
-    by_joint: dict[str, int] = {}
-    for i in mine:
-        first = by_joint.setdefault(places[i].joint, i)
-        if first != i:
-            raise DataError(
-                f"{sheet.path}:1: {sheet.header[first]} and {sheet.header[i]} are one column; "
-                "keep one of them"
-            )
-    if not joints:  # a vector in each cell
-        return [by_joint[""]]
-    lost = [joint for joint in joints if joint not in by_joint]
-    if not lost:
-        return [by_joint[joint] for joint in joints]
-    if kind in ("tau", "i") and len(lost) < len(joints):
-        i = next(i for i, p in places.items() if p.kind == "q" and p.joint == lost[0])
-        raise DataError(
-            f"{sheet.path}:1: joint column {sheet.header[i]} has no torque or current beside "
-            f"{sheet.header[mine[0]]}; add it"
-        )
-    return []
-
-
-def same_width(sheet: Sheet, values: dict[str, Array]) -> dict[str, Array]:
-    """The values, without derivatives of other joints than q has.  Raises DataError."""
-    n = values["q"].shape[1]
-    for kind in ("tau", "i"):
-        if kind in values and values[kind].shape[1] != n:
-            raise DataError(
-                f"{sheet.path}: holds {n} joint values but {values[kind].shape[1]} torques or "
-                "currents a row; log as many of both"
-            )
-    fits = {k: v for k, v in values.items() if v.ndim == 1 or v.shape[1] == n}
-    return {kind: value for kind, value in fits.items() if kind not in ("sec", "nanosec")}
-
-
-def names_of(sheet: Sheet, places: Mapping[int, Place], joints: Sequence[str]) -> tuple[str, ...]:
-    """Names of the joints: those in columns of names, or those that columns are called by.
-
-    Raises DataError where names change along the file.
-    """
-    called = {place.joint: i for i, place in places.items() if place.kind == "name"}
-    if set(joints) <= set(called) and joints:
-        for joint in joints:
-            cells = [row[called[joint]] for row in sheet.cells]
-            other = next((i for i, cell in enumerate(cells) if cell != cells[0]), None)
-            if other is not None:
-                raise DataError(
-                    f"{sheet.path}:{sheet.line[other]}: column {sheet.header[called[joint]]}: "
-                    f"{cells[other]!r} follows {cells[0]!r}: joints of two topics; keep one of them"
-                )
-        return tuple(sheet.cells[0][called[joint]] for joint in joints)
-    return () if all(joint.isdigit() for joint in joints) else tuple(joints)
-
-
-def unused(sheet: Sheet, form: Format, places: Mapping[int, Place]) -> list[str]:
-    """Notices of columns that look like those of the format but are not."""
-    if not form.strict:
-        return []
-    known = ["t_s", "payload_kg", "run"]
-    for j in range(1, 10):
-        known += [f"q{j}_rad", f"q{j}_deg", f"qd{j}_rad_s", f"qdd{j}_rad_s2", f"tau{j}_Nm"]
-        known += [f"i{j}_A", f"q{j}_cmd_rad", f"tau{j}_cmd_Nm", f"temperature{j}_C"]
-    out = []
-    for i, name in enumerate(sheet.header):
-        if i not in places:
-            near = difflib.get_close_matches(name, known, 1, cutoff=0.75)
-            hint = f" (did you mean {near[0]}?)" if near else ""
-            out.append(f"{sheet.path}: column {name} is not used{hint}")
-    return out
-
-
 @dataclass(frozen=True, eq=False)
-class Cells:
-    """The numbers of a sheet.  broken: rows with a cell that is none, and what it holds."""
+class Columns:
+    """The columns of a sheet, whose format is known.
+
+    places: what they hold.  given: units that the user tells.  broken: rows with a cell that is no
+    number, and what it holds.
+    """
 
     sheet: Sheet
+    form: Format
+    places: Mapping[int, Place]
+    given: Mapping[str, str]
     broken: dict[int, str] = field(default_factory=dict)
+
+    def log(self) -> Log:
+        """The columns in SI.  Raises DataError."""
+        values: dict[str, Array] = {}
+        headers: dict[str, tuple[str, ...]] = {}
+        units: dict[str, tuple[str, ...]] = {}
+        for kind in dict.fromkeys(place.kind for place in self.places.values()):
+            at = [] if kind in WORDS else self.of_joints(kind)
+            if not at:
+                continue
+            blocks = [self.block(i) for i in at]
+            wide = [block.shape[1] for block in blocks]
+            units[kind] = tuple(np.repeat([self.unit(i) for i in at], wide).tolist())
+            factors = [FACTORS.get(unit, 1.0) for unit in units[kind]]
+            block = np.concatenate(blocks, axis=1) * factors
+            names = [self.sheet.header[i] for i in at]
+            of_list = tuple(f"{names[0]}[{j}]" for j in range(wide[0]))
+            headers[kind] = of_list if wide[0] > 1 else tuple(names)
+            single = kind in SINGLE or (kind == "temperature" and not self.places[at[0]].joint)
+            values[kind] = block[:, 0] if single else block
+        values["t"] = self.time(values, units.get("t", ("",))[0])
+        run, sheet = self.of_kind("run"), self.sheet
+        whole = np.setdiff1d(np.arange(len(sheet.line)), list(self.broken))
+        return Log(
+            source=str(sheet.path),
+            title=self.form.title,
+            line=sheet.line[whole],
+            values={kind: value[whole] for kind, value in self.same_width(values).items()},
+            headers=headers,
+            units=units,
+            joints=self.names(),
+            run=tuple(sheet.cells[row][run[0]] for row in whole) if run else (),
+            notices=(*self.left_out(), *self.unused()),
+            simulated=sheet.simulated,
+        )
+
+    def error(self, text: str, line: int = 1) -> DataError:
+        """What is wrong, and where."""
+        return DataError(f"{self.sheet.path}:{line}: {text}")
+
+    def of_kind(self, kind: str) -> list[int]:
+        """The columns of a kind."""
+        return [i for i, place in self.places.items() if place.kind == kind]
+
+    def joints(self) -> list[str]:
+        """What tells the joints of a file apart, in order.  Raises DataError."""
+        columns = {self.places[i].joint: self.sheet.header[i] for i in self.of_kind("q")}
+        columns.pop("", None)
+        if not all(key.isdigit() for key in columns):
+            return list(columns)
+        keys = sorted(columns, key=int)
+        for expected, key in enumerate(keys, self.form.first):
+            if int(key) != expected or expected > MOST_JOINTS:
+                raise self.error(
+                    f"joint {expected} has no column, but {columns[keys[-1]]} is there; number "
+                    f"the joints from {self.form.first} on"
+                )
+        return keys
+
+    def of_joints(self, kind: str) -> list[int]:
+        """The columns of a kind, in the joints' order; none where joints lack.
+
+        Raises DataError.
+        """
+        mine, header = self.of_kind(kind), self.sheet.header
+        alone = [i for i in mine if not self.places[i].joint]
+        if kind in SINGLE or (kind == "temperature" and alone):
+            return alone[:1]
+        if kind == "q" and {"rad", "deg"} <= {self.places[i].unit for i in mine}:
+            raise self.error("joint columns mix _rad and _deg; use one of them")
+        by_joint: dict[str, int] = {}
+        for i in mine:
+            if (first := by_joint.setdefault(self.places[i].joint, i)) != i:
+                raise self.error(
+                    f"{header[first]} and {header[i]} are one column; keep one of them"
+                )
+        joints = self.joints() or [""]  # a vector in each cell
+        lost = [joint for joint in joints if joint not in by_joint]
+        if kind in ("tau", "i") and 0 < len(lost) < len(joints):
+            i = next(i for i in self.of_kind("q") if self.places[i].joint == lost[0])
+            raise self.error(
+                f"joint column {header[i]} has no torque or current beside {header[mine[0]]}; "
+                "add it"
+            )
+        return [] if lost else [by_joint[joint] for joint in joints]
+
+    def unit(self, at: int) -> str:
+        """The unit of a column.  Raises DataError where nobody tells it."""
+        place = self.places[at]
+        kind = "q" if place.kind in ("q", "qd", "qdd", "q_cmd") else place.kind
+        unit = self.given.get(kind, "") or place.unit
+        if not unit and kind == "q":
+            raise DataError(
+                f"{self.sheet.path}: column {self.sheet.header[at]}: has no unit; add "
+                "units='q=deg' or units='q=rad'"
+            )
+        return unit
+
+    def same_width(self, values: dict[str, Array]) -> dict[str, Array]:
+        """The values, without derivatives of other joints than q has.  Raises DataError."""
+        n = values["q"].shape[1]
+        for kind in ("tau", "i"):
+            if kind in values and values[kind].shape[1] != n:
+                raise DataError(
+                    f"{self.sheet.path}: holds {n} joint values but {values[kind].shape[1]} "
+                    "torques or currents a row; log as many of both"
+                )
+        fits = {k: v for k, v in values.items() if v.ndim == 1 or v.shape[1] == n}
+        return {kind: value for kind, value in fits.items() if kind not in ("sec", "nanosec")}
+
+    def names(self) -> tuple[str, ...]:
+        """Names of the joints: those in columns of names, or those that columns are called by.
+
+        Raises DataError where names change along the file.
+        """
+        joints, cells = self.joints(), self.sheet.cells
+        called = {self.places[i].joint: i for i in self.of_kind("name")}
+        if not joints or not set(joints) <= set(called):
+            return () if all(joint.isdigit() for joint in joints) else tuple(joints)
+        first = [cells[0][called[joint]] for joint in joints]
+        for line, row in zip(self.sheet.line, cells, strict=True):
+            for joint, name in zip(joints, first, strict=True):
+                if (found := row[called[joint]]) != name:
+                    raise self.error(
+                        f"column {self.sheet.header[called[joint]]}: {found!r} follows {name!r}: "
+                        "joints of two topics; keep one of them",
+                        line,
+                    )
+        return tuple(first)
+
+    def unused(self) -> list[str]:
+        """Notices of columns that look like those of the format but are not."""
+        left = [name for i, name in enumerate(self.sheet.header) if i not in self.places]
+        said = [f"{self.sheet.path}: column {n} is not used{near(n, KNOWN)}" for n in left]
+        return said if self.form.strict else []
 
     def block(self, at: int) -> Array:
         """(m, 1) numbers of a column, or (m, k) of one that holds a list in each cell."""
+        if self.sheet.block is not None:
+            values = self.sheet.block[:, [at]]
+            if (np.abs(values) <= self.most(at)).all():
+                return values
         cells = [row[at] for row in self.sheet.cells]
-        if any(cell.startswith("[") for cell in cells[:SHOWN]):
-            return self.lists(at, cells)
-        return self.numbers(at, cells)[:, None]
-
-    def numbers(self, at: int, cells: list[str]) -> Array:
-        """(m,) numbers, NaN where there is none."""
-        if self.sheet.decimal == ",":
-            cells = [cell.replace(",", ".") for cell in cells]
-        try:
-            if any("_" in cell for cell in cells):
-                raise ValueError
-            out = np.array(cells, dtype=float)
-        except ValueError:
-            out = np.array([self.number(at, row, cell) for row, cell in enumerate(cells)])
-        return np.where(np.isfinite(out), out, np.nan)
-
-    def number(self, at: int, row: int, cell: str) -> float:
-        """One number, NaN where the cell is empty or holds none."""
-        try:
-            return float(cell if "_" not in cell else "no number") if cell else np.nan
-        except ValueError:
-            self.broken.setdefault(row, f"column {self.sheet.header[at]}: {cell!r}")
-            return np.nan
-
-    def lists(self, at: int, cells: list[str]) -> Array:
-        """(m, k) numbers of cells like [1, 2, 3] or [1 2 3]."""
+        if not any(cell.startswith("[") for cell in cells[:SHOWN]):
+            return self.numbers(at, cells)[:, None]
         rows = [cell.strip("[]").replace(",", " ").split() for cell in cells]
         k = max(map(len, rows))
-        for row, parts in enumerate(rows):
-            if len(parts) != k:
-                self.broken.setdefault(row, f"column {self.sheet.header[at]}: {cells[row][:40]!r}")
-        even = [parts if len(parts) == k else [""] * k for parts in rows]
-        columns = [self.numbers(at, [parts[j] for parts in even]) for j in range(k)]
-        return np.stack(columns, axis=1)
+        whole = [parts if len(parts) == k else [cell or "[]"] * k
+                 for parts, cell in zip(rows, cells, strict=True)]  # fmt: skip
+        return np.stack([self.numbers(at, [row[j] for row in whole]) for j in range(k)], axis=1)
+
+    def most(self, at: int) -> float:
+        """The size that no number of a column has."""
+        return MOST_TIME if self.places[at].kind in CLOCKS else MOST
+
+    def numbers(self, at: int, cells: Sequence[str]) -> Array:
+        """(m,) numbers, NaN where there is none."""
+        out = numbers_of(cells, self.sheet.decimal)
+        wild = np.abs(out) > self.most(at)
+        for row in np.flatnonzero(np.isnan(out) | wild).tolist():
+            cell = cells[row][:40]
+            if wild[row] or cell.lower().strip("+-") not in ("", "nan"):
+                why = (
+                    f"{cell} cannot be; check the number and its unit"
+                    if wild[row]
+                    else f"{cell!r} is no number; mend it or delete the row"
+                )
+                self.broken.setdefault(row, f"column {self.sheet.header[at]}: {why}")
+        return np.where(np.isfinite(out), out, np.nan)
 
     def time(self, values: Mapping[str, Array], unit: str) -> Array:
         """(m,) seconds since the first row.  Raises DataError."""
@@ -361,12 +325,12 @@ class Cells:
             )
         return np.asarray(TIMES.get(unit, 1.0) * time)
 
-    def notices(self) -> list[str]:
+    def left_out(self) -> list[str]:
         """What is said of rows that are left out.  Raises DataError for too many."""
         path, line = self.sheet.path, self.sheet.line
         if len(self.broken) > max(1.0, MOST_TORN * len(line)):
             row, what = next(iter(sorted(self.broken.items())))
-            raise DataError(f"{path}:{line[row]}: {what} is no number; mend it or delete the row")
+            raise DataError(f"{path}:{line[row]}: {what}")
         lines = sorted({*self.sheet.torn, *(int(line[row]) for row in self.broken)})
         if not lines:
             return []

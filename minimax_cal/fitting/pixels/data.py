@@ -14,9 +14,9 @@ import numpy as np
 from minimax_cal.fitting.pixels.camera import Camera
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.columns import Rows, read_rows, whole_rows
 from minimax_cal.measuring.joint_rows import joint_rows
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.reading.rows import Rows, read_rows
 
 POSE = re.compile("pose")
 NEEDED = ("pose", "camera", "target", "u_px", "v_px")
@@ -103,7 +103,7 @@ def read_pixels(
     board: Path | str | None = None,
 ) -> PixelData:
     """Detections and joints (CSV), and the places of a board's targets.  Raises DataError."""
-    file = whole_rows(read_rows(detections))
+    file = read_rows(detections)
     header_of(file, NEEDED, "detections")
     at, labels = read_joints(joints)
     known = {camera.name: i for i, camera in enumerate(cameras)}
@@ -184,7 +184,7 @@ def read_joints(path: Path | str) -> tuple[Measurements, tuple[str, ...]]:
 
 def read_board(path: Path | str) -> dict[str, Array]:
     """Places of targets by name [m].  Raises DataError."""
-    file = whole_rows(read_rows(path))
+    file = read_rows(path)
     unit = "m" if "x_m" in file.header else "mm"
     header_of(file, [name.format(unit) for name in BOARD], "the targets of a board")
     place = np.stack([file.number(f"{axis}_{unit}", unit=unit) for axis in "xyz"], axis=1)

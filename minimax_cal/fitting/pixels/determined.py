@@ -11,10 +11,10 @@ from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.drawing import Drawing, Scale, scale_of
-from minimax_cal.fitting.pixels.fit import PixelFit, fit_pixels, right
+from minimax_cal.fitting.pixels.fit import ROUNDS, PixelFit, fit_pixels, right, softly
 from minimax_cal.fitting.pixels.model import PixelModel, Scene
 from minimax_cal.fitting.pixels.options import PixelOptions
-from minimax_cal.fitting.pixels.plausible import check_start
+from minimax_cal.fitting.pixels.plausible import WHOLE_IMAGE, check_start
 from minimax_cal.fitting.pixels.start import from_far, start_scene
 from minimax_cal.fitting.pixels.uncertainty import Uncertainty, uncertainty_of
 from minimax_cal.fitting.pixels.worst import WorstPixels, fit_worst
@@ -75,9 +75,9 @@ def fitted_on(robot: Robot, data: PixelData, options: PixelOptions, progress: Pr
     miss = [one.miss(robot, data) for one in both]
     if miss[0] <= POOR_FIT * robot.reach():
         return fit_pixels(robot, data, both[0], options, progress)
-    both = [one for one, each in zip(both, miss, strict=True) if CLEARLY * each <= miss[0]]
     for started in both:
         check_start(robot, data, started)
+    both = [one for one, each in zip(both, miss, strict=True) if CLEARLY * each <= miss[0]]
     begun = [from_far(robot, data, started) for started in both]
     fits = [fit_pixels(robot, data, started, options, progress) for started in begun]
     return min(fits, key=lambda fit: fit.noise)
@@ -106,12 +106,11 @@ def judged_pixels(robot: Robot, data: PixelData, held: Array, fit: PixelFit) -> 
         known = np.isin(np.arange(len(data.targets)), fit.model.target)
     counts = known[data.target]
     wrong = np.zeros(data.count, dtype=bool)
-    error = model.errors(fit.scene)
     trained = ~held[data.pose]
     wrong[trained] = fit.model.weight == 0.0
-    later = ~trained & counts
+    later = np.flatnonzero(~trained & counts)
     limit = np.linalg.norm(fit.model.errors(fit.scene)[:, fit.model.weight > 0.0], axis=0)
-    wrong[later] = right_beside(error[:, later], limit) == 0.0
+    wrong[later] = standing_out(model, fit.scene, later, limit)
     tables = {
         name: table_of(model, data, scene, counts) for name, scene in
         (("drawn", fit.nominal), ("calibrated", fit.scene))
@@ -133,12 +132,30 @@ def judged_pixels(robot: Robot, data: PixelData, held: Array, fit: PixelFit) -> 
     return JudgedPixels(errors, pixels, np.flatnonzero(wrong), whole)
 
 
-def right_beside(error: Array, size: Array) -> Array:
-    """(N,) 0 where errors (2, N) stand out from those of sizes (t,) that the fit has seen [px]."""
-    seen = np.stack([size, np.zeros_like(size)])
-    both = np.concatenate([seen, error], axis=1)
-    weight = np.concatenate([np.ones(len(size)), np.zeros(error.shape[1])])
-    return right(both, weight)[len(size) :]
+def standing_out(model: PixelModel, x: Scene, rows: Array, size: Array) -> Array:
+    """Which rows (r,) stand out in their own image, each taken with the camera where it fits best.
+
+    What the arm misses moves an image as a whole: no fit may set aside what judges it.  Where most
+    of an image stands out, none of it does.  size: (t,) of the errors that the fit has seen [px].
+    """
+    camera = np.arange(model.names.count) - model.names.geometric
+    error, slope = model.rows(x, (camera >= 0) & (camera < 6 * len(model.intrinsic)))
+    image = model.pose * len(model.intrinsic) + model.camera
+    out = np.zeros(model.pose.shape, dtype=bool)
+    for each in np.unique(image[rows]):
+        mine = rows[image[rows] == each]
+        first = 6 * int(model.camera[mine[0]])
+        by = slope[first : first + 6][..., mine].reshape(6, -1).T
+        left = error[:, mine]
+        for _ in range(ROUNDS):
+            root = np.tile(np.sqrt(softly(left)), 2)
+            moved = np.linalg.lstsq(root[:, None] * by, root * error[:, mine].reshape(-1))[0]
+            left = error[:, mine] - (by @ moved).reshape(2, -1)
+        both = np.concatenate([np.stack([size, np.zeros_like(size)]), left], axis=1)
+        weight = np.append(np.ones(len(size)), np.zeros(len(mine)))
+        off = right(both, weight)[len(size) :] == 0.0
+        out[mine] = off & (off.mean() <= WHOLE_IMAGE)
+    return out[rows]
 
 
 def table_of(model: PixelModel, data: PixelData, x: Scene, counts: Array) -> tuple[Array, Array]:

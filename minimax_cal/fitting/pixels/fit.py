@@ -173,8 +173,8 @@ def fit_pixels(
         model, found, noise = reprojected(model, found.x, loose)
         own = found.x
     off = np.abs(lens_off(model, own, sigma)) * sigma
-    if held:  # the doubt of a lens that the pixels contradict is how far they say it is off
-        sigma = np.where(off > FAR_LENS * sigma, off, sigma)
+    if held:  # known, or as the user says; where pixels contradict a lens, as far as they say
+        sigma = np.where(off > FAR_LENS * sigma, off, sigma * bool(options.camera_prior))
     return PixelFit(
         model, nominal, found.x, known, found, noise, sigma, held, told.by_drawing, own.lens[0],
         options.lens_sigma(model.intrinsic), model.weight, found.x,

@@ -11,13 +11,14 @@ from typing import Annotated
 import numpy as np
 
 from minimax_cal.fitting.pixels.uncertainty import Lack, Uncertainty
-from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import Fact, Mm, derived
 from minimax_cal.measuring.measurements import measurements
+from minimax_cal.modelling.cell import still
 from minimax_cal.modelling.lack import by_pose
-from minimax_cal.modelling.model import arm_at, model_of
+from minimax_cal.modelling.model import TARGET, model_of
 from minimax_cal.modelling.parameters import State, zero_positions
+from minimax_cal.modelling.start import fit_base
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_joints
 
@@ -52,7 +53,7 @@ def free_motion(robot: Robot, q: Array) -> tuple[Array, Array, Array]:
 
     (3m, 5n) by the links, (3m, f) by the functions of `modelling.lack`, (3m, n) by the joints [m].
     """
-    arm = arm_at(robot, q)
+    arm = model_of(robot, still(q, (TARGET,), robot))
     every = arm.jacobian(State(robot.mdh, np.eye(3), np.zeros(3), TOOL[None]))[0]
     joints = every[..., zero_positions(robot.prismatic)]
     turned, _ = by_pose(robot, arm.q, joints)

@@ -113,7 +113,8 @@ class PixelModel:
     ride.  board: (k, 3) or (0, 3) [m].  intrinsic: (c, 16) as their files say.
     pose, camera, target: (N,).  pixel: (N, 2) [px].  weight: (N,).
     names: all p parameters; active: (p,) True where one is free.  prior: on the parameters.
-    sight: None for pixels.
+    sight: None for pixels.  flange: axes (3, 3, m), one a row, and origin (3, m) of it where
+    these are given [m].
     """
 
     q: Array
@@ -130,6 +131,7 @@ class PixelModel:
     active: Array
     prior: Prior
     sight: Sight | None = None
+    flange: tuple[Array, Array] | None = None
 
     @staticmethod
     def of(robot: Robot, data: PixelData, on_flange: bool) -> PixelModel:
@@ -239,7 +241,8 @@ class PixelModel:
         if len(self.board):
             spots = self.board @ x.board_turn[0].T + x.board_place[0]
         own = spots[self.target].T
-        axes, origin = links.axes[..., self.pose], links.origin[:, self.pose]
+        axes, origin = self.flange or (links.axes, links.origin)
+        axes, origin = axes[..., self.pose], origin[:, self.pose]
         if self.on_flange:
             base, fixed = own, np.einsum("ijn,jn->in", axes, own - origin)
         else:
@@ -272,10 +275,8 @@ class PixelModel:
             error = -focal * (point[:2] - direction * point[2])
             slope = focal * (moved[:, :2] - direction * moved[:, 2:])
             return error, np.concatenate([slope, np.zeros((len(lens), *error.shape))])
-        x_, y_ = point[:2] / point[2]
-        pixel, by, own = slopes(self.lenses(x), x_, y_)
-        flat = (moved[:, :2] - np.stack([x_, y_]) * moved[:, 2:]) / point[2]
-        slope = flat[:, :1] * by[0] + flat[:, 1:] * by[1]
+        pixel, by, own = slopes(self.lenses(x), *(point[:2] / point[2]))
+        slope = imaged(seen, by, moved)
         mine = own[lens % LENS] * (self.camera == lens[:, None] // LENS)[:, None, :]
         return self.pixel.T - pixel, np.concatenate([slope, mine])
 
@@ -286,10 +287,13 @@ class PixelModel:
         """
         seen = self.seen(x)
         moved, lens = self.motion(x, seen, active)
-        size = np.linalg.norm(seen.point, axis=0)
-        unit = seen.point / size
-        turned = (moved - np.einsum("pin,in->pn", moved, unit)[:, None] * unit) / size
-        return np.concatenate([turned, np.zeros((len(lens), 3, len(size)))])
+        return np.concatenate([turned(seen, moved), np.zeros((len(lens), 3, len(self.pose)))])
+
+    def by_place(self, seen: Seen) -> Array:
+        """(3, 3, N) slopes of the targets in the cameras' axes by the flange's place."""
+        if not self.on_flange:
+            return seen.view
+        return np.asarray(-np.einsum("ijn,jkn->ikn", seen.view, seen.axes))
 
     def motion(self, x: Scene, seen: Seen, active: Array) -> tuple[Array, Array]:
         """Derivative (free - lenses, 3, N) of the targets in the cameras' axes, and which lenses.
@@ -298,20 +302,11 @@ class PixelModel:
         """
         names, n = self.names, self.q.shape[1]
         cameras, spots, lens = self.split(active[names.geometric :])
-        to_camera = seen.view  # from what the camera is fixed to
-        if self.on_flange:
-            back = np.einsum("ijn,jkn->ikn", to_camera, seen.axes)  # from the base
-            arm, from_spot = -back, back
-        else:
-            arm = to_camera
-            from_spot = np.einsum("ijn,kjn->ikn", to_camera, seen.axes)
+        arm = self.by_place(seen)
+        spot = -arm if self.on_flange else np.einsum("ijn,kjn->ikn", arm, seen.axes)
         parts = [turned_by(arm, swing(seen, self.pose, active[: 5 * n]))]
         parts += self.by_cameras(seen, cameras)
-        parts += (
-            self.by_board(x, from_spot, spots)
-            if len(self.board)
-            else self.by_points(from_spot, spots)
-        )
+        parts += self.by_board(x, spot, spots) if len(self.board) else self.by_points(spot, spots)
         return np.concatenate(parts), np.flatnonzero(lens)
 
     def by_cameras(self, seen: Seen, active: Array) -> list[Array]:
@@ -375,6 +370,19 @@ def swing(seen: Seen, pose: Array, active: Array) -> Array:
     axis, moment = (part[active[2 * n :]][..., pose] for part in kinematics.screws(links))
     turns = moment - kinematics.cross(seen.base, axis)
     return np.concatenate([slides, turns])
+
+
+def imaged(seen: Seen, by: Array, moved: Array) -> Array:
+    """(p, 2, N) how pixels move, by their slopes and the targets' motions (p, 3, N) [px]."""
+    flat = (moved[:, :2] - seen.point[:2] / seen.point[2] * moved[:, 2:]) / seen.point[2]
+    return np.asarray(flat[:, :1] * by[0] + flat[:, 1:] * by[1])
+
+
+def turned(seen: Seen, moved: Array) -> Array:
+    """(p, 3, N) how directions turn, by the targets' motions (p, 3, N) [rad]."""
+    size = np.linalg.norm(seen.point, axis=0)
+    unit = seen.point / size
+    return np.asarray((moved - np.einsum("pin,in->pn", moved, unit)[:, None] * unit) / size)
 
 
 def turned_by(rotation: Array, rows: Array) -> Array:

@@ -106,7 +106,7 @@ class PixelOptions:
 
     objective: sum, minimax (the worst target) or camera (the worst camera).
     qp: backend of the minimax QPs.  camera_on: flange or ground; what fits better unless given.
-    fix_camera: hold the lenses as their files say.
+    fix_camera: hold the lenses as their files say, as known unless `camera_prior` is given.
     camera_prior: how well these know them, as ``f 0.1%, c 2px``.
     drawn_prior: take the drawing as a prior, as well as the robot's `drawn_within` says or better.
     holdout: share of the poses kept out of the fit.  seed: of that choice.
@@ -124,7 +124,7 @@ class PixelOptions:
     )
     fix_camera: bool = seen(
         False,
-        "Hold the lenses as their files say; how well these know them still counts in the sigmas.",
+        "Hold the lenses as their files say, taken as known but for a given --camera-prior.",
     )
     camera_prior: str = seen(
         "",

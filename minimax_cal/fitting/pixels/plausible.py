@@ -1,4 +1,4 @@
-"""Slips of pixels that no fit should be asked to explain: flipped axes, board size, wrong lens."""
+"""Slips of pixels that no fit should explain: flipped axes, board, lens, images of other poses."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+import scipy
 
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
@@ -14,7 +15,7 @@ from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.drawing import Scale
 from minimax_cal.fitting.pixels.fit import FAR_LENS, PixelFit
 from minimax_cal.fitting.pixels.options import PixelOptions
-from minimax_cal.fitting.pixels.start import Started, start_scene
+from minimax_cal.fitting.pixels.start import IMAGES, Started, is_flat, poses_of_images, start_scene
 from minimax_cal.fitting.same_arm import too_changed
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
@@ -28,6 +29,8 @@ WHOLE_IMAGE = 0.5  # of an image: where more pixels stand out, its pose is wrong
 OTHER_LENS = 0.05  # of the focal length: no lens changes so much, it is another one
 OTHER_SIZE, ODD_SIZE = 1e-6, 0.01  # p-values of a board of another size: it fails, a notice
 LEAST_SIZE = 3e-3  # share of a board's size: by less it is no other board
+MOST_PAIRED = 300  # images whose pairing with poses is looked into
+SHIFTS, PAIRINGS = 3, 20  # images lost in a row that are tried; rounds of a pairing
 UNITS = (1e-3, 1e3, 0.1, 10.0, 25.4, 1.0 / 25.4)  # slips of a board's unit
 
 
@@ -38,11 +41,11 @@ def check_start(robot: Robot, data: PixelData, started: Started) -> None:
         return
     found = [
         (start_scene(robot, mended, started.on_flange).miss(robot, mended), text)
-        for text, mended in slips(data)
+        for text, mended in (*slips(data), *other_poses(robot, data, started.direction))
     ]
     least = min(miss for miss, _ in found)
     miss, text = next(each for each in found if each[0] <= ALIKE * least)
-    if miss < BETTER * given and miss < 4.0 * POOR_FIT * robot.reach():
+    if miss < BETTER * given and miss < POOR_FIT * robot.reach():
         raise DataError(
             f"{data.source}: {text} (the drawn arm then misses by {1e3 * miss:.3g} mm at the "
             f"target, not {1e3 * given:.3g} mm)"
@@ -63,6 +66,68 @@ def slips(data: PixelData) -> Iterator[tuple[str, PixelData]]:
     for factor in UNITS if len(data.board) else ():
         text = f"the board's places look {1.0 / factor:g} times too large: check their unit"
         yield text, replace(data, board=factor * data.board)
+
+
+def other_poses(robot: Robot, data: PixelData, seen: Array) -> list[tuple[str, PixelData]]:
+    """The slip that images are paired with other poses, as `slips` yields it.
+
+    The angle by which a board turns between two images is that of the arm between their poses,
+    wherever the camera and the board are.  seen: (2, N) directions.
+    """
+    first = int(np.bincount(data.camera).argmax())
+    image = poses_of_images(data, seen) if is_flat(data.board) else {}
+    rows = np.array([pose for camera, pose in image if camera == first], dtype=int)
+    if not IMAGES < len(rows) <= MOST_PAIRED:
+        return []
+    shown = angles_between(np.stack([image[first, row] for row in rows]))
+    pose = paired(shown, angles_between(robot.pose(data.at.q)), rows)
+    place = np.arange(data.at.poses)
+    place[rows] = pose
+    known = np.isin(data.pose, rows)
+    if (pose == rows).all():
+        return []
+    wrong = np.flatnonzero(pose != rows)
+    text = (
+        f"{len(wrong)} of {len(rows)} images are paired with other poses: that of pose "
+        f"{data.labels[rows[wrong[0]]]} is of pose {data.labels[pose[wrong[0]]]}; was an image or "
+        "a row lost? pair images and joint values again"
+    )
+    some = data.some(known)
+    return [(text, replace(some, pose=place[some.pose]))]
+
+
+def angles_between(pose: Array) -> Array:
+    """(m, m) angle between the rotations of each two poses (m, 4, 4) [rad]."""
+    trace = np.einsum("iab,jab->ij", pose[:, :3, :3], pose[:, :3, :3])
+    return np.asarray(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))
+
+
+def paired(shown: Array, turned: Array, rows: Array) -> Array:
+    """(i,) the pose of each image by the angles (i, i) of the images and (m, m) of the arm.
+
+    Each image goes where its angles to all others fit best, from several pairings; rows: (i,) the
+    given one.
+    """
+    share = np.linspace(0.0, 1.0, len(rows))
+    alike = [np.quantile(angle, share, axis=1).T for angle in (shown, turned)]
+    starts = [np.clip(rows + k, 0, len(turned) - 1) for k in range(-SHIFTS, SHIFTS + 1)]
+    starts += [rows[::-1], assigned(np.abs(alike[0][:, None] - alike[1]).mean(axis=-1))]
+    found = []
+    for pose in starts:
+        for _ in range(PAIRINGS):
+            before = pose
+            pose = assigned(np.abs(shown[:, None] - turned[:, pose]).mean(axis=-1))
+            if (pose == before).all():
+                break
+        found.append((float(np.abs(shown - turned[np.ix_(pose, pose)]).mean()), pose))
+    given = float(np.abs(shown - turned[np.ix_(rows, rows)]).mean())
+    best = min(found, key=lambda each: each[0])
+    return best[1] if best[0] < BETTER * given else rows
+
+
+def assigned(cost: Array) -> Array:
+    """(i,) columns, each once, of least cost (i, m) [Kuhn 1955]."""
+    return np.asarray(scipy.optimize.linear_sum_assignment(cost)[1])
 
 
 def extent_of(data: PixelData, camera: int) -> tuple[float, float]:

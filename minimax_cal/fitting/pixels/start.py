@@ -19,12 +19,12 @@ from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.pixels.camera import undistorted
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.model import PixelModel, Scene, lens_of
-from minimax_cal.fitting.reflectors import LEVER, posed, reflectors, spots_of
-from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
+from minimax_cal.instruments.reflectors import LEVER, posed, reflectors, spots_of
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.start import fit_base
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import nearest_rotation, transform

@@ -13,7 +13,6 @@ from functools import cached_property
 import numpy as np
 
 from minimax_cal.fitting.fit import Fit
-from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.uncertainty import Estimator, Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.judging.watching.old import Old, noise_root, own_poses
@@ -25,6 +24,7 @@ from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import Names, State, zero_positions
+from minimax_cal.modelling.start import fit_base
 
 PLACINGS = 3  # passes that place an arm with effects
 

@@ -19,13 +19,18 @@ from minimax_cal.measuring.importers import cmm, headed, programs
 from minimax_cal.measuring.importers import columns as mapped
 from minimax_cal.measuring.importers.assemble import Assembly, assemble
 from minimax_cal.measuring.importers.reading import Given, Reading
-from minimax_cal.measuring.importers.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
-from minimax_cal.measuring.importers.words import ANGLES, LENGTHS, TEMPERATURES, TIMES
-from minimax_cal.measuring.measurements import Measurements, check_finite, measurements_text
+from minimax_cal.measuring.measurements import (
+    Measurements,
+    check_finite,
+    measurements_text,
+    without_blind,
+)
 from minimax_cal.measuring.mending import mended
 from minimax_cal.measuring.set_aside import left_out, whole
+from minimax_cal.reading.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
+from minimax_cal.reading.words import ANGLES, LENGTHS, TEMPERATURES, TIMES
 
-__all__ = ["Imported", "import_files", "read_any", "save", "units_of"]
+__all__ = ["Given", "Imported", "import_files", "read_any", "save", "units_of"]
 
 # The first that fits a file is taken: of the text alone, then of its rows and columns.
 Read = Callable[[Sheet, Given, bool], Reading | None]  # None where a file is of another format
@@ -89,6 +94,17 @@ class Imported:
             for name, count in zip(data.target_names, data.seen.sum(0), strict=True)
         )
         return f"{data.poses} poses, {data.q.shape[1]} joints; points: {whole}"
+
+    def understood(self) -> Measurements:
+        """The measurements, with a line that says how the files were read."""
+        said = [
+            f"{file['file']}: read as {file['format']}, separated by {file['delimiter']}, decimal "
+            f"{file['decimal']}, {file['encoding']}"
+            for file in self.files().records()
+        ]
+        data = self.data
+        told = replace(data, notices=(*data.notices, *said[:-1], f"{said[-1]}: {self.headline()}"))
+        return without_blind(told, np.zeros(data.poses, dtype=bool))
 
     def put_right(self, mend: Sequence[str], leave_out: Sequence[str]) -> Imported:
         """With mends made and points set aside; what then still looks wrong is a notice.

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.aside import FILE
-from minimax_cal.measuring.columns import is_simulated
 from minimax_cal.measuring.importers.headed import KEPT
 from minimax_cal.measuring.importers.join import (
     Places,
@@ -24,10 +23,10 @@ from minimax_cal.measuring.importers.join import (
 from minimax_cal.measuring.importers.reading import Column, Given, Reading
 from minimax_cal.measuring.importers.times import STAMPED, celsius, seconds
 from minimax_cal.measuring.importers.units import decide
-from minimax_cal.measuring.importers.words import ANGLES, LENGTHS
 from minimax_cal.measuring.measurements import Measurements, check_finite
 from minimax_cal.measuring.set_aside import COLUMN, from_column, set_aside, sound
 from minimax_cal.measuring.tools import by_tool
+from minimax_cal.reading.words import ANGLES, LENGTHS
 
 TEXTS = ("session", "group", "split", "pose", "tool", COLUMN)
 MARKED = "marked deleted in the tracker's file"
@@ -35,15 +34,23 @@ OF_UNIT = {"u95": LENGTHS, "base": LENGTHS, "qread": ANGLES}  # optional columns
 MIXED = "mixed"
 
 
-@dataclass(frozen=True)
+NOTHING = np.empty(0)
+
+
+@dataclass(frozen=True, eq=False)
 class Meaning:
-    """A row of the table: a column, what it means, its unit, how that is known, its first value."""
+    """A row of the table: a column, what it means, its unit, how that is known, its first value.
+
+    values: in SI, of a column that becomes one of the measurements'.  kept: only as text.
+    """
 
     column: Column
     meaning: str
-    unit: str
-    known: str
-    first: str
+    unit: str = ""
+    known: str = ""
+    first: str = ""
+    values: Array = field(default_factory=lambda: NOTHING)
+    kept: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +146,7 @@ def assemble(points: Sequence[Reading], joints: Reading, given: Given) -> Assemb
         notices=tuple(notice for reading in readings for notice in reading.notices),
         source=str(joints.sheet.path),
         digest=hashlib.sha256("".join(r.sheet.text for r in readings).encode()).hexdigest(),
-        simulated=any(is_simulated(r.sheet.text) for r in readings),
+        simulated=any(r.sheet.simulated for r in readings),
     )
     matched = (*(spot.how for spot in places), "")[: len(readings)]
     data = by_tool(without_marked(from_column(data), points, places))
@@ -217,7 +224,7 @@ def gathered(
         for column in part.reading.columns:
             name, target = column.meaning, part.targets.get(column.meaning.partition("_")[0], "")
             found = understood(part.reading, column, given, scales, target)
-            mine.append(found.meaning)
+            mine.append(found)
             if len(found.values) and found.kept:
                 unknown[column.name] = spread(found.values, part.pose, poses, "first")
             elif len(found.values):
@@ -279,63 +286,46 @@ def raw_points(
     return np.concatenate(blocks, axis=1), tuple(names)
 
 
-@dataclass(frozen=True, eq=False)
-class Understood:
-    """A column's row in the table, and its values where it becomes a column of its own."""
-
-    meaning: Meaning
-    values: Array
-    kept: bool = False
-
-
-NOTHING = np.empty(0)
-
-
-def understood(
-    reading: Reading, column: Column, given: Given, scales: Scales, who: str
-) -> Understood:
+def understood(reading: Reading, column: Column, given: Given, scales: Scales, who: str) -> Meaning:
     """What a column means, with its values in SI.  who: the target of a point."""
     unit, known = unit_of(column, given)
     first = next((cell for cell in column.cells if cell), "")
     family = column.family
     if not column.meaning:
-        return left_over(column, unit, first)
+        if column.remark == KEPT:
+            return Meaning(column, "kept", unit, "", first, np.array(column.cells), kept=True)
+        return Meaning(column, "left out", unit, column.remark)
     if family == "q":
         unit, known = (unit, known) if unit else (scales.q, scales.why_q)
         value = reading.number(column, 0, first) * (LENGTHS | ANGLES)[unit]
         si = f"{value:.6g} {'m' if unit in LENGTHS else 'rad'}"
-        return Understood(Meaning(column, f"joint {column.meaning[1:]}", unit, known, si), NOTHING)
+        return Meaning(column, f"joint {column.meaning[1:]}", unit, known, si)
     if family == "smr":
         unit, known = (unit, known) if unit else (scales.y, scales.why_y)
         si = f"{reading.number(column, 0, first) * LENGTHS[unit]:.6g} m" if first else ""
-        what = f"{who} {column.meaning[-1]}"
-        return Understood(Meaning(column, what, unit, known, si), NOTHING)
+        return Meaning(column, f"{who} {column.meaning[-1]}", unit, known, si)
     if family == "target":
-        return Understood(Meaning(column, "name of the target", "", known, first), NOTHING)
+        return Meaning(column, "name of the target", "", known, first)
+    if column.meaning in TEXTS:
+        return Meaning(column, column.meaning, "", known, first, np.array(column.cells))
     if family == "time":
         values, known = seconds(reading, column, given.units.get("time", ""))
-        if not len(values):
-            return Understood(Meaning(column, "left out", "", known, ""), values)
-        return Understood(Meaning(column, "time", "s", known, first), values)
-    if family == "temperature":
+        unit, si = "s", first
+    elif family == "temperature":
         values, unit, known = celsius(reading, column, given.units.get("temperature", ""))
         si = f"{values[0]:.6g} C" if len(values) else ""
-        what = "temperature" if len(values) else "left out"
-        return Understood(Meaning(column, what, unit, known, si), values)
-    if column.meaning in TEXTS:
-        return Understood(Meaning(column, column.meaning, "", known, first), np.array(column.cells))
-    return optional(reading, column, unit, known)
+    else:
+        values, si, known = optional(reading, column, unit, known)
+    if len(values):
+        return Meaning(column, column.meaning, unit, known, si, values)
+    return Meaning(column, "left out", "", known)
 
 
-def left_over(column: Column, unit: str, first: str) -> Understood:
-    """A column that means nothing: kept as text, or left out."""
-    if column.remark == KEPT:
-        return Understood(Meaning(column, "kept", unit, "", first), np.array(column.cells), True)
-    return Understood(Meaning(column, "left out", unit, column.remark, ""), NOTHING)
+def optional(reading: Reading, column: Column, unit: str, known: str) -> tuple[Array, str, str]:
+    """An optional column of numbers in SI, its first, and how its unit is known.
 
-
-def optional(reading: Reading, column: Column, unit: str, known: str) -> Understood:
-    """An optional column of numbers.  Raises DataError where it needs a unit and has none."""
+    Raises DataError where it needs a unit and has none.
+    """
     family = column.family
     centre = family == "payload" and column.meaning != family  # payload_x, beside payload in kg
     factors = LENGTHS if centre else OF_UNIT.get(family, {})
@@ -347,9 +337,9 @@ def optional(reading: Reading, column: Column, unit: str, known: str) -> Underst
         )
     values = reading.numbers(column) * factors.get(unit, 1.0)
     if not np.isfinite(values).any():
-        return Understood(Meaning(column, "left out", "", "empty", ""), NOTHING)
+        return NOTHING, "", "empty"
     si = f"{values[0]:.6g}" + (" rad" if family == "qread" else " m" if factors else "")
-    return Understood(Meaning(column, column.meaning, unit, known, si), values)
+    return values, si, known
 
 
 def spread(values: Array, pose: Array, poses: int, name: str) -> Array:
@@ -372,8 +362,12 @@ def spread(values: Array, pose: Array, poses: int, name: str) -> Array:
 
 
 def together(name: str, one: Array, other: Array) -> Array:
-    """A column that stands in two files: the largest u95, the first time, else the first file's."""
+    """A column that stands in two files: the largest u95, the first time, else the first file's.
+
+    A pose is called as in the file of joints, which comes last: points may have names of their own.
+    """
     if one.dtype.kind in "US":
+        one, other = (other, one) if name == "pose" else (one, other)
         return np.where(one != "", one, other)
     if name in ("u95", "time"):
         return np.asarray((np.fmax if name == "u95" else np.fmin)(one, other))

@@ -12,10 +12,9 @@ import numpy as np
 
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.importers.headed import POINTS, understood
-from minimax_cal.measuring.importers.names import folded
 from minimax_cal.measuring.importers.reading import Given, Reading
-from minimax_cal.measuring.importers.sheet import Sheet, decimal_of
-from minimax_cal.measuring.importers.words import AXIS, MEASURED, split_unit, unit_name
+from minimax_cal.reading.sheet import Sheet, decimal_of
+from minimax_cal.reading.words import AXIS, MEASURED, folded, split_unit, unit_name
 
 # DIM LOC1= LOCATION OF POINT P1_1  UNITS=MM, then AX NOMINAL MEAS ..., then X, Y, Z
 BLOCK = re.compile(

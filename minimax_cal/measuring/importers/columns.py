@@ -6,16 +6,13 @@ import re
 
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring.importers.reading import Column, Given, Reading, checked
-from minimax_cal.measuring.importers.sheet import Sheet
-from minimax_cal.measuring.importers.words import plain, split_unit
+from minimax_cal.reading.sheet import Sheet
+from minimax_cal.reading.words import kind_of, plain, split_unit
 
 TITLE = "columns as mapped"
 SKIP = re.compile(r"(?:-|skip)(?:\*(\d+))?")
 SPAN = re.compile(r"(\d+)(?:-(\d+))?")
 SMR = re.compile(r"smr(\d+)")
-EXACT = re.compile(
-    r"q\d+|smr\d+_[xyz]|payload(?:_[xyz])?|tau\d+|approach\d+|qread\d+|base\d+_[xyz]"
-)
 
 
 def read(sheet: Sheet, given: Given, joints: bool) -> Reading:
@@ -43,8 +40,8 @@ def expand(token: str, room: int) -> list[tuple[str, str]]:
         return [(f"q{i + 1}", unit) for i in range(room)]
     if SMR.fullmatch(stem):
         return [(f"{stem}_{axis}", unit) for axis in "xyz"]
-    if EXACT.fullmatch(stem) or plain(stem):
-        return [(stem if EXACT.fullmatch(stem) else plain(stem), unit)]
+    if what := stem if kind_of(stem) else plain(stem):
+        return [(what, unit)]
     raise OptionError(
         f"columns=: {token!r} is not known; write smr1, smr1_mm, q_deg, q1_deg, u95_mm, "
         "temperature_C, time_s, pose, target, order or skip*3"

@@ -8,19 +8,19 @@ from dataclasses import dataclass, field, replace
 
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.importers.reading import (
-    POINT_NAME,
     Column,
     Given,
     Reading,
     checked,
     family_of,
 )
-from minimax_cal.measuring.importers.sheet import Sheet, is_number
-from minimax_cal.measuring.importers.words import (
+from minimax_cal.reading.sheet import Sheet, is_number
+from minimax_cal.reading.words import (
     WORDS,
     along_arm,
     joint_number,
     joints_of,
+    kind_of,
     plain,
     points_of,
     split_unit,
@@ -31,7 +31,6 @@ Meanings = Mapping[str, str]
 Stems = Sequence[str]
 XYZ = frozenset("xyz")
 MEASURED = {f"measurement_{axis}": f"smr1_{axis}" for axis in "xyz"}
-OPTIONAL = re.compile(r"payload(?:_[xyz])?|tau\d+|approach\d+|qread\d+|base\d+_[xyz]")
 MARKER = re.compile(r"([xyz])(\d+)")
 TURNED = re.compile(r"phi[xyz]\d+")
 LEAST_JOINTS = 2
@@ -83,9 +82,7 @@ def of_figaroh(stems: Stems) -> Meanings:
 
 def of_contract(stems: Stems) -> Meanings:
     """The names of this project's own CSV; others are kept, whatever they mean elsewhere."""
-    known = (re.compile(r"q\d+"), POINT_NAME, OPTIONAL)
-    own = {s for s in stems if s in WORDS or any(name.fullmatch(s) for name in known)}
-    return {stem: stem if stem in own else "" for stem in stems}
+    return {stem: stem if kind_of(stem) or stem in WORDS else "" for stem in stems}
 
 
 def has_both(stems: Stems, joints: bool) -> bool:

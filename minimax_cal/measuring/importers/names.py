@@ -6,10 +6,11 @@
 from __future__ import annotations
 
 import re
-import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+
+from minimax_cal.reading.words import folded
 
 PART = re.compile(r"\d+|[^\W\d_]+")
 MOST_BESIDE = 3  # parts of a name that may be the target's
@@ -28,12 +29,6 @@ class Match:
     pose: tuple[int, ...]
     label: tuple[str, ...]
     how: str
-
-
-def folded(text: str) -> str:
-    """Small letters without accents, in one width."""
-    wide = unicodedata.normalize("NFKD", text.strip().lower())
-    return unicodedata.normalize("NFC", "".join(c for c in wide if not unicodedata.combining(c)))
 
 
 def parts_of(name: str) -> Parts:

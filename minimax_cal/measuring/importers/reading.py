@@ -11,7 +11,8 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import name_first
-from minimax_cal.measuring.importers.sheet import COMMA, POINT, Sheet
+from minimax_cal.reading.rows import lacking
+from minimax_cal.reading.sheet import COMMA, POINT, Sheet, numbers_of
 
 POINT_NAME = re.compile(r"smr(\d+)_([xyz])")
 
@@ -131,10 +132,10 @@ class Reading:
 
     def numbers(self, column: Column, *, empty: bool = True) -> Array:
         """A column as floats, NaN where empty.  Raises DataError."""
-        out = np.full(len(column.cells), np.nan)
-        for i, cell in enumerate(column.cells):
-            if cell or not empty:
-                out[i] = self.number(column, i, cell)
+        out = numbers_of(column.cells, self.sheet.decimal)
+        for i in np.flatnonzero(~np.isfinite(out)):
+            if column.cells[i] or not empty:
+                out[i] = self.number(column, int(i), column.cells[i])
         return out
 
     def number(self, column: Column, row: int, cell: str) -> float:
@@ -167,11 +168,8 @@ def checked(reading: Reading) -> Reading:
                 f"{column.meaning}; delete one, or say which with columns="
             )
         seen[column.meaning] = column.name
-    for number in reading.smrs:
-        for axis in "xyz":
-            if f"smr{number}_{axis}" not in seen:
-                raise DataError(f"{path}: target {number} has no column for {axis}; add it")
-    numbers = [int(column.meaning[1:]) for column in reading.joints]
-    if missing := sorted(set(range(1, max(numbers, default=0) + 1)) - set(numbers)):
-        raise DataError(f"{path}: has no column for joint {missing[0]}; add it")
+    if lost := lacking(seen):
+        target, _, axis = lost.removeprefix("smr").partition("_")
+        what = f"target {target} has no column for {axis}" if axis else f"has no column for {lost}"
+        raise DataError(f"{path}: {what.replace('for q', 'for joint ')}; add it")
     return reading

@@ -9,7 +9,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.importers.reading import Column, Reading
-from minimax_cal.measuring.importers.words import TIMES
+from minimax_cal.reading.words import TIMES
 
 STAMPED = "time stamps"
 CLOCKS = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M", "%I:%M:%S.%f %p", "%I:%M:%S %p", "%I:%M %p")

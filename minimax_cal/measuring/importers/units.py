@@ -13,7 +13,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.importers.words import ANGLES, LENGTHS
+from minimax_cal.reading.words import ANGLES, LENGTHS
 
 MOST_TURN = 4.0 * np.pi  # a joint that turned farther was not written in radians
 FARTHEST_POINT = 200.0  # farther than any tracker measures [m]

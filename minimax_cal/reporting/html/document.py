@@ -10,8 +10,8 @@ from typing import Any
 
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit
-from minimax_cal.fitting.instruments import RelativeCalibration
 from minimax_cal.fitting.opened import RELATIVE
+from minimax_cal.fitting.several import RelativeCalibration
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import visible
 from minimax_cal.judging.tolerance import Limit

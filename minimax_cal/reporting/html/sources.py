@@ -15,9 +15,9 @@ from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.dynamics.result import MotionDiagnosis
 from minimax_cal.fitting.fit import Fit, Provenance
-from minimax_cal.fitting.instruments import RelativeCalibration
-from minimax_cal.fitting.instruments.pixel_result import PIXELS, PixelCalibration
 from minimax_cal.fitting.opened import RELATIVE
+from minimax_cal.fitting.several import RelativeCalibration
+from minimax_cal.fitting.several.pixel_result import PIXELS, PixelCalibration
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import json_of, read_raw

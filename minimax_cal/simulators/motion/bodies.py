@@ -18,8 +18,9 @@ from scipy.spatial.transform import Rotation
 from minimax_cal.correcting.exporters.correct import laid
 from minimax_cal.dynamics.regressor import UPPER
 from minimax_cal.ground.arrays import Array
+from minimax_cal.robots.mjcf import body_pose
 from minimax_cal.robots.transforms import inverse, transform
-from minimax_cal.simulators.chain import Chain, at_zero, body_pose, holders
+from minimax_cal.simulators.chain import Chain, at_zero, holders
 
 PLACES = tuple((i, j) for i in range(4) for j in range(i, 4))  # of the ten coordinates in U
 THINNEST = 1e-6  # of a body's largest second moment: no principal one is smaller

@@ -13,7 +13,7 @@ import numpy as np
 from minimax_cal.dynamics.model import held_friction
 from minimax_cal.dynamics.scene import YIELD
 from minimax_cal.ground.arrays import Array
-from minimax_cal.simulators.chain import mujoco
+from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.simulators.motion.fit import Study, weights, with_numbers
 from minimax_cal.simulators.motion.numbers import Numbers
 

@@ -35,7 +35,7 @@ from minimax_cal.dynamics.result import (
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress
-from minimax_cal.simulators.chain import driven
+from minimax_cal.robots.mjcf import is_driven
 from minimax_cal.simulators.motion.bristles import fit_bristles
 from minimax_cal.simulators.motion.fit import Asked, Study, fit_numbers
 from minimax_cal.simulators.motion.judge import Judge, Missed
@@ -200,7 +200,7 @@ def asked_of(found: MotionDiagnosis, bench: Bench) -> tuple[Asked, tuple[Term, .
     if abs(late) < SHORTEST * float(model.opt.timestep):
         late = 0.0
     chain = bench.opened.chain
-    motors = [driven(model, joint) and chain.servo(joint) < 0 for joint in chain.joints]
+    motors = [is_driven(model, joint) and chain.servo(joint) < 0 for joint in chain.joints]
     geared = tuple(j for j in held_at(terms, GAIN) if motors[j])
     curved = held_at(terms, LEVELLED) if has_powers(model) else ()
     elements = {FRICTION, MASSES, ARMATURE}

@@ -14,7 +14,8 @@ from minimax_cal.dynamics.rows import EDGE_S, Logs
 from minimax_cal.dynamics.run import Run
 from minimax_cal.dynamics.scene import bent_bristles
 from minimax_cal.ground.arrays import Array
-from minimax_cal.simulators.chain import Chain, fill_history, mujoco
+from minimax_cal.robots.mjcf import mujoco
+from minimax_cal.simulators.chain import Chain, fill_history
 from minimax_cal.simulators.drive import check_stable
 from minimax_cal.simulators.motion.numbers import FRICTION, bristles_in, given_bristles
 

@@ -28,7 +28,8 @@ from minimax_cal.dynamics.rows import Logs, Whitening, whitening
 from minimax_cal.dynamics.scene import Arm, Scene
 from minimax_cal.dynamics.search import Columns, generous, solve_scaled
 from minimax_cal.ground.arrays import Array
-from minimax_cal.simulators.chain import Chain, mujoco
+from minimax_cal.robots.mjcf import mujoco
+from minimax_cal.simulators.chain import Chain
 from minimax_cal.simulators.motion.bodies import Bodies, inertial, physical
 from minimax_cal.simulators.motion.numbers import POWERS, Numbers, given_numbers
 

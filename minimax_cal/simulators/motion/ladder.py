@@ -20,8 +20,8 @@ from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.robots.gravity import weighed
+from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.robots.urdf import MODELS
-from minimax_cal.simulators.chain import mujoco
 from minimax_cal.simulators.given import largest_inertia
 from minimax_cal.simulators.motion.bristles import has_bristles
 from minimax_cal.simulators.motion.correct import Bench, correct, lost

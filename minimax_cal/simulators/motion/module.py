@@ -11,7 +11,8 @@ from typing import Any
 
 from minimax_cal.dynamics.laws import Law
 from minimax_cal.ground.arrays import Array
-from minimax_cal.simulators.chain import Chain, mujoco
+from minimax_cal.robots.mjcf import mujoco
+from minimax_cal.simulators.chain import Chain
 from minimax_cal.simulators.motion.numbers import Numbers
 
 NUMBERS = "NUMBERS: dict[str, dict[str, Any]] = {}"  # in callback.py, to be filled

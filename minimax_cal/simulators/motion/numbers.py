@@ -10,7 +10,8 @@ import numpy as np
 from minimax_cal.dynamics.laws import Term
 from minimax_cal.dynamics.scene import YIELD
 from minimax_cal.ground.arrays import Array
-from minimax_cal.simulators.chain import Chain, mujoco
+from minimax_cal.robots.mjcf import mujoco
+from minimax_cal.simulators.chain import Chain
 from minimax_cal.simulators.motion.bodies import Bodies
 
 FRICTION, STIFFNESS = 3, 5  # places in a dcmotor's biasprm and dynprm, then its damper

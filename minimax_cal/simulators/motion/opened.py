@@ -7,19 +7,14 @@ from pathlib import Path
 
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.robots.document import Document
 from minimax_cal.robots.gravity import LEAST_MASS, G, masses_of
+from minimax_cal.robots.mjcf import Given, mujoco, read_model
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.urdf import MODELS, is_urdf
 from minimax_cal.simulators.arm import arm_of, assumed
-from minimax_cal.simulators.chain import Chain, chain_along, chain_of, mujoco
-from minimax_cal.simulators.document import Document
-from minimax_cal.simulators.given import (
-    Given,
-    content_for,
-    corrected,
-    read_model,
-    told_masses,
-)
+from minimax_cal.simulators.chain import Chain, chain_along, chain_of
+from minimax_cal.simulators.given import content_for, corrected, told_masses
 from minimax_cal.simulators.mjcf import new_tree
 from minimax_cal.simulators.motion.written import free_joints, new_model, weigh_drawn
 

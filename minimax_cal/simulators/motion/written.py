@@ -9,13 +9,14 @@ import numpy as np
 
 from minimax_cal.dynamics.regressor import inertial_parameters
 from minimax_cal.ground.arrays import Array
+from minimax_cal.robots.document import Document
 from minimax_cal.robots.gravity import LEAST_MASS, masses_of, weighed
+from minimax_cal.robots.mjcf import numbers
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import tail
 from minimax_cal.simulators.arm import stiff
 from minimax_cal.simulators.chain import Chain, braked
-from minimax_cal.simulators.document import Document
-from minimax_cal.simulators.elements import known, numbers, section, tune
+from minimax_cal.simulators.elements import known, section, tune
 from minimax_cal.simulators.given import counts_degrees, elements_of
 from minimax_cal.simulators.mjcf import new_tree
 from minimax_cal.simulators.motion.bodies import Bodies, inertial, parameters_of, pseudo_inertia

@@ -1,0 +1,55 @@
+"""Whether what is given and what is chosen go together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from minimax_cal.fitting.options import check_resolution
+from minimax_cal.fitting.several.options import RelativeOptions
+from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.instruments.instrument import Instrument
+from minimax_cal.instruments.table import INSTRUMENTS, instrument
+from minimax_cal.solvers.least_squares import AUTO, METHODS
+
+
+def check_given(every: Sequence[Instrument]) -> None:
+    """Raise DataError where there is nothing, or nothing but what another command takes."""
+    if not every:
+        raise DataError("no file of measurements is given")
+    first = every[0]
+    if first.alone and all(data.kind == first.kind for data in every):
+        raise DataError(f"{first.at.source}: {first.alone}")
+
+
+def check_options(every: Sequence[Instrument], options: RelativeOptions) -> None:
+    """Raise OptionError for a choice that does not exist or does not suit the data."""
+    if options.method not in (AUTO, *METHODS):
+        raise OptionError(f"no method {options.method!r}; choose {', '.join((AUTO, *METHODS))}")
+    check_resolution(options.resolution)
+    default = RelativeOptions()
+    for found in map(instrument, INSTRUMENTS):
+        mine = [data for data in every if data.kind == found.kind]
+        for name in found.options:
+            if not mine and getattr(options, name) != getattr(default, name):
+                holds = " and ".join(f"{data.at.source} holds {data.kind}" for data in every)
+                raise OptionError(f"{name}= is for {found.kind}; {holds}: leave it out")
+        if mine:
+            found.check_options(mine, options)
+
+
+def check_noises(
+    labels: Sequence[str], every: Sequence[Instrument], options: RelativeOptions
+) -> None:
+    """Raise OptionError for the noise of a file that is not there, or that is none."""
+    known = dict(zip(labels, every, strict=True))
+    for name, sigma in options.noises.items():
+        if name not in labels:
+            raise OptionError(f"noise {name}: no file is called so; they are {', '.join(labels)}")
+        if not known[name].noise_given:
+            raise OptionError(
+                f"noise {name}: of {known[name].kind} the residuals say it; leave it out"
+            )
+        if not (np.isfinite(sigma) and sigma > 0.0):
+            raise OptionError(f"noise {name}: sigma {sigma:g} must be positive")

@@ -1,0 +1,370 @@
+"""The fit of all instruments: start, identifiable parameters, least squares, noises, sigmas."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+
+from minimax_cal.fitting.found import Parameter, link_by_link
+from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.options import freed
+from minimax_cal.fitting.several.identify import (
+    Alone,
+    determined_alone,
+    generic_count,
+    identified,
+)
+from minimax_cal.fitting.several.laws import Laws
+from minimax_cal.fitting.several.options import (
+    Progress,
+    RelativeOptions,
+    sigmas_of,
+)
+from minimax_cal.fitting.several.stack import Known, Squares, Stack, started
+from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS, without_resting
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.instruments.instrument import Instrument
+from minimax_cal.modelling.effects.bounds import at_bounds
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.near import between, is_kept
+from minimax_cal.modelling.parameters import State, links_of
+from minimax_cal.modelling.rows import MIN_COMPUTED_NOISE
+from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers import least_squares
+from minimax_cal.solvers.least_squares import LeastSquares, method_of, solve_normal
+
+SETTLED = 0.01  # relative change of the noises that ends their weighing
+
+
+@dataclass(frozen=True, eq=False)
+class Train:
+    """What is fitted: each instrument's training measurements and what the file is called."""
+
+    label: str
+    data: Instrument
+
+
+@dataclass(frozen=True, eq=False)
+class InstrumentFit:
+    """What the solver found.
+
+    problem: as it was solved, its instruments weighed by their noise.  nominal: the arm as drawn
+    with the instruments fitted to it.  state: the calibrated one.  covariance: (p, p) [SI], NaN
+    where not identified.  noise: (b,) sigma of a row of each instrument [m].  trains: what was
+    fitted.  alone: what each determines by itself, empty where there is one.  stiff: the fit of
+    geometry alone, where this one has laws besides.
+    """
+
+    problem: Squares
+    nominal: State
+    state: State
+    identification: Identification
+    found: LeastSquares[State]
+    covariance: Array
+    noise: Array
+    trains: Sequence[Train]
+    alone: tuple[Alone, ...]
+    stiff: InstrumentFit | None = None
+
+    @property
+    def stack(self) -> Stack:
+        """The instruments, weighed by their noise."""
+        return self.problem.stack
+
+    def state_of(self, i: int) -> tuple[State, State]:
+        """As drawn and calibrated, of an instrument."""
+        return self.stack.part(self.nominal, i), self.stack.part(self.state, i)
+
+
+def stack_of(robot: Robot, trains: Sequence[Train], options: RelativeOptions) -> Stack:
+    """The training measurements as a least-squares problem."""
+    alone = [each.data.ready(robot, options) for each in trains]
+    every = [one.beside([*alone[:i], *alone[i + 1 :]]) for i, one in enumerate(alone)]
+    stack = Stack.of(robot, every, [each.label for each in trains])
+    given = [options.noises.get(label, np.nan) for label in stack.labels]
+    of_rows = [sigma * one.row_noise for sigma, one in zip(given, every, strict=True)]
+    return replace(stack, given=np.square(of_rows))
+
+
+def allowed_of(stack: Stack, options: RelativeOptions) -> tuple[Array, Array]:
+    """What may be fitted (p,), and what is to be given up last (p,); the base is no unknown."""
+    names = stack.names
+    allowed = ~names.match(options.fix, "fix")
+    wanted = freed(names, options.free, allowed)
+    allowed[5 * names.joints : names.geometric] = False
+    for i, one in enumerate(stack.instruments):
+        allowed[stack.own(i)] &= [name not in one.held for name in one.names]
+    return allowed, wanted
+
+
+def start_of(robot: Robot, stack: Stack, allowed: Array) -> State:
+    """The arm as drawn, and what fits it best."""
+    every = enumerate(stack.instruments)
+    return stack.state(robot.mdh, [started(robot, one, allowed[stack.own(i)]) for i, one in every])
+
+
+def fit_instruments(
+    robot: Robot, trains: Sequence[Train], options: RelativeOptions, progress: Progress
+) -> InstrumentFit:
+    """Fit the identifiable parameters to the training measurements.  Raises DataError."""
+    progress("start")
+    trains = [replace(train, data=train.data.in_order()) for train in trains]
+    stack = stack_of(robot, trains, options)
+    allowed, wanted = allowed_of(stack, options)
+    known = Known(links_of(robot.mdh), sigmas_of(stack.names, options))
+    held = known.told(stack.names.count)
+    nominal = start_of(robot, stack, allowed)
+    progress("identifiable parameters")
+    reference = stack.reference(robot, nominal)
+    check_count(trains, stack, generic_count(robot, reference, nominal, allowed & ~held))
+
+    def identify(stack: Stack, known: Known, x: State) -> Identification:
+        more = (0, len(stack.laws.names))
+        return identified(
+            robot, stack, reference, x, np.pad(allowed, more, constant_values=True),
+            np.pad(wanted, more), known=known.told(stack.names.count),
+            resolution=options.resolution,
+        )  # fmt: skip
+
+    told = identify(stack, known, nominal)
+    progress("least squares")
+    problem, ended = weighed(Squares(stack, told.active, known), nominal, options)
+    if len(trains) > 1:  # an instrument that is rough tells less than it seemed
+        told = identify(problem.stack, known, nominal)
+        again = replace(problem, active=told.active)
+        problem, ended = weighed(again, nominal, options)
+    fit = stiff = solved(problem, ended, nominal, told, trains)
+    if options.effects:
+        progress("effects")
+
+        def beside(fit: InstrumentFit, laws: Laws) -> InstrumentFit:
+            return with_laws(robot, fit, laws, known, identify, options)
+
+        laws = laws_of(robot, stiff, options.effects)
+        fit = replace(beside(beside(stiff, laws), laws), stiff=stiff)  # then for finite turns too
+    return with_alone(robot, fit, options)
+
+
+def with_laws(
+    robot: Robot,
+    fit: InstrumentFit,
+    laws: Laws,
+    known: Known,
+    identify: Callable[[Stack, Known, State], Identification],
+    options: RelativeOptions,
+) -> InstrumentFit:
+    """Geometry and effects together, from a fit whose laws are linear where it ended.
+
+    known: of the links.
+    """
+    scenes = fit.stack.scenes(robot, fit.state)
+    stack, begin = fit.stack.bent(robot, laws, fit.state)
+    first, count = stack.names.geometric, len(laws.names)
+    own = fit.nominal.effects[: stack.lawless - first]
+    drawn = replace(fit.nominal, effects=np.pad(own, (0, count)))
+    known = replace(known, laws=laws.sigma(scenes[0]))
+    told = identify(stack, known, drawn)
+    untold = np.flatnonzero(~told.active[stack.lawless :]) + stack.lawless - first
+    begin.effects[untold] = 0.0
+    problem = Squares(stack, told.active, known, room=laws.room(scenes))
+    return resting(solved(*weighed(problem, begin, options), drawn, told, fit.trains))
+
+
+def solved(
+    problem: Squares,
+    ended: LeastSquares[State],
+    nominal: State,
+    told: Identification,
+    trains: Sequence[Train],
+) -> InstrumentFit:
+    """What a solved problem says."""
+    state = ended.x.take(np.array(0))
+    variance = variances(problem, state)
+    return InstrumentFit(
+        problem, nominal, state, told, ended, covariance_of(problem, state, variance),
+        np.sqrt(variance), trains, (),
+    )  # fmt: skip
+
+
+def with_alone(robot: Robot, fit: InstrumentFit, options: RelativeOptions) -> InstrumentFit:
+    """The fit with what each of several instruments determines by itself."""
+    if len(fit.trains) < 2:
+        return fit
+    closed, active = fit.stack.closed(robot, fit.nominal), fit.identification.active
+    alone = determined_alone(closed, fit.nominal, active, options.resolution)
+    return replace(fit, alone=alone)
+
+
+def laws_of(robot: Robot, fit: InstrumentFit, texts: Sequence[str | Term]) -> Laws:
+    """The effects that were asked for; of a law that has several variants the best one.
+
+    fit: of geometry alone.  Raises OptionError.
+    """
+    from minimax_cal.evidence.selection import best_variant  # slow to import
+    from minimax_cal.fitting.several.linear import rows_of_all, scene_of_all
+    from minimax_cal.modelling.dictionary import ArmLaws
+
+    if any(one.kind == "pixels" for one in fit.stack.instruments):
+        raise OptionError(
+            "effects= is not for pixels yet: leave them out, or fit the effects from the others"
+        )
+    scene = scene_of_all(robot, fit)
+
+    def pick(chosen: Sequence[Term], several: Sequence[Term]) -> Term:
+        laws = ArmLaws(scene, rows_of_all(scene, fit))
+        return cast(Term, best_variant(laws, chosen, several))
+
+    each = fit.stack.scenes(robot, fit.state)
+    return Laws.of(scene, each, texts, pick)
+
+
+def resting(fit: InstrumentFit) -> InstrumentFit:
+    """The fit, the parameters of laws that rest at a bound without sigma."""
+    rests = at_bounds(fit.stack.values(fit.state), fit.problem.room)
+    if not rests.any():
+        return fit
+    names = fit.stack.names
+    every = np.pad(rests, (fit.stack.lawless - names.geometric, 0))
+    known = without_resting(fit.identification, names, every)
+    again = replace(fit.problem, active=known.active)
+    covariance = covariance_of(again, fit.state, np.square(fit.noise))
+    return replace(fit, identification=known, covariance=covariance)
+
+
+def weighed(
+    problem: Squares, begin: State, options: RelativeOptions
+) -> tuple[Squares, LeastSquares[State]]:
+    """Least squares, instruments and priors weighed by the noises that remain.
+
+    The problem with the weights that it ended with.  A lone instrument without priors has nothing
+    to be weighed against.  As `solve.Task.squares` does.
+    """
+    points, method = float(problem.stack.points), method_of(options.method)
+
+    def solved(problem: Squares) -> LeastSquares[State]:
+        found = least_squares.solve(problem, begin.batch(), 1, points, method, least_squares.NEAR)
+        if not len(problem.room) or is_kept(found.x.take(np.array(0)), problem.whole_room):
+            return found
+        return between(problem, points, problem.whole_room, found)
+
+    priors = problem.known is not None and problem.known.any
+    if len(problem.stack.blocks) == 1 and not priors:
+        return problem, solved(problem)
+    count = [one.degrees for one in problem.stack.instruments]
+    none = np.zeros(problem.stack.names.count, dtype=bool)
+    cost = [float(error @ error) for error, _ in problem.stack.rows_by_block(begin, none)]
+    variance = np.maximum(np.divide(cost, count), LEAST_NOISE**2)
+    variance = np.where(np.isnan(problem.stack.given), variance, problem.stack.given)
+    for _ in range(PRIOR_ROUNDS):
+        problem = believed(problem, variance)
+        found = solved(problem)
+        state = found.x.take(np.array(0))
+        previous, variance = variance, variances(problem, state)
+        if np.all(np.abs(variance - previous) <= SETTLED * previous):
+            break
+    return problem, found
+
+
+def believed(problem: Squares, variance: Array) -> Squares:
+    """Instruments and priors weighed by the variances (b,) of their numbers [m^2].
+
+    The best instrument weighs 1, so that a step of the rows is one of metres.
+    """
+    unit, names = float(variance.min()), problem.stack.names
+    weight = problem.known.weights(unit, names.count) if problem.known else np.zeros(0)
+    return replace(problem, stack=replace(problem.stack, precision=unit / variance), weight=weight)
+
+
+def variances(problem: Squares, x: State) -> Array:
+    """(b,) of a number of each block, as given or by what a fit leaves [m^2].
+
+    Each pays for its share of the parameters, tr(H^-1 G_b) of the whole Gram matrix H [Forstner's
+    variance components]; a prior pays for parameters of its own.
+    """
+    cost, spare = remaining(problem, x)
+    weighing = len(problem.stack.blocks) > 1 or len(problem.weight)
+    left = np.maximum(cost / spare, (LEAST_NOISE if weighing else MIN_COMPUTED_NOISE) ** 2)
+    return np.where(np.isnan(problem.stack.given), left, problem.stack.given)
+
+
+def remaining(problem: Squares, x: State) -> tuple[Array, Array]:
+    """(b,) squared error of each block's rows [m^2], and its numbers beyond its parameters."""
+    stack = problem.stack
+    errors, slopes = zip(*stack.rows_by_block(x, problem.active), strict=True)
+    grams = [w * slope @ slope.T for w, slope in zip(stack.precision, slopes, strict=True)]
+    inverse = solve_normal(sum(grams) + problem.prior, np.eye(len(grams[0])))
+    paid = np.array([float(np.trace(inverse @ gram)) for gram in grams])
+    spare = np.maximum([one.degrees for one in stack.instruments] - paid, 1.0)
+    return np.array([float(error @ error) for error in errors]), spare
+
+
+def covariance_of(problem: Squares, x: State, variance: Array) -> Array:
+    """Covariance (p, p) of all parameters at a solution [SI], NaN where not identified.
+
+    s^2 H^-1 F H^-1 with H = sum w j j' + P and F = sum w^2 j j' + P over the rows j of weight w and
+    the priors P: a known distance weighs much and is no surer than a coordinate.  s^2: of a number
+    of the best instrument, to which the others are weighed.  variance: (b,) as `variances` has it.
+    """
+    active, stack = problem.active, problem.stack
+    _, jacobians = stack.rows(x, active)
+    inverse = solve_normal(jacobians @ jacobians.T + problem.prior, np.eye(len(jacobians)))
+    middle = (jacobians * stack.weights(x)) @ jacobians.T + problem.prior
+    covariance = np.full((len(active),) * 2, np.nan)
+    unit = float((variance * stack.precision).mean())
+    covariance[np.ix_(active, active)] = unit * inverse @ middle @ inverse
+    return covariance
+
+
+def check_count(trains: Sequence[Train], stack: Stack, unknowns: int) -> None:
+    """Raise DataError where the training measurements cannot determine the unknowns."""
+    every = [each.data for each in trains]
+    for data in every:
+        data.check_training()
+    given = sum(one.given for one in stack.instruments)
+    different = sum(data.independent for data in every) + given
+    unknowns -= sum(one.costless for one in stack.instruments)
+    if different <= unknowns:
+        where = " and ".join(data.at.source for data in every)
+        what = every[0].words.counted if len(every) == 1 else "numbers"
+        raise DataError(
+            f"{where}: {different} independent {what} in training, but {unknowns} unknown "
+            "parameters need more; measure at more poses, hold out fewer or fix parameters (fix)"
+        )
+
+
+def parameters_of(robot: Robot, fit: InstrumentFit) -> tuple[Parameter, ...]:
+    """Every parameter, link by link; then each instrument's own."""
+    every, names = every_parameter(robot, fit), fit.stack.names
+    own = (own_parameters(robot, fit, i) for i in range(len(fit.stack.blocks)))
+    return sum(own, every[: 5 * names.joints]) + every[fit.stack.lawless :]
+
+
+def every_parameter(robot: Robot, fit: InstrumentFit) -> tuple[Parameter, ...]:
+    """Links, those of all instruments as they are fitted, and last those of the laws."""
+    names = fit.stack.names
+    before, after = (x.along(np.eye(3), robot) for x in (fit.nominal, fit.state))
+    sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    return link_by_link(names, names.units, before, after, sigma, fit.identification)
+
+
+def own_parameters(robot: Robot, fit: InstrumentFit, i: int) -> tuple[Parameter, ...]:
+    """An instrument's own, as people read them."""
+    every, place, one = every_parameter(robot, fit), fit.stack.own(i), fit.stack.instruments[i]
+    found = [every[j] for j, name in zip(place, one.names, strict=True) if name not in one.held]
+    drawn, ended = (fit.stack.blocks[i].own(x) for x in fit.state_of(i))
+    told = one.told(ended, drawn, fit.covariance[np.ix_(place, place)])
+    if not told:
+        return tuple(found)
+    kept, rest = found[: one.targets_at.start], found[one.targets_at.start :]
+    stem = found[0].name.removesuffix(one.names[0])
+    known = all(each.identifiable for each in rest)
+    why = "" if known else "same motion as links and base"
+    for name, unit, *numbers in told:
+        value, was, sigma = map(float, numbers)
+        sure = sigma if known else np.nan
+        kept.append(Parameter(stem + name, value, was, sure, unit, known, why))
+    return tuple(kept)

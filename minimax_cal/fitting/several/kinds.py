@@ -1,0 +1,373 @@
+"""From files of lengths, closures, poses and points to a calibrated robot."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.fitting.fit import Provenance
+from minimax_cal.fitting.identify import Because
+from minimax_cal.fitting.intervals import rms_interval, told
+from minimax_cal.fitting.opened import listed_effects
+from minimax_cal.fitting.options import listed, priors_of
+from minimax_cal.fitting.positions import lacking, position_sigma, positions_by
+from minimax_cal.fitting.several import fit, plausible, remarks
+from minimax_cal.fitting.several.checks import check_given, check_noises, check_options
+from minimax_cal.fitting.several.fit import InstrumentFit, Train
+from minimax_cal.fitting.several.options import (
+    Progress,
+    RelativeOptions,
+    read_noises,
+    silent,
+)
+from minimax_cal.fitting.several.result import (
+    SEVERAL,
+    InstrumentResult,
+    Measured,
+    RelativeCalibration,
+)
+from minimax_cal.ground.arrays import Array, rms
+from minimax_cal.ground.options import takes
+from minimax_cal.instruments.file import read_relative
+from minimax_cal.instruments.instrument import Instrument
+from minimax_cal.instruments.tracker import points
+from minimax_cal.measuring.accuracy import HELD
+from minimax_cal.measuring.campaigns import session_names
+from minimax_cal.measuring.checks import check_joints, limit_notices
+from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.history import Clock, with_history
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.stations import Sessions
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.joint_fit import fitted
+from minimax_cal.modelling.model import TARGET
+from minimax_cal.modelling.parameters import State
+from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.solvers.status import Status
+
+Given = Instrument | Measurements | str | Path
+
+
+READ: Mapping[str, Callable[[Any], Any]] = {  # what people give of an option, as its record has it
+    "fix": listed,
+    "free": listed,
+    "known_distances": tuple,
+    "noises": lambda given: read_noises(given or {}),
+    "priors": priors_of,
+    "effects": listed_effects,
+}
+
+
+@takes(options=RelativeOptions, read=READ)
+def relative(
+    robot: Robot | str | Path,
+    data: Given | Sequence[Given],
+    progress: Progress = silent,
+    *,
+    options: RelativeOptions,
+) -> RelativeCalibration:
+    """Calibrate a robot from lengths, closures or poses, or from several files together.
+
+    Several files share the arm; each has unknowns and a noise of its own, by its own residuals.
+    One of them may be measurements of a tracker.
+
+    Parameters
+    ----------
+    robot, data
+        Loaded, or a name or path; several data in a list.
+    options
+        See `RelativeOptions`.
+    progress
+        Called with a word on each stage.
+
+    Returns
+    -------
+    RelativeCalibration
+        The calibration; how the numbers ended is in its `status`.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
+    >>> print(mc.relative("irb2600", "wires.csv", holdout=0.1).headline())
+    """
+    return asked_of(robot, data, options).calibrated(progress)
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What is to be calibrated, checked.
+
+    every: the measurements of each instrument.  splits: of each, (m,) True where held out, and what
+    the reader should know of that.
+    """
+
+    robot: Robot
+    every: Sequence[Instrument]
+    options: RelativeOptions
+    splits: Sequence[tuple[Array, tuple[str, ...]]]
+
+    @cached_property
+    def trains(self) -> list[Train]:
+        """What fits may see."""
+        named = zip(labels_of(self.every), self.every, self.splits, strict=True)
+        return [Train(label, data.take(~held)) for label, data, (held, _) in named]
+
+    def fit(self, progress: Progress) -> InstrumentFit:
+        """The fit of the training measurements."""
+        return fit.fit_instruments(self.robot, self.trains, self.options, progress)
+
+    def calibrated(self, progress: Progress) -> RelativeCalibration:
+        """The calibration."""
+        began = time.perf_counter()
+        return result_of(self, self.fit(progress), began)
+
+    def beside(self, effects: Sequence[Term]) -> Asked:
+        """The same with effects."""
+        return replace(self, options=replace(self.options, effects=tuple(effects)))
+
+
+def asked_of(
+    robot: Robot | str | Path, data: Given | Sequence[Given], options: RelativeOptions
+) -> Asked:
+    """Data loaded and checked, and split.  Raises CalibrationError."""
+    robot = load_robot(robot)
+    given = [data] if isinstance(data, Given) else list(data)
+    every = sorted(map(loaded, given), key=lambda data: not data.on_arm)
+    check_given(every)
+    check_options(every, options)
+    every = [replace(each, at=with_history(check_joints(robot, each.at))) for each in every]
+    check_noises(labels_of(every), every, options)
+    for each in every:
+        plausible.check_slips(robot, each, options)
+    splits = [each.held_back(options) for each in every]
+    return Asked(robot, every, options, splits)
+
+
+def loaded(data: Given) -> Instrument:
+    """Data as they are, or of a file."""
+    if isinstance(data, Measurements):
+        return points(data)
+    return data if isinstance(data, Instrument) else read_relative(data)
+
+
+def labels_of(every: Sequence[Instrument]) -> list[str]:
+    """What files are called: by their stems; data from arrays by their kind."""
+    files = [Path(data.at.source) for data in every if data.at.digest]
+    names = iter(session_names(files) if files else ())
+    out: list[str] = []
+    for data in every:
+        name = next(names) if data.at.digest else data.kind
+        alike = [each for each in out if each.rstrip("0123456789") == name]
+        out.append(f"{name}{len(alike) + 1}" if name in out else name)
+    return out
+
+
+def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalibration:
+    """What a fit says of all poses.  began: when the work did [s]."""
+    robot, every, splits, options = asked.robot, asked.every, asked.splits, asked.options
+    measured = [
+        measured_by(robot, found, i, data, held)
+        for i, (data, (held, _)) in enumerate(zip(every, splits, strict=True))
+    ]
+    single = len(every) == 1
+    whole = measured[0] if single else together(found.stack.labels, measured)
+    notices = [
+        said
+        for data, (_, notes) in zip(every, splits, strict=True)
+        for said in (*data.at.notices, *limit_notices(robot, data.at), *notes)
+    ]
+    sources = ", ".join(data.at.source for data in every)
+    source = replace(every[0].at, source=sources, digest=" ".join(d.at.digest for d in every))
+    geometry = found.stiff or found
+    settings, left_open = options.settings(), open_positions(robot, found)
+    for one in reversed(found.stack.instruments):  # the first one's stand
+        settings |= one.choices
+    result = RelativeCalibration(
+        **vars(whole),
+        robot=robot.with_mdh(geometry.state.mdh),
+        nominal=robot,
+        status=found.found.status[0],
+        iterations=int(found.found.iterations[0]),
+        seconds=time.perf_counter() - began,
+        parameters=fit.parameters_of(robot, found),
+        identification=found.identification,
+        position_sigma=np.nan if left_open else sigma_of_positions(robot, found),
+        positions_open=left_open,
+        beyond=remarks.beyond(robot, found, options) if single else (),
+        notices=tuple(dict.fromkeys(notices)),
+        provenance=Provenance.of(robot, source, settings),
+        instruments=() if single else instruments_of(found, every, splits, measured),
+        cell=cell_of(robot, found) if found.stiff else None,
+    )
+    return judged(robot, every, splits, found, measured, result, options)
+
+
+def judged(
+    robot: Robot,
+    every: Sequence[Instrument],
+    splits: Sequence[tuple[Array, tuple[str, ...]]],
+    found: InstrumentFit,
+    measured: Sequence[Measured],
+    result: RelativeCalibration,
+    options: RelativeOptions,
+) -> RelativeCalibration:
+    """The result with what the reader should know, failed where it is no calibration."""
+    unfitted = [remarks.unfitted(robot, found, i, options) for i in range(len(every))]
+    wrong = plausible.contradiction(robot, every, found, measured, [mend for _, mend in unfitted])
+    said = [
+        *(remark for i, one in enumerate(found.stack.instruments)
+          for remark in one.remarks(fit.own_parameters(robot, found, i), found.noise[i])),
+        *remarks.of_beyond(result),
+        *remarks.of_scale(found),
+        *remarks.weak(found, result, measured),
+        *remarks.unlikely(result, measured),
+        *filter(None, (*(notice for notice, _ in unfitted), wrong)),
+    ]  # fmt: skip
+    for data, (held, _), each in zip(every, splits, measured, strict=True):
+        said += remarks.general(each, data, held)
+    return replace(
+        result,
+        status=Status.FAILED if wrong else result.status,
+        notices=tuple(dict.fromkeys((*result.notices, *said))),
+    )
+
+
+def measured_by(
+    robot: Robot, found: InstrumentFit, i: int, data: Instrument, held: Array
+) -> Measured:
+    """The errors of an instrument, as drawn and calibrated.  held: (m,)."""
+    stack, seen = found.stack, []
+    for x in found.state_of(i):
+        block = stack.blocks[i].at_rows_of(robot, data, stack.laws, x)
+        seen.append((block.instrument, block.flange(x), block.own(x)))
+    nominal, calibrated = (one.errors(arm, own, held) for one, arm, own in seen)
+    turned = [one.turns(arm, own)[None] for one, arm, own in seen]
+    turns = by_key(turned[0], turned[1], held) if turned[0].size else {}
+    train, drawn, own = stack.instruments[i], seen[0][2], seen[1][2]
+    counts = data.count(held)
+    return Measured(
+        kind=data.kind,
+        parts=train.parts,
+        errors=by_key(nominal, calibrated, held),
+        numbers={key: counts[is_held] for key, is_held in HELD.items()},
+        turns={key: (rms(t), float(t.max()) if t.size else np.nan)
+               for key, t in turns.items()},
+        instrument=train.placed(stack.blocks[i].flange(x), own, drawn),
+    )  # fmt: skip
+
+
+def by_key(nominal: Array, calibrated: Array, held: Array) -> dict[str, Array]:
+    """Errors (parts, m, ...) of all poses by the keys of a result.  held: (m,)."""
+    return {
+        key: (nominal if key.startswith("nominal") else calibrated)[:, held == is_held]
+        for key, is_held in HELD.items()
+    }
+
+
+def together(labels: Sequence[str], measured: Sequence[Measured]) -> Measured:
+    """The errors of all files, one beside the other."""
+    errors = {}
+    for key in HELD:
+        parts = [each.errors[key] for each in measured]
+        ends = np.cumsum([[0, 0], *(part.shape[:2] for part in parts)], axis=0)
+        errors[key] = np.full((*ends[-1], 3), np.nan)
+        for part, (row, pose) in zip(parts, ends, strict=False):
+            errors[key][row : row + part.shape[0], pose : pose + part.shape[1]] = part
+    stems = zip(labels, measured, strict=True)
+    return Measured(
+        kind=SEVERAL,
+        parts=tuple(f"{label} {part}" for label, each in stems for part in each.parts),
+        errors=errors,
+        numbers={key: sum(each.numbers[key] for each in measured) for key in HELD},
+        turns={},
+        instrument={},
+    )
+
+
+def cell_of(robot: Robot, found: InstrumentFit) -> Cell:
+    """The arm with its effects in its own base, and amid the first file's targets one of its own.
+
+    Where these are is all that the laws know of them.
+    """
+    stack = found.stack
+    scene = stack.scenes(robot, found.state)[0]
+    effects = fitted(stack.laws.terms, scene, stack.values(found.state))
+    amid = scene.target_positions.mean(axis=0, keepdims=True)
+    sessions = Sessions({}, Clock.of(found.trains[0].data.at))
+    return Cell(scene.robot, np.eye(4), (TARGET,), amid, effects, sessions)
+
+
+def instruments_of(
+    found: InstrumentFit,
+    every: Sequence[Instrument],
+    splits: Sequence[tuple[Array, tuple[str, ...]]],
+    measured: Sequence[Measured],
+) -> tuple[InstrumentResult, ...]:
+    """Each file's own figures."""
+    out = []
+    for i, (data, (held, _), each) in enumerate(zip(every, splits, measured, strict=True)):
+        error = each.errors["holdout"]
+        interval = rms_interval(error, groups(data.at)[held], rng=np.random.default_rng(0))
+        alone = found.alone[i]
+        out.append(
+            InstrumentResult(
+                **vars(each),
+                name=found.stack.labels[i],
+                interval=told(interval, 1e-3 * each.accuracy["holdout"].rms_mm),
+                noise=float(found.noise[i]) / found.stack.instruments[i].row_noise,
+                alone=alone.names,
+                directions_alone=alone.directions,
+            )
+        )
+    return tuple(out)
+
+
+def sigma_of_positions(robot: Robot, found: InstrumentFit) -> float:
+    """`identify.position_sigma`, of the target of the first file."""
+    place, stack = place_of(found), found.stack
+    covariance = found.covariance[np.ix_(place, place)]
+    values = stack.values(found.state)
+    spots = targets_of(found, found.state)
+    return position_sigma(robot, found.state.mdh, spots, covariance, stack.laws, values)
+
+
+def targets_of(found: InstrumentFit, x: State) -> Array:
+    """(k, 3) targets of the first file on the flange, its origin where there is none [m]."""
+    block = found.stack.blocks[0]
+    spots = block.instrument.targets(block.own(found.stack.part(x, 0)))
+    return spots if len(spots) else np.zeros((1, 3))
+
+
+def place_of(found: InstrumentFit) -> Array:
+    """Where the parameters that move the target of the first file stand among all."""
+    stack = found.stack
+    every = np.arange(stack.names.count)
+    own = stack.own(0)[stack.instruments[0].targets_at]
+    return np.concatenate([every[: 5 * stack.names.joints + 6], own, every[stack.lawless :]])
+
+
+def open_positions(robot: Robot, found: InstrumentFit) -> tuple[str, ...]:
+    """Parameters that positions over the joints' range depend on and the measurements do not tell.
+
+    Asked of the arm as drawn, where what is redundant is so exactly.  Not those that were fixed.
+    """
+    fit = found.stiff or found
+    stack, place = fit.stack, place_of(fit)
+    reasons = fit.identification.reasons
+    names = [stack.names.all[i] for i in place]
+    fixed = [name in reasons and reasons[name].kind is Because.FIXED for name in names]
+    asked = ~np.array(fixed) & stack.movable[place]
+    jacobian = positions_by(robot, fit.nominal.mdh, targets_of(fit, fit.nominal))
+    left = lacking(jacobian, fit.identification.active[place], asked)
+    return tuple(name for name, is_open in zip(names, left, strict=True) if is_open)

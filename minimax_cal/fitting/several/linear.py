@@ -1,0 +1,216 @@
+"""What several instruments leave, linear where their fit ended: the rows of a problem of evidence.
+
+Each row is weighed by its instrument's noise.  The rows of a pose are rotated so that the noise of
+the joints is diagonal, as `modelling.rows` does it.  Geometry, what each instrument has of its own,
+and the places of sockets are projected out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from minimax_cal.evidence.noise import orthonormal
+from minimax_cal.fitting.several.fit import InstrumentFit
+from minimax_cal.ground.arrays import Array
+from minimax_cal.instruments.protocol import ResidualRows
+from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.rows import MAX_COMPUTED_NOISE, Posed
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.robot import Robot
+
+APART = 2.0  # times the largest spread of joints: eigenvalues of rows that hold no number
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """An instrument where a fit ended.
+
+    rows: as it reads there.  targets: how many it has.  root: (rows,) what each is multiplied by.
+    poses: which of all poses are its own.  cell: (rows,) place of each among all, pose by pose.
+    shapeless: (m, r, r) see `Instrument.shapeless`.
+    """
+
+    rows: ResidualRows
+    targets: int
+    root: Array
+    poses: slice
+    cell: Array
+    shapeless: Array
+
+    def of(self, fields: Array) -> Array:
+        """(d, rows) motions (d, k, 3, m) of its targets, m its own poses, as its rows."""
+        rows = self.rows
+        target = rows.part if self.targets > 1 else np.zeros_like(rows.pose)
+        slopes = np.einsum(
+            "rc,drc->dr", rows.by_point, fields[:, target, :, rows.pose].swapaxes(0, 1)
+        )
+        return np.asarray(rows.settled(slopes, loose=True)[1] * self.root)
+
+
+@dataclass(frozen=True, eq=False)
+class StackRows(Posed):
+    """Rows of several instruments; looks: at each, targets: the most of any."""
+
+    looks: tuple[Look, ...]
+
+    def of(self, fields: Array) -> Array:
+        """(N, D) displacement fields (D, k, 3, m) at the poses of all instruments, as rows.
+
+        Of an instrument with fewer targets than k the first count.
+        """
+        d, (m, r) = len(fields), self.weight.shape
+        out = np.zeros((d, m * r))
+        for look in self.looks:
+            out[:, look.cell] = look.of(fields[:, : look.targets, :, look.poses])
+        return self.turned(out)
+
+    def turned(self, rows: Array) -> Array:
+        """(N, D) rows (D, N), pose by pose, in the axes of each pose."""
+        m, r = self.weight.shape
+        flat = np.moveaxis(rows.reshape(-1, m, r), 1, 0) @ self.turn
+        return np.asarray(flat.swapaxes(1, 2).reshape(m * r, -1))
+
+
+def scene_of_all(robot: Robot, fit: InstrumentFit) -> Scene:
+    """All poses that any instrument saw, each with its targets, in the frame of the base."""
+    stack, x = fit.stack, fit.state
+    every = stack.scenes(robot, x)
+    most = max(scene.targets for scene in every)
+    points = [
+        np.concatenate([one.points, np.repeat(one.points[:1], most - one.targets, axis=0)])
+        for one in every
+    ]
+    q = np.concatenate([block.arm.q for block in stack.blocks])
+    links = kinematics.chain(x.mdh, q, robot.prismatic)
+    return Scene(
+        robot.with_mdh(x.mdh), joined([one.data for one in every]), links,
+        every[0].target_positions, np.concatenate(points, axis=-1), np.eye(3), np.zeros(3),
+    )  # fmt: skip
+
+
+def joined(seen: list[Measurements]) -> Measurements:
+    """The poses of all files, with the numbers that any of them tells."""
+    count = [len(each.q) for each in seen]
+    columns = {
+        name: np.concatenate([
+            each.columns.get(name, np.full(m, np.nan)) for each, m in zip(seen, count, strict=True)
+        ])
+        for name in dict.fromkeys(name for each in seen for name in each.columns)
+        if all(each.columns.get(name, np.zeros(0)).dtype.kind == "f" for each in seen)
+    }  # fmt: skip
+    first, total = seen[0], sum(count)
+    return replace(
+        first,
+        q=np.concatenate([each.q for each in seen]),
+        y=np.zeros((total, 0, 3)),
+        target_names=(),
+        line=np.arange(total) + 1,
+        columns=columns,
+        unknown={},
+        aside=None,
+        source=", ".join(each.source for each in seen),
+    )
+
+
+def rows_of_all(scene: Scene, fit: InstrumentFit) -> StackRows:
+    """The rows of all instruments.  scene: `scene_of_all`; fit: of geometry alone."""
+    stack, active = fit.stack, fit.identification.active
+    starts = np.cumsum([0, *(len(block.arm.q) for block in stack.blocks)]).tolist()
+    read = [block.read(stack.part(fit.state, i)) for i, block in enumerate(stack.blocks)]
+    slots = [place_in(rows.pose_of_row) for rows in read]
+    width = max(int(slot.max()) + 1 for slot in slots)
+    looks, errors, slopes, places = [], [], [], []
+    every = zip(stack.blocks, read, slots, np.sqrt(stack.precision), starts, strict=False)
+    for i, (block, rows, slot, precise, start) in enumerate(every):
+        x, columns = stack.part(fit.state, i), stack.columns(i)
+        root = precise / np.sqrt(rows.weights)
+        one, own = block.instrument, block.own(x)
+        shapeless = one.shapeless(block.flange(x), own)
+        at, poses = (
+            (start + rows.pose_of_row) * width + slot,
+            slice(start, start + len(block.arm.q)),
+        )
+        looks.append(Look(rows, len(one.targets(own)), root, poses, at, shapeless))
+        error, slope = block.rows(x, active[columns], loose=True)
+        whole = np.zeros((len(active), len(root)))
+        whole[columns[active[columns]]] = slope * root
+        errors.append(error * root)
+        slopes.append(whole)
+        places.append(rows.places * root)
+    return assembled(scene, fit, looks, errors, slopes, places, width)
+
+
+def assembled(
+    scene: Scene,
+    fit: InstrumentFit,
+    looks: list[Look],
+    errors: list[Array],
+    slopes: list[Array],
+    places: list[Array],
+    width: int,
+) -> StackRows:
+    """Rows pose by pose, each pose turned so that joints and instruments err independently.
+
+    errors: (rows,), slopes: (p, rows), places: (q, rows) of what was eliminated, of each block.
+    """
+    total = scene.poses * width
+    error, nuisance = np.zeros((1, total)), np.zeros((len(slopes[0]), total))
+    real, dead = np.zeros(total, dtype=bool), np.zeros((scene.poses, width, width))
+    beside = []
+    for look, e, slope, more in zip(looks, errors, slopes, places, strict=True):
+        error[0, look.cell], nuisance[:, look.cell] = e, slope
+        real[look.cell] = np.any(slope, axis=0) | np.any(more, axis=0)
+        own = np.zeros((len(more), total))
+        own[:, look.cell] = more
+        beside.append(own)
+        shape = look.shapeless
+        dead[look.poses, : shape.shape[1], : shape.shape[1]] = shape
+    arms = np.zeros((scene.joints, total))
+    for look in looks:
+        arms[:, look.cell] = look.of(scene.jacobian[:, : look.targets, :, look.poses])
+    by_pose = np.moveaxis(arms.reshape(scene.joints, scene.poses, width), 0, -1)
+    spread = by_pose @ np.swapaxes(by_pose, 1, 2)
+    far = APART * max(float(np.trace(spread, axis1=1, axis2=2).max()), 1.0)
+    hidden = dead + np.einsum("mr,rs->mrs", ~real.reshape(-1, width), np.eye(width))
+    values, turn = np.linalg.eigh(spread - far * hidden)
+    values, measured = np.maximum(values, 0.0).reshape(-1), (values > -0.5 * far).reshape(-1)
+    size = max(float(values.sum()) / max(int(measured.sum()), 1), 1e-300)
+    bare = StackRows(
+        error=np.zeros(0),
+        basis=np.zeros((0, 0)),
+        variance_ratio=values / size,
+        size=size,
+        group=np.repeat(numbered(fit), width),
+        measured=measured,
+        exact=MAX_COMPUTED_NOISE,
+        turn=turn,
+        weight=np.ones((scene.poses, width)),
+        looks=tuple(looks),
+    )
+    rest = bare.turned(error)[:, 0] * measured
+    basis = orthonormal(bare.turned(np.concatenate([nuisance, *beside])) * measured[:, None])
+    return replace(bare, error=rest, basis=basis)
+
+
+def place_in(pose: Array) -> Array:
+    """(rows,) which row of its pose each is, from 0.  pose: (rows,)."""
+    order = np.argsort(pose, kind="stable")
+    first = np.concatenate([[True], np.diff(pose[order]) > 0])
+    start = np.maximum.accumulate(np.where(first, np.arange(len(pose)), 0))
+    out = np.empty(len(pose), dtype=int)
+    out[order] = np.arange(len(pose)) - start
+    return out
+
+
+def numbered(fit: InstrumentFit) -> Array:
+    """(m,) a number, from 0, of each pose; repeats of one in a file have the same."""
+    out, count = [], 0
+    for train in fit.trains:
+        number = groups(train.data.at)
+        out.append(number + count)
+        count += int(number.max()) + 1
+    return np.concatenate(out)

@@ -1,0 +1,221 @@
+"""From files of detections to a calibrated robot, and whether to use it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.fitting.fit import Provenance
+from minimax_cal.fitting.found import Parameter, link_by_link
+from minimax_cal.fitting.options import listed, qp_name
+from minimax_cal.fitting.pixels.camera import FLANGE, read_camera
+from minimax_cal.fitting.pixels.data import PixelData, read_pixels
+from minimax_cal.fitting.pixels.determined import Determined, determined, judged_pixels, placed
+from minimax_cal.fitting.pixels.fit import PixelFit
+from minimax_cal.fitting.pixels.judge import Claim, arms_apart, drawn_sigma, position_sigma
+from minimax_cal.fitting.pixels.model import Scene, units_of
+from minimax_cal.fitting.pixels.options import PixelOptions, check_options
+from minimax_cal.fitting.pixels.plausible import contradiction, file_notices, outlier_notices
+from minimax_cal.fitting.pixels.uncertainty import Uncertainty
+from minimax_cal.fitting.several.pixel_result import PIXELS, PixelCalibration
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.options import takes
+from minimax_cal.ground.stages import Progress, silent
+from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.aside import TOOL, SetAside
+from minimax_cal.measuring.checks import check_joints, limit_notices
+from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.solvers.status import Status
+
+
+@takes(options=PixelOptions, read={"fix": listed, "free": listed})
+def calibrate_pixels(
+    robot: Robot | str | Path,
+    pixels: Path | str,
+    joints: Path | str,
+    camera: Mapping[str, Path | str],
+    board: Path | str | None = None,
+    progress: Progress = silent,
+    *,
+    options: PixelOptions,
+) -> PixelCalibration:
+    """Calibrate a robot from what cameras saw.
+
+    Parameters
+    ----------
+    robot
+        Loaded, or a name or path.
+    pixels
+        detections.csv (pose, camera, target, u_px, v_px).
+    joints
+        Joint values by pose.
+    camera
+        Files of K and D by the cameras' names (OpenCV or ROS, YAML).
+    board
+        Places of the targets (target, x_mm, y_mm, z_mm); without it they are fitted, and
+        the drawing alone tells the scale.
+    options
+        See `PixelOptions`.
+    progress
+        Called with a word on each stage.
+
+    Returns
+    -------
+    PixelCalibration
+        The calibration; its `status` is no_better where the drawing is known better than
+        these pixels tell the arm.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
+    >>> fit = mc.calibrate_pixels("ur5", "detections.csv", "joints.csv", {"cam": "camera.yaml"})
+    """
+    began = time.perf_counter()
+    check_options(options)
+    robot = load_robot(robot)
+    cameras = [read_camera(name, path) for name, path in camera.items()]
+    data = read_pixels(pixels, joints, cameras, board)
+    data = replace(data, at=check_joints(robot, data.at))
+    return fitted(robot, data, options, progress, began)
+
+
+def fitted(
+    robot: Robot,
+    data: PixelData,
+    options: PixelOptions,
+    progress: Progress = silent,
+    began: float | None = None,
+) -> PixelCalibration:
+    """As `calibrate_pixels`, of measurements that are read."""
+    began = time.perf_counter() if began is None else began
+    return concluded(determined(robot, data, options, progress), options, began)
+
+
+def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCalibration:
+    """The result: whether to use the arm, and how good it is.  began: by `time.perf_counter`."""
+    robot, data, train, held = one.robot, one.data, one.train, one.held
+    fit, sure, scale = one.fit, one.sure, one.scale
+    if options.drawn_prior:
+        fit, sure = one.drawing.beside(fit, sure)
+    seen = judged_pixels(robot, data, held, fit)
+    arm = robot.with_mdh(fit.scene.mdh[0])
+    claim = claimed(robot, arm, sure, one.drawing.share)
+    reason, status = contradiction(robot, train, fit, scale, options), fit.found.status[0]
+    told = () if reason else file_notices(train, fit, scale)
+    if reason:
+        status = Status.FAILED
+    elif not claim.is_better and status is not Status.FAILED:
+        status, reason = Status.NO_BETTER, kept_because(claim)
+    return PixelCalibration(
+        kind=PIXELS,
+        robot=robot if status is Status.NO_BETTER else arm,
+        nominal=robot,
+        parts=data.parts,
+        status=status,
+        iterations=int(fit.found.iterations[0]),
+        seconds=time.perf_counter() - began,
+        parameters=parameters_of(robot, fit, sure.covariance),
+        errors=seen.errors,
+        numbers={key: 2 * sum(accuracy(error).counts) for key, error in seen.errors.items()},
+        turns={},
+        instrument=placed(data, fit, scale),
+        identification=fit.identification,
+        position_sigma=claim.sigma,
+        beyond=(),
+        notices=(
+            *data.notices, *limit_notices(robot, data.at), *one.notices, *notices_of(fit, held),
+            *told, *outlier_notices(data, seen.aside),
+        ),
+        provenance=Provenance.of(
+            robot, replace(data.at, source=data.source, digest=data.digest), options.settings()
+        ),
+        calibrated=arm,
+        pixels=seen.pixels,
+        claim=claim,
+        set_aside=set_aside(data, seen.aside),
+        with_them=accuracy(seen.whole) if len(seen.aside) else None,
+        reason=reason,
+        objective=options.objective,
+        qp=qp_name(options.qp) if one.worst else "",
+        worst=one.worst,
+    )  # fmt: skip
+
+
+def claimed(robot: Robot, arm: Robot, sure: Uncertainty, share: float) -> Claim:
+    """What is known of the drawn and the calibrated arm.  share: as in `Drawing`."""
+    shown = drawn_sigma(robot, sure.lack, share) if share else 0.0
+    drawn = drawn_sigma(robot, sure.lack)
+    return Claim(position_sigma(arm, sure), drawn, arms_apart(robot, arm), shown)
+
+
+def kept_because(claim: Claim) -> str:
+    """Why the drawn arm is kept."""
+    mm = claim.texts()
+    why = (
+        f"the calibrated arm, known to {mm['sigma']}, differs from the drawn one by "
+        f"{mm['change']}, which shows the drawing to be off by {mm['shown']}: too little to be sure"
+    )
+    if claim.sigma >= claim.drawn:
+        why = (
+            f"the drawing is known better ({mm['drawn']}) than these pixels tell the arm "
+            f"({mm['sigma']})"
+        )
+    return (
+        f"{why}: the drawn arm is kept; take more images, nearer and more tilted, or say how well "
+        "the drawing is known (drawn_within)"
+    )
+
+
+def parameters_of(robot: Robot, fit: PixelFit, covariance: Array) -> tuple[Parameter, ...]:
+    """Every parameter, link by link; then cameras, targets and lenses."""
+    names, base = fit.model.names, np.zeros(6)
+
+    def told(x: Scene) -> Array:
+        mdh = robot.notation.told(x.mdh[0], robot.prismatic)
+        return np.concatenate([mdh.T.reshape(-1), base, x.values()])
+
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    every = link_by_link(
+        names, units_of(names), told(fit.nominal), told(fit.scene), sigma, fit.identification
+    )
+    return tuple(p for p in every if not p.name.startswith("base_"))
+
+
+def notices_of(fit: PixelFit, held: Array) -> list[str]:
+    """What the reader should know: the scale, the lenses, nothing held out."""
+    out = []
+    on = FLANGE if fit.model.on_flange else "ground"
+    out.append(f"the cameras are taken as fixed to the {on}")
+    if fit.by_drawing:
+        out.append(
+            "pixels alone have no length standard: the scale is that of the drawing's lengths, as "
+            "well as drawn_within says; a board of known size gives it"
+        )
+    if fit.held:
+        known = "their doubt counts in every sigma" if fit.lens_sigma.any() else "as known"
+        out.append(f"the lenses are held as their files say, {known}")
+    if not held.any():
+        out.append("no pose is held out: nothing here says how the fit does on new poses")
+    return out
+
+
+def set_aside(data: PixelData, rows: Array) -> tuple[SetAside, ...]:
+    """The pixels that took no part."""
+    return tuple(
+        SetAside(
+            row=int(data.line[row]),
+            pose=int(data.pose[row]) + 1,
+            target=data.targets[data.target[row]],
+            why="the pixel is an outlier",
+            by=TOOL,
+        )
+        for row in rows
+    )

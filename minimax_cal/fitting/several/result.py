@@ -1,0 +1,326 @@
+"""The result of a calibration without coordinates: what was found, how well, and what it is not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Annotated, Any
+
+import numpy as np
+
+from minimax_cal.fitting.fit import ACCURACIES, Provenance
+from minimax_cal.fitting.found import Parameter, parameter_table, table_of_effects
+from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.intervals import Interval
+from minimax_cal.fitting.opened import RELATIVE
+from minimax_cal.ground.arrays import Array, rms
+from minimax_cal.ground.facts import APART, Fact, Mm, derived, in_file, scaled
+from minimax_cal.ground.files import plain
+from minimax_cal.ground.records import as_kind, read, reading, stored
+from minimax_cal.ground.results import Result, merged
+from minimax_cal.ground.tables import Table, filled
+from minimax_cal.ground.words import name_first
+from minimax_cal.instruments.instrument import Words
+from minimax_cal.instruments.table import INSTRUMENTS, instrument
+from minimax_cal.measuring.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
+from minimax_cal.modelling.cell import Cell, cell_from_dict, pose_from_dict
+from minimax_cal.modelling.frames import paired, tables_of
+from minimax_cal.robots.frames import CONVENTION, Frame
+from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers.status import Status
+
+SEVERAL = "several"  # kind of a calibration from several files
+ALL = Words(
+    quantity="what every file measured",
+    caution="Lengths, misclosures and positions are one number here; each file has its own. ",
+)
+
+
+@dataclass(frozen=True)
+class Scores(Accuracy):
+    """Accuracy of lengths, closures or poses, with what else is told of the errors."""
+
+    numbers: int = 0
+    rms_mrad: Annotated[float | None, Fact(brief=True)] = None
+    max_mrad: Annotated[float | None, Fact(brief=True)] = None
+    rms_px: Annotated[float | None, Fact(brief=True)] = None
+    max_px: Annotated[float | None, Fact(brief=True)] = None
+
+
+@dataclass(frozen=True)
+class Stated(Identification):
+    """As a file tells it, without the singular values."""
+
+    told: float
+
+    @property
+    def condition(self) -> float:
+        """As the file says."""
+        return self.told
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measured:
+    """What was measured, and how well it is fitted.
+
+    kind: name of an instrument, or `SEVERAL`.  parts: what each row of the errors is, as wire1.
+    errors: by key nominal, holdout, nominal_train, train, (parts, m, 3) of the measured quantity,
+    NaN where not measured [m]; a length's error stands first of three.  numbers: independent
+    numbers behind each accuracy.  turns: RMS and largest error of orientation by key [rad], empty
+    but for poses.  instrument: what was fitted besides the robot, for JSON.
+    """
+
+    kind: Annotated[str, Fact(key="measured")]
+    parts: tuple[str, ...]
+    errors: Annotated[Mapping[str, Array], APART]
+    numbers: Annotated[Mapping[str, int], APART]
+    turns: Annotated[Mapping[str, tuple[float, float]], APART]
+    instrument: Mapping[str, Any]
+    stated: Annotated[Mapping[str, Scores] | None, APART] = None
+
+    @property
+    def words(self) -> Words:
+        """What is said of it."""
+        return ALL if self.kind == SEVERAL else instrument(self.kind).words
+
+    @cached_property
+    def accuracy(self) -> Mapping[str, Accuracy]:
+        """Of the errors, by their keys; as a file states it where it keeps no errors."""
+        if self.stated is not None:
+            return self.stated
+        return {key: accuracy(error) for key, error in self.errors.items()}
+
+    def before_and_after(self) -> tuple[Accuracy, Accuracy, str]:
+        """On held-out poses where there are any, and which poses those are."""
+        return before_and_after(self.accuracy)
+
+    def scores(self, title: str) -> Table:
+        """Accuracy before and after, training and held out."""
+        rows = ((heading, self.scored(key)) for heading, key in ACCURACIES)
+        columns = (
+            "0=poses | 1.poses=count d | 1.numbers=numbers d | 1.rms_mm=RMS mm .4f | "
+            "1.mean_mm=mean mm .4f | 1.max_mm=max mm .4f"
+        )
+        turns = ("1.rms_mrad=RMS mrad .4f", "1.max_mrad=max mrad .4f") if self.turns else ()
+        return Table.of(title, rows, columns, *turns)
+
+    def parts_table(self, title: str) -> Table:
+        """RMS errors part by part, as wire by wire; empty for a single one."""
+        titles, keys = zip(*ACCURACIES, strict=True)
+        rows = (
+            (part, *(1e3 * rms(np.linalg.norm(self.errors[key][i], axis=-1)) for key in keys))
+            for i, part in enumerate(self.parts)
+            if len(self.parts) > 1 and self.errors
+        )
+        return Table.made(title, rows, "RMS mm", *(f"{each} .4f" for each in titles))
+
+    @property
+    def frames(self) -> dict[str, Frame]:
+        """Base and tool as a tracker's points or whole poses have them, the drawn arm's, and the
+        corrections.
+        """
+        places = {
+            name: pose_from_dict(self.instrument[name]) if name in self.instrument else None
+            for name in ("base", "nominal_base", "tool", "nominal_tool")
+        }
+        base = paired("base", places["base"], places["nominal_base"])
+        return base | paired("tool", places["tool"], places["nominal_tool"])
+
+    def scored(self, key: str) -> Scores:
+        """An accuracy with all that is told beside it."""
+        turned = dict(zip(("rms_mrad", "max_mrad"), self.turns.get(key, ()), strict=False))
+        angles = {name: 1e3 * turn for name, turn in turned.items()}
+        return Scores(**{**vars(self.accuracy[key]), "numbers": self.numbers[key], **angles})
+
+    def measured_beside(self) -> dict[str, Any]:
+        """What of a file its fields do not tell."""
+        frames = {"frames": self.frames, "frames_convention": CONVENTION}
+        return {
+            **(frames if self.frames else {}),
+            "accuracy": {key: in_file(self.scored(key)) for key in self.accuracy},
+        }
+
+    @staticmethod
+    def fields_of(content: Mapping[str, Any], at: str) -> dict[str, Any]:
+        """Fields that are `APART`, without the errors of single rows.  Raises ValueError."""
+        if content["measured"] not in (*INSTRUMENTS, SEVERAL):
+            raise ValueError(f"{at}measured: should be one of {', '.join((*INSTRUMENTS, SEVERAL))}")
+        told = {key: read(Scores, content["accuracy"][key], f"{at}accuracy.{key}") for key in HELD}
+        turns = {
+            key: (1e-3 * each.rms_mrad, 1e-3 * each.max_mrad)
+            for key, each in told.items()
+            if each.rms_mrad is not None and each.max_mrad is not None
+        }
+        if turns and len(turns) < len(told):
+            raise ValueError(f"{at}accuracy: of some only tells angles")
+        numbers = {key: each.numbers for key, each in told.items()}
+        return {"errors": {}, "numbers": numbers, "turns": turns, "stated": told}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InstrumentResult(Measured):
+    """One of several files.
+
+    interval: 95 % of the held-out RMS [m].  noise: sigma of a number by what the fit leaves [m].
+    alone: link parameters that only this file
+    determines; directions_alone: the number of independent directions in which it does.
+    """
+
+    name: str
+    interval: Annotated[Interval, APART]
+    noise: Mm
+    alone: tuple[str, ...]
+    directions_alone: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        told = merged(in_file(self), self.measured_beside())
+        told["accuracy"]["holdout"]["rms_ci95_mm"] = list(scaled(self.interval, 1e3))
+        return dict(plain(told))
+
+    @staticmethod
+    def from_dict(content: Any, at: str) -> InstrumentResult:
+        """From `to_dict`.  Raises ValueError."""
+        told, apart = stored(InstrumentResult, content, at), Measured.fields_of(content, f"{at}.")
+        ends = scaled(apart["stated"]["holdout"].rms_ci95_mm or NO_ENDS, 1e-3)
+        return InstrumentResult(**told, **apart, interval=Interval(*ends))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RelativeCalibration(Measured, Result):
+    """A robot calibrated from lengths, closures or poses, or from several files together.
+
+    robot: calibrated; nominal: as drawn.  position_sigma: expected error of a position over the
+    joints' range, by the parameters' sigmas alone, the base fitted [m]; NaN while a direction that
+    moves positions is open.  positions_open: parameters that positions depend on and that the
+    measurements do not determine.
+    beyond: parameters that whole poses tell and one reflector does not.  instruments: each of
+    several files.  cell: the arm with its effects, fitted together; None without any.  robot is
+    then of a fit without them.
+    """
+
+    KIND = RELATIVE
+    COMMAND = "relative"
+
+    robot: Robot
+    nominal: Annotated[Robot, Fact(key="nominal_robot")]
+    status: Status
+    iterations: int
+    seconds: float
+    parameters: tuple[Parameter, ...]
+    identification: Annotated[Identification, APART]
+    position_sigma: Mm
+    beyond: Annotated[tuple[str, ...], Fact(key="beyond_one_reflector")]
+    notices: tuple[str, ...]
+    provenance: Provenance
+    instruments: Annotated[tuple[InstrumentResult, ...], Fact(brief=True)] = ()
+    positions_open: tuple[str, ...] = ()
+    cell: Annotated[Cell | None, APART] = None
+
+    @derived()
+    def advice(self) -> str:
+        """What its status advises."""
+        return self.status.advice
+
+    @derived()
+    def condition(self) -> float:
+        """Condition number of what was identified."""
+        return self.identification.condition
+
+    @derived()
+    def identified(self) -> int:
+        """Number of identified parameters."""
+        return sum(p.identifiable for p in self.parameters)
+
+    def accuracy_table(self) -> Table:
+        """Accuracy of what was measured, before and after, training and held out."""
+        return self.scores(f"{self.robot.name}: {self.words.quantity}")
+
+    def files_table(self) -> Table:
+        """Each of several files: held-out RMS before and after, and what it alone determines."""
+        rows = (
+            (one.name, before.rms_mm, after.rms_mm, *scaled(one.interval, 1e3), 1e3 * one.noise)
+            for one in self.instruments
+            for before, after, _ in [one.before_and_after()]
+        )
+        columns = "file | nominal mm .4f | RMS mm .4f | 95 % from .4f | to .4f | noise mm .4f"
+        return Table.made("each file, RMS", rows, columns)
+
+    def alone_table(self) -> Table:
+        """What only one of the files determines."""
+        rows = ((one.name, one.directions_alone, one.alone or "none") for one in self.instruments)
+        columns = "only by | directions d | parameters of the arm"
+        return Table.made("identified by one file alone", rows, columns)
+
+    def first_tables(self) -> tuple[Table, ...]:
+        """What stands on the first screen."""
+        first = [self.accuracy_table().brief("poses", "count", "RMS mm", "max mm")]
+        if self.instruments:
+            first = [self.files_table(), self.alone_table()]
+        return filled(*first, table_of_effects(self.parameters))
+
+    def tables(self) -> tuple[Table, ...]:
+        """Every table of the result."""
+        first = self.first_tables()
+        if not self.instruments:
+            first = (self.accuracy_table(), *first[1:], self.parts_table(f"by {self.words.part}"))
+        every = [*first, *tables_of(self.frames)]
+        for one in self.instruments:
+            every += [one.scores(f"{one.name}: {one.words.quantity}"), *tables_of(one.frames),
+                      one.parts_table(f"{one.name}, by {one.words.part}")]  # fmt: skip
+        return (*filled(*every), parameter_table(self.parameters))
+
+    @property
+    def position_claim(self) -> str:
+        """How good positions are, as a sentence."""
+        if self.positions_open:
+            return (
+                f"These data do not determine {name_first(self.positions_open)}, on which "
+                "positions depend: how good a position is they do not say."
+            )
+        return (
+            "By the parameters' sigmas alone, which hold neither effects that the model lacks nor "
+            "errors of what is fixed, a position over the joints' range is good to "
+            f"{1e3 * self.position_sigma:.3f} mm RMS once a base is fitted."
+        )
+
+    def headline(self) -> str:
+        """The result in some sentences, with what it does not say."""
+        before, after, where = self.before_and_after()
+        text = (
+            f"{self.words.quantity.capitalize()}: RMS error {before.rms_mm:.3f} mm -> "
+            f"{after.rms_mm:.3f} mm, largest {before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, "
+            f"at {where}. {self.words.caution}{self.position_claim} {self.identified} of "
+            f"{len(self.parameters)} parameters identified (condition "
+            f"{self.identification.condition:.3g}); {self.status} after {self.iterations} "
+            f"iterations, {self.seconds:.2f} s."
+        )
+        return text + (f" {self.status.advice}." if self.status.advice else "")
+
+    def summary(self, width: int = 110) -> str:
+        """The result as plain text."""
+        return "\n\n".join([*(table.text(width) for table in self.tables()), self.headline()])
+
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
+        """The accuracies, and the arm with its effects."""
+        return self.measured_beside() | ({"cell": self.cell.whole()} if self.cell else {})
+
+    @classmethod
+    def told_beside(
+        cls, content: Mapping[str, Any], told: Mapping[str, Any], source: str
+    ) -> dict[str, Any]:
+        """The accuracies without the errors of single rows, and the arm with its effects."""
+        own = {**told, **cls.fields_of(content, "")}
+        for each in (Measured(**{f.name: own[f.name] for f in fields(Measured)}),
+                     *told.get("instruments", ())):  # fmt: skip
+            with reading(source, "instrument"):  # poses that are none are refused before shown
+                _ = each.frames
+        known = np.array([p.identifiable for p in told["parameters"]])
+        condition = as_kind(float, content.get("condition"), Fact(), "condition")
+        whole = content.get("cell")
+        return {
+            **cls.fields_of(content, ""),
+            "identification": Stated(known, {}, np.zeros(0), np.zeros(0), condition),
+            "cell": cell_from_dict(whole, f"{source}: cell") if whole else None,
+        }

@@ -1,0 +1,68 @@
+"""Files of instruments: CSV in, CSV out, joint columns as in a measurement file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.files import csv_text, write_whole
+from minimax_cal.instruments.instrument import Columns, Instrument, checked
+from minimax_cal.instruments.table import INSTRUMENTS, instrument
+from minimax_cal.measuring.measurements import file_column
+from minimax_cal.reading.rows import read_rows
+
+
+def columns_of(path: Path | str, header: Sequence[str]) -> Columns:
+    """Those of the instrument that a header announces.  Raises DataError."""
+    every = [one.file for one in map(instrument, INSTRUMENTS) if one.file]
+    found: list[tuple[str, Columns]] = []
+    for columns in every:
+        names = [name for name in header if columns.announce.fullmatch(name)]
+        wrong = [name for name in names if not columns.own.fullmatch(name)]
+        if wrong:
+            raise DataError(
+                f"{path}:1: column {wrong[0]} is not understood; write {columns.written}"
+            )
+        found += [(names[0], columns)] if names else []
+    if not found:
+        named = ", or ".join(each.written for each in every)
+        raise DataError(f"{path}:1: no measured columns; name them {named}")
+    first = [each for each in found if not each[1].yields] or found
+    if len(first) > 1:
+        raise DataError(
+            f"{path}:1: columns {first[0][0]} and {first[1][0]} are of different kinds; put them "
+            "into two files"
+        )
+    return first[0][1]
+
+
+def read_relative(path: Path | str) -> Instrument:
+    """Read a CSV file of any instrument, by its columns.  Raises DataError."""
+    file = read_rows(path)
+    return checked(columns_of(path, file.header).read(file))
+
+
+def write_relative(path: Path | str, data: Instrument) -> None:
+    """Write CSV as `read_relative` reads it: radians (mm for slides) and millimetres."""
+    at = data.at
+    columns: dict[str, Array] = {
+        f"q{i + 1}_{'mm' if slides else 'rad'}": at.q[:, i] * (1e3 if slides else 1.0)
+        for i, slides in enumerate(at.sliding)
+    }
+    columns |= data.columns()
+    for stem, column in at.columns.items():
+        name, factor = file_column(stem)
+        columns[name] = column if column.dtype.kind == "U" else factor * column
+    rows = ([cell(value) for value in row] for row in zip(*columns.values(), strict=True))
+    write_whole(path, csv_text([list(columns), *rows]))
+
+
+def cell(value: str | float) -> str:
+    """A label as it is, a number to nine decimals; nothing for NaN."""
+    if isinstance(value, str):
+        return str(value)
+    return "" if np.isnan(value) else f"{value:.9f}"

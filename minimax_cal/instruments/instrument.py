@@ -1,0 +1,416 @@
+"""An instrument: what was measured at some poses, what is unknown of it, and how it reads an arm.
+
+`names`, `starts` and `read` are the protocol.  The rest is policy and has a default: which unknowns
+redundancy takes first, what an instrument lacks, its columns in a file, its slips, its words.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self, TypeVar
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.instruments.options import InstrumentOptions
+from minimax_cal.instruments.protocol import Arm, FlangePoses, ResidualRows
+from minimax_cal.measuring.grouping import groups, held_out
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.reading.rows import Rows
+from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.sampling import random_joints
+
+SPOT = tuple(f"target_{axis}" for axis in "xyz")  # the point on the flange, or the ball
+FRAMELESS = "moves nothing that is measured"
+ANGLES = ("_rx", "_ry", "_rz", "_tilt1", "_tilt2")  # endings of names
+PLENTY = 200  # poses that show what no poses could tell
+LINEAR_RANK = 1e-6  # relative singular value below which a linear start says nothing
+SPREAD = (0.05, 0.2)  # where the target may be, from the last frame, per metre of reach
+Told = tuple[str, str, float, float, float]  # name, unit, value, as drawn, sigma [SI]
+UNREADY: Any = None  # what `ready` fills
+Slip = tuple[str, "Instrument"]  # what to say, and the measurements with the slip mended
+Started = Callable[["Instrument"], tuple[Any, FlangePoses, Array]]  # ready, and fitted as drawn
+Limits = Callable[["Instrument", Array], Array]  # of each sum, how far priors let it be off [m]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """How a file of an instrument is known, and read.
+
+    announce: a column that says that the file is of the instrument.  own: every column that `read`
+    understands.  written: how these are named, for messages.  yields: whether columns of another
+    instrument come first.
+    """
+
+    announce: re.Pattern[str]
+    own: re.Pattern[str]
+    written: str
+    read: Callable[[Rows], Instrument]
+    yields: bool = False
+
+
+@dataclass(frozen=True)
+class Words:
+    """What a result says of what an instrument measured.
+
+    quantity: what the errors are of.  part: what each row of them is.  caution: what they do not
+    say.  counted: its numbers.  check: what to check where they contradict the arm.  more: what
+    helps where they tell positions weakly, empty where they are positions.  of_position: whether
+    the errors are.  whole: what several of its places are together, for reasons.
+    """
+
+    quantity: str
+    part: str = "part"
+    caution: str = ""
+    counted: str = "numbers"
+    check: str = "the order of the rows"
+    more: str = ""
+    of_position: bool = False
+    whole: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Instrument:
+    """Joint values, and in a class of each instrument's own what was measured there.
+
+    at: the m poses (q, line, columns), with points where these were measured.
+
+    Of a class: kind: its name.  words: what is said of it.  by_row: fields with an entry for each
+    pose; chosen: fields that `ready` fills.  file: its columns, None where it has none of its own.
+    options: the fields of the options that are its own.  targets_at: where the points on the flange
+    stand among its own parameters.  given_up: beginnings of those that redundancy takes first.
+    has_length: whether something that it measures is a length.  shrinks: whether an arm that hardly
+    moves fits anything.  refines: whether its starts are to be refined.  row_noise: sigma of a row
+    over that of a number.  costless: parameters that cost no number.  on_arm: whether a point on
+    the flange is among its own.  noise_given: whether the user may say its noise.  alone: what to
+    do instead where nothing else is given, empty where it needs nothing else.  unmoved: why a link
+    tells nothing that moves nothing.  scale: what it lacks where it has no length standard, and
+    what gives it.  lone_names: of its unknowns from the targets on, as people read them, those of
+    `lone` first.  first_column: the beginning of its first column, for messages.
+    """
+
+    at: Measurements
+
+    kind: ClassVar[str]
+    words: ClassVar[Words]
+    by_row: ClassVar[tuple[str, ...]] = ()
+    chosen: ClassVar[tuple[str, ...]] = ()
+    file: ClassVar[Columns | None] = None
+    options: ClassVar[tuple[str, ...]] = ()
+    targets_at: ClassVar[slice] = slice(0, 3)
+    given_up: ClassVar[tuple[str, ...]] = ()
+    shrinks: ClassVar[bool] = False
+    refines: ClassVar[bool] = True
+    row_noise: ClassVar[float] = 1.0
+    on_arm: ClassVar[bool] = True
+    noise_given: ClassVar[bool] = True
+    alone: ClassVar[str] = ""
+    unmoved: ClassVar[str] = FRAMELESS
+    scale: ClassVar[tuple[str, ...]] = ()
+    lone_names: ClassVar[tuple[str, ...]] = ()
+    first_column: ClassVar[str] = "smr1_x_"
+
+    # ---- the protocol ------------------------------------------------------------------------
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(e,) names of its own unknowns."""
+        raise NotImplementedError
+
+    def starts(self, arm: FlangePoses, free: Array) -> Sequence[Array]:
+        """Values (e,) each from which its own unknowns may be fitted to the arm as drawn.
+
+        free: (e,) True where one may be fitted.
+        """
+        raise NotImplementedError
+
+    def read(self, arm: FlangePoses, own: Array) -> ResidualRows:
+        """What was measured minus what it would measure.  own: (e,)."""
+        raise NotImplementedError
+
+    # ---- what was measured -------------------------------------------------------------------
+
+    @property
+    def poses(self) -> int:
+        """Number of rows."""
+        return len(self.at.q)
+
+    @property
+    def numbers(self) -> Array:
+        """(m,) how many numbers each row holds: one."""
+        return np.ones(self.poses, dtype=int)
+
+    @property
+    def points(self) -> int:
+        """Number of compared points, which turns a sum of squares into a mean motion."""
+        return int(self.numbers.sum())
+
+    @property
+    def degrees(self) -> int:
+        """Independent numbers, and as many more as parameters that cost none."""
+        return int(self.numbers.sum()) + self.costless
+
+    @property
+    def costless(self) -> int:
+        """Parameters that cost no number."""
+        return 0
+
+    @property
+    def independent(self) -> int:
+        """How many of the numbers are independent of each other: those of different poses."""
+        _, first = np.unique(groups(self.at), return_index=True)
+        return int(self.numbers[first].sum())
+
+    def count(self, held: Array) -> tuple[int, int]:
+        """Numbers behind the errors of training and held-out rows.  held: (m,)."""
+        return int(self.numbers[~held].sum()), int(self.numbers[held].sum())
+
+    def check(self) -> None:
+        """Raise DataError where no fit can make sense of them."""
+
+    def check_training(self) -> None:
+        """Raise DataError where they are too few to be fitted."""
+
+    def columns(self) -> Mapping[str, Array]:
+        """What was measured, by the names of a file's columns and in their units."""
+        return {}
+
+    def take(self, rows: Array) -> Self:
+        """The measurements at some rows only.  rows: indices or a mask."""
+        own = {name: getattr(self, name)[rows] for name in self.by_row}
+        return replace(self, at=self.at.take(rows), **own)
+
+    def in_order(self) -> Self:
+        """The rows in the order in which they are fitted."""
+        return self
+
+    def screened(self) -> Array:
+        """Rows that tell one start from another."""
+        return np.arange(self.poses)
+
+    def says(self, row: int) -> str:
+        """Where a row stands, for a message."""
+        return f"{self.at.source}:{self.at.line[row]}"
+
+    def held_back(self, options: InstrumentOptions) -> tuple[Array, tuple[str, ...]]:
+        """(m,) True where a row is held out; notices."""
+        return held_out(self.at, options.holdout, options.seed)
+
+    # ---- what it is in a fit -----------------------------------------------------------------
+
+    def ready(self, robot: Robot, options: InstrumentOptions) -> Self:
+        """The instrument with what it chooses before a fit."""
+        return self
+
+    def at_rows_of(self, other: Self) -> Self:
+        """Other measurements of it, with what this one has chosen."""
+        return replace(other, **{name: getattr(self, name) for name in self.chosen})
+
+    def beside(self, others: Sequence[Instrument]) -> Self:
+        """The instrument in one fit with all of some others."""
+        return self
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Its unknowns that are not fitted, as their values are given."""
+        return ()
+
+    @property
+    def has_length(self) -> bool:
+        """Whether something that it measures is a length."""
+        return True
+
+    @property
+    def given(self) -> int:
+        """Numbers that are given besides those of the data."""
+        return 0
+
+    @property
+    def choices(self) -> Mapping[str, object]:
+        """What it has chosen where the user has not, for the record."""
+        return {}
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """(e,) SI, of its own unknowns."""
+        return tuple("rad" if name.endswith(ANGLES) else "m" for name in self.names)
+
+    @property
+    def seen(self) -> Measurements:
+        """Its poses, with the points that are compared."""
+        return self.at
+
+    @property
+    def lone(self) -> Instrument | None:
+        """One point of what it measures, None where it measures no more."""
+        return None
+
+    def lone_values(self, own: Array) -> Array:
+        """(e',) unknowns of `lone`, by its own."""
+        raise NotImplementedError
+
+    def base(self, own: Array) -> tuple[Array, Array]:
+        """Rotation (3, 3) and origin (3,) of the robot's base in its frame [m]."""
+        return np.eye(3), np.zeros(3)
+
+    def targets(self, own: Array) -> Array:
+        """(k, 3) points on the flange [m]."""
+        return np.asarray(own[self.targets_at].reshape(-1, 3))
+
+    def elsewhere(self, robot: Robot, own: Array) -> Self:
+        """The instrument at plenty of poses that it could measure, of an arm: at any."""
+        count = max(PLENTY, 5 * robot.joints + 6 + len(self.names))
+        at, names = anywhere(robot, count), self.at.target_names
+        at = replace(at, y=np.zeros((count, len(names), 3)), target_names=names)
+        blank = {name: np.zeros((count, *getattr(self, name).shape[1:])) for name in self.by_row}
+        return replace(self, at=at, **blank)
+
+    def fitting(self, robot: Robot, own: Array) -> Self:
+        """The instrument at poses near its own where an arm itself fits it."""
+        return self
+
+    def shapeless(self, arm: FlangePoses, own: Array) -> Array:
+        """(m, r, r) projector, pose by pose, on sums of its rows that hold no number."""
+        return np.zeros((self.poses, 0, 0))
+
+    # ---- how well it is fitted ---------------------------------------------------------------
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """What each row of `errors` is."""
+        return (self.kind,)
+
+    def mean_square(self, arm: FlangePoses, own: Array) -> float:
+        """Of the misses of its points [m^2]."""
+        return float((self.read(arm, own).residual ** 2).sum() / self.points)
+
+    def errors(self, arm: FlangePoses, own: Array, held: Array) -> Array:
+        """(parts, m, 3), NaN where not measured [m]; numbers first."""
+        rows = self.read(arm, own)
+        out = np.full((len(self.parts), self.poses, 3), np.nan)
+        part = rows.part if len(rows.part) else np.zeros(len(rows.pose), dtype=int)
+        out[part, rows.pose] = 0.0
+        out[part, rows.pose, 0] = rows.residual
+        return out
+
+    def turns(self, arm: FlangePoses, own: Array) -> Array:
+        """(m,) errors of orientation [rad], empty where none is measured."""
+        return np.zeros(0)
+
+    def told(self, own: Array, drawn: Array, covariance: Array) -> tuple[Told, ...]:
+        """Those of its unknowns, the last ones, that people are told otherwise.
+
+        own, drawn: (e,) found, and fitted to the arm as drawn.  covariance: (e, e).
+        """
+        return ()
+
+    def placed(self, arm: FlangePoses, own: Array, drawn: Array) -> dict[str, Any]:
+        """For JSON: what was fitted besides the robot.  drawn: (e,) to the arm as drawn."""
+        return {}
+
+    # ---- slips and remarks -------------------------------------------------------------------
+
+    @classmethod
+    def check_options(cls, every: Sequence[Any], options: InstrumentOptions) -> None:
+        """Raise OptionError for wrong choices, of all its files."""
+
+    def slips(self) -> Iterable[Slip]:
+        """Slips of its own, besides those of joints."""
+        return ()
+
+    def tried(self) -> Self:
+        """At some of the poses, that are enough to try slips."""
+        return self
+
+    def check_given(self, started: Started) -> None:
+        """Raise DataError for what is given and cannot be."""
+
+    def check_start(self, started: Started, limits: Limits) -> None:
+        """Raise for what shows where the arm as drawn, `started`, fits it."""
+
+    def remarks(self, parameters: Sequence[Any], noise: float) -> tuple[str, ...]:
+        """What the reader should know.  parameters: its own, found.  noise: of a number [m]."""
+        return ()
+
+    def wider(self, options: InstrumentOptions) -> Mapping[str, object]:
+        """Options that would fit more of it than these."""
+        return {}
+
+    def told_wider(self, before: float, after: float) -> tuple[str, str]:
+        """What to say, and the mend, where `wider` explains most.  Noises [m]."""
+        return "", ""
+
+
+D = TypeVar("D", bound=Instrument)
+
+
+def spots_aside(arm: FlangePoses, first: Array) -> list[Array]:
+    """Places (3,) on the flange worth a start: a first one, the last frame, and about it [m]."""
+    aside = np.concatenate([np.zeros((1, 3)), *(s * np.eye(3) for s in SPREAD), -0.1 * np.eye(3)])
+    return [first, *(arm.reach * aside)]
+
+
+def scaled_lstsq(matrix: Array, right: Array) -> Array:
+    """Least squares with columns scaled to one; the least solution where poses do not tell."""
+    norm = np.linalg.norm(matrix, axis=0)
+    norm = np.where(norm > 0.0, norm, 1.0)
+    return np.asarray(np.linalg.lstsq(matrix / norm, right, rcond=LINEAR_RANK)[0] / norm)
+
+
+def anywhere(robot: Robot, poses: int) -> Measurements:
+    """Random poses over the joints' whole range, nothing measured."""
+    return bare(random_joints(robot, (poses,), np.random.default_rng(0)), {})
+
+
+def arm_of(robot: Robot, one: Instrument) -> Arm:
+    """The stiff arm at the poses of an instrument."""
+    return Arm.of(robot, one.at.q)
+
+
+def bare(q: Array, columns: Mapping[str, Array], **measured: Array) -> Measurements:
+    """Poses without any point.  q: (m, n) [rad, m].  measured: by what the caller calls it."""
+    q = np.array(q, dtype=float)
+    if q.ndim != 2:
+        raise DataError(f"q must be (m, n); got {q.shape}")
+    extra = {name: np.asarray(column) for name, column in columns.items()}
+    for name, column in (*measured.items(), *extra.items()):
+        if len(column) != len(q):
+            raise DataError(f"{name} has {len(column)} entries, but there are {len(q)} poses")
+    sliding = np.zeros(q.shape[1], dtype=bool)
+    return Measurements(q, np.zeros((len(q), 0, 3)), (), sliding, np.arange(len(q)) + 1, extra)
+
+
+def checked(data: D) -> D:
+    """The data, if a fit can make sense of them.  Raises DataError."""
+    where = data.at.source
+    if not data.poses:
+        raise DataError(f"{where}: holds no poses")
+    if not np.isfinite(data.at.q).all():
+        row, joint = np.argwhere(~np.isfinite(data.at.q))[0]
+        raise DataError(f"{data.says(row)}: joint {joint + 1} is not a finite number")
+    if len(np.unique(groups(data.at))) == 1:
+        raise DataError(
+            f"{where}: holds one pose only; its joint values must differ from row to row"
+        )
+    data.check()
+    return data
+
+
+def without_blind(data: D, blind: Array) -> D:
+    """The data of a file without the rows at which nothing was measured.  blind: (m,) mask."""
+    path = data.at.source
+    if blind.all():
+        raise DataError(f"{path}: nothing was measured at any pose")
+    if not blind.any():
+        return data
+    notice = f"{path}: {blind.sum()} rows hold nothing measured and are left out"
+    data = data.take(~blind)
+    return replace(data, at=replace(data.at, notices=(*data.at.notices, notice)))
+
+
+def different(at: Measurements, rows: Array) -> int:
+    """How many different poses some rows (m,) hold."""
+    return len(np.unique(groups(at)[rows]))

@@ -1,0 +1,62 @@
+"""What can be chosen of instruments."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.options import grouped
+
+Known = tuple[str, str, float]
+HOLDOUT, SEED = 0.2, 0
+
+
+def known_of(text: str) -> Known:
+    """A,B,MM: two sockets and the distance of their centres.  Raises OptionError."""
+    parts = [part.strip() for part in text.split(",")]
+    number = parts[-1].removesuffix("mm").strip()
+    if len(parts) == 3 and parts[0] and parts[1] and re.fullmatch(r"[-+.\deE]+", number):
+        try:
+            return parts[0], parts[1], 1e-3 * float(number)
+        except ValueError:
+            pass
+    raise OptionError(f"known_distances={text!r}: write two sockets and a length, as A,B,500.02")
+
+
+def known_text(known: Known) -> str:
+    """A known distance as it was asked for."""
+    first, second, distance = known
+    return f"known_distances={f'{first},{second},{1e3 * distance:g}'!r}"
+
+
+fitted = grouped("What is fitted")
+
+
+@dataclass(frozen=True)
+class InstrumentOptions:
+    """What instruments ask of whoever calibrates.
+
+    holdout: share kept out of the fit.  seed: of that choice.  offset: of lengths, fit a constant
+    one of each wire.  known_distances: of closures, sockets A, B and the distance of their centres
+    [m].  lever: of poses, what a radian counts as [m]; the file's own unless given.
+    """
+
+    holdout: float = HOLDOUT
+    seed: int = SEED
+    offset: bool = fitted(False, "Lengths: fit a constant offset of each wire (weakly determined).")
+    known_distances: Sequence[Known] = fitted(
+        (),
+        "Closures: the distance between two sockets' centres; gives the scale.",
+        flag="--known-distance",
+        metavar="A,B,MM",
+        read=known_of,
+        many=tuple,
+    )
+    lever: float | None = fitted(
+        None,
+        "Poses: what a radian counts as, linear over angular noise [default: of the columns "
+        "u95_mm and rotation_u95_rad, else 100].",
+        "mm",
+    )

@@ -1,0 +1,374 @@
+"""A ball on the flange that visits sockets again: the places of the sockets are eliminated."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.instruments.closing import closing_poses, reach
+from minimax_cal.instruments.instrument import (
+    LINEAR_RANK,
+    SPOT,
+    Columns,
+    Instrument,
+    Limits,
+    Started,
+    Words,
+    bare,
+    checked,
+    different,
+    without_blind,
+)
+from minimax_cal.instruments.options import InstrumentOptions, Known, known_text
+from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
+from minimax_cal.measuring.grouping import groups, held_out
+from minimax_cal.measuring.joint_rows import joint_rows
+from minimax_cal.measuring.measurements import FARTHEST
+from minimax_cal.reading.rows import Rows
+from minimax_cal.robots.robot import Robot
+
+SOCKET = re.compile("socket")
+WHOLE = 5  # sockets from which on whole ones are held out
+SOCKETS, VISITS = 20, 10
+
+
+@dataclass(frozen=True, eq=False)
+class Visits(Instrument):
+    """Visits to sockets.
+
+    socket: (m,) label of the socket that held the ball.  known: sockets whose distance is known
+    [m].  sole_length: whether these are the only lengths of the fit; single: whether the closures
+    are all of it.
+
+    Its own: the ball on the flange.  The best place of a socket is the visits' barycentre, whatever
+    the other parameters are: eliminating it leaves the visits about it.
+    """
+
+    socket: Array
+    known: tuple[Known, ...] = ()
+    sole_length: bool = True
+    single: bool = True
+
+    kind = "closures"
+    words = Words(
+        quantity="ball about its socket",
+        caution="A misclosure is no error of position: what moves all visits of a socket alike "
+        "does not show in it. ",
+        counted="coordinates of visits",
+        check="the labels of the sockets",
+        more="more sockets, farther apart",
+    )
+    names = SPOT
+    parts = ("visits",)
+    by_row = ("socket",)
+    chosen = ("known", "sole_length", "single")
+    options = ("known_distances",)
+    shrinks = True
+    refines = False
+    unmoved = "moves or turns all sockets alike: closures know no base frame"
+    scale = (
+        "a closure has no length standard",
+        "one known length, as known_distances= A,B,MM, gives it",
+    )
+
+    @property
+    def sockets(self) -> tuple[str, ...]:
+        """The sockets' labels, in alphabetical order."""
+        return tuple(str(label) for label in np.unique(self.socket))
+
+    @property
+    def independent(self) -> int:
+        """Three for each different pose in a socket but the first."""
+        return sum(3 * (different(self.at, self.socket == label) - 1) for label in self.sockets)
+
+    def count(self, held: Array) -> tuple[int, int]:
+        """Three less for each barycentre."""
+        return free_numbers(self.socket, held)
+
+    def check(self) -> None:
+        """Raise DataError for a socket that was not visited again with other joint values."""
+        group = groups(self.at)
+        for label in self.sockets:
+            rows = np.flatnonzero(self.socket == label)
+            if len(np.unique(group[rows])) < 2:
+                often = "once" if len(rows) == 1 else "with the same joint values only"
+                raise DataError(
+                    f"{self.says(rows[0])}: column socket: {label!r} is visited {often}; visit it "
+                    "again with other joint values, or leave the cell empty"
+                )
+
+    def in_order(self) -> Self:
+        """Visits of one socket together."""
+        return self.take(np.argsort(self.socket, kind="stable"))
+
+    def columns(self) -> Mapping[str, Array]:
+        """The labels."""
+        return {"socket": self.socket}
+
+    # ---- in a fit ----------------------------------------------------------------------------
+
+    def ready(self, robot: Robot, options: InstrumentOptions) -> Visits:
+        """With the distances that are known between them."""
+        there = set(self.sockets)
+        known = tuple(one for one in options.known_distances if set(one[:2]) <= there)
+        return replace(self, known=known)
+
+    def beside(self, others: Sequence[Instrument]) -> Visits:
+        """A length of any other instrument is as good as a known distance."""
+        lengths = any(one.has_length for one in others if not isinstance(one, Visits))
+        return replace(self, sole_length=not lengths, single=not others)
+
+    @property
+    def has_length(self) -> bool:
+        """Whether a distance of sockets is known."""
+        return bool(self.known)
+
+    @property
+    def degrees(self) -> int:
+        """Three less for each socket's place; and known distances."""
+        return 3 * (self.poses - len(self.sockets)) + len(self.known)
+
+    @property
+    def given(self) -> int:
+        """The known distances."""
+        return len(self.known)
+
+    def centres(self, place: Array) -> Array:
+        """(g, 3) barycentres of the visits to each socket.  place: (m, 3) of the ball."""
+        return np.stack([place[self.socket == label].mean(axis=0) for label in self.sockets])
+
+    def read(self, arm: FlangePoses, own: Array) -> ResidualRows:
+        """Three rows a visit, axis by axis, about the socket's barycentre; known distances.
+
+        One weighs as much as all visits together, else the fit would shrink the arm to shrink its
+        misclosures.  Where other instruments measure lengths too, it counts as a coordinate.
+        """
+        m, place = self.poses, arm.place(own[:3])
+        _, here = np.unique(self.socket, return_inverse=True)
+        count = int(here.max()) + 1
+        axis = np.repeat(np.arange(3), m)
+        rows = ResidualRows(
+            residual=-place.T.reshape(-1),
+            pose=np.tile(np.arange(m), 3),
+            point=np.tile(place, (3, 1)),
+            by_point=np.eye(3)[axis],
+            by_rotation=np.zeros((3 * m, 3)),
+            by_own=arm.rotation.swapaxes(0, 1).reshape(3 * m, 3),
+            about=np.tile(here, 3) + count * axis,
+        )
+        if not self.known:
+            return rows
+        heavy = 3 * m if self.sole_length else 1
+        at, first = {label: i for i, label in enumerate(self.sockets)}, []
+        sums, short, root = np.zeros((len(self.known), 3, m)), [], np.sqrt(heavy)
+        for one, (a, b, distance) in zip(sums, self.known, strict=True):
+            mine, other = here == at[a], here == at[b]
+            gap = place[mine].mean(axis=0) - place[other].mean(axis=0)
+            length = max(float(np.linalg.norm(gap)), 1e-12)
+            one += (gap / length)[:, None] * (mine / mine.sum() - other / other.sum())
+            short.append(distance - length)
+            first.append(int(mine.argmax()))
+        return rows._replace(
+            sums=root * sums.reshape(-1, 3 * m), short=root * np.array(short),
+            sum_pose=np.array(first), heavy=float(heavy),
+        )  # fmt: skip
+
+    def starts(self, arm: FlangePoses, free: Array) -> Sequence[Array]:
+        """The ball's place on the flange for the arm as drawn, in which misclosures are linear."""
+        rows = replace(self, known=()).read(arm, np.zeros(3))
+        error, slopes = rows.settled(rows.by_own.T[free])
+        values, vectors = np.linalg.eigh(slopes @ slopes.T)
+        told = values > LINEAR_RANK**2 * max(float(values[-1]), 1e-30)
+        ball = np.zeros(3)
+        ball[free] = vectors[:, told] @ (vectors[:, told].T @ (slopes @ error) / values[told])
+        return [ball]
+
+    def elsewhere(self, robot: Robot, own: Array) -> Visits:
+        """At plenty of random poses that close."""
+        q, socket = closing_poses(robot, own[:3], SOCKETS, VISITS, np.random.default_rng(0))
+        if len(np.unique(socket)) < 2:  # an arm that hardly reaches a place in two ways
+            return self.fitting(robot, own)
+        labels = np.array([f"{number:03d}" for number in socket])
+        pair = np.unique(labels)[:2].tolist()
+        known = ((pair[0], pair[1], 0.0),) * min(len(self.known), 1)
+        return replace(self, at=bare(q, {}), socket=labels, known=known)
+
+    def fitting(self, robot: Robot, own: Array) -> Visits:
+        """At nearby poses where the arm itself closes.
+
+        Where a closure misses by millimetres, its rows turn with a turn of the whole arm, as if
+        that could be told.
+        """
+        pose = robot.pose(self.at.q)
+        centre = self.centres(pose[:, :3, :3] @ own[:3] + pose[:, :3, 3])
+        goal = centre[np.unique(self.socket, return_inverse=True)[1]]
+        q, _ = reach(robot, own[:3], goal, self.at.q)
+        return replace(self, at=replace(self.at, q=q))
+
+    def mean_square(self, arm: FlangePoses, own: Array) -> float:
+        """Of visits about their socket [m^2]."""
+        rows = self.read(arm, own)
+        return float((rows.centred(rows.residual) ** 2).sum() / self.poses)
+
+    def errors(self, arm: FlangePoses, own: Array, held: Array) -> Array:
+        """Of visits about their socket."""
+        return misclosures(arm.place(own[:3]), self.socket, held)[None]
+
+    def placed(self, arm: FlangePoses, own: Array, drawn: Array) -> dict[str, Any]:
+        """Ball in the last frame, sockets in the robot's base."""
+        centre = self.centres(arm.place(own[:3]))
+        other = "as drawn" if self.single else "other files"
+        return {
+            "target_mm": (1e3 * own[:3]).tolist(),
+            "sockets_mm": dict(zip(self.sockets, (1e3 * centre).tolist(), strict=True)),
+            "known_distances": [[a, b, 1e3 * length] for a, b, length in self.known],
+            "scale": "known distance" if self.known else other,
+        }
+
+    def held_back(self, options: InstrumentOptions) -> tuple[Array, tuple[str, ...]]:
+        """(m,) True where a visit is held out; sockets of known distances stay."""
+        needed = tuple(label for known in options.known_distances for label in known[:2])
+        return split_sockets(self, options.holdout, options.seed, needed)
+
+    # ---- slips -------------------------------------------------------------------------------
+
+    @classmethod
+    def check_options(cls, every: Sequence[Visits], options: InstrumentOptions) -> None:
+        """Raise OptionError for a known distance that is none of these files'."""
+        sockets = [set(data.sockets) for data in every]
+        files = ", ".join(data.at.source for data in every)
+        asked: set[frozenset[str]] = set()
+        for known in options.known_distances:
+            first, second, distance = known
+            said = known_text(known)
+            if {first, second} in asked:
+                raise OptionError(f"{said}: this distance is given twice; give it once")
+            asked.add(frozenset((first, second)))
+            for label in (first, second):
+                if not any(label in some for some in sockets):
+                    raise OptionError(f"{said}: {files} has no socket {label!r}")
+            if first == second or not 0.0 < distance < FARTHEST:
+                raise OptionError(f"{said}: needs two different sockets and a positive length")
+            if sum({first, second} <= some for some in sockets) != 1:
+                raise OptionError(f"{said}: both sockets must be in one file, and in no other")
+
+    def check_start(self, started: Started, limits: Limits) -> None:
+        """Raise OptionError for a known distance that no arm like the drawn one can have."""
+        ready, arm, own = started(self)
+        centre = dict(zip(ready.sockets, ready.centres(arm.place(own[:3])), strict=True))
+        for known, limit in zip(ready.known, limits(ready, own), strict=True):
+            drawn, told = float(np.linalg.norm(centre[known[0]] - centre[known[1]])), known[2]
+            if abs(drawn - told) <= limit:
+                continue
+            metres = "; metres? give millimetres" if abs(drawn - 1e3 * told) <= limit else ""
+            raise OptionError(
+                f"{known_text(known)}: by the arm as drawn these sockets of {self.at.source} are "
+                f"{1e3 * drawn:.4g} mm apart{metres or '; check the labels and the length'}"
+            )
+
+
+def closures(q: Array, socket: Array, **columns: Array) -> Visits:
+    """Sockets visited again, from arrays.  q: (m, n) [rad, m].  socket: (m,) labels."""
+    labels = np.asarray(socket).astype(str)
+    return checked(Visits(bare(q, columns, socket=labels), labels))
+
+
+def read(file: Rows) -> Visits:
+    """The sockets' labels.  Raises DataError."""
+    file, at = joint_rows(file, SOCKET)
+    labels = np.array(file.text("socket"))
+    return without_blind(Visits(at, labels), np.asarray(labels == ""))
+
+
+def split_sockets(
+    data: Visits, holdout: float, seed: int, needed: tuple[str, ...]
+) -> tuple[Array, tuple[str, ...]]:
+    """(m,) True where a visit is held out, and a notice that says what was chosen.
+
+    Whole sockets where there are enough: nothing of them shaped the fit.  Else visits, of which
+    each socket keeps two.  needed: sockets that must stay, those of known distances.
+    """
+    held, notices = held_out(data.at, holdout, seed)  # raises for a wrong option
+    if "split" in data.at.columns:
+        gone = [label for label in needed if held[data.socket == label].all()]
+        if gone:
+            raise DataError(
+                f"{data.at.source}: column split holds out all of socket {gone[0]!r}, whose "
+                "distance is given with known_distances=; leave some of its visits in training"
+            )
+        return held, notices
+    if holdout == 0.0:
+        return held, notices
+    rng = np.random.default_rng(seed)
+    labels = np.array(data.sockets)
+    loose = labels[~np.isin(labels, needed)]
+    whole = round(holdout * len(labels))
+    if len(labels) >= WHOLE and 0 < whole <= len(loose):
+        chosen = rng.permutation(loose)[:whole]
+        notice = (
+            f"{whole} of {len(labels)} sockets are held out whole, their own barycentres fitted: "
+            "an error is about that barycentre, three degrees of freedom less for each socket"
+        )
+        return np.isin(data.socket, chosen), (notice,)
+    held = spare_visits(data, holdout, rng)
+    count = f"{len(labels)} socket{'s' if len(labels) > 1 else ''}"
+    notice = (
+        f"with {count}, visits are held out, not sockets: an error is about the barycentre of the "
+        "training visits"
+    )
+    return held, (notice,)
+
+
+def spare_visits(data: Visits, holdout: float, rng: np.random.Generator) -> Array:
+    """(m,) True for a share of the visits; each socket keeps two different poses."""
+    pose = groups(data.at)
+    held = np.zeros(data.poses, dtype=bool)
+    wanted = round(holdout * data.poses)
+    for chosen in rng.permutation(np.unique(pose)):
+        if held.sum() >= wanted:
+            break
+        rows = pose == chosen
+        rest = ~held & ~rows
+        left = [
+            len(np.unique(pose[rest & (data.socket == label)]))
+            for label in np.unique(data.socket[rows])
+        ]
+        if min(left) >= 2:
+            held |= rows
+    return held
+
+
+def misclosures(place: Array, socket: Array, held: Array) -> Array:
+    """Errors of visits as if about known sockets: (m, 3) [m], NaN where nothing closes.
+
+    place: (m, 3) of the ball by some model [m].  socket: (m,) labels.  held: (m,) True where held
+    out.  A visit is about the barycentre of its socket's training visits, n in number, of which it
+    is one: sqrt(n/(n-1)) makes up for it.  In a socket held out whole it is the same, about its own
+    barycentre.  A held-out visit about n training visits holds their error too: sqrt(n/(n+1)).
+    """
+    error = np.full(place.shape, np.nan)
+    for label in np.unique(socket):
+        here = socket == label
+        about = here & ~held if (here & ~held).any() else here
+        n, apart = int(about.sum()), here & ~about
+        centre = place[about].mean(axis=0)
+        error[apart] = (place[apart] - centre) * np.sqrt(n / (n + 1.0))
+        if n > 1:
+            error[about] = (place[about] - centre) * np.sqrt(n / (n - 1.0))
+    return error
+
+
+def free_numbers(socket: Array, held: Array) -> tuple[int, int]:
+    """Independent coordinates of training and held-out visits: three less for each barycentre."""
+    trained, left = np.unique(socket[~held]), np.unique(socket[held])
+    alone = len(left) - int(np.isin(left, trained).sum())
+    return 3 * (int((~held).sum()) - len(trained)), 3 * (int(held.sum()) - alone)
+
+
+Visits.file = Columns(SOCKET, SOCKET, "socket", read)

@@ -1,0 +1,1 @@
+"""Any file of a tracker, controller, log, camera or robot as rows and named columns."""

@@ -1,0 +1,433 @@
+"""A text file as it is: encoding, delimiter, decimal sign, header and cells."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import hashlib
+import io
+import re
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import overload
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.files import read_raw
+from minimax_cal.reading.words import is_understood, unit_name
+from minimax_cal.reading.workbook import is_workbook, text_of_workbook
+
+DELIMITERS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "spaces"}
+DECIMALS = {".": "point", ",": "comma"}
+POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+COMMA = re.compile(r"[-+]?(\d*),(\d+)([eE][-+]?\d+)?")
+COMMENTS = ("#", "%", "//", "!")
+SIMULATED = "# simulated"  # first line of a file whose points were computed, not measured
+ENCODINGS = (  # names and codecs; the last takes any bytes, and cp1252 is meant by latin-1 mostly
+    ("utf-8", "utf-8-sig"), ("utf-16", "utf-16"), ("gb2312", "gb2312"), ("latin-1", "cp1252"),
+    ("latin-1", "latin-1"),
+)  # fmt: skip
+MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+PACKED = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how spreadsheets begin
+WORKBOOK = "workbook"
+COORDINATES = 3  # of a point
+BLANK = " \t,;"
+MOST_COLUMNS = 1 << 14  # as of workbooks
+NUMERIC = b"0123456789+-.eE, "  # letters of numbers
+AT_ONCE = 1 << 13  # rows that are made numbers at once
+LOOKED_AT = 200  # rows that decide the delimiter
+Row = tuple[str, ...]
+NumberedRow = tuple[int, Row]  # the line of the file, and its cells
+
+
+@dataclass(frozen=True, eq=False)
+class Lines(Sequence[Row]):
+    """Lines as rows of cells, each cut when it is asked for."""
+
+    lines: Sequence[str]
+    delimiter: str
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    @overload
+    def __getitem__(self, at: int) -> Row: ...
+    @overload
+    def __getitem__(self, at: slice) -> Lines: ...
+    def __getitem__(self, at: int | slice) -> Row | Lines:
+        some = self.lines[at]
+        return (
+            split_line(some, self.delimiter) if isinstance(some, str) else replace(self, lines=some)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """A file of rows and columns.
+
+    header: names, or empty.  line: (m,) line of the file of each row.  cells: m rows of text.
+    delimiter, decimal: empty where the text has no columns.  above, below: lines that are not of
+    the table.  torn: lines that have fewer or more cells, where they were left out.
+    block: (m, width) the cells as numbers, where all are.
+    """
+
+    path: Path
+    text: str
+    encoding: str
+    delimiter: str
+    decimal: str
+    header: tuple[str, ...]
+    line: Array
+    cells: Sequence[Row]
+    torn: tuple[int, ...] = ()
+    above: tuple[int, ...] = ()
+    below: tuple[int, ...] = ()
+    block: Array | None = None
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return len(self.header) or max(map(len, self.cells), default=0)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the text."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the first line says that the points were computed, not measured."""
+        return self.text.partition("\n")[0].strip(' \t\r,;"').lower() == SIMULATED
+
+
+def numbers_of(cells: Sequence[str], decimal: str = ".") -> Array:
+    """(m,) numbers, NaN where a cell is empty or holds none."""
+    given = [cell.replace(",", ".") for cell in cells] if decimal == "," else list(cells)
+    with suppress(ValueError):
+        if "_" not in "".join(given):  # 1_000 is a number to Python only
+            return np.array([cell or "nan" for cell in given], dtype=float)
+    return np.array([number_of(cell) for cell in given], dtype=float)
+
+
+def number_of(cell: str) -> float:
+    """One number, NaN where the cell holds none."""
+    try:
+        return float(cell if "_" not in cell else "nan")
+    except ValueError:
+        return np.nan
+
+
+def open_text(path: Path | str) -> Sheet:
+    """A text file, not yet cut into rows and columns.  Raises DataError."""
+    path = Path(path)
+    return sheet_of(
+        path, *((text_of_workbook(path), WORKBOOK) if is_workbook(path) else decoded(path))
+    )
+
+
+def sheet_of(path: Path | str, text: str, encoding: str = "utf-8") -> Sheet:
+    """A text that is, or shall be, in a file.  Raises DataError where it is none."""
+    if "\0" in text:
+        raise DataError(f"{path}: is not a text file; expected rows of numbers")
+    if not text.strip():
+        raise DataError(f"{path}: is empty")
+    return Sheet(Path(path), text, encoding, "", "", (), np.empty(0, dtype=int), ())
+
+
+def cut(
+    sheet: Sheet,
+    decimal: str = "",
+    *,
+    most_torn: float = 0.0,
+    remarks: bool = True,
+    alone: str = "",
+) -> Sheet:
+    """The rows and columns of a text, by the delimiter and decimal sign found.  Raises DataError.
+
+    decimal: the sign, where the user gives it.  most_torn: share of rows that may be left out
+    because they have fewer or more cells than the others.  remarks: whether there may be some below
+    the table.  alone: the delimiter of a table of one column.
+    """
+    path = sheet.path
+    delimiter, notes, lines = split(sheet, alone)
+    if (found := of_numbers(sheet, delimiter, lines)) is not None:
+        return replace(found, decimal=decimal or ".")
+    rows = rows_of(path, lines, delimiter)
+    if not rows:
+        raise DataError(f"{path}: is empty")
+    above = [] if most_torn else above_table([row for _, row in rows])
+    below = (
+        []
+        if most_torn or not remarks
+        else below_table([row for _, row in rows], sheet.encoding == WORKBOOK)
+    )
+    above, below = [[rows[i][0] for i in some] for some in (above, below)]
+    rows = rows[len(above) : len(rows) - len(below)]
+    header, rows = split_header(rows)
+    if not header and not most_torn:
+        header = noted_header(
+            [line for n, line in notes.items() if n < rows[0][0]], delimiter, rows
+        )
+    if not rows:
+        raise DataError(f"{path}: holds a header but no rows")
+    width = len(header) or Counter(len(trimmed(row)) for _, row in rows).most_common(1)[0][0]
+    if width > MOST_COLUMNS:
+        raise DataError(f"{path}: has {width} columns; a table has at most {MOST_COLUMNS}")
+    torn = [(number, row) for number, row in rows if len(row) < width or any(row[width:])]
+    if len(torn) > (max(1.0, most_torn * len(rows)) if most_torn else 0.0):
+        number, row = torn[0]
+        what = "the header has" if header else "most rows have"
+        raise DataError(
+            f"{path}:{number}: {len(trimmed(row))} cells, but {what} {width}; "
+            "complete the row or delete it"
+        )
+    lost = tuple(number for number, _ in torn)
+    rows = [(number, row) for number, row in rows if number not in lost] if lost else rows
+    line = np.array([number for number, _ in rows], dtype=int)
+    cells = tuple(row[:width] for _, row in rows)
+    names = header or tuple(f"column {i + 1}" for i in range(width))
+    plain = delimiter == "," and '"' not in sheet.text
+    sign = decimal or ("." if plain else decimal_of(path, names, line, cells))
+    found = replace(sheet, delimiter=delimiter, decimal=sign, header=header, line=line, cells=cells)
+    return replace(found, torn=lost, above=tuple(above), below=tuple(below))
+
+
+def split(sheet: Sheet, alone: str) -> tuple[str, dict[int, str], list[str]]:
+    """The delimiter of a text, its comments by line, and its other lines.  Raises DataError."""
+    lines = sheet.text.split("\n")
+    notes = {n: line for n, line in enumerate(lines, 1) if line.lstrip().startswith(COMMENTS)}
+    for n in notes:
+        lines[n - 1] = ""
+    some = [line for line in lines if line.strip(BLANK)][:LOOKED_AT]
+    delimiter = "\t" if sheet.encoding == WORKBOOK else delimiter_of(some) or alone
+    if not delimiter:
+        raise DataError(
+            f"{sheet.path}: has no columns that commas, semicolons, tabs or spaces separate"
+        )
+    return delimiter, notes, lines
+
+
+def of_numbers(sheet: Sheet, delimiter: str, lines: list[str]) -> Sheet | None:
+    """The table of a text that holds a header and below it numbers with points alone; else None.
+
+    Read as JSON, whose numbers are rounded as Python's.
+    """
+    from pydantic_core import from_json
+
+    told = [n for n, line in enumerate(lines) if line.strip(BLANK)]
+    body = [lines[n] for n in told[1:]]
+    if not body or delimiter == " " or '"' in lines[told[0]]:
+        return None
+    head = trimmed(split_line(lines[told[0]], delimiter))
+    if not is_header(head):
+        return None
+    if any(line.count(delimiter) != len(head) - 1 for line in body):
+        return None
+    block = np.empty((len(body), len(head)))
+    for first in range(0, len(body), AT_ONCE):
+        some = body[first : first + AT_ONCE]
+        raw = delimiter.join(some).replace(delimiter, ",").encode()
+        if raw.translate(None, NUMERIC):
+            return None
+        try:
+            values = np.array(from_json(b"[" + raw + b"]"), dtype=float)
+            block[first : first + AT_ONCE] = values.reshape(len(some), len(head))
+        except ValueError:
+            return None
+    if not np.isfinite(block).all():
+        return None
+    line = np.array(told[1:]) + 1
+    return replace(sheet, delimiter=delimiter, header=head, line=line,
+                   cells=Lines(body, delimiter), block=block)  # fmt: skip
+
+
+def above_table(rows: list[Row]) -> range:
+    """Rows above the table that say something else: they are half as long, or shorter."""
+    lengths = [len(trimmed(row)) for row in rows]
+    width = Counter(lengths).most_common(1)[0][0]
+    first = next((i for i, length in enumerate(lengths) if 2 * length > width), 0)
+    return range(first if first < len(rows) - 1 else 0)
+
+
+def below_table(rows: list[Row], padded: bool) -> range:
+    """Rows below the table: half as long, or shorter, with words, too few numbers for a point.
+
+    padded: whether all rows have cells up to the last column.
+    """
+    lengths = [len(trimmed(row) if padded else row) for row in rows]
+    width = Counter(lengths).most_common(1)[0][0]
+    last = len(rows)
+    while last > 1 and 2 * lengths[last - 1] <= width and is_remark(rows[last - 1]):
+        last -= 1
+    return range(last, len(rows))
+
+
+def is_remark(row: Row) -> bool:
+    """Whether a row holds words, and too few numbers for a point."""
+    filled = sum(map(bool, row))
+    return numbers_in(row) < min(filled, COORDINATES)
+
+
+def split_header(rows: list[NumberedRow]) -> tuple[tuple[str, ...], list[NumberedRow]]:
+    """Names of the columns with their units, and the rows below.
+
+    A row of names that are the same, or not there, has names of groups above it or below it: SMR 1
+    over X, Y, Z.
+    """
+    if not is_header(rows[0][1]):
+        return (), rows
+    names, rows = [*trimmed(rows[0][1])], rows[1:]
+    if "" in names and len(rows) > 1 and not any(map(is_number, rows[0][1])):
+        names, rows = grouped(names, rows[0][1]), rows[1:]
+    if rows and (units := units_in(rows[0][1], len(names))):
+        names = [f"{n} [{u}]" if u else n for n, u in zip(names, units, strict=True)]
+        rows = rows[1:]
+    return tuple(names), rows
+
+
+def grouped(groups: Sequence[str], below: Row) -> list[str]:
+    """The names below groups, each with that of its group where others are called alike."""
+    names = [*trimmed(below)]
+    names += [""] * (len(groups) - len(names))
+    over: list[str] = []
+    for group in [*groups, *[""] * len(names)][: len(names)]:
+        over.append(group or (over[-1] if over else ""))
+    return [
+        f"{group} {name}".strip() if not name or names.count(name) > 1 else name
+        for group, name in zip(over, names, strict=True)
+    ]
+
+
+def noted_header(notes: list[str], delimiter: str, rows: list[NumberedRow]) -> tuple[str, ...]:
+    """The names of a last comment above the rows that has one for each column, else nothing."""
+    marks = "".join(COMMENTS)
+    names = (
+        () if not notes or '"' in notes[-1] else split_line(notes[-1].strip(marks + " "), delimiter)
+    )
+    right = len(names) == len(trimmed(rows[0][1])) and is_header(names)
+    return tuple(names) if right and is_understood(names) else ()
+
+
+def units_in(row: Row, width: int) -> list[str]:
+    """The units of a row that holds nothing else, below the header; else nothing."""
+    cells = [cell.strip("[]() ") for cell in (*row, *[""] * width)][:width]
+    filled = [cell for cell in cells if cell and cell != "-"]
+    known = bool(filled) and all(map(unit_name, filled))
+    return [cell if unit_name(cell) else "" for cell in cells] if known else []
+
+
+def decoded(path: Path) -> tuple[str, str]:
+    """The text, its lines ended alike, and the name of its encoding.  Raises DataError."""
+    raw = read_raw(path, kind=DataError)
+    if raw.startswith(PACKED):
+        raise DataError(f"{path}: is a spreadsheet, not text; save it as CSV")
+    for name, codec in ENCODINGS:
+        with suppress(UnicodeError):
+            text = raw.decode(codec)
+            if name == "utf-16" and not raw.startswith(MARKS):
+                continue
+            return text.replace("\r\n", "\n").replace("\r", "\n"), name
+    raise DataError(f"{path}: is not a text file; expected rows of numbers")
+
+
+def split_line(line: str, delimiter: str) -> Row:
+    """The cells of a line."""
+    if delimiter == " ":
+        return tuple(line.split())
+    if '"' not in line:
+        return tuple(map(str.strip, line.split(delimiter)))
+    row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True, strict=True))
+    return tuple(map(str.strip, row))
+
+
+def rows_of(path: Path, lines: Sequence[str], delimiter: str) -> list[NumberedRow]:
+    """The rows that hold something, each with the line on which it ends.  Raises DataError."""
+    if delimiter == " " or not any('"' in line for line in lines):
+        return [(n, split_line(line, delimiter)) for n, line in enumerate(lines, 1)
+                if line.strip(BLANK)]  # fmt: skip
+    text = io.StringIO("\n".join(lines), newline="")
+    reader = csv.reader(text, delimiter=delimiter, skipinitialspace=True, strict=True)
+    rows, begun = [], 0
+    try:
+        for row in reader:
+            begun = reader.line_num
+            rows.append((begun, tuple(map(str.strip, row))))
+    except csv.Error:
+        what = "has a quotation mark without its pair; delete it"
+        raise DataError(f"{path}:{begun + 1}: {what}") from None
+    return [row for row in rows if any(row[1])]
+
+
+def trimmed(row: Row) -> Row:
+    """A row without empty cells at its end."""
+    end = max((i + 1 for i, cell in enumerate(row) if cell), default=0)
+    return row[:end]
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell is a number with either decimal sign."""
+    return bool(POINT.fullmatch(cell) or COMMA.fullmatch(cell))
+
+
+def numbers_in(row: Row) -> int:
+    """How many cells of a row are numbers."""
+    return sum(map(is_number, row))
+
+
+def is_header(row: Row) -> bool:
+    """Whether most cells of a row are words."""
+    filled = [cell for cell in row if cell]
+    return 2 * sum(not is_number(cell) for cell in filled) > len(filled)
+
+
+def delimiter_of(lines: list[str]) -> str:
+    """The delimiter that cuts most lines into one count, with most digits in numbers, or ''."""
+    best, most = "", 0.0
+    for delimiter in DELIMITERS:
+        rows: list[Row] = []
+        for line in lines:
+            with suppress(csv.Error):
+                rows.append(split_line(line, delimiter))
+        if not rows:
+            continue
+        count, times = Counter(map(len, rows)).most_common(1)[0]
+        if count < 2 or 2 * times < len(rows):
+            continue
+        body = rows[1:] or rows
+        score = times * sum(len(cell) for row in body for cell in row if is_number(cell))
+        if score > most or not best:
+            best, most = delimiter, score
+    return best
+
+
+def decimal_of(
+    path: Path, names: tuple[str, ...], line: Array, cells: tuple[tuple[str, ...], ...]
+) -> str:
+    """The decimal sign, where the cells prove it.  Raises DataError."""
+    if not any("," in cell for row in cells for cell in row):
+        return "."
+    comma, point, proven = "", "", False
+    for number, row in zip(line, cells, strict=True):
+        for name, cell in zip(names, row, strict=True):
+            if found := COMMA.fullmatch(cell):
+                comma = comma or f"{path}:{number}: column {name}: {cell}"
+                proven |= len(found[2]) != 3 or len(found[1]) > 3 or found[1] in ("", "0")
+                proven |= bool(found[3])
+            elif not point and "." in cell and POINT.fullmatch(cell):
+                point = f"column {name} of line {number}: {cell}"
+    if comma and point:
+        raise DataError(
+            f"{comma} has a decimal comma, but {point} has a decimal point; use a decimal point in "
+            "all, or a comma"
+        )
+    if comma and not proven:
+        raise DataError(
+            f"{comma} may have a decimal comma or be thousands; add decimal='comma', or take "
+            "the commas out"
+        )
+    return "," if comma else "."

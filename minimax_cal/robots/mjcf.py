@@ -1,0 +1,335 @@
+"""MJCF in: a file with what it includes, and the links and joints that MuJoCo makes of it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Mapping
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from os import path as paths
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import RobotError
+from minimax_cal.ground.files import read_raw
+from minimax_cal.ground.optional import optional
+from minimax_cal.robots.document import NESTED, NESTED_TOO_DEEP, Document, read_document
+from minimax_cal.robots.transforms import inverse, transform
+from minimax_cal.robots.urdf_file import (
+    ASSUMED,
+    MOVING,
+    UPRIGHT,
+    Joint,
+    Mimic,
+    Urdf,
+    parse_xml,
+    walk,
+)
+
+KINDS = ("floating", "ball", "prismatic", "revolute")  # of MuJoCo's joints, by mjtJoint
+COUPLES_JOINTS = 2  # mjEQ_JOINT
+DRIVES_TENDON = 3  # mjTRN_TENDON
+LOG = logging.getLogger("minimax_cal")
+MOST = {  # what a model of an arm and its cell may hold, and what it is called
+    "elements": (10_000.0, "elements, replicated ones too"),
+    "body": (1_000.0, "bodies"),
+    "freejoint": (50.0, "bodies that float freely"),
+    "hfield": (4e6, "<hfield>: cells"),
+    "texture": (2e7, "<texture>: pixels"),
+    "size": (1e5, "<size>: numbers set aside"),
+}
+
+
+def mujoco() -> Any:
+    """The package, whose warnings would go to a file.  Raises OptionError without it."""
+    found = optional("mujoco", "a simulator's model", "minimax-cal[mujoco]")
+    if found.get_mju_user_warning() is None:
+        found.set_mju_user_warning(LOG.info)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """A model's file.  document: with all that it includes.  folder: where its assets are.
+
+    assumed: whether it says itself that its masses are.
+    """
+
+    source: str
+    document: Document
+    folder: Path
+    assumed: bool = False
+
+    def compiled(self, tree: ET.Element | None = None) -> Any:
+        """The model as MuJoCo sees it.  Raises RobotError."""
+        text = ET.tostring(
+            assets_from(self.document.root if tree is None else tree, self.folder.resolve())
+        )
+        try:
+            return mujoco().MjModel.from_xml_string(text.decode())
+        except (ValueError, RuntimeError) as error:
+            raise RobotError(f"{self.source}: MuJoCo refuses it: {one(error)}") from error
+
+
+def one(error: Exception) -> str:
+    """A message in one line."""
+    return " ".join(str(error).split())
+
+
+def read_model(path: Path | str) -> Given:
+    """An MJCF, or a URDF as MuJoCo takes it.  Raises RobotError."""
+    path = Path(path)
+    raw = read_raw(path, kind=RobotError)
+    top = parse_xml(raw, str(path))
+    if top.tag == "robot":
+        marked = any(ASSUMED in element.attributes for element in walk(top))
+        tree = from_urdf(path, with_limits=not marked)
+        return Given(str(path), Document(tree), path.parent, marked)
+    if top.tag != "mujoco":
+        raise RobotError(f"{path}: is neither MJCF nor URDF: its root is <{top.tag}>")
+    document = read_document(path)
+    check_size(document.root, str(path))
+    return Given(str(path), document, path.parent)
+
+
+def check_size(tree: ET.Element, source: str) -> None:
+    """Raise RobotError for what fills any memory, or never ends, once MuJoCo makes it.
+
+    Elements count as often as what they stand in is replicated.
+    """
+    kinds, stack = dict.fromkeys(MOST, 0.0), [(tree, 1.0, 0)]
+    while stack:
+        element, times, depth = stack.pop()
+        tag = str(element.tag)
+        if depth > NESTED:
+            raise RobotError(f"{source}: {NESTED_TOO_DEEP}")
+        times *= product(element.get("count"))
+        told = {"elements": times, tag: times}
+        if tag == "joint" and element.get("type") == "free":
+            told["freejoint"] = times
+        if tag == "hfield":
+            told[tag] = product(element.get("nrow")) * product(element.get("ncol"))
+        if tag == "texture":
+            told[tag] = product(element.get("width")) * product(element.get("height"))
+        if tag == "size":
+            told[tag] = max([1.0, *(product(v) for k, v in element.items() if k != "memory")])
+        for kind, amount in told.items():
+            if kind in kinds:
+                kinds[kind] += amount
+        stack += [(child, times, depth + 1) for child in element]
+    for kind, amount in kinds.items():
+        if not amount <= MOST[kind][0]:
+            what, most = MOST[kind][1], MOST[kind][0]
+            raise RobotError(f"{source}: {what}: {amount:.3g}, at most {most:g} are taken")
+
+
+def product(text: str | None) -> float:
+    """Of the numbers of an attribute; 1 without it, or where MuJoCo will refuse it."""
+    try:
+        return float(np.prod([abs(float(word)) for word in (text or "1").split()]))
+    except ValueError:
+        return 1.0
+
+
+def from_urdf(path: Path, *, with_limits: bool) -> ET.Element:
+    """A URDF as MJCF, its bodies with all the digits that MuJoCo's own writer leaves out.
+
+    with_limits: whether its limits of effort are any; beside assumed masses they are not.
+    """
+    try:
+        spec = mujoco().MjSpec.from_file(str(path))
+        model = spec.compile()
+        root = ET.fromstring(spec.to_xml())
+    except (ValueError, RuntimeError) as error:
+        raise RobotError(f"{path}: MuJoCo refuses it: {one(error)}") from error
+    for element in root.iter("body"):
+        body = model.body(element.get("name"))
+        element.set("pos", numbers(model.body_pos[body.id]))
+        element.set("quat", numbers(model.body_quat[body.id]))
+    for element in root.iter("joint"):
+        if element.get("name"):
+            joint = model.joint(element.get("name")).id
+            element.set("axis", numbers(model.jnt_axis[joint]))
+        if not with_limits:
+            element.attrib.pop("actuatorfrcrange", None)
+    return root
+
+
+def assets_from(tree: ET.Element, folder: Path) -> ET.Element:
+    """A copy whose assets are looked for where the given file had them."""
+    tree = deepcopy(tree)
+    find_assets(tree, folder)
+    return tree
+
+
+def find_assets(tree: ET.Element, folder: Path) -> None:
+    """Tell a tree where its assets are."""
+    compilers = [c for c in tree if c.tag == "compiler"]
+    if not compilers:
+        compilers = [ET.Element("compiler")]
+        tree.insert(0, compilers[0])
+    shared = next((c.get("assetdir") for c in compilers if c.get("assetdir")), "")
+    for name in ("meshdir", "texturedir"):
+        told = [c.get(name) for c in compilers if c.get(name)]
+        place = paths.join(folder, (told[-1] if told else shared) or "")
+        for compiler in compilers:
+            compiler.set(name, place)
+
+
+def read_mjcf(path: Path | str) -> Urdf:
+    """The links and joints of an MJCF.  Raises RobotError.
+
+    Where actuators drive joints, the others are not the controller's: they follow a driven one,
+    where an equality says so, or stay where the file has them.
+    """
+    model = read_model(path).compiled()
+    arms = [j for j in range(model.njnt) if KINDS[model.jnt_type[j]] in MOVING]
+    driven = {joint for joint in arms if is_driven(model, joint)}
+    held = set(arms) - driven if driven else set()
+    moving = set(range(model.njnt)) - held
+    mimics = {j: mimic for j, other, mimic in couplings_of(model) if j in held and other in moving}
+    left = ", ".join(joint_name(model, joint) for joint in sorted(held - mimics.keys())[:8])
+    said = f"{path}: no actuator drives these joints; they stay where the file has them: {left}"
+    tree = tree_of(model, str(path), moving | mimics.keys(), mimics)
+    return replace(tree, notices=(said,) if left else ())
+
+
+def tree_of(
+    model: Any, source: str, moving: Collection[int], mimics: Mapping[int, Mimic] | None = None
+) -> Urdf:
+    """The bodies and sites of a compiled model as links, the world first.
+
+    moving: ids of its joints that count; the others stay where the file has them.  The link of a
+    joint lies at the joint's anchor, in the axes of its body.
+    """
+    data = mujoco().MjData(model)
+    mujoco().mj_kinematics(model, data)
+    names = [body_name(model, body) for body in range(model.nbody)]
+    poses, joints = [body_pose(data, body) for body in range(model.nbody)], list[Joint]()
+    masses, inertias = {}, {}
+    for body in range(1, model.nbody):
+        above, first = int(model.body_parentid[body]), int(model.body_jntadr[body])
+        parent, frame = names[above], inverse(poses[above]) @ poses[body]
+        for number in range(first, first + int(model.body_jntnum[body])):
+            if number in moving:
+                joint = joint_at(model, number, parent, frame)
+                joints.append(replace(joint, mimic=(mimics or {}).get(number)))
+                parent, frame = joint.child, shifted(-model.jnt_pos[number])
+        if parent != names[body]:
+            joints.append(fixed(parent, names[body], frame))
+        if model.body_mass[body] > 0.0:
+            inward = inverse(poses[body])
+            turn = inward[:3, :3] @ data.ximat[body].reshape(3, 3)
+            centre = inward[:3, :3] @ data.xipos[body] + inward[:3, 3]
+            masses[names[body]] = float(model.body_mass[body]), centre
+            if model.body_inertia[body].any():
+                inertias[names[body]] = turn @ np.diag(model.body_inertia[body]) @ turn.T
+    for site in range(model.nsite):
+        name, body = model.site(site).name, int(model.site_bodyid[site])
+        if name and name not in names:
+            pose = transform(data.site_xmat[site].reshape(3, 3), data.site_xpos[site])
+            joints.append(fixed(names[body], name, inverse(poses[body]) @ pose))
+    size = float(np.linalg.norm(model.opt.gravity))
+    up = -model.opt.gravity / size if size else UPRIGHT
+    return Urdf(source, b"", Path(source).stem, "world", tuple(joints), masses, inertias, up)
+
+
+def joint_at(model: Any, number: int, parent: str, frame: Array) -> Joint:
+    """A joint on a link, at its value 0.  frame: (4, 4) its body in that, at its reference [m]."""
+    kind, name = KINDS[int(model.jnt_type[number])], joint_name(model, number)
+    body = int(model.jnt_bodyid[number])
+    last = number + 1 == model.body_jntadr[body] + model.body_jntnum[body]
+    whole = last and not model.jnt_pos[number].any()
+    limited = kind in MOVING and bool(model.jnt_limited[number])
+    joint = Joint(
+        name=name,
+        kind="continuous" if kind == "revolute" and not limited else kind,
+        parent=parent,
+        child=body_name(model, body) if whole else f"{name} (axis)",
+        origin=frame @ shifted(model.jnt_pos[number]),
+        axis=np.array(model.jnt_axis[number]),
+        lower=float(model.jnt_range[number, 0]) if limited else -np.inf,
+        upper=float(model.jnt_range[number, 1]) if limited else np.inf,
+        mimic=None,
+    )
+    if not joint.moves:
+        return joint
+    return replace(joint, origin=joint.origin @ joint.motion(-reference(model, number))[0])
+
+
+def fixed(parent: str, child: str, origin: Array) -> Joint:
+    """A link that stays where it is in another: origin (4, 4) [m]."""
+    return Joint(f"to {child}", "fixed", parent, child, origin, np.zeros(3), -np.inf, np.inf, None)
+
+
+def body_name(model: Any, number: int) -> str:
+    """Of a body, also of one without a name; the world is body 0."""
+    return str(model.body(number).name or f"body {number}")
+
+
+def joint_name(model: Any, number: int) -> str:
+    """Of a joint, also of one without a name."""
+    return str(model.joint(number).name or f"joint {number + 1}")
+
+
+def reference(model: Any, number: int) -> Array:
+    """(1,) the value at which a joint stands as its file has it [rad, m]."""
+    return np.array(model.qpos0[[model.jnt_qposadr[number]]])
+
+
+def couplings_of(model: Any) -> list[tuple[int, int, Mimic]]:
+    """Of the equalities that couple two joints linearly: the one, the other, and how it follows."""
+    out = []
+    for i in range(model.neq):
+        one, other = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
+        start, slope, *bent = model.eq_data[i, :5].tolist()
+        if model.eq_type[i] == COUPLES_JOINTS and other >= 0 and not any(bent):
+            at, from_ = (float(reference(model, j)[0]) for j in (one, other))
+            follows = Mimic(joint_name(model, other), slope, at + start - slope * from_)
+            out.append((one, other, follows))
+    return out
+
+
+def way_to(model: Any, body: int) -> tuple[int, ...]:
+    """Ids of the hinges and slides from the world to a body."""
+    out: list[int] = []
+    while body > 0:
+        first, number = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+        own = [j for j in range(first, first + number) if KINDS[model.jnt_type[j]] in MOVING]
+        out = [*own, *out]
+        body = int(model.body_parentid[body])
+    return tuple(out)
+
+
+def is_driven(model: Any, joint: int) -> bool:
+    """Whether an actuator drives a joint."""
+    return any(drives(model, i, joint) for i in range(model.nu))
+
+
+def drives(model: Any, actuator: int, joint: int) -> bool:
+    """Whether an actuator drives a joint, itself or by a tendon of ours."""
+    kind, number = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
+    if kind == DRIVES_TENDON:
+        name = model.joint(joint).name
+        return bool(name) and bool(model.tendon(number).name == f"{name}_drive")
+    return kind == 0 and number == joint
+
+
+def body_pose(data: Any, body: int) -> Array:
+    """(4, 4) of a body in the world [m]."""
+    return transform(np.array(data.xmat[body]).reshape(3, 3), np.array(data.xpos[body]))
+
+
+def shifted(point: Array) -> Array:
+    """A translation (4, 4)."""
+    return transform(np.eye(3), np.asarray(point, dtype=float))
+
+
+def numbers(values: ArrayLike) -> str:
+    """Numbers as they are read back."""
+    return " ".join(repr(float(v) + 0.0) for v in np.ravel(values))
