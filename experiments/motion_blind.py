@@ -197,7 +197,7 @@ def by_laws(columns: Columns, white: Whitening, truth: Name) -> tuple[Array, lis
 def by_masses(columns: Columns, white: Whitening, truth: Name) -> tuple[Array, list[Array]]:
     """Usual friction, and the span of every link but the true one."""
     scene, link = columns.scene, int(truth[1][1:]) - 1
-    basis = orthonormal(white.white(columns.usual()[white.kept]))
+    basis = orthonormal(white.white(columns.usual[white.kept]))
     rows = white.white(np.moveaxis(scene.logs.filtered(scene.regressor), 1, 0)[white.kept])
     parts = [rows[:, PER_LINK * k : PER_LINK * (k + 1)] for k in range(scene.logs.joints)]
     return basis, [beside(basis, part) for k, part in enumerate(parts) if k != link]

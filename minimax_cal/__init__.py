@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.diagnosing.result import Diagnosis
     from minimax_cal.dynamics.diagnose import diagnose_motion
     from minimax_cal.dynamics.evaluate import evaluate_motion
+    from minimax_cal.dynamics.laws import register_law
     from minimax_cal.dynamics.logs import read_runs
     from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
     from minimax_cal.dynamics.run import Run
@@ -126,6 +127,7 @@ __all__ = [
     "read_runs",
     "register",
     "register_instrument",
+    "register_law",
     "relative",
     "report",
     "simulate",
@@ -176,6 +178,7 @@ MODULES = {  # name: where it is defined
     "RelativeDiagnosis": "diagnosing.instruments_result",
     "diagnose_relative": "diagnosing.instruments",
     "Run": "dynamics.run",
+    "register_law": "dynamics.laws",
     "read_runs": "dynamics.logs",
     "MotionDiagnosis": "dynamics.result",
     "load_motion": "dynamics.result",

@@ -41,6 +41,13 @@ ADDED: dict[str, str] = {}
 CHANGED: dict[str, str] = {
     "import leica/stdout*": "a table breaks no path",
     "import wrong/stdout*": "a table breaks no path",
+    "gap logs/files/driven.gap.json/notices": "what other simulators leave out of a file is said",
+    **dict.fromkeys(
+        ("gap poses/files/posed.xml/*", "export mjcf again/files/*", "export effects mjcf/files/*"),
+        "a gain that carries a deflection says so in the file",
+    ),
+    "gap logs/stderr*": "what other simulators leave out of a file is said",
+    "*/files/*_friction.py/*": "laws of the module are written from their one statement",
 }
 RENAMED: dict[str, str] = {}  # keys of before by what they are called now
 # What rounding leaves of larger numbers, and how far off it may be: a difference of coordinates of

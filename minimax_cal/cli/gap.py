@@ -29,7 +29,7 @@ from minimax_cal.simulators.ladder import simulator_gap
 from minimax_cal.simulators.motion.ladder import motion_gap
 
 LOGS = "Logs of motion"
-OF_LOGS = ("holdout_run", "payload", "drive_gain", "ratio", "gains", "friction")
+OF_LOGS = ("holdout_run", "payload", "drive_gain", "ratio", "gains", "friction", "plain")
 
 
 def paired(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -56,6 +56,7 @@ def paired(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     holdout_run=Option(
         "Judge on this run alone, which no fit sees.", metavar="NAME", many=tuple, group=LOGS
     ),
+    plain=Option("Write only what other simulators read as well.", group=LOGS),
     friction=Option(
         "What holds friction of joints at rest beside `frictionloss`: dcmotor.",
         metavar="ELEMENT",

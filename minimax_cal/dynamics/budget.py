@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 
 from minimax_cal.dynamics.laws import Term
-from minimax_cal.dynamics.model import FRICTION, RIGID, Normal, held_friction, solve_scaled
+from minimax_cal.dynamics.model import Normal, held_friction
 from minimax_cal.dynamics.rows import QUARTERS, Logs, rms_by_joint
-from minimax_cal.dynamics.search import Columns
+from minimax_cal.dynamics.search import FRICTION, RIGID, Columns, solve_scaled
 from minimax_cal.ground.arrays import Array
 
 NEVER_OUT = -1  # number of the fold of rows that are always fitted
@@ -54,14 +54,11 @@ class LeftOut:
         each = [np.flatnonzero(rows.any(axis=0)) for rows in self.raw]
         return [(used, rows[:, used]) for used, rows in zip(each, self.raw, strict=True)]
 
-    def values(self, parts: Sequence[str]) -> list[Array]:
-        """(p,) values of some parts, of the fit without each fold."""
-        index = self.normal.index(parts)
-        out = []
-        for gram, pull in zip(self.gram, self.pull, strict=True):
-            value = np.zeros(len(pull))
+    def values(self, index: Array) -> Array:
+        """(f, p) values of some columns, of the fit without each fold."""
+        out = np.zeros(self.pull.shape)
+        for value, gram, pull in zip(out, self.gram, self.pull, strict=True):
             value[index] = solve_scaled(gram[np.ix_(index, index)], pull[index])
-            out.append(value)
         return out
 
     def missed(
@@ -74,9 +71,7 @@ class LeftOut:
         """
         index = np.setdiff1d(self.normal.index(parts), np.array(without, dtype=int))
         seen = self.error if delayed else self.early
-        value = np.zeros((self.raw.shape[2], len(self.gram)))
-        for f, (gram, pull) in enumerate(zip(self.gram, self.pull, strict=True)):
-            value[index, f] = solve_scaled(gram[np.ix_(index, index)], pull[index])
+        value = self.values(index).T.copy()
         fitted = np.stack([rows @ value[used] for used, rows in self.compact])
         own = np.where(self.fold == NEVER_OUT, 0, self.fold)
         out = seen - np.take_along_axis(fitted, own[None, :, None], axis=2)[..., 0]

@@ -24,7 +24,7 @@ from minimax_cal.dynamics.given import MotionKnown, runs_of
 from minimax_cal.dynamics.laws import ANGLE, CURVE, LAWS, USUAL, Term, terms_of
 from minimax_cal.dynamics.links import LinkChange, body_as_given, carried, weighing
 from minimax_cal.dynamics.logs.with_robot import LEAST_SCALE, MOST_SCALE
-from minimax_cal.dynamics.model import FRICTION, RIGID, Body, Normal, TorqueModel, first_body
+from minimax_cal.dynamics.model import Body, Normal, TorqueModel, first_body
 from minimax_cal.dynamics.probes import Unexplained, unexplained
 from minimax_cal.dynamics.result import (
     Alternative,
@@ -43,7 +43,7 @@ from minimax_cal.dynamics.result import (
 from minimax_cal.dynamics.rows import ROW_HZ, Logs, prepare, whitening
 from minimax_cal.dynamics.run import CURRENT, Run
 from minimax_cal.dynamics.scene import Arm, Scene, sense_of
-from minimax_cal.dynamics.search import Columns, dictionary_of, generous
+from minimax_cal.dynamics.search import FRICTION, RIGID, Columns, dictionary_of, generous
 from minimax_cal.dynamics.softness import softened
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Library
@@ -66,7 +66,6 @@ FOUND_AGAIN = 0.75  # share of the halves in which a confirmed name is found
 SEED = 0  # of the halves
 SHOWN_ROWS = 750  # of the held-out run that is drawn
 CURVE_POINTS = 61
-TUNED_UNITS = {"length": "rad", "seconds": "s"}  # of tuned numbers that are no shares
 MAX_GAIN_ERROR = 0.3  # of a drive: what is off by more has another unit or sign
 LATE = 1e-4  # delays below it move no row [s]
 
@@ -217,7 +216,7 @@ def fitted(found: Found, columns: Columns) -> Normal:
 def helpful(found: Found) -> Found:
     """What was found, less the laws that harm the joints of runs left out more than they help."""
     logs = found.columns.scene.logs
-    normal, known = fitted(found, found.columns), found.columns.error()
+    normal, known = fitted(found, found.columns), found.columns.error
     fold = by_loads(folds_of(logs, FOLD, ()), logs, found.terms)
     kept = without_harmful(LeftOut.of(normal, known, known, fold), found.terms)
     choice = replace(found.choice, found=tuple(
@@ -271,10 +270,10 @@ def examined(
     found = helpful(found)
     columns = found.columns
     if len(learning) < len(logs.names):
-        columns = Columns(found.context.scene(arm, logs))
+        columns = Columns(found.context.in_scene(Scene.of(arm, logs)))
     normal = fitted(found, columns)
     fold, whole = by_loads(fold, logs, found.terms), fold
-    known = columns.error()
+    known = columns.error
     before = known + (early.y - logs.y).T
     judge = LeftOut.of(normal, known, before, fold)
     again = frequencies(found.choice)
@@ -375,7 +374,7 @@ def parameters_of(term: Term, value: Array, sigma: Array, scene: Scene) -> tuple
         Parameter(name, float(v), float(s), said.get(unit, unit.replace("t", scene.logs.unit, 1)))
         for name, unit, v, s in zip(law.names, law.units, value, sigma, strict=False)
     ]
-    tuned = [Parameter(name, v, float("nan"), TUNED_UNITS.get(name, "1"))
+    tuned = [Parameter(name, v, float("nan"), law.tuned[name].unit if name in law.tuned else "1")
              for name, v in term.tuned.items()]  # fmt: skip
     return (*fitted_ones, *tuned)
 
@@ -384,16 +383,7 @@ def others_of(choice: Choice, number: int) -> tuple[Alternative, ...]:
     """What else could be an effect that was found."""
     found = alternatives(*choice.beside_others(number))
     terms = ((other.candidate.term, rho2) for other, rho2, _ in found)
-    return tuple(Alternative(t.effect, t.place, rho2, separating(t)) for t, rho2 in terms)
-
-
-def separating(term: Term) -> str:
-    """The run that would tell a law from others."""
-    if term.effect in ("drive_gain", "payload", "link_inertia"):
-        return "a run with a known payload"
-    if term.law.family:
-        return "a run with a slow part and one at full speed"
-    return "longer runs of another kind"
+    return tuple(Alternative(t.effect, t.place, rho2, t.law.separate) for t, rho2 in terms)
 
 
 def usual_found(normal: Normal, judge: LeftOut) -> Iterator[MotionEffect]:
@@ -447,7 +437,7 @@ def changed_link(change: LinkChange) -> MotionEffect:
     )
     worth = worth_by_joint(change.before, change.after)
     others = tuple(Alternative("payload" if k == count - 1 else "link_inertia", f"L{k + 1}", 1.0,
-                               "a run with a known payload") for k in change.others)  # fmt: skip
+                               law.separate) for k in change.others)  # fmt: skip
     return MotionEffect(effect, f"L{change.link + 1}", parameters, worth, others,
                         minor=is_minor(worth, change.before))  # fmt: skip
 
@@ -557,30 +547,21 @@ def held_run(judge: LeftOut, logs: Logs, parts: Sequence[str]) -> HeldRun:
     return HeldRun(logs.names[run], time_s, brief(measured), brief(predicted))
 
 
-def form_of(term: Term, sense: Array, share: Array) -> Array:
-    """(v,) friction per unit of a form of the curve over speed; 0 of what is no function of it.
-
-    sense, share: (v,) soft sign of the speed, and its size over the largest.
-    """
-    if term.effect == "degressive":
-        return np.asarray(sense * share ** term.tuned["power"])
-    if term.effect == "stribeck":
-        return np.asarray(sense * np.exp(-((share / term.tuned["speed"]) ** 2)))
-    return share if term.effect == "asymmetry" else np.zeros_like(share)
-
-
 def curves(found: Found, normal: Normal, judge: LeftOut) -> Iterator[FrictionCurve]:
     """Friction over the speed of each joint, and its spread over fits without each fold."""
     arm, every = normal.columns.scene.arm, parts_of(found.terms)
-    values = np.array([normal.solve(every), *judge.values(every)])
+    values = np.array([normal.solve(every), *judge.values(normal.index(every))])
     for j in range(arm.robot.joints):
         v = np.linspace(-1.0, 1.0, CURVE_POINTS) * arm.fastest[j]
-        sense, share = sense_of(v, arm.soft[j]), np.abs(v) / arm.fastest[j]
+        sense = sense_of(v, arm.soft[j])
         at = normal.place[FRICTION].start + 2 * j
         drawn = np.outer(values[:, at], sense) + np.outer(values[:, at + 1], v)
         for term in (t for t in found.terms if t.place == f"J{j + 1}"):
-            amount = values[:, normal.place[term.text].start]
-            drawn += np.outer(amount, form_of(term, sense, share))
+            amounts = values[:, normal.place[term.text]].T
+            for amount, form in zip(
+                amounts, term.law.curve(v / arm.fastest[j], sense, term.tuned), strict=False
+            ):
+                drawn += np.outer(amount, form)
         folds = drawn[1:]
         wide = np.sqrt((len(folds) - 1) * folds.var(axis=0))  # jackknife
         yield FrictionCurve(f"J{j + 1}", v, drawn[0], wide)

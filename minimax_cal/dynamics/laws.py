@@ -1,13 +1,17 @@
-"""What may explain torques that a rigid body with usual friction does not: a table of laws.
+"""What may explain torques that a rigid body with usual friction does not: each law, once.
 
 Usual friction, Coulomb and viscous, stands beside the rigid body at every joint and is judged at
-the end.  A law at one joint adds to that joint's rows only; one of the whole motion to all.
+the end.  A law at one joint adds to that joint's rows only; one of the whole motion to all.  Of a
+law's `torque` are made: columns of the search, the curve that is drawn, the module beside a
+simulator's file and its callback, the rows of the documentation's table.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,102 +19,132 @@ from minimax_cal.dynamics.regressor import PER_LINK
 from minimax_cal.dynamics.rows import CUTOFF_HZ
 from minimax_cal.dynamics.scene import Scene
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.tables import Table
 
 Choice = Mapping[str, float]
-BOUNDS = {"power": (0.1, 0.85), "speed": (0.01, 0.35)}  # of tuned numbers: beyond, another law
 FINER = (0.75, 0.87, 1.15, 1.33)  # times a tuned number, in a finer search
 WARM_S = 60.0  # shortest run in which warming up can show [s]
 SPREAD = 0.5  # turn of a joint that shows what depends on its angle [rad]
 SLOW = 0.05  # of a joint's largest speed, which a log must hold for Stribeck friction
 NO_GAIN = "drive gains (N m per A) of all joints"
+KNOWN_LOAD, OTHER_RUNS = "a run with a known payload", "longer runs of another kind"
+SLOW_AND_FAST = "a run with a slow part and one at full speed"
+NO_ELEMENT = "a model has no element for it"
+FRICTION, MASSES, ARMATURE = "friction", "masses", "armature"  # elements of a simulator's file
+LEVELLED, SPRINGS, GAIN, DELAY = "friction curve", "springs", "drive gain", "delay"
+BRISTLES, MODULE = "friction at rest", "module"
+CURVE, ANGLE = "friction_curve", "torque_by_angle"  # families
+# Of one joint along the motion, by the names that laws use for them; the module knows IN_MODULE.
+QUANTITIES: dict[str, Callable[[Scene, int], Any]] = {
+    "q": lambda s, j: s.logs.motion.q[:, j],  # joint value [rad, m]
+    "v": lambda s, j: s.logs.motion.qd[:, j] / s.arm.fastest[j],  # speed over the largest
+    "a": lambda s, j: s.logs.motion.qdd[:, j],  # acceleration
+    "load": lambda s, j: s.load[:, j],  # torque that the body puts on the joint
+    "way": lambda s, j: s.since_reversal[:, j],  # from where it turned round last [rad, m]
+    "gear": lambda s, j: abs(s.arm.ratio[j]),  # its ratio
+}
+IN_MODULE = QUANTITIES.keys() - {"a"}
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """A shape number of a law: values that are tried, its unit, and bounds of a finer search.
+
+    Beyond its bounds it is another law; without any it is not searched finer.
+    """
+
+    values: tuple[float, ...] = ()
+    unit: str = "1"
+    bounds: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Law:
     """A law of torque.
 
-    columns: of a scene, a joint from 0 and a choice, (M, d), or (M, n, d) where `whole`.
-    names, units: of its parameters; `t` stands for the unit of the log.  choices: of a scene and a
-    joint.  needs: what the logs lack at a joint, empty where they have it.  nonnegative: whether
-    its parameters have one sign.  typical: the usual size of a parameter, times the torque of the
-    joint where `of_torque`.  family: what it is a form of.  arm_wide: it has no joint.
+    torque: per unit of each parameter, expressions of QUANTITIES and tuned numbers by NumPy (np).
+    made: instead, of a scene, a joint from 0 and a choice, (M, d), or (M, n, d) of a whole motion.
+    dry: whether it is friction, which counts with the sense of the speed.  names, units: of its
+    parameters; `t` stands for the unit of the log.  tuned: its shape numbers; choices: of a scene
+    and a joint, where these depend on them.  needs: what the logs lack at a joint, empty where they
+    have it.  nonnegative: whether its parameters have one sign.  typical: the usual size of a
+    parameter, times the torque of the joint where `of_torque`.  family: what it is a form of.  at:
+    every joint, the arm, or the last link.  separate: the run that would tell it from others.
+    held: elements of a simulator that hold it; why: why none does.
     """
 
-    columns: Callable[[Scene, int, Choice], Array]
-    names: tuple[str, ...]
-    units: tuple[str, ...]
+    name: str
     words: str
-    choices: Callable[[Scene, int], list[Choice]] = lambda scene, j: [{}]
+    torque: tuple[str, ...] = ()
+    names: tuple[str, ...] = ("friction",)
+    units: tuple[str, ...] = ("t",)
+    made: Callable[[Scene, int, Choice], Array] | None = None
+    tuned: Mapping[str, Tuned] = field(default_factory=dict)
+    choices: Callable[[Scene, int], list[Choice]] | None = None
     needs: Callable[[Scene, int], str] = lambda scene, j: ""
+    dry: bool = False
     nonnegative: bool = False
     typical: float = 1.0
     of_torque: bool = True
     family: str = ""
-    whole: bool = False
-    arm_wide: bool = False
+    at: Literal["joint", "all", "last link"] = "joint"
     repeats: bool = False
+    separate: str = OTHER_RUNS
+    held: tuple[str, ...] = (MODULE,)
+    why: str = NO_ELEMENT
 
+    @cached_property
+    def reads(self) -> frozenset[str]:
+        """The quantities that its expressions read; none of a function."""
+        names = (compile(one, self.name, "eval").co_names for one in self.torque)
+        return frozenset(QUANTITIES.keys() & {name for some in names for name in some})
 
-def speed(scene: Scene, j: int) -> Array:
-    """(M,) speed over the largest [-]."""
-    return np.asarray(scene.logs.motion.qd[:, j] / scene.arm.fastest[j])
+    def per_unit(self, known: Mapping[str, Any]) -> list[Any]:
+        """Its expressions, of quantities and tuned numbers."""
+        return [eval(one, {"np": np}, dict(known)) for one in self.torque]
 
+    def columns(self, scene: Scene, j: int, choice: Choice) -> Array:
+        """(M, d) of a joint, or (M, n, d) of the whole motion, in the unit of the log."""
+        if self.made is not None:
+            return self.made(scene, j, choice)
+        found = self.per_unit({k: QUANTITIES[k](scene, j) for k in self.reads} | {**choice})
+        rows = np.stack([np.broadcast_to(one, len(scene.load)) for one in found], axis=1)
+        return np.asarray(scene.sense[:, [j]] * rows if self.dry else rows)
 
-def fading(scene: Scene, j: int, choice: Choice) -> Array:
-    """Stribeck friction: it falls from rest with the speed [Armstrong-Helouvry 1994]."""
-    slowed = np.exp(-((speed(scene, j) / choice["speed"]) ** 2))
-    return np.asarray(scene.sense[:, j] * slowed)[:, None]
+    def curve(self, v: Array, sense: Array, choice: Choice) -> list[Array]:
+        """(k,) torque per unit over a speed, of each parameter; none of a law of anything else.
 
+        v: (k,) over the joint's largest.  sense: (k,) its soft sign.
+        """
+        if self.reads != {"v"}:
+            return []
+        return [one * sense if self.dry else one for one in self.per_unit({"v": v, **choice})]
 
-def degressive(scene: Scene, j: int, choice: Choice) -> Array:
-    """Viscous friction of a lubricant that thins with shear: a power of the speed below one."""
-    v = speed(scene, j)
-    return np.asarray(scene.sense[:, j] * np.abs(v) ** choice["power"])[:, None]
+    def tried(self, scene: Scene, j: int) -> list[Choice]:
+        """Tuned numbers to begin with."""
+        if self.choices is not None:
+            return self.choices(scene, j)
+        return [{name: value} for name, one in self.tuned.items() for value in one.values] or [{}]
 
-
-def presliding(scene: Scene, j: int, choice: Choice) -> Array:
-    """Friction that is not yet there just after a reversal [Dahl 1968]."""
-    lag = np.exp(-scene.since_reversal[:, j] / choice["length"])
-    return np.asarray(-scene.sense[:, j] * lag)[:, None]
-
-
-def load_friction(scene: Scene, j: int, choice: Choice) -> Array:
-    """Coulomb friction in proportion to the load that the gear transmits."""
-    return np.asarray(scene.sense[:, j] * np.abs(scene.load[:, j]))[:, None]
-
-
-def angle_friction(scene: Scene, j: int, choice: Choice) -> Array:
-    """Coulomb friction that changes once a turn of the joint."""
-    q = scene.logs.motion.q[:, j]
-    return np.asarray(scene.sense[:, j, None] * np.stack([np.cos(q), np.sin(q)], axis=1))
+    def places(self, joints: int) -> list[str]:
+        """Where it may be."""
+        last = {"all": ["all"], "last link": [f"L{joints}"]}
+        return last.get(self.at) or [f"J{j + 1}" for j in range(joints)]
 
 
 def warm_up(scene: Scene, j: int, choice: Choice) -> Array:
     """Coulomb friction that falls as the gear warms up, by the sensor or by the time."""
-    if "seconds" in choice:
-        return np.asarray(
-            scene.sense[:, j] * np.exp(-scene.logs.since / choice["seconds"])
-        )[:, None]  # fmt: skip
     cold = scene.logs.temperature[:, j]
-    return np.asarray(scene.sense[:, j] * (cold - cold.mean()))[:, None]
-
-
-def ripple(scene: Scene, j: int, choice: Choice) -> Array:
-    """Waves of torque at a multiple of the gear ratio."""
-    turn = choice["multiple"] * abs(scene.arm.ratio[j]) * scene.logs.motion.q[:, j]
-    return np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    warmth = (np.exp(-scene.logs.since / choice["seconds"]) if "seconds" in choice
+              else cold - cold.mean())  # fmt: skip
+    return np.asarray(scene.sense[:, j] * warmth)[:, None]
 
 
 def cable(scene: Scene, j: int, choice: Choice) -> Array:
     """A hose or spring that pulls with the angle."""
     q = scene.logs.motion.q[:, j] - scene.logs.motion.q[:, j].mean()
     return np.stack([q**k for k in range(1, int(choice["order"]) + 1)], axis=1)
-
-
-def gravity_spring(scene: Scene, j: int, choice: Choice) -> Array:
-    """A compensator of gravity, beyond the first wave, which masses imitate."""
-    q = 2.0 * scene.logs.motion.q[:, j]
-    return np.stack([np.cos(q), np.sin(q)], axis=1)
 
 
 def payload(scene: Scene, j: int, choice: Choice) -> Array:
@@ -139,11 +173,6 @@ def delay(scene: Scene, j: int, choice: Choice) -> Array:
     return np.asarray(-scene.logs.slope(scene.load + scene.friction))[..., None]
 
 
-def by_number(name: str, *values: float) -> Callable[[Scene, int], list[Choice]]:
-    """Choices of one tuned number."""
-    return lambda scene, j: [{name: value} for value in values]
-
-
 def by_length(scene: Scene, j: int) -> list[Choice]:
     """Lengths over which friction builds up, as shares of the way between reversals."""
     way = float(scene.since_reversal[:, j].max())
@@ -167,7 +196,7 @@ def moves(scene: Scene, j: int) -> str:
 def is_slow(scene: Scene, j: int) -> str:
     """Whether a joint moves slowly at times, away from reversals."""
     rows = scene.logs.fitted[:, j]
-    slow = np.abs(speed(scene, j)[scene.logs.picked][rows]) < SLOW
+    slow = np.abs(QUANTITIES["v"](scene, j)[scene.logs.picked][rows]) < SLOW
     enough = np.count_nonzero(slow) >= 20
     return "" if enough else "a run with a slow part, below a twentieth of the speed of the others"
 
@@ -206,49 +235,104 @@ def turns(scene: Scene, j: int) -> str:
     return "a joint that turns" if scene.arm.robot.prismatic[j] else moves(scene, j)
 
 
-CURVE, ANGLE = "friction_curve", "torque_by_angle"
-LAWS: dict[str, Law] = {
-    "degressive": Law(degressive, ("friction",), ("t",), "viscous friction that levels off",
-                      by_number("power", 0.25, 0.5, 0.7), nonnegative=True, family=CURVE),
-    "stribeck": Law(fading, ("friction",), ("t",), "Stribeck friction",
-                    by_number("speed", 0.03, 0.08, 0.2), is_slow, nonnegative=True, family=CURVE),
-    "presliding": Law(presliding, ("friction",), ("t",), "presliding", by_length,
-                      nonnegative=True, family=CURVE),
-    "asymmetry": Law(lambda s, j, c: np.abs(speed(s, j))[:, None], ("friction",), ("t",),
-                     "friction that differs by direction", family=CURVE),
-    "load_friction": Law(load_friction, ("share",), ("",), "friction in proportion to the load",
-                         nonnegative=True, typical=0.2, of_torque=False),
-    "angle_friction": Law(angle_friction, ("cos", "sin"), ("t", "t"),
-                          "friction that depends on the angle", needs=turns),
-    "warm_up": Law(warm_up, ("friction",), ("t",), "friction that falls with warmth", by_warmth,
-                   warms),
-    "armature": Law(lambda s, j, c: s.logs.motion.qdd[:, [j]], ("inertia",), ("t s^2/rad",),
-                    "rotor inertia", nonnegative=True),
-    "drive_gain": Law(lambda s, j, c: s.load[:, [j]], ("share",), ("",), "drive gain",
-                      needs=has_gains, typical=0.2, of_torque=False),
-    "torque_offset": Law(lambda s, j, c: np.ones((len(s.load), 1)), ("offset",), ("t",),
-                         "torque offset", family=ANGLE),
-    "torque_ripple": Law(ripple, ("cos", "sin"), ("t", "t"), "torque ripple of the gear",
-                         lambda s, j: [{"multiple": 1.0}, {"multiple": 2.0}], has_ratio,
-                         repeats=True),
-    "cable": Law(cable, ("first", "second"), ("t/rad", "t/rad^2"), "cable or spring",
-                 lambda s, j: [{"order": 1.0}, {"order": 2.0}], moves, family=ANGLE),
-    "gravity_spring": Law(gravity_spring, ("cos", "sin"), ("t", "t"), "gravity compensator",
-                          needs=turns, family=ANGLE),
-    "payload": Law(payload, ("mass", *(f"moment_{k}" for k in "xyz"),
-                             *(f"inertia_{k}" for k in ("xx", "xy", "xz", "yy", "yz", "zz"))),
-                   ("kg", *("kg m",) * 3, *("kg m^2",) * 6), "payload that changes between runs",
-                   needs=has_runs, typical=10.0, of_torque=False, whole=True, arm_wide=True,
-                   repeats=True),
-    "joint_flexibility": Law(compliant, ("compliance",), ("rad/(N m)",), "joint flexibility",
-                             needs=has_gains, nonnegative=True, typical=1e-3, of_torque=False,
-                             whole=True),
-    "delay": Law(delay, ("time",), ("s",), "delay of the torque", typical=0.02, of_torque=False,
-                 whole=True, arm_wide=True),
-    "encoder_zero": Law(encoder_zero, ("offset",), ("rad",), "encoder zero", needs=has_gains,
-                        typical=0.02, of_torque=False, whole=True),
-}  # fmt: skip
+WAVES: Any = {"names": ("cos", "sin"), "units": ("t", "t")}
+IN_CURVE: Any = {"family": CURVE, "separate": SLOW_AND_FAST}
+BY_ANGLE: Any = {"family": ANGLE, "separate": SLOW_AND_FAST}
+SHARE: Any = {"names": ("share",), "units": ("",), "typical": 0.2, "of_torque": False}
+EVERY = (
+    # a lubricant that thins with shear: a power of the speed below one
+    Law("degressive", "viscous friction that levels off", ("np.abs(v) ** power",), dry=True,
+        tuned={"power": Tuned((0.25, 0.5, 0.7), bounds=(0.1, 0.85))}, nonnegative=True,
+        held=(LEVELLED, MODULE), **IN_CURVE),
+    # it falls from rest with the speed [Armstrong-Helouvry 1994]
+    Law("stribeck", "Stribeck friction", ("np.exp(-((v / speed) ** 2))",), dry=True,
+        tuned={"speed": Tuned((0.03, 0.08, 0.2), bounds=(0.01, 0.35))}, needs=is_slow,
+        nonnegative=True, held=(LEVELLED, MODULE), **IN_CURVE),
+    # friction that is not yet there just after a reversal [Dahl 1968]
+    Law("presliding", "presliding", ("-np.exp(-way / length)",), dry=True,
+        tuned={"length": Tuned(unit="rad", bounds=(0.0, np.inf))}, choices=by_length,
+        nonnegative=True, **IN_CURVE),
+    Law("asymmetry", "friction that differs by direction", ("np.abs(v)",), **IN_CURVE),
+    Law("load_friction", "friction in proportion to the load", ("np.abs(load)",), dry=True,
+        nonnegative=True, **SHARE),
+    Law("angle_friction", "friction that depends on the angle", ("np.cos(q)", "np.sin(q)"),
+        dry=True, needs=turns, **WAVES),
+    Law("warm_up", "friction that falls with warmth", made=warm_up, choices=by_warmth, needs=warms,
+        tuned={"seconds": Tuned(unit="s", bounds=(0.0, np.inf))}, held=()),
+    Law("armature", "rotor inertia", ("a",), names=("inertia",), units=("t s^2/rad",),
+        nonnegative=True, held=(ARMATURE,)),
+    Law("drive_gain", "drive gain", ("load",), needs=has_gains, separate=KNOWN_LOAD, held=(GAIN,),
+        why="scales what is logged, and no motor of the model holds it: give drive_gain=", **SHARE),
+    Law("torque_offset", "torque offset", ("1.0",), names=("offset",), held=(),
+        why="the torque is read with an offset, which is none of the arm's", **BY_ANGLE),
+    Law("torque_ripple", "torque ripple of the gear",
+        ("np.cos(multiple * gear * q)", "np.sin(multiple * gear * q)"),
+        tuned={"multiple": Tuned((1.0, 2.0))}, needs=has_ratio, repeats=True, **WAVES),
+    Law("cable", "cable or spring", (), ("first", "second"), ("t/rad", "t/rad^2"), cable,
+        tuned={"order": Tuned((1.0, 2.0))}, needs=moves, held=(SPRINGS,), **BY_ANGLE),
+    # a compensator of gravity, beyond the first wave, which masses imitate
+    Law("gravity_spring", "gravity compensator", ("np.cos(2.0 * q)", "np.sin(2.0 * q)"),
+        needs=turns, **BY_ANGLE, **WAVES),
+    Law("payload", "payload that changes between runs", (),
+        ("mass", *(f"moment_{k}" for k in "xyz"),
+         *(f"inertia_{k}" for k in ("xx", "xy", "xz", "yy", "yz", "zz"))),
+        ("kg", *("kg m",) * 3, *("kg m^2",) * 6), payload, needs=has_runs,
+        typical=10.0, of_torque=False, at="last link", repeats=True, separate=KNOWN_LOAD, held=(),
+        why="changes between the runs; the model carries one load"),
+    Law("joint_flexibility", "joint flexibility", (), ("compliance",), ("rad/(N m)",), compliant,
+        needs=has_gains, nonnegative=True, typical=1e-3, of_torque=False, held=(),
+        why="give a static calibration (fit=), whose springs a model holds"),
+    Law("delay", "delay of the torque", (), ("time",), ("s",), delay, typical=0.02, of_torque=False,
+        at="all", held=(DELAY,)),
+    Law("encoder_zero", "encoder zero", (), ("offset",), ("rad",), encoder_zero, needs=has_gains,
+        typical=0.02, of_torque=False, held=()),
+)  # fmt: skip
+LAWS: dict[str, Law] = {law.name: law for law in EVERY}
 USUAL = ("coulomb", "viscous")
+WORDS = {"coulomb": "Coulomb friction", "viscous": "viscous friction",
+         "link_inertia": "mass or inertia of a link"}  # fmt: skip
+WORDS |= {name: law.words for name, law in LAWS.items()}
+
+
+def register_law(law: Law) -> Law:
+    """Add a law of torque of one's own to the library of this process.
+
+    Parameters
+    ----------
+    law
+        Its expressions read q [rad, m], v (speed over the joint's largest), a, load, way (from
+        where the joint turned round last), gear, and its tuned numbers.
+
+    Returns
+    -------
+    Law
+        The same law.
+
+    Raises
+    ------
+    OptionError
+        For facts that do not belong together.
+
+    Examples
+    --------
+    >>> mc.register_law(Law("tanh", "levels off", ("np.tanh(np.abs(v))",), dry=True))
+    """
+    if len({len(law.names), len(law.units), len(law.torque or law.names)}) > 1:
+        raise OptionError(f"law {law.name}: give a name and a unit for each of its parameters")
+    if MODULE in law.held and not law.reads <= IN_MODULE:
+        unknown = ", ".join(sorted(law.reads - IN_MODULE))
+        raise OptionError(f"law {law.name}: the module beside a file knows no {unknown}")
+    LAWS[law.name], WORDS[law.name] = law, law.words
+    return law
+
+
+def laws_table() -> Table:
+    """The laws for people: what each adds to a joint's torque, and where a simulator has it."""
+    rows = []
+    for law in LAWS.values():
+        form = ", ".join(law.torque).replace("np.", "") or None
+        rows.append((law.name, law.words, form, ", ".join(law.held) or None))
+    return Table.made("Laws", rows, "name | law | torque per unit | held by")
 
 
 @dataclass(frozen=True)
@@ -286,25 +370,22 @@ class Term:
 
     def finer(self) -> list[Term]:
         """With its tuned number closer together."""
-        if self.effect in ("torque_ripple", "cable", "payload") or not self.tuned:
-            return []
-        ((name, value),) = self.tuned.items()
-        near = [value * by for by in FINER]
-        low, high = BOUNDS.get(name, (0.0, np.inf))
-        return [Term(self.effect, self.place, {name: v}) for v in near if low < v < high]
+        out = []
+        for name, value in self.tuned.items():
+            told = self.law.tuned.get(name)
+            low, high = told.bounds if told and told.bounds else (np.inf, -np.inf)
+            near = (value * by for by in FINER)
+            out += [Term(self.effect, self.place, {name: v}) for v in near if low < v < high]
+        return out
 
 
 def terms_of(scene: Scene, exclude: Sequence[str]) -> tuple[list[Term], list[tuple[str, str, str]]]:
     """Every law at every place that the logs can test; (effect, place, what is needed) if not."""
     found, lacking = list[Term](), list[tuple[str, str, str]]()
     for effect, law in LAWS.items():
-        if effect in exclude:
-            continue
-        for j in range(1 if law.arm_wide else scene.logs.joints):
-            place = ("all" if effect == "delay" else f"L{scene.logs.joints}") if law.arm_wide else (
-                f"J{j + 1}")  # fmt: skip
+        for j, place in enumerate(law.places(scene.logs.joints) if effect not in exclude else ()):
             if needs := law.needs(scene, j):
                 lacking.append((effect, place, needs))
                 continue
-            found += [Term(effect, place, c) for c in law.choices(scene, j)]
+            found += [Term(effect, place, c) for c in law.tried(scene, j)]
     return found, lacking

@@ -12,10 +12,10 @@ from scipy.special import fdtrc
 
 from minimax_cal.dynamics.budget import parts_of
 from minimax_cal.dynamics.laws import Term
-from minimax_cal.dynamics.model import FRICTION, Normal
+from minimax_cal.dynamics.model import Normal
 from minimax_cal.dynamics.regressor import PER_LINK
 from minimax_cal.dynamics.rows import whitening
-from minimax_cal.dynamics.search import Columns, generous, one_of_each
+from minimax_cal.dynamics.search import FRICTION, Columns, generous, one_of_each
 from minimax_cal.evidence.noise import inflation, orthonormal
 from minimax_cal.ground.arrays import Array
 
@@ -68,7 +68,7 @@ def body_as_given(normal: Normal) -> tuple[bool, LinkChange | None]:
     value = normal.solve(every)
     full = normal.error - normal.matrix @ value
     free, dof = arm.base.shape[1], len(normal.error) - len(value)
-    rows = np.moveaxis(logs.filtered(scene.regressor), 1, 0)
+    rows = normal.columns.links
     links = white.white(rows[white.kept])
     others = normal.index(every[1:])
     matrix = np.concatenate([normal.matrix[:, others], links], axis=1)
@@ -112,7 +112,7 @@ def changed(
     alone = Normal(normal.columns, white, (), raw, matrix, error, places, normal.group)
     value = alone.solve([FRICTION, LINK])
     sigma = alone.spread([FRICTION, LINK], value)
-    plain = normal.columns.error()[white.kept] - rows[white.kept] @ arm.drawn
+    plain = normal.columns.error[white.kept] - rows[white.kept] @ arm.drawn
 
     def rms(values: Array) -> Array:
         rest = plain - raw[white.kept] @ values
@@ -139,7 +139,7 @@ def carried(columns: Columns, terms: Sequence[Term]) -> list[Term]:
     link = np.moveaxis(logs.filtered(columns.scene.regressor[:, :, -PER_LINK:]), 1, 0)
     link = white.white(link[kept])
     link /= np.maximum(np.linalg.norm(link, axis=0), 1e-300)
-    error = white.white(columns.error()[kept])
+    error = white.white(columns.error[kept])
     error = error - basis @ (basis.T @ error)
     each = [(link[run == r], basis[run == r]) for r in range(count)]
     shared = np.concatenate([own.T @ rows for rows, own in each], axis=1)

@@ -10,19 +10,17 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from minimax_cal.dynamics.laws import Term
-from minimax_cal.dynamics.rows import Logs, Whitening
+from minimax_cal.dynamics.rows import Whitening
 from minimax_cal.dynamics.scene import YIELD, Arm, Scene
-from minimax_cal.dynamics.search import RIDGE, Columns, least_squares
+from minimax_cal.dynamics.search import (
+    FRICTION,
+    RIDGE,
+    RIGID,
+    Columns,
+    least_squares,
+    solve_scaled,
+)
 from minimax_cal.ground.arrays import Array
-
-RIGID, FRICTION = "rigid", "usual"  # parts of a fit beside the laws
-
-
-def solve_scaled(gram: Array, pull: Array) -> Array:
-    """(p,) least squares by products (p, p) and (p,); columns alike share what they explain."""
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    unit = gram / np.outer(scale, scale) + RIDGE * np.eye(len(gram))
-    return np.asarray(np.linalg.solve(unit, pull / scale) / scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +34,12 @@ class Body:
     rigid: Array
     usual: Array
 
-    def scene(self, arm: Arm, logs: Logs) -> Scene:
-        """The scene of some logs, with this load and friction."""
-        return self.in_scene(Scene.of(arm, logs))
+    @staticmethod
+    def of(arm: Arm, rigid: Array, usual: Array) -> Body:
+        """Of fitted base parameters and friction (2 n,); the body is the nearest to the drawing."""
+        each = rigid.reshape(-1, arm.base.shape[1])
+        near = arm.drawn + (each - arm.base.T @ arm.drawn) @ arm.base.T
+        return Body(near, usual.reshape(-1, 2))
 
     def in_scene(self, scene: Scene) -> Scene:
         """A scene with this load and friction."""
@@ -75,7 +76,7 @@ class TorqueModel:
         scene = columns.scene
         base = np.broadcast_to(self.body.rigid, scene.rigid.shape) @ scene.arm.base
         rigid = np.einsum("rjp,jp->jr", scene.base_rows, base)
-        friction = columns.usual() @ self.body.usual.ravel()
+        friction = columns.usual @ self.body.usual.ravel()
         out = rigid + friction + scene.logs.filtered(scene.known_torque).T
         for term in self.terms:
             joints, rows = columns.rows_of(term)
@@ -103,17 +104,10 @@ class Normal:
     @staticmethod
     def of(columns: Columns, white: Whitening, terms: Sequence[Term]) -> Normal:
         """Of all rows that are fitted."""
-        parts = {RIGID: columns.rigid(), FRICTION: columns.usual()}
-        parts |= {term.text: columns.at_all(term) for term in terms}
-        ends = np.cumsum([0, *(part.shape[2] for part in parts.values())])
-        spans = map(slice, map(int, ends[:-1]), map(int, ends[1:]))
-        kept = white.kept
-        raw = np.concatenate(list(parts.values()), axis=2)
-        matrix = white.white(raw[kept])
-        error = white.white(columns.error()[kept])
+        raw, kept = columns.design(terms), white.kept
         group = np.broadcast_to(columns.scene.logs.quarter, kept.shape)[kept]
-        return Normal(columns, white, tuple(terms), raw, matrix, error,
-                      dict(zip(parts, spans, strict=True)), group)  # fmt: skip
+        return Normal(columns, white, tuple(terms), raw, white.white(raw[kept]),
+                      white.white(columns.error[kept]), columns.places(terms), group)  # fmt: skip
 
     def index(self, parts: Sequence[str]) -> Array:
         """(q,) columns of some parts."""
@@ -139,7 +133,7 @@ class Normal:
     def rest(self, value: Array) -> Array:
         """(N,) what values leave of the rows, not whitened."""
         kept = self.white.kept
-        return np.asarray(self.columns.error()[kept] - self.raw[kept] @ value)
+        return np.asarray(self.columns.error[kept] - self.raw[kept] @ value)
 
     def spread(self, parts: Sequence[str], value: Array) -> Array:
         """(p,) standard deviations of the values of some parts, of rows that err by groups.
@@ -163,20 +157,16 @@ class Normal:
         return out
 
     def body(self, value: Array) -> Body:
-        """Rigid body and friction of values (p,); the body is the nearest to the drawing."""
-        arm, n = self.columns.scene.arm, self.columns.scene.logs.joints
-        drawn, base = arm.drawn, arm.base
-        each = value[self.place[RIGID]].reshape(-1, base.shape[1])
-        rigid = drawn + (each - base.T @ drawn) @ base.T
-        usual = value[self.place[FRICTION]].reshape(n, 2)
-        return Body(rigid, usual)
+        """Rigid body and friction of values (p,)."""
+        parts = (value[self.place[part]] for part in (RIGID, FRICTION))
+        return Body.of(self.columns.scene.arm, *parts)
 
     def model(self, name: str, terms: Sequence[Term], context: Body, delay: float) -> TorqueModel:
         """The fit of rigid body, usual friction and some laws."""
         value = self.solve([RIGID, FRICTION, *(t.text for t in terms)])
         found = tuple(FittedTerm(**vars(t), value=value[self.place[t.text]]) for t in terms)
         bristles = self.columns.scene.bristles
-        held = held_friction(bristles, (self.columns.error() - self.raw @ value).T)
+        held = held_friction(bristles, (self.columns.error - self.raw @ value).T)
         return TorqueModel(name, self.body(value), found, context, held, delay)
 
     def rigid_model(self, name: str, context: Body) -> TorqueModel:
@@ -197,11 +187,6 @@ def held_friction(bent: Array, off: Array) -> Array:
 
 def first_body(columns: Columns) -> Body:
     """Rigid body and usual friction by plain least squares on the rows that are fitted."""
-    rigid, usual = columns.rigid(), columns.usual()
     kept = columns.scene.logs.fitted.T
-    matrix = np.concatenate([rigid, usual], axis=2)[kept]
-    value = least_squares(matrix, columns.error()[kept])
-    arm, n = columns.scene.arm, columns.scene.logs.joints
-    each = value[: rigid.shape[2]].reshape(-1, arm.base.shape[1])
-    body = arm.drawn + (each - arm.base.T @ arm.drawn) @ arm.base.T
-    return Body(body, value[rigid.shape[2] :].reshape(n, 2))
+    value = least_squares(columns.design()[kept], columns.error[kept])
+    return Body.of(columns.scene.arm, *np.split(value, [columns.rigid.shape[2]]))

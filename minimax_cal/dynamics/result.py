@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from minimax_cal.dynamics.laws import LAWS, USUAL
+from minimax_cal.dynamics.laws import USUAL, WORDS
 from minimax_cal.dynamics.model import TorqueModel
 from minimax_cal.dynamics.probes import Unexplained
 from minimax_cal.dynamics.regressor import PER_LINK
@@ -24,9 +24,6 @@ from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.robots.robot import robot_from_dict
 
 Verdict = Literal["named", "one_of", "unknown", "none"]
-WORDS = {"coulomb": "Coulomb friction", "viscous": "viscous friction",
-         "link_inertia": "mass or inertia of a link"}  # fmt: skip
-WORDS |= {name: law.words for name, law in LAWS.items()}
 SHOWN = 1e-3  # relative change of a joint's RMS that is listed
 SENTENCES: dict[Verdict, str] = {
     "named": "Cause identified",

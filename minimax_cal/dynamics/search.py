@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from minimax_cal.evidence.noise import Noise, Problem, orthonormal
 from minimax_cal.ground.arrays import Array
 
 RIDGE = 1e-10  # of the squares of a column: keeps a fit of columns alike from running away
+RIGID, FRICTION = "rigid", "usual"  # parts of a fit beside the laws
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,17 +45,37 @@ class Columns:
         out[joints] = rows
         return out
 
+    @cached_property
     def rigid(self) -> Array:
         """(n, R, p) of the rigid body; of each joint for itself where they share no parameters."""
         base = np.moveaxis(self.scene.base_rows, 1, 0)
         return base if self.scene.arm.shared else block_rows(base)
 
+    @cached_property
     def usual(self) -> Array:
         """(n, R, 2 n) Coulomb and viscous friction of every joint."""
         qd = self.scene.logs.motion.qd
         both = self.scene.logs.filtered(np.stack([self.scene.sense, qd], axis=-1))
         return block_rows(np.moveaxis(both, 1, 0))
 
+    @cached_property
+    def links(self) -> Array:
+        """(n, R, 10 n) of the inertial parameters of all links."""
+        return np.moveaxis(self.scene.logs.filtered(self.scene.regressor), 1, 0)
+
+    def design(self, terms: Sequence[Term] = ()) -> Array:
+        """(n, R, p) rigid body, usual friction and some laws: the columns of every fit."""
+        every = (self.at_all(term) for term in terms)
+        return np.concatenate([self.rigid, self.usual, *every], axis=2)
+
+    def places(self, terms: Sequence[Term] = ()) -> dict[str, slice]:
+        """Which of these columns belong to what."""
+        size = {RIGID: self.rigid.shape[2], FRICTION: self.usual.shape[2]}
+        size |= {term.text: self.rows_of(term)[1].shape[2] for term in terms}
+        ends = np.cumsum([0, *size.values()]).tolist()
+        return dict(zip(size, map(slice, ends[:-1], ends[1:]), strict=True))
+
+    @cached_property
     def error(self) -> Array:
         """(n, R) torques less those of what the flange is known to carry."""
         known = self.scene.logs.filtered(self.scene.known_torque)
@@ -68,12 +90,25 @@ def block_rows(each: Array) -> Array:
     return out.reshape(n, count, n * d)
 
 
+def solve_ridged(gram: Array, pull: Array, ridge: float = RIDGE) -> Array:
+    """(p,) least squares by products (p, p) with a unit diagonal and (p,)."""
+    return np.asarray(np.linalg.solve(gram + ridge * np.eye(len(gram)), pull))
+
+
+def solve_scaled(gram: Array, pull: Array, ridge: float = RIDGE) -> Array:
+    """(p,) least squares by products (p, p) and (p,); columns alike share what they explain.
+
+    ridge: of the products with a unit diagonal.
+    """
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    return np.asarray(solve_ridged(gram / np.outer(scale, scale), pull / scale, ridge) / scale)
+
+
 def least_squares(columns: Array, error: Array) -> Array:
     """(p,) values of columns (N, p), those alike sharing what they explain."""
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     unit = columns / scale
-    gram = unit.T @ unit + RIDGE * np.eye(columns.shape[1])
-    return np.asarray(np.linalg.solve(gram, unit.T @ error) / scale)
+    return np.asarray(solve_ridged(unit.T @ unit, unit.T @ error) / scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +160,8 @@ class TorqueLaws:
 
 def dictionary_of(columns: Columns, white: Whitening) -> TorqueLaws:
     """The dictionary of whitened rows, rigid body and usual friction projected out."""
-    both = np.concatenate([columns.rigid(), columns.usual()], axis=2)
-    nuisance = white.white(both[white.kept])
-    error = white.white(columns.error()[white.kept])
+    nuisance = white.white(columns.design()[white.kept])
+    error = white.white(columns.error[white.kept])
     logs = columns.scene.logs
     group = np.broadcast_to(logs.quarter, white.kept.shape)[white.kept]
     problem = Problem(
@@ -145,13 +179,12 @@ def dictionary_of(columns: Columns, white: Whitening) -> TorqueLaws:
 def one_of_each(columns: Columns, terms: Sequence[Term]) -> Array:
     """(n, R, p) rigid body, usual friction, one variant of every law, and all that runs carry."""
     first = {t.text if t.effect == "payload" else t.key: t for t in reversed(terms)}
-    every = (columns.at_all(term) for term in first.values())
-    return np.concatenate([columns.rigid(), columns.usual(), *every], axis=2)
+    return columns.design(list(first.values()))
 
 
 def generous(columns: Columns, terms: Sequence[Term]) -> Array:
     """(N,) what a fit of one variant of every law leaves: noise, were one of them true."""
     kept = columns.scene.logs.fitted.T
     matrix = one_of_each(columns, terms)[kept]
-    error = columns.error()[kept]
+    error = columns.error[kept]
     return np.asarray(error - matrix @ least_squares(matrix, error))

@@ -27,14 +27,14 @@ def softened(columns: Columns, terms: Sequence[Term]) -> Array:
     columns: of a scene.  terms: what is named.
     """
     scene, arm = columns.scene, columns.scene.arm
-    logs, error, out = scene.logs, columns.error(), arm.soft.copy()
-    parts = [columns.rigid(), columns.usual(), *map(columns.at_all, terms)]
+    logs, error, out = scene.logs, columns.error, arm.soft.copy()
+    design = columns.design(terms)
     for j in range(logs.joints):
         rows = logs.fitted[:, j]
-        beside = np.concatenate([part[j, rows] for part in parts], axis=1)
+        beside = design[j, rows]
         if np.count_nonzero(rows) < 2 * beside.shape[1]:
             continue
-        beside[:, parts[0].shape[2] + 2 * j] = 0.0  # the Coulomb friction of this joint
+        beside[:, columns.rigid.shape[2] + 2 * j] = 0.0  # the Coulomb friction of this joint
         basis = orthonormal(beside)
         left = error[j, rows] - basis @ (basis.T @ error[j, rows])
 

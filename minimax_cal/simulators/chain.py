@@ -195,6 +195,13 @@ def way_holds(model: Any, body: int, other: int) -> bool:
     return False
 
 
+def fill_history(model: Any, data: Any) -> None:
+    """Let delayed actuators have had their commands all the time: MuJoCo begins with 0."""
+    for k, (count, _) in enumerate(getattr(model, "actuator_history", ())):
+        if count:
+            mujoco().mj_initCtrlHistory(model, data, k, None, np.full(count, data.ctrl[k]))
+
+
 def at_zero(model: Any, joints: Sequence[int]) -> Any:
     """The model's data with the arm at joint values 0, all else as the file has it."""
     data = mujoco().MjData(model)

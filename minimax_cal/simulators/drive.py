@@ -19,7 +19,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
 from minimax_cal.robots.mjcf import body_pose, mujoco, way_to
-from minimax_cal.simulators.chain import Chain, carrier, holders
+from minimax_cal.simulators.chain import Chain, carrier, fill_history, holders
 
 MOVE, REST = 2.0, 1.5  # a move lasts at least, and a rest after it [s]
 FASTEST, FASTEST_SLIDE = 1.0, 0.25  # no joint is commanded faster [rad/s, m/s]
@@ -124,6 +124,7 @@ def visits(
     step = float(model.opt.timestep)
     start = commands[rows[0] - 1]
     data.qpos[at], data.ctrl[servos] = start, start
+    fill_history(model, data)
     settle(mj, model, data, limits, round(REST / step))
     out = []
     for row in rows:

@@ -148,6 +148,13 @@ def write_servos(layout: Layout, arm: Arm, servos: Servos) -> None:
                 layout.joints[i].set("damping", numbers([damper]))
                 damper = 0.0
             tune(servo, gain, max(damper - layout.drives.own[i], 0.0) / gear**2)
+        for custom in layout.root.findall("custom"):  # of a calibration before this one
+            for old in [e for e in custom if e.get("name") == f"{name}_deflection"]:
+                custom.remove(old)
+        if arm.turn[i] > NOTHING and not servos.sprung[i]:
+            said = (f"the gain of {servo.get('name')} is a spring: under gravity {name} turns by "
+                    f"{arm.turn[i]:.6g} rad/(N m); another gain is another deflection")  # fmt: skip
+            known(section(layout.root, "custom"), "text", f"{name}_deflection", data=said)
         if arm.gain[i]:
             servo.set("gear", numbers([gear]))
         others = [(j, c) for k, j, c in arm.coupled if k == i]

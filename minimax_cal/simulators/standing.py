@@ -13,7 +13,7 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots.mjcf import mujoco, way_to
 from minimax_cal.robots.transforms import inverse
 from minimax_cal.simulators.arm import Arm
-from minimax_cal.simulators.chain import Chain
+from minimax_cal.simulators.chain import Chain, fill_history
 from minimax_cal.simulators.commands import Commands
 from minimax_cal.simulators.drive import plays
 
@@ -72,6 +72,7 @@ def stand(chain: Chain, names: tuple[str, ...], commands: Array, play: Array | N
     for row, command in enumerate(commands):
         mj.mj_resetData(model, data)
         data.qpos[chain.places] = data.ctrl[servos] = command
+        fill_history(model, data)
         data.act[states[states >= 0]] = command[states >= 0]
         for joint, place in sides.items():
             data.qpos[place] = model.qpos_spring[place] = 0.0 if play is None else play[row, joint]

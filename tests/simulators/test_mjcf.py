@@ -183,6 +183,18 @@ def test_all_effects_at_once_on_arms_of_unknown_masses(name: str) -> None:
     assert np.sqrt((off**2).sum(axis=-1).mean()) < IMITATED
 
 
+def test_a_gain_that_carries_a_deflection_says_so() -> None:
+    """The compliance that is said is the law's: that of the gain under its share of gravity."""
+    cell = cell_with(with_masses(robot_called("irb2600")), "joint_compliance:all")
+    model, ((_, compliance),) = model_of(cell), cell.effects.pairs
+    told = bytes(model.text_data).decode().split("\0")
+    said = [text for text in told if "is a spring" in text]
+    share = 1.0 - model.body_gravcomp[model.body("link2").id]
+    for j, (text, value) in enumerate(zip(said, compliance, strict=True), start=2):
+        assert f"joint{j} turns by {value:.6g} rad/(N m)" in text
+        assert share / model.actuator(f"joint{j}").gainprm[0] == pytest.approx(value, rel=1e-9)
+
+
 def test_turns_without_an_element_go_into_the_commands(tmp_path: Path) -> None:
     robot = with_masses(robot_called("irb2600"))
     cell = cell_with(robot, "gear_error:J3:turns=2", "joint_compliance:J2",

@@ -15,8 +15,9 @@ from minimax_cal.dynamics.given import MotionKnown, Payload, read_logs
 from minimax_cal.dynamics.logs import runs_text
 from minimax_cal.dynamics.regressor import link_parameters
 from minimax_cal.dynamics.run import Run
+from minimax_cal.ground.errors import OptionError
 from tests.conftest import run
-from tests.dynamics.motions import three_joints
+from tests.dynamics.motions import run_of, three_joints
 from tests.problems_mjcf import drive_alone
 from tests.simulators.test_mjcf import in_base
 
@@ -32,6 +33,7 @@ from experiments.driven_arms import (  # noqa: E402
     with_motors,
 )
 from minimax_cal.simulators.motion import bodies  # noqa: E402
+from minimax_cal.simulators.motion.driven import follow_commands  # noqa: E402
 from minimax_cal.simulators.motion.fit import least_within, levelling, speeds  # noqa: E402
 from minimax_cal.simulators.motion.judge import Judge  # noqa: E402
 from minimax_cal.simulators.motion.module import installed, loaded  # noqa: E402
@@ -130,6 +132,44 @@ def test_the_ladder_says_so(made: SimpleNamespace) -> None:
         e.worth.values(), key=lambda ends: ends[0] / ends[1])])  # fmt: skip
     assert made.figure.read_bytes().startswith(b"\x89PNG")
     assert any(text.startswith("not in the file") for text in gap.sentences())
+
+
+def test_a_plain_file_has_nothing_that_others_leave_out(made: SimpleNamespace,
+                                                       tmp_path: Path) -> None:  # fmt: skip
+    out = tmp_path / "plain.xml"
+    gap = mc.motion_gap(made.model, made.logs, write=out, plain=True, driven=False)
+    assert not gap.module
+    assert not [text for text in gap.notices if "leave out" in text]
+    assert any(
+        "simulators but MuJoCo leave out what no element" in text for text in made.gap.notices
+    )
+    model, bent = mujoco.MjModel.from_xml_path(str(out)), ("dof_dampingpoly", "jnt_stiffnesspoly")
+    assert not any(np.any(getattr(model, name, 0.0)) for name in bent)
+    assert_allclose(
+        reached(out, "", read_logs(made.model, made.logs)), gap.rungs[-1].torque_rms, rtol=1e-4
+    )
+    with pytest.raises(OptionError, match="leave plain or friction"):
+        mc.motion_gap(made.model, made.logs, plain=True, friction="dcmotor")
+
+
+def test_a_plain_file_moves_alike_in_every_simulator(made: SimpleNamespace, tmp_path: Path) -> None:
+    """MuJoCo in C, in JAX and in Warp: 50 steps from a start at speed, in single precision."""
+    mjx = pytest.importorskip("mujoco.mjx", reason="needs pip install minimax-cal[rl]")
+    jax = pytest.importorskip("jax", reason="needs pip install minimax-cal[rl]")
+    warp = pytest.importorskip("mujoco_warp", reason="needs pip install minimax-cal[rl]")
+    out, speed = tmp_path / "plain.xml", [1.0, -0.5, 2.0]
+    mc.motion_gap(made.model, made.logs, write=out, plain=True, driven=False)
+    model = mujoco.MjModel.from_xml_path(str(out))
+    data = mujoco.MjData(model)
+    data.qvel[:] = speed
+    in_jax, in_warp = mjx.put_data(model, data), warp.put_data(model, data)
+    jax_model, warp_model, step = mjx.put_model(model), warp.put_model(model), jax.jit(mjx.step)
+    for _ in range(50):
+        mujoco.mj_step(model, data)
+        in_jax = step(jax_model, in_jax)
+        warp.step(warp_model, in_warp)
+    assert_allclose(in_jax.qpos, data.qpos, atol=1e-4)
+    assert_allclose(in_warp.qpos.numpy()[0], data.qpos, atol=1e-4)
 
 
 def reached(path: Path, module: str, runs: list[Run], payload: Payload | None = None) -> np.ndarray:
@@ -275,6 +315,19 @@ def test_logged_commands_drive_the_servos_of_the_model(tmp_path: Path) -> None:
     assert gap.drives == "its position servos and the logged commands"
     first, last = (np.array(r.tracking_rms_mrad) for r in (gap.rungs[0], gap.rungs[-1]))
     assert (last < 0.1 * first).all()
+
+
+@pytest.mark.skipif(not hasattr(mujoco, "mj_initCtrlHistory"), reason="no delays in this MuJoCo")
+def test_a_delayed_servo_at_its_command_stays_there(tmp_path: Path) -> None:
+    """MuJoCo fills the history of a delayed command with 0: the arm would jump towards it."""
+    servo = '<position kp="2000" kv="200" delay="0.02" nsample="14" '
+    path, q = tmp_path / "late.xml", np.array([0.4, -0.3, 0.5])
+    path.write_text(with_motors(three_joints()).decode().replace("<motor ", servo))
+    chain, time = open_model(path, 3).chain, np.arange(0.0, 0.5, 0.01)
+    chain.model.opt.gravity[:] = 0.0
+    still = np.broadcast_to(q, (len(time), 3))
+    log = run_of("still", time, still, 0.0 * still)
+    assert_allclose(follow_commands(chain, log, still, str(path)), still, atol=1e-9)
 
 
 def test_no_link_grows_in_place_of_a_rotor(tmp_path: Path) -> None:

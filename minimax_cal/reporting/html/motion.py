@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.dynamics.result import WORDS, MotionDiagnosis
+from minimax_cal.dynamics.laws import WORDS
+from minimax_cal.dynamics.result import MotionDiagnosis
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import visible

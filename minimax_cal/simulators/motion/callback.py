@@ -14,29 +14,21 @@ from typing import Any
 import mujoco
 import numpy as np
 
-NUMBERS: dict[str, dict[str, Any]] = {}  # by joint: its elements, and its laws as (law, numbers)
+NUMBERS: dict[str, dict[str, Any]] = {}
+# of each law whether it is friction, and its torque per unit of each of its parameters
+LAWS: dict[str, tuple[bool, Any]] = {}
 FRICTION = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
 LEAST = 1e-9  # of a friction, for MuJoCo to have a constraint [N m]
-PRESLIDING = "presliding"  # the law that remembers where a joint turned round
-
-
-def degressive(qd: float, amount: float, fastest: float, power: float) -> float:
-    """Viscous friction that levels off."""
-    return float(amount * (abs(qd) / fastest) ** power)
-
-
-def stribeck(qd: float, amount: float, fastest: float, speed: float) -> float:
-    """Friction that falls with the speed."""
-    return float(amount * np.exp(-((qd / fastest / speed) ** 2)))
 
 
 class Joint:
-    """A joint of a model with its laws."""
+    """A joint of a model: its elements, and its laws as (law, amounts, tuned numbers)."""
 
     def __init__(self, model: Any, name: str, told: dict[str, Any]) -> None:
         joint = model.joint(name)
         self.dof, self.place = int(joint.dofadr[0]), int(joint.qposadr[0])
         self.friction, self.laws = told["frictionloss"], told["laws"]
+        self.fastest, self.gear = told["fastest"], told.get("gear")
         self.turned: dict[int, tuple[bool, float]] = {}
         model.dof_frictionloss[self.dof] = max(self.friction, LEAST)
         model.dof_damping[self.dof] = told["damping"][0]
@@ -46,23 +38,14 @@ class Joint:
     def largest(self, data: Any, load: Any) -> tuple[float, float]:
         """The largest friction, and a torque that is none."""
         q, qd = float(data.qpos[self.place]), float(data.qvel[self.dof])
+        at = {"q": q, "v": qd / self.fastest, "load": load[self.dof], "gear": self.gear,
+              "way": self.since(data, q, qd)}  # fmt: skip
         friction, torque = self.friction, 0.0
-        for law, numbers in self.laws:
-            if law == "load_friction":
-                friction += numbers["share"] * abs(load[self.dof])
-            elif law == "degressive":
-                friction += degressive(qd, **numbers)
-            elif law == "stribeck":
-                friction += stribeck(qd, **numbers)
-            elif law == "angle_friction":
-                friction += numbers["cos"] * np.cos(q) + numbers["sin"] * np.sin(q)
-            elif law == PRESLIDING:
-                friction -= numbers["amount"] * np.exp(-self.since(data, q, qd) / numbers["length"])
-            elif law == "asymmetry":
-                torque += numbers["amount"] * abs(qd) / numbers["fastest"]
-            elif law == "waves":
-                turn = numbers["times"] * q
-                torque += numbers["cos"] * np.cos(turn) + numbers["sin"] * np.sin(turn)
+        for law, amounts, tuned in self.laws:
+            dry, units = LAWS[law]
+            each = zip(amounts, units(**at, **tuned), strict=True)
+            amount = float(sum(amount * unit for amount, unit in each))
+            friction, torque = friction + dry * amount, torque + (not dry) * amount
         return max(friction, LEAST), torque
 
     def since(self, data: Any, q: float, qd: float) -> float:

@@ -11,10 +11,22 @@ from functools import partial
 import numpy as np
 
 from minimax_cal.dynamics.diagnose import MATTERS
-from minimax_cal.dynamics.laws import CURVE as SPEED_CURVE
-from minimax_cal.dynamics.laws import LAWS, Term
-from minimax_cal.dynamics.result import (
+from minimax_cal.dynamics.laws import (
+    ARMATURE,
+    BRISTLES,
+    CURVE,
+    DELAY,
+    FRICTION,
+    GAIN,
+    LAWS,
+    LEVELLED,
+    MASSES,
+    MODULE,
+    SPRINGS,
     WORDS,
+    Term,
+)
+from minimax_cal.dynamics.result import (
     MotionDiagnosis,
     MotionEffect,
     best_worth,
@@ -25,22 +37,10 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress
 from minimax_cal.robots.mjcf import is_driven
 from minimax_cal.simulators.motion.bristles import fit_bristles
-from minimax_cal.simulators.motion.fit import (
-    ARMATURE,
-    BRISTLES,
-    CURVE,
-    DELAY,
-    FRICTION,
-    GAIN,
-    MASSES,
-    SPRINGS,
-    Asked,
-    Study,
-    fit_numbers,
-)
+from minimax_cal.simulators.motion.fit import Asked, Study, fit_numbers
 from minimax_cal.simulators.motion.judge import Judge, Missed
-from minimax_cal.simulators.motion.module import HELD, installed, module_text
-from minimax_cal.simulators.motion.numbers import Numbers, has_powers
+from minimax_cal.simulators.motion.module import installed, module_text
+from minimax_cal.simulators.motion.numbers import POWERS, Numbers, has_powers
 from minimax_cal.simulators.motion.opened import Opened
 from minimax_cal.simulators.motion.result import MotionRung, WrittenElement
 from minimax_cal.simulators.motion.written import SHORTEST, stiffen, unwritten, write_numbers
@@ -49,24 +49,21 @@ ATTRIBUTES = {  # of the elements, in the order in which they are shown
     FRICTION: "frictionloss, damping",
     MASSES: "inertial",
     ARMATURE: "armature",
-    CURVE: "damping of v, v|v|, v^3",
+    LEVELLED: "damping of v, v|v|, v^3",
     SPRINGS: "stiffness, springref",
     GAIN: "gear",
     DELAY: "delay",
     BRISTLES: "frictionloss, dcmotor with lugre",
 }
 STAYS = 1e-3  # fall of the mean log RMS torque by which an element stays
-MODULE = 0.01  # the same, for a module beside the file, and of all rows for friction at rest
-LEVELS = ("degressive", "stribeck")  # laws that damping of higher powers comes near to
-SPRUNG, GEARED = ("cable",), ("drive_gain",)
-IN_FILE = frozenset({"armature", "delay", *LEVELS, *SPRUNG})
-WHY = {  # laws that a model does not hold
-    "torque_offset": "the torque is read with an offset, which is none of the arm's",
-    "drive_gain": "scales what is logged, and no motor of the model holds it: give drive_gain=",
-    "payload": "changes between the runs; the model carries one load",
-    "joint_flexibility": "give a static calibration (fit=), whose springs a model holds",
+LOST = {  # of an element, what readers of the file leave out, and which
+    LEVELLED: ("all but the first number of `damping`", "MJX, USD and SDF"),
+    SPRINGS: ("all but the first number of `stiffness`", "MJX, USD and SDF"),
+    DELAY: ("`delay`", "MJX, USD and SDF"),
+    BRISTLES: ("`dcmotor`, with which MJX loads no file", "USD and SDF"),
+    MODULE: ("what no element holds", "all simulators but MuJoCo"),
 }
-NO_ELEMENT = "a model has no element for it"
+BESIDE = 0.01  # the same, for a module beside the file, and of all rows for friction at rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +91,15 @@ def mean_log(values: Array) -> float:
 class Bench:
     """Where candidates are fitted and judged; each once.
 
-    bristled: whether motors without input may hold friction at rest.
+    bristled: whether motors without input may hold friction at rest.  plain: whether the file may
+    have nothing that other simulators leave out.
     """
 
     judge: Judge
     opened: Opened
     study: Study
     bristled: bool = False
+    plain: bool = False
     made: dict[Asked, Candidate] = field(default_factory=dict)
     followed: dict[Asked, float] = field(default_factory=dict)
 
@@ -202,20 +201,22 @@ def asked_of(found: MotionDiagnosis, bench: Bench) -> tuple[Asked, tuple[Term, .
         late = 0.0
     chain = bench.opened.chain
     motors = [is_driven(model, joint) and chain.servo(joint) < 0 for joint in chain.joints]
-    geared = tuple(j for j in joints(terms, GEARED) if motors[j])
-    curved = joints(terms, LEVELS) if has_powers(model) else ()
+    geared = tuple(j for j in held_at(terms, GAIN) if motors[j])
+    curved = held_at(terms, LEVELLED) if has_powers(model) else ()
     elements = {FRICTION, MASSES, ARMATURE}
-    for name, some in ((CURVE, curved), (SPRINGS, joints(terms, SPRUNG)),
-                       (GAIN, geared), (DELAY, (0,) if late else ())):  # fmt: skip
-        elements |= {name} if some else set()
-    asked = Asked(frozenset(elements), link, curved, joints(terms, SPRUNG), geared,
-                  late=late)  # fmt: skip
-    return asked, tuple(term for term in terms if term.effect in HELD)
+    sprung = held_at(terms, SPRINGS)
+    some = {LEVELLED: curved, SPRINGS: sprung, GAIN: geared, DELAY: late}
+    elements |= {name for name, where in some.items() if where}
+    if bench.plain:
+        elements -= {LEVELLED, DELAY}
+    bent = 1 if bench.plain else POWERS - 1
+    asked = Asked(frozenset(elements), link, curved, sprung, geared, late=late, bent=bent)
+    return asked, tuple(term for term in terms if MODULE in term.law.held)
 
 
-def joints(terms: Sequence[Term], effects: Sequence[str]) -> tuple[int, ...]:
-    """Joints at which some effects are."""
-    return tuple(sorted({term.joint for term in terms if term.effect in effects}))
+def held_at(terms: Sequence[Term], element: str) -> tuple[int, ...]:
+    """Joints at which an element may hold a law."""
+    return tuple(sorted({term.joint for term in terms if element in term.law.held}))
 
 
 def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Corrected:
@@ -224,7 +225,7 @@ def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Correct
     progress("fitting the elements of the model")
     full = without_idle(bench, first_choice(bench, whole, laws))
     plain = without_idle(bench, by_elements(bench, full, whole))
-    if bench.beside(plain, full.asked.laws).score > plain.score - MODULE:
+    if bench.plain or bench.beside(plain, full.asked.laws).score > plain.score - BESIDE:
         full = plain
     if bench.bristled:
         plain, full = at_rest(bench, plain, full)
@@ -240,8 +241,8 @@ def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Correct
 
 def first_choice(bench: Bench, whole: Asked, laws: tuple[Term, ...]) -> Candidate:
     """All elements and laws: with the masses of all links or of the one that changed."""
-    if any(term.law.family == SPEED_CURVE for term in laws):
-        whole = replace(whole, elements=whole.elements - {CURVE})  # the laws say it better
+    if any(term.law.family == CURVE for term in laws):
+        whole = replace(whole, elements=whole.elements - {LEVELLED})  # the laws say it better
     whole = replace(whole, laws=laws)
     best = bench.candidate(replace(whole, link=-1))
     if whole.link >= 0:
@@ -254,7 +255,7 @@ def by_elements(bench: Bench, full: Candidate, whole: Asked) -> Candidate:
     """Elements alone, with the masses that belong to the laws that none holds."""
     if not full.asked.laws:
         return full
-    elements = full.asked.elements | (whole.elements & {CURVE, FRICTION})
+    elements = full.asked.elements | (whole.elements & {LEVELLED, FRICTION})
     asked = replace(full.asked, elements=elements, laws=(), behind=full.asked.laws)
     return bench.candidate(asked)
 
@@ -283,7 +284,7 @@ def at_rest(bench: Bench, plain: Candidate, full: Candidate) -> tuple[Candidate,
     """Both with the same bristles, if all rows gain by them, and more than moving ones lose."""
     more = bench.candidate(full.asked.adding(BRISTLES))
     gain = mean_log(full.missed.whole) - mean_log(more.missed.whole)
-    helps = gain > MODULE + max(0.0, more.score - full.score)
+    helps = gain > BESIDE + max(0.0, more.score - full.score)
     if not helps or bench.tracking(more) > bench.tracking(full) + STAYS:
         return plain, full
     if full is plain:
@@ -345,19 +346,35 @@ def law_worths(bench: Bench, plain: Candidate, full: Candidate) -> Iterator[Writ
         yield WrittenElement(WORDS[effect], "module", f"at {where}", worth)
 
 
+def lost(made: Corrected) -> Iterator[str]:
+    """What other simulators leave out of the file, for people."""
+    numbers, elements = made.plain.numbers, made.plain.asked.elements
+    held = {
+        LEVELLED: numbers.damping[:, 1:].any(),
+        SPRINGS: numbers.stiffness[:, 1:].any(),
+        DELAY: DELAY in elements,
+        BRISTLES: numbers.bristles.any(),
+        MODULE: made.full.module,
+    }
+    for name, is_there in held.items():
+        if is_there:
+            yield f"{LOST[name][1]} leave out {LOST[name][0]} ({name}); see plain="
+    if DELAY in elements and numbers.late < 0.0:
+        yield "MuJoCo begins with 0 in the history of delayed commands: call mj_initCtrlHistory"
+
+
 def left_out(found: MotionDiagnosis, geared: Sequence[int]) -> Iterator[str]:
     """What neither file nor module holds, and what that costs.
 
     geared: joints whose drive gain the file holds.
     """
     for one in found.effects:
-        held = one.effect in IN_FILE.union(HELD)
-        if one.effect in GEARED:
-            held = int(one.place[1:]) - 1 in geared
-        if one.effect in LAWS and not held and not is_body(one):
+        law = LAWS.get(one.effect)
+        held = law and law.held and (law.held != (GAIN,) or int(one.place[1:]) - 1 in geared)
+        if law and not held and not is_body(one):
             joint, (without, with_it) = best_worth(one)
             cost = f"{joint} {without:.3g} in place of {with_it:.3g} {found.unit}"
-            yield f"{one.words}: {WHY.get(one.effect, NO_ELEMENT)} (costs {cost})"
+            yield f"{one.words}: {law.why} (costs {cost})"
     for rest in (one for one in found.unexplained if one.share > MATTERS):
         size = f"{rest.size:.3g} {found.unit}"
         yield f"{size} at {rest.place} follow the {rest.follows} and have no name"

@@ -15,7 +15,7 @@ from minimax_cal.dynamics.run import Run
 from minimax_cal.dynamics.scene import bent_bristles
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.mjcf import mujoco
-from minimax_cal.simulators.chain import Chain
+from minimax_cal.simulators.chain import Chain, fill_history
 from minimax_cal.simulators.drive import check_stable
 from minimax_cal.simulators.motion.numbers import FRICTION, bristles_in, given_bristles
 
@@ -61,6 +61,8 @@ def follow_commands(chain: Chain, run: Run, commands: Array, source: str) -> Arr
 
     def drive(data: Any, now: int) -> None:
         data.ctrl[servos] = path[now]
+        if not now:
+            fill_history(chain.model, data)
 
     path = on_steps(run.time, commands, chain)
     return stepped(chain, run, drive, source)

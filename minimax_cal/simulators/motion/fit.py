@@ -13,11 +13,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from minimax_cal.dynamics.laws import Term
+from minimax_cal.dynamics.laws import (
+    ARMATURE,
+    DELAY,
+    FRICTION,
+    GAIN,
+    LEVELLED,
+    MASSES,
+    SPRINGS,
+    Term,
+)
 from minimax_cal.dynamics.regressor import PER_LINK
 from minimax_cal.dynamics.rows import Logs, Whitening, whitening
 from minimax_cal.dynamics.scene import Arm, Scene
-from minimax_cal.dynamics.search import Columns, generous
+from minimax_cal.dynamics.search import Columns, generous, solve_scaled
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.simulators.chain import Chain
@@ -34,11 +43,6 @@ FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-9  # of the normal matrix with a unit di
 CLOSE = 1e-7  # relative fall of the squares that ends a fit
 IMPEDANCES = (1e-4, 0.9999)  # least and largest that MuJoCo takes [mjMINIMP, mjMAXIMP]
 LEAST_FRICTION = 1e-6  # of a joint's largest torque: a smaller one has no say
-DRY = ("degressive", "stribeck", "presliding", "load_friction", "angle_friction")  # with its sense
-
-FRICTION, MASSES, ARMATURE = "friction", "masses", "armature"
-CURVE, SPRINGS, GAIN, DELAY = "friction curve", "springs", "drive gain", "delay"
-BRISTLES = "friction at rest"
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +52,7 @@ class Asked:
     elements: of those above.  link: the only one whose masses change, -1 for all.
     behind: laws with which masses and armature are fitted first, and kept.
     curved: joints whose damping levels off.  sprung, geared: joints with a spring, or whose drive
-    gain is off.  laws: that no element holds.
+    gain is off.  laws: that no element holds.  bent: powers of the angle in a spring's torque.
     """
 
     elements: frozenset[str]
@@ -59,6 +63,7 @@ class Asked:
     laws: tuple[Term, ...] = ()
     behind: tuple[Term, ...] = ()
     late: float = 0.0
+    bent: int = POWERS - 1
 
     def adding(self, element: str) -> Asked:
         """With one element more."""
@@ -105,25 +110,19 @@ class Study:
     def of(chain: Chain, arm: Arm, logs: Logs, terms: tuple[Term, ...], inertia: Array,
            *, assumed: bool) -> Study:  # fmt: skip
         """Of the logs to learn from.  terms: the laws of a diagnosis."""
-        bodies = Bodies.of(chain)
-        given = given_numbers(chain, bodies)
-        scene = Scene.of(arm, logs)
-        scene = scene.with_body(of_all(bodies.links(given.bodies)), scene.friction)
-        white = whitening(logs, generous(Columns(scene), terms))
-        rows = np.moveaxis(logs.filtered(scene.regressor), 1, 0)
-        return Study(chain, bodies, given, scene, white, white.white(rows[white.kept]), inertia,
-                     PRIOR_ASSUMED if assumed else PRIOR)  # fmt: skip
+        bodies, given, columns = begun(chain, arm, logs)
+        white = whitening(logs, generous(columns, terms))
+        links = white.white(columns.links[white.kept])
+        prior = PRIOR_ASSUMED if assumed else PRIOR
+        return Study(chain, bodies, given, columns.scene, white, links, inertia, prior)
 
     def of_file(self, chain: Chain, gain: Array) -> Study:
         """The same logs, for a written model.  gain: (n,) of its drives over those of the logs."""
-        bodies = Bodies.of(chain)
-        given = given_numbers(chain, bodies)
         arm = replace(self.scene.arm, gain=self.scene.arm.gain / gain)
-        scene = Scene.of(arm, self.scene.logs)
-        scene = scene.with_body(of_all(bodies.links(given.bodies)), self.scene.friction)
-        rows = np.moveaxis(scene.logs.filtered(scene.regressor), 1, 0)
-        links = self.white.white(rows[self.white.kept])
-        return replace(self, chain=chain, bodies=bodies, given=given, scene=scene, links=links)
+        bodies, given, columns = begun(chain, arm, self.scene.logs)
+        links = self.white.white(columns.links[self.white.kept])
+        return replace(self, chain=chain, bodies=bodies, given=given, scene=columns.scene,
+                       links=links)  # fmt: skip
 
     def error(self, late: float) -> Array:
         """(N,) whitened torques less those of a known payload; so much earlier [s]."""
@@ -138,6 +137,14 @@ class Study:
         given = self.given.put(bodies=own, armature=found.armature)
         scene = self.scene.with_body(of_all(bodies.links(own)), self.scene.friction)
         return replace(self, bodies=bodies, given=given, scene=scene)
+
+
+def begun(chain: Chain, arm: Arm, logs: Logs) -> tuple[Bodies, Numbers, Columns]:
+    """What a model has, and columns of logs of its arm with its masses."""
+    bodies = Bodies.of(chain)
+    given, scene = given_numbers(chain, bodies), Scene.of(arm, logs)
+    rigid = of_all(bodies.links(given.bodies))
+    return bodies, given, Columns(scene.with_body(rigid, scene.friction))
 
 
 def of_all(links: Array) -> Array:
@@ -169,7 +176,7 @@ def columns_of(study: Study, scene: Scene, asked: Asked) -> Iterator[Column]:
         if FRICTION in asked.elements:
             yield Column("friction", j, scene.sense[:, j] / unit[j])
             yield Column("damping", j, qd / unit[j])
-        if CURVE in asked.elements and j in asked.curved:
+        if LEVELLED in asked.elements and j in asked.curved:
             for share in LEVELS_OFF:
                 powers = levelling(share * scene.arm.fastest[j])
                 yield Column(f"curve {share}", j, speeds(qd) @ powers / unit[j])
@@ -178,7 +185,7 @@ def columns_of(study: Study, scene: Scene, asked: Asked) -> Iterator[Column]:
             doubt = max(given.armature[j], ROTOR * study.inertia[j], ROTOR * whole)
             yield Column("armature", j, qdd / unit[j], mean=given.armature[j], sd=doubt)
         if SPRINGS in asked.elements and j in asked.sprung:
-            for power in range(POWERS):
+            for power in range(asked.bent + 1):
                 yield Column(f"spring {power}", j, motion.q[:, j] ** power / unit[j], -np.inf)
         if GAIN in asked.elements and j in asked.geared:
             yield Column("gain", j, scene.load[:, j], -np.inf)
@@ -318,11 +325,7 @@ def damped_step(gram: Array, pull: Array, damping: float, free: Array) -> Array:
     """(p,) step of the free ones; 0 of the others."""
     out = np.zeros(len(pull))
     if free.any():
-        part = gram[np.ix_(free, free)]
-        scale = np.sqrt(np.maximum(np.diag(part), 1e-300))
-        unit = part / np.outer(scale, scale)
-        unit[np.diag_indices_from(unit)] += damping
-        out[free] = -np.linalg.solve(unit, pull[free] / scale) / scale
+        out[free] = -solve_scaled(gram[np.ix_(free, free)], pull[free], damping)
     return out
 
 
@@ -412,7 +415,7 @@ def sense_of(study: Study, scene: Scene, numbers: Numbers) -> Array:
     sliding = scene.with_body(scene.rigid, scene.friction)
     vars(sliding)["sense"] = np.ones_like(motion.q)
     for term, value in zip(numbers.laws, numbers.value, strict=True):
-        if term.effect in DRY and len(value):
+        if term.law.dry and len(value):
             amount = (term.columns(sliding) @ value) * scene.divisor[term.joint]
             whole[:, term.joint] = np.maximum(whole[:, term.joint] + amount, least[term.joint])
     stiffness, rate = softness(study.chain, numbers)

@@ -24,7 +24,7 @@ from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.robots.urdf import MODELS
 from minimax_cal.simulators.given import largest_inertia
 from minimax_cal.simulators.motion.bristles import has_bristles
-from minimax_cal.simulators.motion.correct import Bench, correct
+from minimax_cal.simulators.motion.correct import Bench, correct, lost
 from minimax_cal.simulators.motion.fit import Study
 from minimax_cal.simulators.motion.judge import Judge
 from minimax_cal.simulators.motion.module import ENDING
@@ -46,6 +46,7 @@ def motion_gap(
     known: MotionKnown,
     gains: tuple[Sequence[float], Sequence[float]] | None = None,
     friction: str | None = None,
+    plain: bool = False,
     driven: bool = True,
     progress: Progress = silent,
 ) -> MotionGap:
@@ -72,6 +73,9 @@ def motion_gap(
     friction
         `dcmotor` for motors without input beside MuJoCo's `frictionloss`, whose LuGre friction is
         that of a joint at rest (MuJoCo 3.16 or later).
+    plain
+        Whether the file is fitted without what other simulators leave out of it: damping and
+        stiffness of higher powers, delay, and the module.
     driven
         Whether drives move the arm along the held-out runs as well.
     progress
@@ -91,7 +95,7 @@ def motion_gap(
     >>> print(mc.motion_gap("arm.xml", ["run1.csv", "run2.csv"], write="corrected.xml").summary())
     """
     began = time.perf_counter()
-    check_request(write, friction)
+    check_request(write, friction, plain=plain)
     progress("reading the model and the logs")
     runs = read_logs(model, logs)
     opened = open_model(model, runs[0].joints if runs else 0, tip)
@@ -107,7 +111,8 @@ def motion_gap(
         found = told_or_found(judge, opened, diagnosis, known.payload, progress)
         judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
                                            soft=found.arm.soft))  # fmt: skip
-        bench = bench_of(judge, opened, found, bristled=friction == MOTOR)
+        bench = bench_of(judge, opened, found)
+        bench = replace(bench, bristled=friction == MOTOR, plain=plain)
         made = correct(bench, found, progress)
     path = None if write is None else Path(write)
     beside = path.with_name(path.stem + ENDING) if path and made.full.module else None
@@ -115,7 +120,8 @@ def motion_gap(
         write_whole(path, made.plain.opened.content(path))
     if beside is not None:
         write_whole(beside, made.full.module)
-    said = (*(text for run in runs for text in run.notices), *notices, *made.notices)
+    told = (text for run in runs for text in run.notices)
+    said = (*told, *notices, *made.notices, *(lost(made) if path else ()))
     return MotionGap(
         model=str(model),
         robot=opened.chain.robot.name,
@@ -161,20 +167,22 @@ def told_or_found(
     return found
 
 
-def check_request(write: Path | str | None, friction: str | None) -> None:
+def check_request(write: Path | str | None, friction: str | None, *, plain: bool) -> None:
     """Raise CalibrationError for what cannot be written, what holds no friction, and no MuJoCo."""
     if write is not None:
         check_writable(write, MODELS)
     mujoco()
     if friction not in (None, MOTOR):
         raise OptionError(f"friction={friction!r}: give {MOTOR}, or leave it")
+    if friction and plain:
+        raise OptionError(f"plain: other simulators leave out {MOTOR}; leave plain or friction")
     if friction == MOTOR and not has_bristles():
         raise OptionError(f"friction={MOTOR}: this MuJoCo has no motors without input; update it")
 
 
-def bench_of(judge: Judge, opened: Opened, found: MotionDiagnosis, *, bristled: bool) -> Bench:
+def bench_of(judge: Judge, opened: Opened, found: MotionDiagnosis) -> Bench:
     """Where corrections of a model are fitted and judged."""
     assumed = opened.given.assumed or not weighed(opened.chain.robot).all()
     study = Study.of(opened.chain, judge.arm, judge.learning, found.models[-1].terms,
                      largest_inertia(opened.chain), assumed=bool(assumed))  # fmt: skip
-    return Bench(judge, opened, study, bristled)
+    return Bench(judge, opened, study)

@@ -3,65 +3,59 @@
 from __future__ import annotations
 
 import pprint
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import resources
 from types import ModuleType
 from typing import Any
 
-from minimax_cal.dynamics.laws import Term
+from minimax_cal.dynamics.laws import Law
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.simulators.chain import Chain
 from minimax_cal.simulators.motion.numbers import Numbers
 
-EMPTY = "NUMBERS: dict[str, dict[str, Any]] = {}"
+NUMBERS = "NUMBERS: dict[str, dict[str, Any]] = {}"  # in callback.py, to be filled
+LAWS = "LAWS: dict[str, tuple[bool, Any]] = {}"
 ENDING = "_friction.py"
-WAVES = {"gravity_spring": 2.0}  # times the angle
-HELD = ("load_friction", "degressive", "stribeck", "angle_friction", "presliding", "asymmetry",
-        "torque_ripple", "gravity_spring")  # fmt: skip
 
 
 def module_text(chain: Chain, numbers: Numbers, unit: Array, ratio: Array) -> str:
     """The module.  unit: (n,) torque per unit of the log.  ratio: (n,) of the gears."""
     told: dict[str, Any] = {}
+    laws = {term.effect: term.law for term in numbers.laws}
     for j, name in enumerate(chain.names):
         pairs = zip(numbers.laws, numbers.value, strict=True)
-        laws = [law_of(term, value * unit[j] / numbers.gain[j], value / numbers.gain[j], numbers,
-                       float(ratio[j])) for term, value in pairs if term.joint == j]  # fmt: skip
+        mine = [(t.effect, amounts_of(t.law, value, float(unit[j]), float(numbers.gain[j])),
+                 dict(t.tuned)) for t, value in pairs if t.joint == j]  # fmt: skip
         told[name] = {
             "frictionloss": float(numbers.loss[j]),
             "damping": [float(v) for v in numbers.damping[j]],
-            "laws": laws,
+            "fastest": float(numbers.fastest[j]),
+            "laws": mine,
         }
+        if any("gear" in laws[law].reads for law, *_ in mine):
+            told[name]["gear"] = abs(float(ratio[j]))
     source = (resources.files("minimax_cal.simulators.motion") / "callback.py").read_text("utf-8")
-    return source.replace(
-        EMPTY,
-        f"NUMBERS: dict[str, dict[str, Any]] = {pprint.pformat(told, width=96, sort_dicts=False)}",
-    )
+    filled = pprint.pformat(told, width=96, sort_dicts=False)
+    source = source.replace(NUMBERS, f"{NUMBERS[:-2]}{filled}")
+    return source.replace(LAWS, f"{LAWS[:-1]}\n{laws_text(laws)}}}" if laws else LAWS)
 
 
-def law_of(
-    term: Term, torque: Array, share: Array, numbers: Numbers, ratio: float
-) -> tuple[str, dict[str, float]]:
-    """A law with its numbers at the joint.  torque: (d,) [N m]; share: the same without a unit."""
-    tuned, fastest = term.tuned, float(numbers.fastest[term.joint])
-    amount = float(torque[0])
-    match term.effect:
-        case "load_friction":
-            return term.effect, {"share": float(share[0])}
-        case "degressive":
-            return term.effect, {"amount": amount, "fastest": fastest, "power": tuned["power"]}
-        case "stribeck":
-            return term.effect, {"amount": amount, "fastest": fastest, "speed": tuned["speed"]}
-        case "presliding":
-            return term.effect, {"amount": amount, "length": tuned["length"]}
-        case "asymmetry":
-            return term.effect, {"amount": amount, "fastest": fastest}
-        case "angle_friction":
-            return term.effect, {"cos": amount, "sin": float(torque[1])}
-    times = WAVES.get(term.effect, tuned.get("multiple", 1.0) * abs(ratio))
-    return "waves", {"times": times, "cos": amount, "sin": float(torque[1])}
+def amounts_of(law: Law, value: Array, unit: float, gain: float) -> list[float]:
+    """A law's parameters at the joint [N m, or its share of torque]."""
+    pairs = zip(value, law.units, strict=False)
+    return [float(v * (unit if of.startswith("t") else 1.0) / gain) for v, of in pairs]
+
+
+def laws_text(laws: Mapping[str, Law]) -> str:
+    """Laws as entries of the module: whether friction, and torque per unit of each parameter."""
+    out = ""
+    for name, law in laws.items():
+        known = ", ".join([*sorted(law.reads), *law.tuned, "**_"])
+        out += f"    # {law.words}\n"
+        out += f'    "{name}": ({law.dry}, lambda {known}: ({", ".join(law.torque)},)),\n'
+    return out
 
 
 def loaded(text: str) -> ModuleType:

@@ -1,0 +1,82 @@
+"""A law of torque states itself once: rows, curve, module and documentation agree."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dynamics.motions import simulated, three_joints
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from minimax_cal.dynamics.laws import LAWS, MODULE, QUANTITIES, WORDS, Law, Tuned, laws_table
+from minimax_cal.dynamics.rows import prepare
+from minimax_cal.dynamics.scene import Arm, Scene, sense_of
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.simulators.motion.module import laws_text
+
+DOCS = Path(__file__).parents[2] / "docs" / "torques.md"
+WAVE = Law(
+    "third_wave", "a third wave of the angle", ("np.cos(times * q)", "np.sin(times * q)"),
+    ("cos", "sin"), ("t", "t"), tuned={"times": Tuned((3.0,))},
+)  # fmt: skip
+
+
+@pytest.fixture
+def scene() -> Scene:
+    logs, robot = prepare(simulated(seed=1, runs=2)), three_joints()
+    arm = Arm.of(robot, np.ones(3), np.full(3, 50.0), np.zeros(10), logs)
+    return Scene.of(arm, logs)
+
+
+@pytest.fixture
+def registered() -> Iterator[Law]:
+    yield mc.register_law(WAVE)
+    del LAWS[WAVE.name], WORDS[WAVE.name]
+
+
+@pytest.mark.parametrize("name", [name for name, law in LAWS.items() if MODULE in law.held])
+def test_the_module_says_what_the_rows_say(name: str, scene: Scene) -> None:
+    law, j = LAWS[name], 1
+    written = eval(f"{{{laws_text({name: law})}}}", {"np": np})
+    dry, per_unit = written[name]
+    for choice in law.tried(scene, j):
+        at = {of: quantity(scene, j) for of, quantity in QUANTITIES.items()}
+        sense = scene.sense[:, j] if dry else 1.0
+        said = np.stack([sense * one for one in per_unit(**at, **choice)], axis=1)
+        assert_allclose(law.columns(scene, j, choice), said, rtol=1e-15)
+
+
+def test_a_curve_over_speed_is_the_law_along_it(scene: Scene) -> None:
+    v, seen = QUANTITIES["v"](scene, 0), []
+    sense = sense_of(scene.logs.motion.qd[:, 0], scene.arm.soft[0])
+    for name, law in LAWS.items():
+        for form in law.curve(v, sense, law.tried(scene, 0)[0]):
+            assert_allclose(form, law.columns(scene, 0, law.tried(scene, 0)[0])[:, 0], rtol=1e-15)
+            seen.append(name)
+    assert seen == ["degressive", "stribeck", "asymmetry"]
+
+
+def test_a_registered_law_is_found_with_its_size(registered: Law) -> None:
+    """Three waves a turn at joint 2: 2.5 N m of cosine, -1.5 of sine."""
+    runs = simulated(
+        lambda m, rigid, t: np.stack([0.0 * t, 2.5 * np.cos(3.0 * m.q[:, 1])
+                                      - 1.5 * np.sin(3.0 * m.q[:, 1]), 0.0 * t], axis=1), seed=3,
+    )  # fmt: skip
+    found = mc.diagnose_motion(three_joints(), runs)
+    (one,) = [e for e in found.effects if e.effect == registered.name]
+    assert one.place == "J2"
+    assert_allclose([p.value for p in one.parameters], [2.5, -1.5, 3.0], atol=0.1)
+    assert one.words == "a third wave of the angle at joint 2"
+
+
+def test_wrong_facts_are_refused() -> None:
+    with pytest.raises(OptionError, match="a name and a unit"):
+        mc.register_law(Law("two", "two", ("q", "v")))
+    with pytest.raises(OptionError, match="knows no a"):
+        mc.register_law(Law("late", "late", ("a",)))
+
+
+def test_the_documentation_has_every_law() -> None:
+    table = laws_table().markdown()
+    assert table[table.index("|") :].strip() in DOCS.read_text(encoding="utf-8")
