@@ -13,7 +13,7 @@ from conftest import ROOT, run
 
 import minimax_cal as mc
 from minimax_cal.cli.commands import ENTRIES
-from minimax_cal.cli.options import RESULT, Grouped, InGroups, in_flags
+from minimax_cal.cli.options import FIRST, MOST_USED, RESULT, Grouped, InGroups, in_flags
 from minimax_cal.cli.running import cli
 
 PACKAGE = ROOT / "minimax_cal"
@@ -91,8 +91,18 @@ def test_help_is_in_groups_and_whole_sentences(
     assert titles[-1] == RESULT
     assert len(titles) == len(set(titles))
     options = [p for p in command.params if isinstance(p, click.Option)]
+    first = MOST_USED.get(name, "").split()
     groups = {p.group or RESULT for p in options if isinstance(p, Grouped)}
-    assert groups <= set(titles)
+    assert groups <= {
+        *titles,
+        *(p.group for p in options if p.name in first and isinstance(p, Grouped)),
+    }
+    if first:
+        assert len(first) == 10
+        assert titles[0] == FIRST
+        part = out.partition(f"{FIRST}:")[2].partition(f"\n{titles[1]}:")[0]
+        assert len(re.findall(r"^  -", part, re.M)) == 10
+    assert len(options) <= 15 or first
     for each in options:
         text = re.sub(r" \[default: [^]]*\]", "", each.help or "")
         assert re.match(r"[A-Z]|u95", text), f"{name} {each.name}: {text!r}"

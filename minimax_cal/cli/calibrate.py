@@ -32,7 +32,6 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text, plain
 from minimax_cal.reporting.plots.figures import save_errors
 from minimax_cal.robots.kernels.choice import work
-from minimax_cal.robots.urdf import ends_of, has_links, is_urdf
 from minimax_cal.solvers.status import Status
 
 if TYPE_CHECKING:
@@ -126,6 +125,8 @@ def advice(
     fit: Fit, robot: str, data: tuple[Path, ...], written: Path | None
 ) -> Iterator[tuple[str, str]]:
     """What to do next, and its command.  written: where the result went."""
+    from minimax_cal.robots.urdf import ends_of, has_links, is_urdf  # not before it has calibrated
+
     if not fit.cell.effects.terms:
         left = f"{fit.within.after.rms_mm:.3f} mm"
         diagnose = f"minimax-cal diagnose {robot} {' '.join(map(str, data))}"

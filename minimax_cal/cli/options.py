@@ -35,6 +35,15 @@ FIRST_WIDTH = 80  # of a first screen, which any terminal can show
 MOST_NOTICES = 50
 MOST = 1e12  # of any number: squares of what is larger overflow somewhere
 RESULT = "Measurements and result"
+FIRST = "What is used most"
+MOST_USED = {  # ten of each command with many options, by their names in Python
+    "calibrate": "objective effects only fix priors holdout instrument figure details output",
+    "relative": "effects diagnose noises priors pixels joints camera board details output",
+    "diagnose": "exclude instrument holdout quick jobs in_rows figure details as_json output",
+    "plan": "poses tracker targets volume floor joints data fit details output",
+    "compensate": "nominal frame tolerance most_change tool wobj lever safe_cells as_json output",
+    "gap": "write fit diagnosis tip payload drive_gain ratio figure details output",
+}
 DRAWN = (".png", ".svg", ".pdf")
 Advice = Iterable[tuple[str, str]]  # what for, and the command
 Lazy = Callable[[], Any] | None  # what is made where it is asked for
@@ -196,15 +205,21 @@ class Grouped(click.Option):
 
 
 class InGroups(click.Command):
-    """A command whose help lists its options part by part, those of the result last."""
+    """A command whose help lists its options part by part: the most used, ..., of the result."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The options under their headings, in the order in which these come first."""
-        groups: dict[str, list[tuple[str, str]]] = {}
+        first = dict.fromkeys(MOST_USED.get(self.name or "", "").split(), ("", ""))
+        groups: dict[str, list[tuple[str, str]]] = {FIRST: []}
         for each in self.get_params(ctx):
+            title = getattr(each, "group", "") or RESULT
             record = each.get_help_record(ctx) if isinstance(each, click.Option) else None
-            if record:
-                groups.setdefault(getattr(each, "group", "") or RESULT, []).append(record)
+            if record and each.name in first:
+                groups.setdefault(title, [])
+                first[each.name] = record
+            elif record:
+                groups.setdefault(title, []).append(record)
+        groups[FIRST] += first.values()
         last = groups.pop(RESULT, [])
         for title, records in (*groups.items(), (RESULT, last)):
             if records:
