@@ -288,6 +288,7 @@ EVERY = (
         typical=0.02, of_torque=False, held=()),
 )  # fmt: skip
 LAWS: dict[str, Law] = {law.name: law for law in EVERY}
+BUILT_IN = frozenset(LAWS)
 USUAL = ("coulomb", "viscous")
 WORDS = {"coulomb": "Coulomb friction", "viscous": "viscous friction",
          "link_inertia": "mass or inertia of a link"}  # fmt: skip
@@ -317,6 +318,8 @@ def register_law(law: Law) -> Law:
     --------
     >>> mc.register_law(Law("tanh", "levels off", ("np.tanh(np.abs(v))",), dry=True))
     """
+    if not law.name or law.name in BUILT_IN:
+        raise OptionError(f"law {law.name!r}: is built in, or no name; give it one of its own")
     if len({len(law.names), len(law.units), len(law.torque or law.names)}) > 1:
         raise OptionError(f"law {law.name}: give a name and a unit for each of its parameters")
     if MODULE in law.held and not law.reads <= IN_MODULE:

@@ -264,8 +264,9 @@ class Instrument:
         return np.eye(3), np.zeros(3)
 
     def targets(self, own: Array) -> Array:
-        """(k, 3) points on the flange [m]."""
-        return np.asarray(own[self.targets_at].reshape(-1, 3))
+        """(k, 3) points on the flange, its origin where it has none of its own [m]."""
+        spots = own[self.targets_at].reshape(-1, 3)
+        return np.asarray(spots if len(spots) else np.zeros((1, 3)))
 
     def elsewhere(self, robot: Robot, own: Array) -> Self:
         """The instrument at plenty of poses that it could measure, of an arm: at any."""

@@ -26,6 +26,7 @@ def joint_rows(
     header_check(file.path, [*bare, *ANY_TARGET])
     q, sliding = file.joints()
     columns, left = file.optional(own, doubts)
+    left |= {name: "" for name in file.header if TARGET.fullmatch(name) and not own.fullmatch(name)}
     idle = (f"{file.path}: column {name} {unused}{why}" for name, why in left.items())
     notices = (*file.notices, *idle)
     at = Measurements(

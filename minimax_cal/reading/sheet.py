@@ -198,17 +198,26 @@ def cut(
 
 
 def split(sheet: Sheet, alone: str) -> tuple[str, dict[int, str], list[str]]:
-    """The delimiter of a text, its comments by line, and its other lines.  Raises DataError."""
+    """The delimiter of a text, its comments by line, and its other lines.  Raises DataError.
+
+    A line below the first other one that has as many cells as most is no comment, however it
+    begins: a pose may be called #1.
+    """
     lines = sheet.text.split("\n")
     notes = {n: line for n, line in enumerate(lines, 1) if line.lstrip().startswith(COMMENTS)}
-    for n in notes:
-        lines[n - 1] = ""
-    some = [line for line in lines if line.strip(BLANK)][:LOOKED_AT]
+    told = [n for n, line in enumerate(lines, 1) if n not in notes and line.strip(BLANK)]
+    some = [lines[n - 1] for n in told[:LOOKED_AT]]
     delimiter = "\t" if sheet.encoding == WORKBOOK else delimiter_of(some) or alone
     if not delimiter:
         raise DataError(
             f"{sheet.path}: has no columns that commas, semicolons, tabs or spaces separate"
         )
+    usual, *_ = Counter(line.count(delimiter) for line in some).most_common(1)[:1] or [(0, 0)]
+    if delimiter != " " and usual[0]:
+        notes = {n: line for n, line in notes.items()
+                 if n < told[0] or line.count(delimiter) != usual[0]}  # fmt: skip
+    for n in notes:
+        lines[n - 1] = ""
     return delimiter, notes, lines
 
 

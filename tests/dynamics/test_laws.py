@@ -73,6 +73,8 @@ def test_a_registered_law_is_found_with_its_size(registered: Law) -> None:
 def test_wrong_facts_are_refused() -> None:
     with pytest.raises(OptionError, match="a name and a unit"):
         mc.register_law(Law("two", "two", ("q", "v")))
+    with pytest.raises(mc.OptionError, match="law 'stribeck': is built in"):
+        mc.register_law(Law("stribeck", "mine", ("q",)))
     with pytest.raises(OptionError, match="knows no a"):
         mc.register_law(Law("late", "late", ("a",)))
 

@@ -228,3 +228,11 @@ def test_bad_arrays() -> None:
         closures(q, np.repeat(["A", "B"], 3), order=np.arange(5))
     with pytest.raises(mc.DataError, match=r"q must be \(m, n\)"):
         distances(q[0], np.ones(6))
+
+
+def test_points_beside_wires_are_said_not_to_be_used(tmp_path: Path) -> None:
+    rows = "\n".join(f"{0.1 * i},{0.2 * i},{1000 + i},{i},2,3" for i in range(8))
+    path = tmp_path / "wires.csv"
+    path.write_text(f"q1_rad,q2_rad,wire1_mm,smr1_x_mm,smr1_y_mm,smr1_z_mm\n{rows}\n")
+    said = read_relative(path).at.notices
+    assert any("column smr1_x_mm is not used" in notice for notice in said)

@@ -712,3 +712,42 @@ def test_readings_that_are_no_numbers_are_named(robot: mc.Robot) -> None:
         mc.relative(robot, Height(bare(q, {}), np.zeros(39)))
     with pytest.raises(mc.DataError, match="height is not a finite number"):
         mc.relative(robot, Height(bare(q, {}), np.full(40, np.nan)))
+
+
+@dataclass(frozen=True, eq=False)
+class Level(mc_instruments.Instrument):
+    """How far the flange's z axis leans along the base's x: no point is looked at."""
+
+    lean: Array
+
+    kind = "level"
+    words = Words(quantity="lean")
+    by_row = ("lean",)
+    names = ("lean_zero_rx",)
+    targets_at = slice(0, 0)
+
+    def starts(self, arm: FlangePoses, free: Array) -> list[Array]:
+        return [np.zeros(1)]
+
+    def read(self, arm: FlangePoses, own: Array) -> ResidualRows:
+        axis, m = arm.rotation[:, :, 2], self.poses
+        nowhere, across = np.zeros((m, 3)), np.cross(axis, [1.0, 0.0, 0.0])
+        error = self.lean - axis[:, 0] - own[0]
+        return ResidualRows(error, np.arange(m), nowhere, nowhere, across, np.ones((m, 1)))
+
+
+def test_an_instrument_may_read_the_flange_itself(robot: mc.Robot) -> None:
+    """Beside a tracker it is fitted; what the evidence cannot know of it is refused in words."""
+    arm, rng = Arm.of("irb2600", 1, 0.0), np.random.default_rng(0)
+    mc.register_instrument(Level)
+    q, seen = random_poses(arm.robot, 80, rng), random_poses(arm.robot, 40, rng)
+    lean = arm.real.pose(q)[:, 0, 2] + 0.01 + 1e-6 * rng.normal(size=80)
+    level, points = Level(bare(q, {}), lean), mc.measurements(seen, arm.place(seen)[:, None])
+    mc_instruments.check_instrument(level, arm.robot)
+    fit = mc.relative(arm.robot, [points, level])
+    zero = next(p for p in fit.parameters if p.name == "level.lean_zero_rx")
+    assert zero.unit == "rad"
+    assert zero.value == pytest.approx(0.01, abs=5e-6)
+    assert mc.relative(arm.robot, level, holdout=0.0).positions_open
+    with pytest.raises(mc.OptionError, match="level: reads more than points of its own"):
+        mc.diagnose_relative(arm.robot, [points, level])

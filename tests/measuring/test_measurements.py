@@ -231,3 +231,21 @@ def test_rows_pasted_twice_count_once(tmp_path: Path) -> None:
     assert "lines 5-7 repeat lines 2-4, line 8 repeats line 3 in every cell" in said
     visits = [f"{row},{i}" for i, row in enumerate([one, two, one])]
     assert read("\n".join([head + ",order", *visits]) + "\n", tmp_path).poses == 3
+
+
+@pytest.mark.parametrize("first", ["pose", "session"])
+def test_a_row_whose_name_begins_like_a_comment_is_a_row(first: str, tmp_path: Path) -> None:
+    rows = [f"{'#' if i % 2 else ''}{i},{0.1 * i},1,2,{i}" for i in range(6)]
+    text = "\n".join(["# made by hand", f"{first},q1_rad,smr1_x_mm,smr1_y_mm,smr1_z_mm", *rows])
+    (tmp_path / "n.csv").write_text(text + "\n")
+    data = mc.read_measurements(tmp_path / "n.csv")
+    assert data.poses == 6
+    assert list(data.columns[first]) == ["0", "#1", "2", "#3", "4", "#5"]
+
+
+def test_a_payload_beside_joints_in_words_is_no_point(tmp_path: Path) -> None:
+    head = "Achse 1 [rad],Achse 2 [rad],X [mm],Y [mm],Z [mm],payload_kg,payload_x_mm,payload_y_mm,"
+    rows = [f"{0.1 * i},{0.2 * i * i},{i},2,3,1.5,10,20,30" for i in range(6)]
+    (tmp_path / "n.csv").write_text("\n".join([head + "payload_z_mm", *rows]) + "\n")
+    data = mc.read_measurements(tmp_path / "n.csv")
+    assert data.target_names == ("smr1",)

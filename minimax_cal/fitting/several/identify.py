@@ -63,7 +63,8 @@ def length_row(stack: Stack, x: State) -> Array:
     slopes = by_arm(arm, ResidualRows(none[:, 0], ends, point[ends], by_point, none, none[:, :0]))
     row, (far, near) = np.zeros(stack.names.count), arm.rotation[ends]
     row[:links], row[stack.lawless :] = np.split(slopes.sum(axis=1), [links])
-    row[stack.own(0)[one.targets_at][:3]] = along @ (far - near)
+    at = stack.own(0)[one.targets_at][:3]
+    row[at] = (along @ (far - near))[: len(at)]
     return row
 
 

@@ -234,7 +234,7 @@ def judged(
           for remark in one.remarks(fit.own_parameters(robot, found, i), found.noise[i])),
         *remarks.of_beyond(result),
         *remarks.of_scale(found),
-        *remarks.weak(found, result, measured),
+        *remarks.weak(found, result, measured, sigma_of_positions(robot, found)),
         *remarks.unlikely(result, measured),
         *filter(None, (*(notice for notice, _ in unfitted), wrong)),
     ]  # fmt: skip
@@ -338,27 +338,30 @@ def instruments_of(
 
 
 def sigma_of_positions(robot: Robot, found: InstrumentFit) -> float:
-    """`identify.position_sigma`, of the target of the first file."""
-    place, stack = place_of(found), found.stack
-    covariance = found.covariance[np.ix_(place, place)]
-    values = stack.values(found.state)
-    spots = targets_of(found, found.state)
+    """`positions.position_sigma`, of the target of the first file."""
+    stack, spots = found.stack, targets_of(found, found.state)
+    (place, column), values = places_of(found), stack.values(found.state)
+    count = 5 * robot.joints + 6 + 3 * len(spots) + len(values)
+    covariance = np.full((count, count), np.nan)
+    covariance[np.ix_(column, column)] = found.covariance[np.ix_(place, place)]
     return position_sigma(robot, found.state.mdh, spots, covariance, stack.laws, values)
 
 
 def targets_of(found: InstrumentFit, x: State) -> Array:
-    """(k, 3) targets of the first file on the flange, its origin where there is none [m]."""
+    """(k, 3) targets of the first file on the flange [m]."""
     block = found.stack.blocks[0]
-    spots = block.instrument.targets(block.own(found.stack.part(x, 0)))
-    return spots if len(spots) else np.zeros((1, 3))
+    return block.instrument.targets(block.own(found.stack.part(x, 0)))
 
 
-def place_of(found: InstrumentFit) -> Array:
-    """Where the parameters that move the target of the first file stand among all."""
-    stack = found.stack
+def places_of(found: InstrumentFit) -> tuple[Array, Array]:
+    """Where what moves the target of the first file stands among all, and in `positions_by`."""
+    stack, spots = found.stack, targets_of(found, found.state)
     every = np.arange(stack.names.count)
     own = stack.own(0)[stack.instruments[0].targets_at]
-    return np.concatenate([every[: 5 * stack.names.joints + 6], own, every[stack.lawless :]])
+    first, laws = 5 * stack.names.joints + 6, every[stack.lawless :]
+    place = np.concatenate([every[:first], own, laws])
+    last = first + 3 * len(spots) + laws - stack.lawless
+    return place, np.concatenate([every[: first + len(own)], last])
 
 
 def open_positions(robot: Robot, found: InstrumentFit) -> tuple[str, ...]:
@@ -367,11 +370,10 @@ def open_positions(robot: Robot, found: InstrumentFit) -> tuple[str, ...]:
     Asked of the arm as drawn, where what is redundant is so exactly.  Not those that were fixed.
     """
     fit = found.stiff or found
-    stack, place = fit.stack, place_of(fit)
-    reasons = fit.identification.reasons
+    (place, column), stack, reasons = places_of(fit), fit.stack, fit.identification.reasons
     names = [stack.names.all[i] for i in place]
     fixed = [name in reasons and reasons[name].kind is Because.FIXED for name in names]
     asked = ~np.array(fixed) & stack.movable[place]
-    jacobian = positions_by(robot, fit.nominal.mdh, targets_of(fit, fit.nominal))
+    jacobian = positions_by(robot, fit.nominal.mdh, targets_of(fit, fit.nominal))[:, column]
     left = lacking(jacobian, fit.identification.active[place], asked)
     return tuple(name for name, is_open in zip(names, left, strict=True) if is_open)

@@ -14,6 +14,8 @@ import numpy as np
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.fitting.several.fit import InstrumentFit
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.instruments.protocol import ResidualRows
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements
@@ -129,7 +131,9 @@ def rows_of_all(scene: Scene, fit: InstrumentFit) -> StackRows:
         x, columns = stack.part(fit.state, i), stack.columns(i)
         root = precise / np.sqrt(rows.weights)
         one, own = block.instrument, block.own(x)
-        shapeless = one.shapeless(block.flange(x), own)
+        flange = block.flange(x)
+        check_point_reader(one, rows, flange.place(one.targets(own)))
+        shapeless = one.shapeless(flange, own)
         at, poses = (
             (start + rows.pose_of_row) * width + slot,
             slice(start, start + len(block.arm.q)),
@@ -142,6 +146,20 @@ def rows_of_all(scene: Scene, fit: InstrumentFit) -> StackRows:
         slopes.append(whole)
         places.append(rows.places * root)
     return assembled(scene, fit, looks, errors, slopes, places, width)
+
+
+def check_point_reader(one: Instrument, rows: ResidualRows, place: Array) -> None:
+    """Raise OptionError for what reads more than its targets.  place: (m, k, 3) of these [m].
+
+    Evidence knows by how much a law moves a target, and neither turns nor other points.
+    """
+    part = rows.part if place.shape[1] > 1 else np.zeros_like(rows.pose)
+    off = (rows.point - place[rows.pose, part]) * rows.by_point.any(axis=1, keepdims=True)
+    if rows.by_rotation.any() or np.abs(off).max() > 1e-9:
+        raise OptionError(
+            f"{one.kind}: reads more than points of its own on the flange, which a diagnosis and "
+            "the choice among variants of an effect do not know yet; leave it out"
+        )
 
 
 def assembled(

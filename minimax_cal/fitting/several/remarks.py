@@ -44,9 +44,9 @@ def of_scale(fit: InstrumentFit) -> tuple[str, ...]:
         return ()
     first = fit.stack.instruments[0]
     return (
-        f"the scale is not identifiable from {first.kind}: {kept[0]} is kept as drawn, and if that "
-        "is wrong by a part in a thousand, so is every length; sigmas leave this out; "
-        + first.scale[-1],
+        f"the scale is not identifiable from {first.kind}: {kept[0]} is kept as drawn, whatever "
+        "its prior, and if that is wrong by a part in a thousand, so is every length; sigmas leave "
+        "this out; " + first.scale[-1],
     )
 
 
@@ -64,11 +64,14 @@ def general(result: Measured, data: Instrument, held: Array) -> tuple[str, ...]:
 
 
 def weak(
-    fit: InstrumentFit, result: RelativeCalibration, measured: Sequence[Measured]
+    fit: InstrumentFit, result: RelativeCalibration, measured: Sequence[Measured], sigma: float
 ) -> tuple[str, ...]:
-    """A notice where positions are told far worse than what was measured."""
+    """A notice where positions are told far worse than what was measured.
+
+    sigma: of a position, but for what is open [m].
+    """
     rms_mm = min(each.accuracy["train"].rms_mm for each in measured)
-    expected_mm = 1e3 * result.position_sigma
+    expected_mm = 1e3 * sigma
     more = [one.words.more for one in fit.stack.instruments]
     untold = [
         p.name for p in result.parameters if TARGET in p.name and p.because is Because.NOT_TOLD
@@ -76,9 +79,8 @@ def weak(
     if not all(more) or not (expected_mm > WEAK * rms_mm or untold):
         return ()
     where = f" ({', '.join(untold)} not at all)" if untold else ""
-    sigma = "" if result.positions_open else f"by the sigmas to {expected_mm:.3g} mm, "
     return (
-        f"positions are poorly determined{where}: {sigma}"
+        f"positions are poorly determined{where}: by the sigmas to {expected_mm:.3g} mm, "
         f"what was measured fits to {rms_mm:.3g} mm, and model error makes positions worse still; "
         f"turn the flange more from pose to pose, and measure with {more[0]}",
     )
