@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from typing import TypeVar
+
 import numpy as np
 import scipy
 
@@ -12,8 +15,8 @@ from minimax_cal.measuring.checks import best_orders, swapped
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.slips import (
     DIGITS,
-    LATE,
-    MOST_SHIFT,
+    SHIFTS,
+    beside,
     digits_of,
     left_out_by,
     mend_by,
@@ -42,8 +45,8 @@ FEW_CLIPPED = 3  # rows at the end of a joint's values that are no chance
 MOST_SCALE = 0.05  # a larger one is another unit, or another arm
 MIN_SCALE_GAIN = 50.0  # twice the log likelihood that a common factor must gain, as elsewhere
 LEAST_MOVING = 5  # joints whose links have ways enough to differ from a common factor
-SHIFTS = tuple(by for size in range(1, MOST_SHIFT + 1) for by in (size, -size))
 NO_ROWS: Array = np.zeros(0, dtype=int)
+T = TypeVar("T")
 
 
 def fitted(robot: Robot, data: Measurements) -> BaseFit:
@@ -55,6 +58,36 @@ def measured_and_predicted(model: Model, state: State) -> tuple[Array, Array]:
     """Points of the targets in the base, (k, 3, m) each [m]."""
     links = kinematics.chain(state.mdh, model.q, model.prismatic)
     return in_base(state, model.y), kinematics.points(links, state.target_positions)
+
+
+def check_mends(
+    source: str,
+    given: tuple[float, float],
+    tables: Iterable[Iterable[tuple[str, T]]],
+    fit: Callable[[T], tuple[float, float]],
+    good: float,
+    limit: float = 4.0,
+    share: float = EXPLAINED,
+    alike: float = 2.0,
+    said: str = "the nominal robot then misses by {:.3g} mm, not {:.3g} mm",
+) -> None:
+    """Raise DataError for the mend with which the drawn arm fits far better, of equals the first.
+
+    given: mean square of the misses [m^2], and as it is compared.  tables: what to say, and what
+    `fit`, which returns such a pair, takes: the data mended.  A table is tried where none before it
+    fits to `good` [m], an RMS.  limit: times that, which may be left.  share: of the mean square.
+    alike: factor between equals, as a mirrored arm and one with some joints reversed are.
+    """
+    trials: list[tuple[float, float, str]] = []
+    for table in tables:
+        trials += [(*fit(mended), text) for text, mended in table]
+        if any(np.sqrt(square) <= good for square, _, _ in trials):
+            break
+    least = min(compared for _, compared, _ in trials)
+    square, compared, text = next(trial for trial in trials if trial[1] <= alike * least)
+    if np.sqrt(square) <= limit * good and compared < share * given[1]:
+        miss_mm = 1e3 * np.sqrt([square, given[0]])
+        raise DataError(f"{source}: {text} ({said.format(*miss_mm)})")
 
 
 def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
@@ -75,23 +108,16 @@ def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
     if np.sqrt(given.mean_square) <= limit:
         return given
     check_broken(robot, data)
-    mirrored = "the measurement frame looks left-handed; reverse one of its axes"
-    shown = fitted(robot, few_of(data))  # of the same rows as trials
-    trials = [(mirrored, shown.mirrored)]
+    shown = fitted(robot, few_of(data)).mean_square  # of the same rows as trials
+
+    def tried(mended: tuple[Robot, Measurements]) -> tuple[float, float]:
+        few = few_of(mended[1])
+        left = fitted(mended[0], few).mean_square
+        near = left >= EXPLAINED * spread(few)  # points drawn together are near any arm
+        return left, np.inf if near else left
+
     with work(brief=False):
-        for slip in slips(robot, data):
-            mended = few_of(slip.data)
-            left = fitted(slip.robot, mended).mean_square
-            if left < EXPLAINED * spread(mended):  # points drawn together are near any arm
-                trials.append((slip.text, left))
-    least_square = min(mean_square for _, mean_square in trials)
-    # a mirrored arm is one with some joints reversed: of equals the simplest, named first, is meant
-    text, mean_square = next(trial for trial in trials if trial[1] <= 2.0 * least_square)
-    if np.sqrt(mean_square) <= 4.0 * limit and mean_square < EXPLAINED * shown.mean_square:
-        raise DataError(
-            f"{data.source}: {text} (the nominal robot then misses by "
-            f"{1e3 * np.sqrt(mean_square):.3g} mm, not {1e3 * np.sqrt(shown.mean_square):.3g} mm)"
-        )
+        check_mends(data.source, (shown, shown), [slips(robot, data)], tried, limit)
     check_clipped(robot, data)
     return given
 
@@ -162,13 +188,12 @@ def check_broken(robot: Robot, data: Measurements) -> None:
         if np.median(beyond) <= limit:  # some points are off, not all of these rows
             continue
         if np.sqrt(cost / data.poses) <= limit and cost < EXPLAINED * float((own**2).sum()):
-            word, where = ("below", by) if by > 0 else ("above", -by)
             way = "up to" if end[0] > 0 else "from"
             line = data.line[at]
             to = f"..{line}" if end[0] > 0 else f"{line}.."
             raise DataError(
-                f"{data.source}:{line}: {way} about this line the points of each pose stand "
-                f"{LATE[where]} {word} its joints: a row was lost, or is too many; complete it, or "
+                f"{data.source}:{line}: {way} about this line the points of each pose "
+                f"{beside(by)}: a row was lost, or is too many; complete it, or "
                 + mend_by(data, f"shift={by}@{to}")
             )
 

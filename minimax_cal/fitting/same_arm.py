@@ -1,4 +1,4 @@
-"""Whether a result, or new measurements, can be of an arm at all."""
+"""Whether a result, or new measurements, can be of an arm at all, and of any that was measured."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.floor import SIGMAS, declared
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.joint_fit import refitted
 from minimax_cal.modelling.parameters import Names, links_of, zero_positions
@@ -24,6 +25,11 @@ WILD_LENGTH = 0.02  # nor a length, of its reach
 LARGE_LENGTH = 0.05  # of the reach: with an identified length so far off it is another arm
 LARGE_TWIST, LARGE_ZERO = math.radians(5.0), math.radians(30.0)  # alpha, beta; theta, as well
 MAX_NAMED = 5  # changes that are told one by one
+FRACTION = 20.0  # errors of less than this part of the noise are none of an instrument
+# Where nothing is declared: laser trackers, the most exact instruments of these distances, promise
+# 15 um of a coordinate (u95).  A twentieth, 0.7 um in space, is above what three decimals of a
+# millimetre leave by rounding (0.5 um) and far below the repeatability of any arm (5 um).
+LEAST_U95 = 15e-6
 
 
 def wild(names: Names, change: Array, reach: float) -> str:
@@ -96,3 +102,38 @@ def check_arm(robot: Robot, data: Measurements) -> None:
             "zeros of the joints are: check that the data are of the calibrated arm, with its "
             "units, joint signs and targets"
         )
+
+
+def least_noise(data: Measurements, repeatability: float) -> tuple[float, str]:
+    """RMS distance of noise that is declared, or the least that any instrument has [m]; in words.
+
+    repeatability: of the arm by ISO 9283, NaN unknown [m].
+    """
+    parts = declared(data, repeatability)
+    if parts is None:
+        return math.sqrt(3.0) * LEAST_U95 / SIGMAS, "the least noise of any tracker"
+    return 1e-3 * math.hypot(*np.nan_to_num(parts)), "the declared noise"
+
+
+def residual(error: Array, paid: float = 0.0) -> float:
+    """RMS distance of errors (k, m, 3), NaN unknown, with what parameters took put back [m].
+
+    paid: coordinates that the parameters took up.
+    """
+    count = 3.0 * np.count_nonzero(np.isfinite(error[..., 0]))
+    return math.sqrt(3.0 * float(np.nansum(error**2)) / max(count - paid, 1.0)) if count else np.inf
+
+
+def computed(data: Measurements, size: float, noise: tuple[float, str], arm: str) -> str:
+    """Why points were computed, not measured; empty where they may have been measured.
+
+    size: RMS distance from an arm [m].  noise: as of `least_noise`.  arm: which, in words.
+    """
+    if data.simulated or not size < noise[0] / FRACTION:
+        return ""
+    return (
+        f"{data.source}: these points were computed, not measured: {arm} misses them by "
+        f"{1e3 * size:.2g} mm, less than a twentieth of {noise[1]} ({1e3 * noise[0]:.3g} mm); "
+        "give the points of the instrument, not those of the controller, or simulated=True for a "
+        "simulation"
+    )

@@ -1,23 +1,26 @@
-"""Slips worth testing when nothing fits: rows, columns, units, signs, conventions; and their mends.
+"""Does the drawn arm fit far better with a slip mended?  Rows, columns, units, signs, conventions.
 
-Each is tried by the alignment of the drawn arm alone, which takes milliseconds.
+Each is tried by the alignment of the drawn arm alone, which takes milliseconds.  The mends of whole
+files that the messages name are made here as well, where the user asks for them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots import notation
 from minimax_cal.robots.notation import Notation
 from minimax_cal.robots.robot import Robot
 
-MOST_SHIFT = 3  # rows that a file is shifted by: a line more or less, seldom two
+SHIFTS = (1, -1, 2, -2, 3, -3)  # rows that a file is shifted by: a line more or less, seldom two
 INCH = 25.4
 LATE = {1: "one row", 2: "two rows", 3: "three rows"}
 NAMED = 12  # lines that a message names
@@ -25,7 +28,9 @@ STILL = 0.01  # a flange that moved farther leaves no point where it was [m]
 DEGREE = np.pi / 180.0
 OF_ROBOT = "(or the robot file gives {} under the unit {})"
 INCHES = "the points look like inches given as {}: minimax-cal import {{}} --units smr=in -o "
-SCALED = (  # what to say, and by what to multiply turning joints and points
+SCALED = (  # what to say, and by what to multiply turning joints and points; likely ones first
+    ("the measurement frame looks left-handed; reverse one of its axes",
+     1.0, np.array([1.0, 1.0, -1.0])),
     ("the joint values look like degrees; name the columns q1_deg, q2_deg, ...", DEGREE, 1.0),
     ("the joint values look like radians; name the columns q1_rad, q2_rad, ...", 1 / DEGREE, 1.0),
     ("the points look like millimetres given as metres: name the columns smr1_x_mm, ... "
@@ -45,13 +50,9 @@ DIGITS = {  # of joint values with so few, the step in rad and what to say
 ON_GRID = 1e-6  # share of a step by which printed values miss their grid
 
 
-@dataclass(frozen=True, eq=False)
-class Slip:
-    """What may be wrong: what to say, and robot and data with it mended."""
-
-    text: str
-    robot: Robot
-    data: Measurements
+SPAN = re.compile(r"(-?\d+)(?:@(\d*)\.\.(\d*))?")
+WAYS = "shift=1, shift=-1@40.. (from line 40 on), reverse, joints=1:3:2, scale=0.999"
+MOST_SCALE = 1e3
 
 
 def with_points_moved(data: Measurements, by: int) -> Measurements:
@@ -78,21 +79,20 @@ def with_joints_ordered(data: Measurements, order: list[int]) -> Measurements:
     return replace(data, q=data.q[:, order], sliding=data.sliding[order])
 
 
-def slips(robot: Robot, data: Measurements) -> Iterator[Slip]:
-    """Slips of the whole file, likely ones first."""
+def slips(robot: Robot, data: Measurements) -> Iterator[tuple[str, tuple[Robot, Measurements]]]:
+    """Slips of the whole file: what to say, and robot and data with it mended."""
     for text, mended in (*of_units(robot, data), *of_rows(data), *of_columns(robot, data)):
-        yield Slip(text, robot, mended)
+        yield text, (robot, mended)
     other = in_other_convention(robot)
     if other is not None:
         name = "modified (Craig's)" if other.notation.modified else "standard"
-        yield Slip(
+        text = (
             f"the rows of {robot.name} look like {name} DH; set "
-            f'"convention": "{name.split()[0]}" in the robot file',
-            other,
-            data,
+            f'"convention": "{name.split()[0]}" in the robot file'
         )
-    for text, mended in (*of_couplings(robot, data), *of_signs(robot, data)):
-        yield Slip(text, robot, mended)
+        yield text, (other, data)
+    for text, mended in of_joints(robot, data):
+        yield text, (robot, mended)
 
 
 def mend_by(data: Measurements, how: str) -> str:
@@ -114,17 +114,17 @@ def of_units(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measuremen
         yield text.format(data.source), replace(data, q=q, y=data.y * scaled)
 
 
+def beside(by: int) -> str:
+    """Where points stand that are so many rows further on than their joints."""
+    return f"stand {LATE[abs(by)]} {'below' if by > 0 else 'above'} its joints"
+
+
 def of_rows(data: Measurements) -> Iterator[tuple[str, Measurements]]:
     """Points in other rows than their joints."""
-    for size in range(1, MOST_SHIFT + 1):
-        for by in (size, -size):
-            if data.poses > 10 + size:
-                word = "below" if by > 0 else "above"
-                text = (
-                    f"the points look shifted: those of each pose stand {LATE[size]} {word} its "
-                    f"joints; {mend_by(data, f'shift={by}')}"
-                )
-                yield text, with_points_moved(data, by)
+    for by in SHIFTS:
+        if data.poses > 10 + abs(by):
+            text = f"the points look shifted: those of each pose {beside(by)}; "
+            yield text + mend_by(data, f"shift={by}"), with_points_moved(data, by)
     yield (
         "the points look like those of the poses in reverse order; " + mend_by(data, "reverse"),
         with_points_reversed(data),
@@ -166,12 +166,12 @@ def in_other_convention(robot: Robot) -> Robot | None:
     return replace(robot, mdh=mdh, sign=sign, notation=said)
 
 
-def of_couplings(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:
-    """Joints 2 and 3 that a controller counts together."""
-    turning = ~robot.prismatic
+def of_joints(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:
+    """Joints 2 and 3 that a controller counts together, and joints that turn the other way."""
+    n = robot.joints
     for i, j in ((2, 1), (1, 2)):
         for sign in (1.0, -1.0):
-            if robot.joints > 2 and turning[i] and turning[j]:
+            if n > 2 and not robot.prismatic[[i, j]].any():
                 q = data.q.copy()
                 q[:, i] += sign * q[:, j]
                 yield (
@@ -179,18 +179,12 @@ def of_couplings(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measur
                     f'"coupling": {{"J{i + 1}": {{"J{j + 1}": {sign:g}}}}} in the robot file',
                     replace(data, q=q),
                 )
-
-
-def of_signs(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:
-    """Joints that turn the other way."""
-    for count in range(1, min(robot.joints, 6) + 1):
-        for flipped in combinations(range(robot.joints), count):
-            q = data.q.copy()
-            q[:, flipped] *= -1.0
+    for count in range(1, min(n, 6) + 1):
+        for flipped in combinations(range(n), count):
             names = ", ".join(f"{i + 1}" for i in flipped)
             yield (
                 f"the sign of joint {names} looks reversed; set its sign in the robot file",
-                replace(data, q=q),
+                replace(data, q=np.where(np.isin(np.arange(n), flipped), -data.q, data.q)),
             )
 
 
@@ -217,3 +211,67 @@ def digits_of(robot: Robot, data: Measurements) -> str:
         if (away < max(ON_GRID, 1e-9 / step)).all():
             return name
     return ""
+
+
+def mended(data: Measurements, how: Iterable[str]) -> Measurements:
+    """The data with mends made, one after the other.
+
+    how: shift=N (each row takes the points of the row N further on; @A..B in lines A to B alone),
+    reverse (points in the opposite order), joints=1:3:2 (which column each joint's values stand
+    in), scale=S (of the points).  Raises OptionError.
+    """
+    for text in how:
+        name, _, value = text.strip().partition("=")
+        if name not in MENDS:
+            raise OptionError(f"mend={text!r}: write {WAYS}")
+        if data.aside is not None:
+            raise OptionError(f"mend={text!r}: mend the file before points are set aside in it")
+        data = MENDS[name](data, value)
+    return data
+
+
+def shifted(data: Measurements, value: str) -> Measurements:
+    """Points moved by rows, in some lines or in all."""
+    found = SPAN.fullmatch(value)
+    if not found or not 0 < abs(int(found[1])) < data.poses:
+        raise OptionError(f"mend='shift={value}': write shift=1, shift=-2 or shift=1@40..")
+    first, last = int(found[2] or 0), int(found[3] or data.line.max())
+    inside = (data.line >= first) & (data.line <= last)
+    if not inside.any():
+        raise OptionError(
+            f"mend='shift={value}': no row stands there; lines are {data.line.min()} to "
+            f"{data.line.max()}"
+        )
+    moved = with_points_moved(data.take(inside), int(found[1]))
+    return data.take(data.line < first).followed_by(moved, data.take(data.line > last))
+
+
+def ordered(data: Measurements, value: str) -> Measurements:
+    """Joint columns in another order."""
+    n = data.q.shape[1]
+    order = [int(part) - 1 for part in value.split(":") if part.isdigit()]
+    if sorted(order) != list(range(n)):
+        raise OptionError(
+            f"mend='joints={value}': name each of the {n} columns once, as "
+            f"joints={':'.join(str(i + 1) for i in range(n))}"
+        )
+    return with_joints_ordered(data, order)
+
+
+def scaled(data: Measurements, value: str) -> Measurements:
+    """Points times a factor."""
+    try:
+        factor = float(value)
+    except ValueError:
+        factor = 0.0
+    if not 1.0 / MOST_SCALE < factor < MOST_SCALE:
+        raise OptionError(f"mend='scale={value}': write a factor, as scale=0.999")
+    return data.with_y(factor * data.y)
+
+
+MENDS: dict[str, Callable[[Measurements, str], Measurements]] = {
+    "shift": shifted,
+    "reverse": lambda data, _: with_points_reversed(data),
+    "joints": ordered,
+    "scale": scaled,
+}

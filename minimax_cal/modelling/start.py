@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -49,18 +48,10 @@ class BaseFit:
     """Base and targets that fit a fixed geometry best.
 
     state: the geometry with its base and targets.  mean_square: of the point errors [m^2].
-    turning: what is left to minimise over the base's rotation.  points: how many were measured.
     """
 
     state: State
     mean_square: float
-    turning: Turning
-    points: int
-
-    @cached_property
-    def mirrored(self) -> float:
-        """The mean square if the measurement frame were left-handed [m^2]."""
-        return self.turning.best(-1.0)[1] / self.points
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,22 +64,21 @@ class Turning:
     matrix: Array
     right: Array
 
-    def best(self, sign: float) -> tuple[Array, float]:
-        """The best rotation, or with sign -1 the best mirrored one, and what it costs.
+    def best(self) -> tuple[Array, float]:
+        """The best rotation, and what it costs.
 
         From the unconstrained minimum projected by SVD, and where that may not be the only minimum
         from the 24 turns of a cube too.
         """
         guess = np.linalg.lstsq(self.matrix, self.right, rcond=1e-9)[0].reshape(3, 3)
-        found = self.polished(nearest_rotation(sign * guess[None]), sign)
-        if self.alone(sign * found[0], guess):
+        found = self.polished(nearest_rotation(guess[None]))
+        if self.alone(found[0], guess):
             return found
-        return min(found, self.polished(CUBE, sign), key=lambda one: one[1])
+        return min(found, self.polished(CUBE), key=lambda one: one[1])
 
-    def polished(self, starts: Array, sign: float) -> tuple[Array, float]:
+    def polished(self, starts: Array) -> tuple[Array, float]:
         """The best minimum that some starts (s, 3, 3) lead to."""
-        signs = np.full(len(starts), sign)
-        found, cost = kernels().polish(self.matrix, self.right, *ready(starts), signs)
+        found, cost = kernels().polish(self.matrix, self.right, *ready(starts))
         winner = int(np.argmin(cost))
         return found[winner], float(cost[winner])
 
@@ -119,14 +109,13 @@ def fit_base(model: Model, mdh: Array, near: Array = EVERYWHERE) -> BaseFit:
     plain, rest = np.split(whole, [whole.shape[1] - 10], axis=1)
     inside, left = np.split(rest, [plain.shape[1]])
     turning = Turning(np.ascontiguousarray(left[:, :9]), left[:, 9].copy())
-    turn, cost = turning.polished(near.T[None], 1.0) if len(near) else turning.best(1.0)
+    turn, cost = turning.polished(near.T[None]) if len(near) else turning.best()
     # an ill-conditioned set of poses leaves some of c, t open: the least solution then
     remaining = inside[:, :9] @ turn.reshape(9) - inside[:, 9]
     lengths = np.linalg.lstsq(plain[: len(inside)], remaining, rcond=1e-10)[0]
     shift, targets = lengths[:3], lengths[3:].reshape(-1, 3)
     state = State(mdh, turn.T, centre + turn.T @ shift, targets)
-    points = int(np.count_nonzero(model.seen))
-    return BaseFit(state, cost / points, turning, points)
+    return BaseFit(state, cost / int(np.count_nonzero(model.seen)))
 
 
 def condensed(model: Model, mdh: Array, centre: Array) -> Array:

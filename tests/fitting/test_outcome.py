@@ -10,10 +10,9 @@ from conftest import SHARED, run
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.fitting.computed import FRACTION, least_noise
 from minimax_cal.fitting.improvement import compare_arms, improvement
 from minimax_cal.fitting.intervals import Interval, told
-from minimax_cal.fitting.same_arm import LARGE_LENGTH, too_changed
+from minimax_cal.fitting.same_arm import FRACTION, LARGE_LENGTH, least_noise, too_changed
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import Measurements

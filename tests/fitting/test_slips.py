@@ -17,7 +17,7 @@ from minimax_cal.fitting.checks import check_plausible, coarse_joints, fitted
 from minimax_cal.fitting.common_scale import common_share, scale_of
 from minimax_cal.fitting.unknown_arm import rough
 from minimax_cal.measuring import slips
-from minimax_cal.measuring.mending import mended
+from minimax_cal.measuring.slips import mended
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 from minimax_cal.robots.robot import robot_from_dict
 

@@ -23,20 +23,19 @@ def test_the_only_minimum_is_the_best_of_many(rng: np.random.Generator) -> None:
         matrix = rng.normal(size=(60, 9))
         right = matrix @ truth.reshape(9) + noise * rng.normal(size=60)
         turning = Turning(matrix, right)
-        turn, cost = turning.best(1.0)
+        turn, cost = turning.best()
         guess = np.linalg.lstsq(matrix, right, rcond=1e-9)[0].reshape(3, 3)
         alone += turning.alone(turn, guess)
-        _, costs = plain.polish(matrix, right, CUBE.copy(), np.ones(24))
+        _, costs = plain.polish(matrix, right, CUBE.copy())
         assert cost <= costs.min() * (1.0 + 1e-9)
     assert 5 < alone < 40
 
 
-def test_a_mirrored_frame_is_told(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_mirrored_frame_fits_far_worse(robot: mc.Robot, noisy: Simulation) -> None:
     given = fit_base(model_of(robot, noisy.data), robot.mdh)
     left = noisy.data.with_y(noisy.data.y * [1.0, 1.0, -1.0])
     other = fit_base(model_of(robot, left), robot.mdh)
-    assert other.mirrored == pytest.approx(given.mean_square, rel=1e-6)
-    assert given.mirrored > 100.0 * given.mean_square
+    assert other.mean_square > 100.0 * given.mean_square
 
 
 def test_poses_in_parts_are_all_poses(

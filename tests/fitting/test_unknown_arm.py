@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from minimax_cal.fitting import unknown_arm
-from minimax_cal.fitting.sweeps import axes_of, links_of_axes
 from minimax_cal.fitting.unknown_arm import SEARCH, SWEEPS, identify_arm, rough, types_of
 
 NOISE = 20e-6
@@ -72,7 +71,8 @@ def test_axes_of_exact_sweeps_are_the_arm(rng: np.random.Generator) -> None:
     for _ in range(5):
         robot = drawn(rng)
         data = measured(robot, rng, noise=0.0)
-        found = rough("found", links_of_axes(axes_of(data, robot.prismatic)), robot.prismatic)
+        links = unknown_arm.links_of_axes(unknown_arm.axes_of(data, robot.prismatic))
+        found = rough("found", links, robot.prismatic)
         here, there = found.pose(data.q), robot.pose(data.q)
         moves = [np.trace(a @ np.linalg.inv(a[0]), axis1=1, axis2=2) for a in (here, there)]
         assert_allclose(*moves, rtol=0, atol=1e-8)  # the same arm up to base and tool

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
-from minimax_cal.fitting.checks import POOR_FIT
+from minimax_cal.fitting.checks import POOR_FIT, check_mends
 from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
 from minimax_cal.fitting.pixels.camera import INTRINSICS
 from minimax_cal.fitting.pixels.data import PixelData
@@ -18,11 +18,11 @@ from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import IMAGES, Started, is_flat, poses_of_images, start_scene
 from minimax_cal.fitting.same_arm import too_changed
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError
 from minimax_cal.robots.robot import Robot
 
 BETTER = 0.3  # of the error: a slip whose mending leaves no more is the cause
 ALIKE = 1.2  # errors that differ by less do not tell one slip from another
+SAID = "the drawn arm then misses by {:.3g} mm at the target, not {:.3g} mm"
 MOST_ASIDE = 1.0 / 3.0  # of the pixels: where more stand out, none of them is to be believed
 LISTED = 5  # lines, or images, that a notice names
 WHOLE_IMAGE = 0.5  # of an image: where more pixels stand out, its pose is wrong, not its pixels
@@ -36,20 +36,17 @@ UNITS = (1e-3, 1e3, 0.1, 10.0, 25.4, 1.0 / 25.4)  # slips of a board's unit
 
 def check_start(robot: Robot, data: PixelData, started: Started) -> None:
     """Raise DataError for slips that show where the arm as drawn is fitted."""
-    given = started.miss(robot, data)
-    if given <= POOR_FIT * robot.reach():
+    miss, good = started.miss(robot, data), POOR_FIT * robot.reach()
+    if miss <= good:
         return
-    found = [
-        (start_scene(robot, mended, started.on_flange).miss(robot, mended), text)
-        for text, mended in (*slips(data), *other_poses(robot, data, started.direction))
-    ]
-    least = min(miss for miss, _ in found)
-    miss, text = next(each for each in found if each[0] <= ALIKE * least)
-    if miss < BETTER * given and miss < POOR_FIT * robot.reach():
-        raise DataError(
-            f"{data.source}: {text} (the drawn arm then misses by {1e3 * miss:.3g} mm at the "
-            f"target, not {1e3 * given:.3g} mm)"
-        )
+
+    def tried(mended: PixelData) -> tuple[float, float]:
+        square = start_scene(robot, mended, started.on_flange).miss(robot, mended) ** 2
+        return square, square
+
+    every = (*slips(data), *other_poses(robot, data, started.direction))
+    given = miss**2, miss**2
+    check_mends(data.source, given, [every], tried, good, 1.0, BETTER**2, ALIKE**2, SAID)
 
 
 def slips(data: PixelData) -> Iterator[tuple[str, PixelData]]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.checks import EXPLAINED, POOR_FIT, check_plausible
+from minimax_cal.fitting.checks import POOR_FIT, check_mends, check_plausible
 from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
 from minimax_cal.fitting.several.fit import (
     InstrumentFit,
@@ -24,7 +25,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.instrument import PLENTY, Instrument, Slip, anywhere
 from minimax_cal.instruments.protocol import Arm, FlangePoses
-from minimax_cal.measuring.slips import of_couplings, of_signs, of_units
+from minimax_cal.measuring.slips import of_joints, of_units
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot
 
@@ -34,7 +35,11 @@ RESIZED = 0.25  # of what the arm sweeps: a fit that changes it by more is of no
 def check_slips(robot: Robot, data: Instrument, options: RelativeOptions) -> None:
     """Raise DataError or OptionError for slips that show where the arm as drawn is fitted."""
     if data.seen.target_names:
-        check_points(robot, data.ready(robot, options) if data.options else data)
+        seen = (data.ready(robot, options) if data.options else data).seen
+        try:
+            check_plausible(robot, seen)
+        except DataError as wrong:  # the user's columns have other names
+            raise DataError(str(wrong).replace("smr1_x_", data.first_column)) from wrong
         return
 
     def fitted(one: Instrument) -> tuple[Any, FlangePoses, Array]:
@@ -44,48 +49,30 @@ def check_slips(robot: Robot, data: Instrument, options: RelativeOptions) -> Non
         return block.instrument, block.flange(x), block.own(x)
 
     data.check_given(fitted)
-    some = data.tried()
-    one, arm, own = fitted(some)
-    given, limit = one.mean_square(arm, own), POOR_FIT * robot.reach()
-    if np.sqrt(given) <= limit:
-        data.check_start(fitted, lambda ready, own: farthest(robot, options, ready, own))
+    some, good = data.tried(), POOR_FIT * robot.reach()
+    given = measured(*fitted(some))
+    if np.sqrt(given[0]) <= good:
+        data.check_start(fitted, partial(farthest, robot, options))
         return
-
-    def tried(slips: Iterable[Slip]) -> list[tuple[float, float, str]]:
-        out = []
-        for text, mended in slips:
-            square, size = measured(*fitted(mended))
-            out.append((square / size, square, text))
-        return out
-
-    trials = tried(some.slips())
-    if all(np.sqrt(square) > limit for _, square, _ in trials):
-        trials += tried(slips_of_joints(robot, some))
-    least = min(share for share, _, _ in trials)
-    share, square, text = next(trial for trial in trials if trial[0] <= 2.0 * least)
-    if np.sqrt(square) <= 4.0 * limit and share < EXPLAINED * given / measured(one, arm, own)[1]:
-        raise DataError(
-            f"{data.at.source}: {text} (the nominal robot then misses by "
-            f"{1e3 * np.sqrt(square):.3g} mm, not {1e3 * np.sqrt(given):.3g} mm)"
-        )
+    check_mends(
+        data.at.source,
+        given,
+        (some.slips(), slips_of_joints(robot, some)),
+        lambda mended: measured(*fitted(mended)),
+        good,
+    )
 
 
 def measured(one: Instrument, arm: FlangePoses, own: Array) -> tuple[float, float]:
-    """Mean square of the misses, and by what it is to be seen.
+    """Mean square of the misses, and that over what it is to be seen by.
 
     The target's spread where an arm that hardly moves fits anything [m^2].
     """
-    place = arm.place(one.targets(own)[0]) if one.shrinks else np.zeros((1, 3))
-    size = max(float(place.var(axis=0).sum()), 1e-12) if one.shrinks else 1.0
-    return one.mean_square(arm, own), size
-
-
-def check_points(robot: Robot, data: Instrument) -> None:
-    """Raise DataError for slips, by points in space."""
-    try:
-        check_plausible(robot, data.seen)
-    except DataError as wrong:  # the user's columns have other names
-        raise DataError(str(wrong).replace("smr1_x_", data.first_column)) from wrong
+    square = one.mean_square(arm, own)
+    if not one.shrinks:
+        return square, square
+    place = arm.place(one.targets(own)[0])
+    return square, square / max(float(place.var(axis=0).sum()), 1e-12)
 
 
 def farthest(robot: Robot, options: RelativeOptions, one: Instrument, own: Array) -> Array:
@@ -105,9 +92,8 @@ def farthest(robot: Robot, options: RelativeOptions, one: Instrument, own: Array
 
 def slips_of_joints(robot: Robot, data: Instrument) -> Iterator[Slip]:
     """Those of their units, couplings and signs."""
-    given = robot, data.at
-    for text, mended in (*of_units(*given), *of_couplings(*given), *of_signs(*given)):
-        if mended.q is not data.at.q:  # else of points, which are not measured here
+    for text, mended in (*of_units(robot, data.at), *of_joints(robot, data.at)):
+        if (mended.q != data.at.q).any():  # else of points, which are not measured here
             yield text, replace(data, at=mended)
 
 

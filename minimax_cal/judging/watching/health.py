@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.computed import computed, residual
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.fitting.intervals import Interval, chance_of_larger, max_interval, rms_interval
 from minimax_cal.fitting.options import listed
-from minimax_cal.fitting.same_arm import check_arm
+from minimax_cal.fitting.same_arm import check_arm, computed, residual
 from minimax_cal.fitting.set_aside import errors_of, with_them
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError

@@ -25,8 +25,8 @@ from minimax_cal.measuring.measurements import (
     measurements_text,
     without_blind,
 )
-from minimax_cal.measuring.mending import mended
 from minimax_cal.measuring.set_aside import left_out, whole
+from minimax_cal.measuring.slips import mended
 from minimax_cal.reading.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
 from minimax_cal.reading.words import ANGLES, LENGTHS, TEMPERATURES, TIMES
 

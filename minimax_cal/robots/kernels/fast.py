@@ -353,7 +353,7 @@ def stepped(
 
 
 @compiled
-def misfit(matrix: Array, right: Array, sign: float, S: Array, error: Array) -> float:
+def misfit(matrix: Array, right: Array, S: Array, error: Array) -> float:
     """The cost of `polish` at a rotation; writes the residuals (r,)."""
     cost = 0.0
     for r in range(len(right)):
@@ -361,13 +361,13 @@ def misfit(matrix: Array, right: Array, sign: float, S: Array, error: Array) -> 
         for a in range(3):
             for b in range(3):
                 total += matrix[r, 3 * a + b] * S[a, b]
-        error[r] = sign * total - right[r]
+        error[r] = total - right[r]
         cost += error[r] * error[r]
     return cost
 
 
 @compiled
-def slopes(matrix: Array, sign: float, S: Array, error: Array, gram: Array, pull: Array) -> None:
+def slopes(matrix: Array, S: Array, error: Array, gram: Array, pull: Array) -> None:
     """Write gram (3, 3) and slope (3,) of the cost of `polish` for turns about S's own axes."""
     row = np.empty(3)
     for i in range(3):
@@ -379,7 +379,7 @@ def slopes(matrix: Array, sign: float, S: Array, error: Array, gram: Array, pull
             j, k = (i + 1) % 3, (i + 2) % 3
             row[i] = 0.0
             for a in range(3):
-                row[i] += sign * (matrix[r, 3 * a + j] * S[a, k] - matrix[r, 3 * a + k] * S[a, j])
+                row[i] += matrix[r, 3 * a + j] * S[a, k] - matrix[r, 3 * a + k] * S[a, j]
         for i in range(3):
             pull[i] -= row[i] * error[r]
             for j in range(3):
@@ -387,22 +387,22 @@ def slopes(matrix: Array, sign: float, S: Array, error: Array, gram: Array, pull
 
 
 @compiled
-def polish(matrix: Array, right: Array, starts: Array, signs: Array) -> tuple[Array, Array]:
+def polish(matrix: Array, right: Array, starts: Array) -> tuple[Array, Array]:
     """See `plain.polish`."""
     turns, costs = starts.copy(), np.empty(len(starts))
     error, gram, pull, step = np.empty(len(right)), np.empty((3, 3)), np.empty(3), np.empty(3)
     trial = np.empty((3, 3))
     for s in range(len(starts)):
-        at, sign, damping = turns[s], signs[s], FIRST
-        cost = misfit(matrix, right, sign, at, error)
+        at, damping = turns[s], FIRST
+        cost = misfit(matrix, right, at, error)
         for _ in range(ROUNDS):
-            slopes(matrix, sign, at, error, gram, pull)
+            slopes(matrix, at, error, gram, pull)
             more = damping * (gram[0, 0] + gram[1, 1] + gram[2, 2] + 1e-300)
             for i in range(3):
                 gram[i, i] += more
             cholesky(gram, pull, step)
             turned(at, step, trial)
-            new = misfit(matrix, right, sign, trial, error)
+            new = misfit(matrix, right, trial, error)
             gain = pull[0] * step[0] + pull[1] * step[1] + pull[2] * step[2]
             if new < cost or gain <= TRUST * cost:
                 cost, damping = new, 0.1 * damping
@@ -411,7 +411,7 @@ def polish(matrix: Array, right: Array, starts: Array, signs: Array) -> tuple[Ar
                         at[i, j] = trial[i, j]
             else:
                 damping *= 4.0
-                misfit(matrix, right, sign, at, error)
+                misfit(matrix, right, at, error)
             still = step[0] * step[0] + step[1] * step[1] + step[2] * step[2]
             if still <= STILL**2 or damping > STUCK:
                 break

@@ -299,29 +299,29 @@ def turned(w: Array) -> Array:
     return np.asarray(np.eye(3) + first * k + second * (k @ k))
 
 
-def polish(matrix: Array, right: Array, starts: Array, signs: Array) -> tuple[Array, Array]:
-    """Rotations S that minimise |sign matrix vec(S) - right|^2, by damped steps from each start.
+def polish(matrix: Array, right: Array, starts: Array) -> tuple[Array, Array]:
+    """Rotations S that minimise |matrix vec(S) - right|^2, by damped steps from each start.
 
-    matrix: (r, 9).  right: (r,).  starts: (s, 3, 3).  signs: (s,) 1 or -1.  Returns the rotations
-    and the costs (s,).
+    matrix: (r, 9).  right: (r,).  starts: (s, 3, 3).  Returns the rotations and the costs
+    (s,).
     """
     turn = starts.copy()
     damping = np.full(len(starts), FIRST)
-    error = signs[:, None] * (turn.reshape(-1, 9) @ matrix.T) - right
+    error = turn.reshape(-1, 9) @ matrix.T - right
     cost = (error**2).sum(-1)
     alive = np.arange(len(starts))
     for _ in range(ROUNDS):
         if not len(alive):
             break
-        at, old, sign = turn[alive], cost[alive], signs[alive, None]
-        slopes = sign[..., None] * ((at[:, None] @ HATS).reshape(-1, 3, 9) @ matrix.T)
+        at, old = turn[alive], cost[alive]
+        slopes = (at[:, None] @ HATS).reshape(-1, 3, 9) @ matrix.T
         gram = slopes @ np.swapaxes(slopes, -1, -2)
         size = np.trace(gram, axis1=-2, axis2=-1) + 1e-300
         pull = -(slopes @ error[alive][..., None])
         damped = gram + (damping[alive] * size)[:, None, None] * np.eye(3)
         step = np.linalg.solve(damped, pull)[..., 0]
         trial = at @ np.stack([turned(w) for w in step])
-        after = sign * (trial.reshape(-1, 9) @ matrix.T) - right
+        after = trial.reshape(-1, 9) @ matrix.T - right
         new = (after**2).sum(-1)
         gain = (step * pull[..., 0]).sum(-1)
         better = (new < old) | (gain <= TRUST * old)
