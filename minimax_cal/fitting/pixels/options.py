@@ -124,7 +124,7 @@ class PixelOptions:
     )
     fix_camera: bool = seen(
         False,
-        "Hold the lenses as their files say, taken as known but for a given --camera-prior.",
+        "Hold the lenses as their files say, taken as known but where a prior of theirs is given.",
     )
     camera_prior: str = seen(
         "",
