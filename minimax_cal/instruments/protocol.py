@@ -200,7 +200,7 @@ class Arm:
         moved = given.moved + np.tensordot(values, given.linear, 1)
         bend, none = rotation(swing), np.zeros((0, *origin.shape))
         out = FlangePoses(bend @ turn, origin + moved, none, none, self.reach)
-        if active is None:
+        if active is None or not active.any():
             return out
         slides, turns, bends = np.split(active, [2 * len(mdh), 5 * len(mdh)])
         along = np.moveaxis(np.concatenate([links.x, links.z])[slides], 1, -1)
