@@ -46,6 +46,7 @@ CHANGED: dict[str, str] = {
         ("gap poses/files/posed.xml/*", "export mjcf again/files/*", "export effects mjcf/files/*"),
         "a gain that carries a deflection says so in the file",
     ),
+    "relative diagnose/*": "a law turns the flange, not the place where a target once was",
     "gap logs/stderr*": "what other simulators leave out of a file is said",
     "*/files/*_friction.py/*": "laws of the module are written from their one statement",
 }

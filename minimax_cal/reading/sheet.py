@@ -24,7 +24,7 @@ from minimax_cal.reading.workbook import is_workbook, text_of_workbook
 
 DELIMITERS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "spaces"}
 DECIMALS = {".": "point", ",": "comma"}
-POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+POINT = re.compile(r"[-+]?(\d+(?:\.\d*)?|\.\d+)([eE][-+]?\d+)?")
 COMMA = re.compile(r"[-+]?(\d*),(\d+)([eE][-+]?\d+)?")
 COMMENTS = ("#", "%", "//", "!")
 SIMULATED = "# simulated"  # first line of a file whose points were computed, not measured

@@ -249,3 +249,9 @@ def test_a_payload_beside_joints_in_words_is_no_point(tmp_path: Path) -> None:
     (tmp_path / "n.csv").write_text("\n".join([head + "payload_z_mm", *rows]) + "\n")
     data = mc.read_measurements(tmp_path / "n.csv")
     assert data.target_names == ("smr1",)
+
+
+def test_a_cell_of_very_many_digits_is_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text(f"q1_rad,smr1_x_mm\n0.1,{'1' * 200_000}x\n")
+    with pytest.raises(mc.DataError):
+        mc.read_measurements(tmp_path / "m.csv")

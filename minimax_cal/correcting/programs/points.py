@@ -16,7 +16,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.robots.transforms import transform
 
-NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 LONGEST = 40  # letters of a number
 FARTHEST = 1e5  # of a coordinate [mm]
 MARK = "Corrected by minimax-cal compensate; correct the program as it was before, not this one"

@@ -15,7 +15,7 @@ from minimax_cal.reading.sheet import POINT, Sheet
 
 RAPID_ASIDE = re.compile(r'"[^"\r\n]*"|![^\r\n]*')  # strings and comments
 KRL_ASIDE = re.compile(r'"[^"\r\n]*"|;[^\r\n]*')
-NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 UNUSED = {0.0, 9e9}  # of an axis that is not there; RAPID writes 9E9
 ROBOT_AXES = 6
 
