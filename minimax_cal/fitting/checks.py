@@ -15,6 +15,7 @@ from minimax_cal.measuring.checks import best_orders, swapped
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.slips import (
     DIGITS,
+    MAX_TRIAL_POSES,
     SHIFTS,
     beside,
     digits_of,
@@ -31,7 +32,6 @@ from minimax_cal.robots import kinematics
 from minimax_cal.robots.kernels.choice import work
 from minimax_cal.robots.robot import Robot
 
-MAX_TRIAL_POSES = 30  # poses that are enough to test a slip of units or signs
 POOR_FIT = 5e-3  # errors above this share of the arm's reach are not what calibration is about
 EXPLAINED = 0.04  # of the mean square: a slip that leaves no more is the cause
 MAX_ROUNDS = 5

@@ -10,7 +10,6 @@ import numpy as np
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.fitting.beyond import Beyond, left_out, not_claimed
 from minimax_cal.fitting.crossed import MIN_HELD_POSES, crossed
-from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.positions import lacking, positions_by
 from minimax_cal.fitting.solve import Solved
@@ -73,14 +72,13 @@ def other_points(robot: Robot, solved: Solved, error: Array) -> Iterator[str]:
     if len(spots) > 2:  # they tell the whole flange
         return
     names = solved.names.all[:n]
-    fixed = [name in known.reasons and known.reasons[name].kind is Because.FIXED for name in names]
     rest = []
     for spot in corners(spots.mean(axis=0)):
         motion = positions_by(robot, solved.state.mdh, spot[None])
         tool = orthonormal(motion[:, n + 6 :])
         rest.append(motion[:, :n] - tool @ (tool.T @ motion[:, :n]))
     whole = np.concatenate(rest)
-    untold = np.flatnonzero(lacking(whole, known.active[:n], ~np.array(fixed)))
+    untold = np.flatnonzero(lacking(whole, known.active[:n], known.asked(names)))
     sigma = np.sqrt(3.0 * ((whole @ solved.uncertainty.root[:n]) ** 2).sum() / len(whole))
     missed = np.sqrt(np.nanmean((error**2).sum(axis=-1)))
     if len(untold) or sigma > WEAK * missed:

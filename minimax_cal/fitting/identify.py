@@ -89,6 +89,11 @@ class Identification:
         """Condition number of the scaled Jacobian of the kept parameters (1/O2 of the field)."""
         return float(self.singular[0] / self.singular[-1])
 
+    def asked(self, names: Sequence[str]) -> Array:
+        """(p,) True but for names that the user fixed."""
+        return np.array([self.reasons.get(name, Reason("")).kind is not Because.FIXED
+                         for name in names])  # fmt: skip
+
 
 @dataclass(frozen=True, eq=False)
 class Kept:

@@ -20,6 +20,7 @@ from minimax_cal.ground.options import grouped
 from minimax_cal.ground.records import as_kind
 from minimax_cal.ground.stages import Progress as Progress
 from minimax_cal.ground.stages import silent as silent
+from minimax_cal.instruments.options import InstrumentOptions
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import Names
@@ -113,9 +114,10 @@ class Options:
         "and daqp:direct is the fastest.",
     )
     holdout: float = held_out(
-        0.2, "The share of the poses that the fit does not see; a split column overrides it."
+        InstrumentOptions.holdout,
+        "The share of the poses that the fit does not see; a split column overrides it.",
     )
-    seed: int = held_out(0, "The seed of the choice of held-out poses.")
+    seed: int = held_out(InstrumentOptions.seed, "The seed of the choice of held-out poses.")
     holdout_by: str | None = held_out(
         None,
         "Hold out whole groups of poses: a column, as session or group, or region; those are also "

@@ -10,21 +10,22 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.instruments.options import InstrumentOptions
-from minimax_cal.instruments.protocol import Arm, FlangePoses, ResidualRows
+from minimax_cal.instruments.protocol import Arm, FlangePoses, ResidualRows, by_turns
 from minimax_cal.robots.kinematics import rotation
 from minimax_cal.robots.robot import Robot
 
 STEP = 1e-5  # of differences [m, rad]
 ALIKE = 1e-3  # of the largest slope of a kind
-DEFAULT = InstrumentOptions()
 
 
-def check_instrument(one: Instrument, robot: Robot, options: InstrumentOptions = DEFAULT) -> None:
+def check_instrument(
+    one: Instrument, robot: Robot, options: InstrumentOptions | None = None
+) -> None:
     """Raise DataError where an instrument does not read an arm as drawn as its slopes say.
 
     `relative` asks it of every class that is registered.
     """
-    one = one.ready(robot, options)
+    one = one.ready(robot, options or InstrumentOptions())
     arm, count = Arm.of(robot, one.at.q).at(robot.mdh), len(one.names)
     starts = one.starts(arm, np.ones(count, dtype=bool))
     for start in starts:
@@ -37,10 +38,9 @@ def check_instrument(one: Instrument, robot: Robot, options: InstrumentOptions =
     for name, shape in shapes.items():
         alike(one, f"{name} of read", np.asarray(getattr(rows, name)), shape)
     for name, said, found in compared(one, arm, own, rows):
-        size = max(float(np.abs(found).max(initial=0.0)), float(np.abs(said).max(initial=0.0)))
-        wrong = np.abs(said - found) > ALIKE * max(size, ALIKE)
-        if wrong.any():
-            at = int(np.argmax(np.abs(said - found)))
+        off, size = np.abs(said - found), np.abs([said, found]).max(initial=ALIKE)
+        if (off > ALIKE * size).any():
+            at = int(off.argmax())
             raise DataError(
                 f"{one.kind}: {name} of row {at} is {said[at]:.6g}, but the prediction, measured "
                 f"minus residual, changes by {found[at]:.6g}: slopes are those of the prediction"
@@ -63,20 +63,14 @@ def compared(
     def slope(ahead: ResidualRows, behind: ResidualRows) -> Array:
         return (behind.residual - ahead.residual) / (2.0 * STEP)
 
-    for i, name in enumerate(one.names):
-        step = np.zeros(len(own))
-        step[i] = STEP
-        yield (
-            f"by_own for {name}",
-            rows.by_own[:, i],
-            slope(one.read(arm, own + step), one.read(arm, own - step)),
-        )
-    lever = rows.point - arm.origin[rows.pose]
-    turning = np.cross(lever, rows.by_point) + rows.by_rotation
+    for name, step, said in zip(one.names, STEP * np.eye(len(own)), rows.by_own.T, strict=True):
+        ends = (one.read(arm, own + step), one.read(arm, own - step))
+        yield f"by_own for {name}", said, slope(*ends)
+    by_turn = by_turns(arm, rows)
     for i, axis in enumerate("xyz"):
         step = STEP * np.eye(3)[i]
         moved = [one.read(arm._replace(origin=arm.origin + s * step), own) for s in (1, -1)]
-        yield f"by_point along {axis}", rows.by_point[:, i], slope(moved[0], moved[1])
+        yield f"by_point along {axis}", rows.by_point[:, i], slope(*moved)
         turns = [rotation(s * step) @ arm.rotation for s in (1, -1)]
         turned = [one.read(arm._replace(rotation=turn), own) for turn in turns]
-        yield f"by_point and by_rotation about {axis}", turning[:, i], slope(turned[0], turned[1])
+        yield f"by_point and by_rotation about {axis}", by_turn[:, i], slope(*turned)

@@ -16,14 +16,15 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.options import InstrumentOptions
-from minimax_cal.instruments.protocol import Arm, FlangePoses, ResidualRows
+from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
 from minimax_cal.measuring.grouping import groups, held_out
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.model import TARGET
 from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_joints
 
-SPOT = tuple(f"target_{axis}" for axis in "xyz")  # the point on the flange, or the ball
+SPOT = tuple(f"{TARGET}_{axis}" for axis in "xyz")  # the point on the flange, or the ball
 FRAMELESS = "moves nothing that is measured"
 ANGLES = ("_rx", "_ry", "_rz", "_tilt1", "_tilt2")  # endings of names
 PLENTY = 200  # poses that show what no poses could tell
@@ -343,8 +344,8 @@ class Instrument:
         """What the reader should know.  parameters: its own, found.  noise: of a number [m]."""
         return ()
 
-    def wider(self, options: InstrumentOptions) -> Mapping[str, object]:
-        """Options that would fit more of it than these."""
+    def wider(self) -> Mapping[str, object]:
+        """Options that would fit more of it."""
         return {}
 
     def told_wider(self, before: float, after: float) -> tuple[str, str]:
@@ -371,11 +372,6 @@ def scaled_lstsq(matrix: Array, right: Array) -> Array:
 def anywhere(robot: Robot, poses: int) -> Measurements:
     """Random poses over the joints' whole range, nothing measured."""
     return bare(random_joints(robot, (poses,), np.random.default_rng(0)), {})
-
-
-def arm_of(robot: Robot, one: Instrument) -> Arm:
-    """The stiff arm at the poses of an instrument."""
-    return Arm.of(robot, one.at.q)
 
 
 def bare(q: Array, columns: Mapping[str, Array], **measured: Array) -> Measurements:

@@ -10,7 +10,7 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import grouped
 
 Known = tuple[str, str, float]
-HOLDOUT, SEED = 0.2, 0
+FAR = 4.0  # sigmas that what is given, or known before, may be off
 
 
 def known_of(text: str) -> Known:
@@ -43,8 +43,8 @@ class InstrumentOptions:
     [m].  lever: of poses, what a radian counts as [m]; the file's own unless given.
     """
 
-    holdout: float = HOLDOUT
-    seed: int = SEED
+    holdout: float = 0.2
+    seed: int = 0
     offset: bool = fitted(False, "Lengths: fit a constant offset of each wire (weakly determined).")
     known_distances: Sequence[Known] = fitted(
         (),

@@ -15,7 +15,7 @@ from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import right_jacobian, rotation
 from minimax_cal.robots.robot import Robot
 
-CORNERS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
+TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
 EDGE = 0.1  # how far from their middle the corners lie by which laws are asked [m]
 NONE: Array = np.zeros(0, dtype=int)
 NO_SUMS: Array = np.zeros((0, 0))
@@ -104,10 +104,14 @@ class ResidualRows(NamedTuple):
 
 def by_arm(arm: FlangePoses, rows: ResidualRows) -> Array:
     """(p, r) slopes of any instrument's predictions by the arm's parameters."""
-    lever = rows.point - arm.origin[rows.pose]
-    turning = np.cross(lever, rows.by_point) + rows.by_rotation
     along = np.einsum("rc,prc->pr", rows.by_point, arm.linear[:, rows.pose])
-    return np.asarray(along + np.einsum("rc,prc->pr", turning, arm.angular[:, rows.pose]))
+    turned = np.einsum("rc,prc->pr", by_turns(arm, rows), arm.angular[:, rows.pose])
+    return np.asarray(along + turned)
+
+
+def by_turns(arm: FlangePoses, rows: ResidualRows) -> Array:
+    """(r, 3) slopes by a turn of the flange about its origin, the points on it turning along."""
+    return np.cross(rows.point - arm.origin[rows.pose], rows.by_point) + rows.by_rotation
 
 
 # ---- the arm ----------------------------------------------------------------------------------
@@ -139,7 +143,7 @@ class Given:
         arm: as stiff as the fields are of.  middle: (3,) in the flange [m].  values: (d,) at which
         more comes to the fields.
         """
-        levers = np.einsum("mij,kj->kmi", arm.rotation, EDGE * CORNERS)
+        levers = np.einsum("mij,kj->kmi", arm.rotation, corners(np.zeros(3)))
         size = 3.0 / (8.0 * EDGE**2)  # one over the corners' moment of inertia
 
         def twist(motion: Array) -> tuple[Array, Array]:
@@ -163,7 +167,7 @@ class Given:
 
 def corners(middle: Array) -> Array:
     """(4, 3) points of the flange about one (3,) by which motions of the flange are known [m]."""
-    return np.asarray(middle + EDGE * CORNERS)
+    return np.asarray(middle + EDGE * TETRAHEDRON)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,13 +13,14 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.instruments.protocol import TETRAHEDRON
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots.transforms import nearest_rotation, transform
 
 LEVER = 0.1  # where nothing tells the ratio of the noises [m]
 CORNERS = {  # of unit distance from their centre
     3: np.stack([[np.cos(a), np.sin(a), 0.0] for a in 2.0 * np.pi * np.arange(3) / 3.0]),
-    4: np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0),
+    4: TETRAHEDRON,
 }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -82,6 +83,11 @@ class Visits(Instrument):
         """The sockets' labels, in alphabetical order."""
         return tuple(str(label) for label in np.unique(self.socket))
 
+    @cached_property
+    def number(self) -> Array:
+        """(m,) which of the sockets."""
+        return np.unique(self.socket, return_inverse=True)[1]
+
     @property
     def independent(self) -> int:
         """Three for each different pose in a socket but the first."""
@@ -149,8 +155,7 @@ class Visits(Instrument):
         One weighs as much as all visits together, else the fit would shrink the arm to shrink its
         misclosures.  Where other instruments measure lengths too, it counts as a coordinate.
         """
-        m, place = self.poses, arm.place(own[:3])
-        _, here = np.unique(self.socket, return_inverse=True)
+        m, place, here = self.poses, arm.place(own[:3]), self.number
         count = int(here.max()) + 1
         axis = np.repeat(np.arange(3), m)
         rows = ResidualRows(
@@ -165,17 +170,16 @@ class Visits(Instrument):
         if not self.known:
             return rows
         heavy = 3 * m if self.sole_length else 1
-        at, first = {label: i for i, label in enumerate(self.sockets)}, []
-        sums, short, root = np.zeros((len(self.known), 3, m)), [], np.sqrt(heavy)
+        sums, short, first = np.zeros((len(self.known), 3, m)), [], []
         for one, (a, b, distance) in zip(sums, self.known, strict=True):
-            mine, other = here == at[a], here == at[b]
+            mine, other = self.socket == a, self.socket == b
             gap = place[mine].mean(axis=0) - place[other].mean(axis=0)
             length = max(float(np.linalg.norm(gap)), 1e-12)
             one += (gap / length)[:, None] * (mine / mine.sum() - other / other.sum())
             short.append(distance - length)
             first.append(int(mine.argmax()))
         return rows._replace(
-            sums=root * sums.reshape(-1, 3 * m), short=root * np.array(short),
+            sums=np.sqrt(heavy) * sums.reshape(-1, 3 * m), short=np.sqrt(heavy) * np.array(short),
             sum_pose=np.array(first), heavy=float(heavy),
         )  # fmt: skip
 
@@ -207,8 +211,7 @@ class Visits(Instrument):
         """
         pose = robot.pose(self.at.q)
         centre = self.centres(pose[:, :3, :3] @ own[:3] + pose[:, :3, 3])
-        goal = centre[np.unique(self.socket, return_inverse=True)[1]]
-        q, _ = reach(robot, own[:3], goal, self.at.q)
+        q, _ = reach(robot, own[:3], centre[self.number], self.at.q)
         return replace(self, at=replace(self.at, q=q))
 
     def mean_square(self, arm: FlangePoses, own: Array) -> float:

@@ -12,7 +12,7 @@ INSTRUMENTS: dict[str, str | type[Instrument]] = {  # name: where its class is, 
     "closures": "minimax_cal.instruments.sockets:Visits",
     "poses": "minimax_cal.instruments.poses:WholePoses",
     "points": "minimax_cal.instruments.tracker:Points",
-    "contacts": "minimax_cal.instruments.contacts:Touches",
+    "contacts": "minimax_cal.instruments.probe:Touches",
     "pixels": "minimax_cal.fitting.several.cameras:Images",
 }
 

@@ -94,18 +94,18 @@ class Points(Instrument):
         axes = self.drawn.rotation
         return axes @ rotation(own[3:6]), axes @ own[:3]
 
-    def misses(self, arm: FlangePoses, own: Array) -> Array:
-        """(k, m, 3) measured minus predicted, along the axes of the base [m]."""
+    def placed_at(self, arm: FlangePoses, own: Array) -> tuple[Array, Array]:
+        """(k, m, 3) measured minus predicted, and predicted, along the axes of the base [m]."""
         turn, origin = self.base(own)
-        measured = (np.moveaxis(self.seen.y, 1, 0) - origin) @ turn
-        return np.asarray(measured - np.moveaxis(arm.place(self.targets(own)), 1, 0))
+        place = np.moveaxis(arm.place(self.targets(own)), 1, 0)
+        return (np.moveaxis(self.seen.y, 1, 0) - origin) @ turn - place, place
 
     def read(self, arm: FlangePoses, own: Array) -> ResidualRows:
         """Three rows for each target at each pose, axis by axis, 0 where it was not measured."""
         seen = self.seen
         k, m = len(seen.target_names), seen.poses
         root = np.sqrt(point_weights(seen))
-        place = np.moveaxis(arm.place(self.targets(own)), 1, 0)
+        off, place = self.placed_at(arm, own)
         part, axis, pose = (each.reshape(-1) for each in np.indices((k, 3, m)))
         point = place[part, pose]
         by_point = np.eye(3)[axis] * root[part, pose][:, None]
@@ -115,7 +115,7 @@ class Points(Instrument):
         spots = np.einsum("ri,rij->rj", by_point, arm.rotation[pose])
         for column in range(3):
             by_own[np.arange(len(part)), 6 + 3 * part + column] = spots[:, column]
-        error = np.nan_to_num(np.swapaxes(self.misses(arm, own) * root[..., None], 1, 2))
+        error = np.nan_to_num(np.swapaxes(off * root[..., None], 1, 2))
         return ResidualRows(
             error.reshape(-1), pose, point, by_point, np.zeros_like(by_point), by_own, part
         )
@@ -127,11 +127,11 @@ class Points(Instrument):
 
     def mean_square(self, arm: FlangePoses, own: Array) -> float:
         """Of the errors of points [m^2]."""
-        return float(np.nanmean((self.misses(arm, own) ** 2).sum(axis=-1)))
+        return float(np.nanmean((self.placed_at(arm, own)[0] ** 2).sum(axis=-1)))
 
     def errors(self, arm: FlangePoses, own: Array, held: Array) -> Array:
         """Of the points, along the axes of the base."""
-        return self.misses(arm, own)
+        return self.placed_at(arm, own)[0]
 
     def placed(self, arm: FlangePoses, own: Array, drawn: Array) -> dict[str, Any]:
         """Base in the instrument's frame, targets in the flange."""

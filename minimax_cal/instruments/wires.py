@@ -28,12 +28,13 @@ from minimax_cal.instruments.options import InstrumentOptions
 from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
 from minimax_cal.measuring.joint_rows import joint_rows
 from minimax_cal.measuring.measurements import FARTHEST
+from minimax_cal.measuring.slips import MAX_TRIAL_POSES
 from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.robot import Robot
 
 WIRE = re.compile(r"wire(\d+)_(mm|m)")
 LEAST_LENGTHS = 5  # of one wire; its anchor alone has three unknowns
-ENOUGH, FEW = 60, 30  # poses that tell one start from another, and that try a slip
+ENOUGH = 60  # poses that tell one start from another
 BETTER = 0.25  # of the mean square: what explains so much is worth a look
 
 
@@ -195,7 +196,7 @@ class Lengths(Instrument):
 
     def tried(self) -> Lengths:
         """Some lengths of each wire, the held-out ones among them."""
-        return self.take(self.some(FEW))
+        return self.take(self.some(MAX_TRIAL_POSES))
 
     def slips(self) -> Iterable[Slip]:
         """Units that were taken for others."""
@@ -217,7 +218,7 @@ class Lengths(Instrument):
             f"{each}; only how the wires' directions vary tells an offset from the anchor's place",
         )
 
-    def wider(self, options: InstrumentOptions) -> Mapping[str, object]:
+    def wider(self) -> Mapping[str, object]:
         """Offsets, where they are not fitted."""
         return {} if self.offset else {"offset": True}
 

@@ -20,6 +20,7 @@ from minimax_cal.robots import notation
 from minimax_cal.robots.notation import Notation
 from minimax_cal.robots.robot import Robot
 
+MAX_TRIAL_POSES = 30  # poses that are enough to test a slip of units or signs
 SHIFTS = (1, -1, 2, -2, 3, -3)  # rows that a file is shifted by: a line more or less, seldom two
 INCH = 25.4
 LATE = {1: "one row", 2: "two rows", 3: "three rows"}

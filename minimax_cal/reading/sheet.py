@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import mode
 from typing import overload
 
 import numpy as np
@@ -24,7 +25,7 @@ from minimax_cal.reading.workbook import is_workbook, text_of_workbook
 
 DELIMITERS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "spaces"}
 DECIMALS = {".": "point", ",": "comma"}
-POINT = re.compile(r"[-+]?(\d+(?:\.\d*)?|\.\d+)([eE][-+]?\d+)?")
+POINT = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 COMMA = re.compile(r"[-+]?(\d*),(\d+)([eE][-+]?\d+)?")
 COMMENTS = ("#", "%", "//", "!")
 SIMULATED = "# simulated"  # first line of a file whose points were computed, not measured
@@ -212,10 +213,9 @@ def split(sheet: Sheet, alone: str) -> tuple[str, dict[int, str], list[str]]:
         raise DataError(
             f"{sheet.path}: has no columns that commas, semicolons, tabs or spaces separate"
         )
-    usual, *_ = Counter(line.count(delimiter) for line in some).most_common(1)[:1] or [(0, 0)]
-    if delimiter != " " and usual[0]:
+    if told and delimiter != " " and (usual := mode([line.count(delimiter) for line in some])):
         notes = {n: line for n, line in notes.items()
-                 if n < told[0] or line.count(delimiter) != usual[0]}  # fmt: skip
+                 if n < told[0] or line.count(delimiter) != usual}  # fmt: skip
     for n in notes:
         lines[n - 1] = ""
     return delimiter, notes, lines

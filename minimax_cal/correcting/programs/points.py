@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.reading.sheet import POINT
 from minimax_cal.robots.transforms import transform
 
-NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 LONGEST = 40  # letters of a number
 FARTHEST = 1e5  # of a coordinate [mm]
 MARK = "Corrected by minimax-cal compensate; correct the program as it was before, not this one"
@@ -79,7 +79,7 @@ class Text:
         for part in self.bare[start:stop].split(","):
             inner = part.strip()
             begin = at + len(part) - len(part.lstrip())
-            if len(inner) > LONGEST or not NUMBER.fullmatch(inner):
+            if len(inner) > LONGEST or not POINT.fullmatch(inner):
                 raise DataError(
                     f"{self.source}:{self.line(start)}: {what}: {inner[:LONGEST]!r} is no number; "
                     "write points as numbers, not as expressions"

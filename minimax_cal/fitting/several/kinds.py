@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.intervals import rms_interval, told
 from minimax_cal.fitting.opened import listed_effects
 from minimax_cal.fitting.options import listed, priors_of
@@ -195,6 +194,7 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
     source = replace(every[0].at, source=sources, digest=" ".join(d.at.digest for d in every))
     geometry = found.stiff or found
     settings, left_open = options.settings(), open_positions(robot, found)
+    sigma = sigma_of_positions(robot, found)
     for one in reversed(found.stack.instruments):  # the first one's stand
         settings |= one.choices
     result = RelativeCalibration(
@@ -206,7 +206,7 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
         seconds=time.perf_counter() - began,
         parameters=fit.parameters_of(robot, found),
         identification=found.identification,
-        position_sigma=np.nan if left_open else sigma_of_positions(robot, found),
+        position_sigma=np.nan if left_open else sigma,
         positions_open=left_open,
         beyond=remarks.beyond(robot, found, options) if single else (),
         notices=tuple(dict.fromkeys(notices)),
@@ -214,19 +214,21 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
         instruments=() if single else instruments_of(found, every, splits, measured),
         cell=cell_of(robot, found) if found.stiff else None,
     )
-    return judged(robot, every, splits, found, measured, result, options)
+    return judged(asked, found, measured, result, sigma)
 
 
 def judged(
-    robot: Robot,
-    every: Sequence[Instrument],
-    splits: Sequence[tuple[Array, tuple[str, ...]]],
+    asked: Asked,
     found: InstrumentFit,
     measured: Sequence[Measured],
     result: RelativeCalibration,
-    options: RelativeOptions,
+    sigma: float,
 ) -> RelativeCalibration:
-    """The result with what the reader should know, failed where it is no calibration."""
+    """The result with what the reader should know, failed where it is no calibration.
+
+    sigma: of a position, but for what is open [m].
+    """
+    robot, every, options = asked.robot, asked.every, asked.options
     unfitted = [remarks.unfitted(robot, found, i, options) for i in range(len(every))]
     wrong = plausible.contradiction(robot, every, found, measured, [mend for _, mend in unfitted])
     said = [
@@ -234,11 +236,11 @@ def judged(
           for remark in one.remarks(fit.own_parameters(robot, found, i), found.noise[i])),
         *remarks.of_beyond(result),
         *remarks.of_scale(found),
-        *remarks.weak(found, result, measured, sigma_of_positions(robot, found)),
+        *remarks.weak(found, result, measured, sigma),
         *remarks.unlikely(result, measured),
         *filter(None, (*(notice for notice, _ in unfitted), wrong)),
     ]  # fmt: skip
-    for data, (held, _), each in zip(every, splits, measured, strict=True):
+    for data, (held, _), each in zip(every, asked.splits, measured, strict=True):
         said += remarks.general(each, data, held)
     return replace(
         result,
@@ -370,10 +372,9 @@ def open_positions(robot: Robot, found: InstrumentFit) -> tuple[str, ...]:
     Asked of the arm as drawn, where what is redundant is so exactly.  Not those that were fixed.
     """
     fit = found.stiff or found
-    (place, column), stack, reasons = places_of(fit), fit.stack, fit.identification.reasons
+    (place, column), stack, known = places_of(fit), fit.stack, fit.identification
     names = [stack.names.all[i] for i in place]
-    fixed = [name in reasons and reasons[name].kind is Because.FIXED for name in names]
-    asked = ~np.array(fixed) & stack.movable[place]
+    asked = known.asked(names) & stack.movable[place]
     jacobian = positions_by(robot, fit.nominal.mdh, targets_of(fit, fit.nominal))[:, column]
-    left = lacking(jacobian, fit.identification.active[place], asked)
+    left = lacking(jacobian, known.active[place], asked)
     return tuple(name for name, is_open in zip(names, left, strict=True) if is_open)

@@ -16,8 +16,6 @@ from minimax_cal.instruments.options import InstrumentOptions, fitted
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import Names
 
-FAR = 4.0  # sigmas of a prior that an arm may be off
-
 
 def noise_of(text: str) -> tuple[str, float]:
     """FILE=SIGMA: a file by its stem, and how noisy its numbers are, in mm.  Raises OptionError."""

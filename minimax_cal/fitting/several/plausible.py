@@ -18,12 +18,13 @@ from minimax_cal.fitting.several.fit import (
     stack_of,
     start_of,
 )
-from minimax_cal.fitting.several.options import FAR, RelativeOptions, sigmas_of
+from minimax_cal.fitting.several.options import RelativeOptions, sigmas_of
 from minimax_cal.fitting.several.result import Measured
 from minimax_cal.fitting.several.stack import Block, Stack, own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.instrument import PLENTY, Instrument, Slip, anywhere
+from minimax_cal.instruments.options import FAR
 from minimax_cal.instruments.protocol import Arm, FlangePoses
 from minimax_cal.measuring.slips import of_joints, of_units
 from minimax_cal.modelling.parameters import State

@@ -110,7 +110,7 @@ def unlikely(result: RelativeCalibration, measured: Sequence[Measured]) -> tuple
 def unfitted(robot: Robot, fit: InstrumentFit, i: int, options: RelativeOptions) -> tuple[str, str]:
     """A notice, and its mend, where more of an instrument would explain what the fit leaves."""
     one, noise = fit.stack.instruments[i], float(fit.noise[i])
-    more = one.wider(options)
+    more = one.wider()
     if not more or noise < LEAST:
         return "", ""
     try:
@@ -136,7 +136,6 @@ def beyond(robot: Robot, fit: InstrumentFit, options: RelativeOptions) -> tuple[
     )  # fmt: skip
     rows = lone.names.geometric + one.targets_at.start
     more = fit.identification.active[:rows] & ~alone.active[:rows]
-    told = [name for name, known in zip(one.lone_names, alone.active[rows:], strict=False)
-            if not known]  # fmt: skip
-    rest = one.lone_names[len(alone.active) - rows :]
-    return (*(lone.names.all[i] for i in np.flatnonzero(more)), *told, *rest)
+    known = np.pad(alone.active[rows:], (0, len(one.lone_names) + rows - len(alone.active)))
+    untold = (name for name, told in zip(one.lone_names, known, strict=True) if not told)
+    return (*(lone.names.all[i] for i in np.flatnonzero(more)), *untold)

@@ -15,7 +15,6 @@ from minimax_cal.reading.sheet import POINT, Sheet
 
 RAPID_ASIDE = re.compile(r'"[^"\r\n]*"|![^\r\n]*')  # strings and comments
 KRL_ASIDE = re.compile(r'"[^"\r\n]*"|;[^\r\n]*')
-NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 UNUSED = {0.0, 9e9}  # of an axis that is not there; RAPID writes 9E9
 ROBOT_AXES = 6
 
@@ -77,7 +76,7 @@ def rapid_targets(text: str) -> Iterator[Target]:
 UR_LIST = re.compile(
     r"(?:\b(?:global\s+)?(\w++)\s*+=\s*+|\bmovej\s*\(\s*"
     r"|^[ \t]*+(?:(\w++)(?=[ \t:,;])[ \t]*+[:,;]?[ \t]*+)?)"
-    rf"\[\s*({NUMBER}(?:\s*,\s*{NUMBER})+)\s*\]",
+    rf"\[\s*({POINT.pattern}(?:\s*,\s*{POINT.pattern})+)\s*\]",
     re.MULTILINE,
 )
 

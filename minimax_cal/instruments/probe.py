@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from minimax_cal.instruments.instrument import (
     different,
     without_blind,
 )
-from minimax_cal.instruments.options import InstrumentOptions
+from minimax_cal.instruments.options import FAR, InstrumentOptions
 from minimax_cal.instruments.protocol import Arm, FlangePoses, ResidualRows
 from minimax_cal.instruments.shapes import PLANE, SPHERE, Shapes, Surface, placed_best
 from minimax_cal.measuring.joint_rows import joint_rows
@@ -41,7 +42,6 @@ CONTACT = re.compile(r"surface|kind|(?:radius|ball_radius|offset)_(?:mm|m)|norma
 LEAST_CONTACTS = {PLANE: 4, SPHERE: 5}  # one more than the surface itself has unknowns
 PLENTY = 300  # contacts that show what no contacts could tell
 BETTER_RADIUS = 4.0  # times the mean square of a sphere whose radius is free
-FAR = 4.0  # sigmas that a given radius may be off
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ class Touches(Instrument):
         shapes, drawn = placed_best(arm, self.surfaces, self.ball_radius, self.touched)
         return replace(self, shapes=shapes, drawn=drawn)
 
-    @property
+    @cached_property
     def touched(self) -> Array:
         """(m,) which surface."""
         labels = self.parts
