@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import os
 import platform
 import subprocess
@@ -78,6 +79,7 @@ def save_figure(folder: Path, name: str, figure: Figure) -> None:
 
 
 def save_json(path: Path, content: Mapping[str, object]) -> None:
-    """Write the figures of a study for other programs."""
+    """Write the figures of a study for other programs: null for what is not known (NaN)."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, json_text({"schema": 1, **content}))
+    known = json.loads(json.dumps(content), parse_constant=lambda _: None)
+    write_whole(path, json_text({"schema": 1, **known}))

@@ -466,7 +466,7 @@ def real_table(found: dict[tuple[str, str], list[RealOutcome]]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for (robot, kind), some in found.items():
         held, before, after = (
-            float(np.median(values))
+            middle(values)
             for values in zip(*((o.held_mm, *o.position_mm) for o in some), strict=True)
         )
         first = some[0]
@@ -499,16 +499,17 @@ def identified_table(found: Found) -> Table:
     return Table("what is identifiable", header, tuple(rows), ("", "", "d", "d", "d", "d", ""))
 
 
+def middle(values: Sequence[float]) -> float:
+    """The median."""
+    return float(np.median(values))
+
+
 def accuracy_table(found: Found, compliance: float) -> Table:
     """Medians over the seeds of held-out and true errors."""
     rows: list[tuple[Cell, ...]] = []
     for (robot, kind, bend), outcomes in found.items():
         if bend != compliance:
             continue
-
-        def middle(values: Sequence[float]) -> float:
-            return float(np.median(values))
-
         true = middle([o.true_mm[1] for o in outcomes])
         tracker = middle([o.true_mm[1] for o in found[robot, "tracker", compliance]])
         rows.append(
@@ -548,8 +549,8 @@ def figure_of(found: Found) -> Figure:
     for axes, (robot, title) in zip(panels, ROBOTS.items(), strict=True):
         for compliance, marker, word in ((0.0, "o", "stiff"), (COMPLIANCE, "s", "bending")):
             cells = [found[robot, kind, compliance] for kind in KINDS]
-            held = [np.median([o.held_mm[1] for o in outcomes]) for outcomes in cells]
-            true = [np.median([o.true_mm[1] for o in outcomes]) for outcomes in cells]
+            held = [middle([o.held_mm[1] for o in outcomes]) for outcomes in cells]
+            true = [middle([o.true_mm[1] for o in outcomes]) for outcomes in cells]
             axes.plot(held, at, marker, color="#0072b2", mfc="none", label=f"held out, {word} arm")
             axes.plot(true, at, marker, color="#d55e00", label=f"true position, {word} arm")
         axes.set(title=title, xscale="log", xlabel="RMS error (mm)")

@@ -88,7 +88,7 @@ SAID = f"(?:[ _.-]?(?:{ACTUAL}|{PLACE}))*"
 AXIS = re.compile(f"(?:(?:{ACTUAL}|{PLACE})[ _.-]?)?([xyz]){SAID}|(?:(.+?)[ _.-])([xyz]){SAID}")
 MEASURED = re.compile(f"(?:(?:{PLACE})[ _.-]?)?(?:{ACTUAL})(?:[ _.-]?(?:{PLACE}))?")
 NOMINAL = re.compile(  # no measured points: planned ones, differences, uncertainties
-    r"u[ _]?\(?95\)?|target|goal|cmd|command|delta|d|tcp|robot|payload|flange|base\d*"
+    r"u[ _]?\(?95\)?|target|goal|cmd|command|delta|d|tcp|robot|flange"
     r"|(?:.+[ _.-])?(?:soll|sollwert|nominal|nom|teorico|theorique"
     r"|\u7406\u8bba|abw|abweichung|dev|deviation|desv|desviacion|ecart|diff"
     r"|error|fehler|erreur|\u504f\u5dee|tol|toleranz|tolerance|tolerancia|\u516c\u5dee|std|sigma)"
@@ -213,7 +213,7 @@ def points_of(stems: Sequence[str]) -> dict[str, str]:
     axes: dict[str, dict[str, str]] = {}
     for stem in stems:
         found = AXIS.fullmatch(folded(stem))
-        if not found:
+        if not found or kind_of(stem) not in ("", "smr"):
             continue
         letter, target = found[1] or found[3], (found[2] or "").rstrip(".")
         if not NOMINAL.fullmatch(target):

@@ -1,5 +1,6 @@
 import hashlib
 import json
+import math
 import os
 import pickle
 import signal
@@ -311,7 +312,7 @@ def good(study: Study) -> None:
     figure.subplots()
     save_figure(study.out, "a picture", figure)
     assert study.json
-    save_json(study.json, {"seed": study.seed, "quick": study.quick})
+    save_json(study.json, {"seed": study.seed, "quick": study.quick, "unknown": [math.nan]})
 
 
 def bad(study: Study) -> None:
@@ -351,7 +352,7 @@ def test_all_studies_make_one_page(
     assert str(tmp_path) not in page
     found = json.loads(numbers.read_text())["studies"]
     assert [found[name]["status"] for name in table] == ["failed", "done", "skipped"]
-    assert found["good"]["numbers"] == {"schema": 1, "seed": 7, "quick": True}
+    assert found["good"]["numbers"] == {"schema": 1, "seed": 7, "quick": True, "unknown": [None]}
     CliRunner().invoke(studies.everything, options)
     assert (out / "index.html").read_text() == page
 
