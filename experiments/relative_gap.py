@@ -19,9 +19,10 @@ from experiments import sweep
 from experiments.relative import LENGTH, NOISE, SIMULATORS, Arm, Measured
 from experiments.sweep import Study, study_options
 from minimax_cal.diagnosing.instruments import diagnose_relative
-from minimax_cal.fitting.several.kinds import Given, labels_of, loaded
+from minimax_cal.fitting.several.kinds import labels_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.instruments.file import Given, as_instrument
 from minimax_cal.measuring.measurements import measurements
 from minimax_cal.modelling.simulate import gravity
 from minimax_cal.robots.robot import load_robot
@@ -123,7 +124,7 @@ def run(job: Job) -> Answer:
     """The diagnosis of one arm."""
     arm, rng = arm_of(job), np.random.default_rng([job.seed, 2])
     data = [seen(arm, kind, job.poses, rng) for kind in job.instruments]
-    names = labels_of([loaded(each) for each in data])
+    names = labels_of([as_instrument(each) for each in data])
     noises = dict.fromkeys(names, NOISE) if job.given else {}
     found = diagnose_relative(arm.robot, data, noises=noises)
     sure = [f.term.effect for f in found.effects if f.established and not f.minor]

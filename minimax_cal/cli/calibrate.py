@@ -16,20 +16,22 @@ from minimax_cal.cli.options import (
     Output,
     command,
     flag,
-    measured,
+    of_any,
     on_command_line,
     options_from,
     plain_option,
     record_of,
     refuse,
     result_options,
+    together,
 )
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.pixels.options import PixelFiles, PixelOptions
-from minimax_cal.ground.errors import OptionError
+from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.ground.files import json_text, plain
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.reporting.plots.figures import save_errors
 from minimax_cal.robots.kernels.choice import work
 from minimax_cal.solvers.status import Status
@@ -37,6 +39,7 @@ from minimax_cal.solvers.status import Status
 if TYPE_CHECKING:
     from minimax_cal.judging.bootstrap import Bootstrap
 
+OPTIONS = {f.name for kind in (Options, RelativeOptions) for f in fields(kind)}
 CAMERAS = {f.name for f in fields(PixelOptions)} - {f.name for f in fields(Options)}
 BRIEF = 1000  # poses that one fit needs no compiled kernels for
 
@@ -45,6 +48,7 @@ BRIEF = 1000  # poses that one fit needs no compiled kernels for
 @ROBOT
 @SOME_CAMPAIGNS
 @options_from(Options)
+@options_from(RelativeOptions, "offset", "known_distances", "noises")
 @options_from(PixelFiles)
 @options_from(PixelOptions)
 @ROWS
@@ -73,18 +77,32 @@ def calibrate_command(
 ) -> int:
     """Calibrate ROBOT (a file or a built-in name) from the measurements in DATA.
 
-    Or from what cameras saw, with --pixels, --joints and --camera in place of DATA.
+    DATA has joint columns, and the points of a tracker (smr1_x_mm ...), or those of another
+    instrument: wire1_mm ... (lengths from unknown fixed points to a target on the flange);
+    socket (rows with the same label held the flange's ball in the same socket); surface with kind,
+    plane or sphere (what a probe's ball touched; where known radius_mm, ball_radius_mm, and
+    normal_x, normal_y, normal_z, offset_mm of a body's faces); flange_x_mm, flange_y_mm,
+    flange_z_mm with flange_rx_rad ... or flange_qw ... (whole poses).
+
+    Files of several instruments are one fit: all share the arm, each counts by its own noise.
+    What cameras saw is given with --pixels, --joints and --camera, alone or beside DATA.
     """
     files = record_of(PixelFiles, chosen)
-    if files.given:
-        return by_cameras(robot, data, files, to, chosen)
-    if not data:
+    if not (data or files.given):
         raise click.UsageError(
             "Missing argument 'DATA...', or --pixels with --joints and --camera."
         )
-    refuse(CAMERAS, "is about what cameras see, with pixels=, joints= and camera=")
-    asked = {one.name: chosen[one.name] for one in fields(Options) if one.name in chosen}
-    given = measured(data, in_rows)
+    if not files.given:
+        refuse(CAMERAS, "is about what cameras see, with pixels=, joints= and camera=")
+    files, rest = files.among(data)
+    if files.given and not rest:
+        return by_cameras(robot, files, to, chosen)
+    asked = {name: chosen[name] for name in chosen if name in OPTIONS}
+    given = of_any(rest, in_rows, to)
+    if files.given or not isinstance(given, Measurements):
+        refuse(("replicates", "in_rows", "without"), "is for points of a tracker")
+        every = given if isinstance(given, list) else [given]
+        return together(calibrate, robot, every, files, to, asked)
     with work(brief=replicates is None and given.poses <= BRIEF), to.stages() as progress:
         fit = calibrate(robot, given, progress=progress, **asked)
         more: dict[str, Bootstrap] = {}
@@ -104,16 +122,10 @@ def calibrate_command(
     )
 
 
-def by_cameras(
-    robot: str, data: tuple[Path, ...], files: PixelFiles, to: Output, chosen: dict[str, Any]
-) -> int:
+def by_cameras(robot: str, files: PixelFiles, to: Output, chosen: dict[str, Any]) -> int:
     """Calibrate from pixels.  Raises OptionError for what they do not know."""
     from minimax_cal.fitting.several.pixel_calibration import calibrate_pixels
 
-    if data:
-        raise OptionError(
-            f"{data[0]}: DATA and pixels are one fit in minimax-cal relative; give one of them here"
-        )
     known = {field.name for field in fields(PixelOptions)}
     refuse({*chosen, "replicates", "in_rows", "without"} - known, "is not for pixels")
     own = {name: chosen[name] for name in on_command_line() & known}

@@ -19,14 +19,19 @@ from minimax_cal.cli.options import (
     command,
     looked_up,
     measured,
+    of_any,
+    on_command_line,
     options_from,
+    refuse,
     result_options,
     workers,
 )
 from minimax_cal.diagnosing.diagnose import DiagnosisOptions, diagnose
 from minimax_cal.diagnosing.result import Diagnosis
+from minimax_cal.dynamics.logs import are_logs
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.measuring.history import with_history
@@ -40,14 +45,25 @@ from minimax_cal.solvers.status import Status
 @CAMPAIGNS
 @options_from(Options, "holdout", "seed", "holdout_by", "instrument")
 @options_from(DiagnosisOptions)
+@options_from(RelativeOptions, "offset", "known_distances", "lever", "noises")
 @workers(1, "1")
 @ROWS
 @result_options("the diagnosis (JSON)", keep="diagnosis.json", figure="the gap and where it lies")
 def diagnose_command(
     robot: str, data: tuple[Path, ...], in_rows: bool, to: Output, **chosen: Any
 ) -> int:
-    """Say why ROBOT still misses once calibrated, as far as the measurements in DATA can tell."""
-    found = to.work(diagnose, robot, measured(data, in_rows), **chosen)
+    """Say why ROBOT still misses once calibrated, as far as the measurements in DATA can tell.
+
+    DATA is as `calibrate` takes it; of logs, `torques` says why their torques are not ROBOT's.
+    """
+    if are_logs(data):
+        return by_torques(robot, data, to, chosen)
+    given = of_any(data, in_rows, to)
+    if isinstance(given, list):
+        refuse(("in_rows", "jobs", "cluster"), "is for points of a tracker")
+    found = to.work(diagnose, robot, given, **chosen)
+    if isinstance(given, list):
+        return to.finish(found, status=found.status)
     return to.finish(
         found,
         status=found.status,
@@ -56,6 +72,21 @@ def diagnose_command(
         advice=advice(found, robot, data, to.output),
         draw=save_diagnosis,
     )
+
+
+def by_torques(robot: str, logs: tuple[Path, ...], to: Output, chosen: dict[str, Any]) -> int:
+    """Diagnose torques.  Raises OptionError for what they do not know."""
+    from minimax_cal.cli.torques import model_of
+    from minimax_cal.dynamics.diagnose import diagnose_motion
+    from minimax_cal.dynamics.given import read_logs
+
+    known = {"holdout", "exclude"}
+    refuse({*chosen, "in_rows"} - known, "is for measurements; minimax-cal torques has its own")
+    runs = read_logs(robot, logs)
+    own = {name: chosen[name] for name in on_command_line() & known}
+    to.took(*((run.source, f"torques of {run.joints} joints") for run in runs))
+    found = to.work(diagnose_motion, model_of(robot, runs), runs, **own)
+    return to.finish(found, sentences=found.sentences())
 
 
 def every_table(found: Diagnosis) -> Iterator[Table]:

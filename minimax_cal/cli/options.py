@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.text import Text
 
 from minimax_cal.cli.progress import stages
-from minimax_cal.cli.stderr import PROGRESS, complain, tell
+from minimax_cal.cli.stderr import PROGRESS, TAKEN, complain, tell, tell_taken
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, json_text, plain, write_whole
 from minimax_cal.ground.options import SI, Option, names_of, pair
@@ -28,6 +28,8 @@ from minimax_cal.ground.words import visible, without_formulas
 from minimax_cal.solvers.status import Status
 
 if TYPE_CHECKING:
+    from minimax_cal.fitting.pixels.options import PixelFiles
+    from minimax_cal.instruments.instrument import Instrument
     from minimax_cal.measuring.measurements import Measurements
 
 WIDTH = 110  # of text that goes to no terminal
@@ -317,12 +319,18 @@ class Output:
             return verb(*given, progress=progress, **chosen)
 
     def notice(self, *texts: str) -> None:
-        """Print notices on stderr, one a line."""
+        """Print notices on stderr, one a line, and before them what files were taken for."""
+        tell_taken()
         shown = () if self.quiet else texts[:MOST_NOTICES]
         for text in shown:
             tell("notice", flagged(text))
         if shown and len(texts) > MOST_NOTICES:
             tell("notice", f"and {len(texts) - MOST_NOTICES} more, in the JSON")
+
+    def took(self, *sources: tuple[str, str]) -> None:
+        """Say on stderr what files were taken for, once the work comes to something."""
+        if not self.quiet:
+            TAKEN.set([f"{source} holds {what}" for source, what in sources])
 
     def cells(self, text: str, safe: bool) -> str:
         """CSV that holds text of its input; what a spreadsheet would run is said, or made safe."""
@@ -458,6 +466,35 @@ def measured(paths: Sequence[Path], in_rows: bool) -> Measurements:
 
     data = read_campaigns(paths)
     return data.in_visit_order() if in_rows and not ordered(data) else data
+
+
+def of_any(paths: Sequence[Path], in_rows: bool, to: Output) -> Measurements | list[Instrument]:
+    """`measured` of trackers, or what else the files hold; stderr says what each was taken for."""
+    from minimax_cal.instruments.file import taken
+    from minimax_cal.measuring.history import ordered
+
+    data = taken(paths)
+    if isinstance(data, list):
+        to.took(*((one.at.source, f"{one.kind} at {one.poses} poses") for one in data))
+        return data
+    to.took((data.source, f"points at {data.poses} poses"))
+    return data.in_visit_order() if in_rows and not ordered(data) else data
+
+
+def together(
+    verb: Callable[..., Any],
+    robot: str,
+    data: Sequence[Any],
+    files: PixelFiles,
+    to: Output,
+    chosen: dict[str, Any],
+) -> int:
+    """What a verb says of data of any instruments, and of what cameras saw; the exit code."""
+    from minimax_cal.fitting.several.cameras import detected
+
+    seen = [detected(*files.paths())] if files.given else []
+    found = to.work(verb, robot, [*data, *seen], **chosen)
+    return to.finish(found, status=found.status)
 
 
 def result_options(what: str, *, keep: str = "", figure: str = "") -> Decorator:

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import copy_context
 from typing import Any
 
 from rich.console import Console
@@ -89,7 +90,8 @@ class Ticker:
 @contextmanager
 def ticking(ticker: Ticker) -> Iterator[Callable[[str], None]]:
     """A callback for each stage, of which a thread prints the last now and then."""
-    thread = threading.Thread(target=ticker.run, name="progress", daemon=True)
+    known = copy_context()  # of the command
+    thread = threading.Thread(target=known.run, args=(ticker.run,), name="progress", daemon=True)
     thread.start()
     try:
         yield ticker.show

@@ -17,11 +17,11 @@ from minimax_cal.cli.options import (
     record_of,
     refuse,
     result_options,
+    together,
 )
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.pixels.options import PixelFiles, PixelOptions
 from minimax_cal.fitting.several import RelativeOptions, relative
-from minimax_cal.fitting.several.kinds import Given
 from minimax_cal.ground.errors import OptionError
 
 SOUGHT = "What is sought"
@@ -59,26 +59,10 @@ def relative_command(
     to: Output,
     **chosen: Any,
 ) -> int:
-    """Calibrate ROBOT without coordinates, by lengths, closures, contacts or poses in DATA.
-
-    DATA has joint columns and one of: wire1_mm ... (lengths from unknown fixed points to a target
-    on the flange); socket (rows with the same label held the flange's ball in the same socket);
-    surface with kind, plane or sphere (what a probe's ball touched; where known radius_mm,
-    ball_radius_mm, and normal_x, normal_y, normal_z, offset_mm of a body's faces);
-    flange_x_mm, flange_y_mm, flange_z_mm with flange_rx_rad ... or flange_qw ... (whole poses).
-
-    Several files, of any kinds, are one fit: all share the arm, each counts by its own noise.  A
-    tracker's measurements (smr1_x_mm ...) may be among them, and what cameras saw (--pixels).
+    """Calibrate ROBOT by DATA, as `calibrate` takes it, of any instruments but a tracker alone.
 
     With --diagnose the file holds the diagnosis as well, and the arm with the effects found.
     """
-    files, every = record_of(PixelFiles, chosen), list[Given](data)
-    if files.given:
-        from minimax_cal.fitting.several.cameras import detected
-
-        every.append(detected(*files.paths()))
-    else:
-        refuse(CAMERAS, "is about what cameras see, with pixels=, joints= and camera=")
     if exclude and not diagnose:
         raise OptionError("--without is of --diagnose; give both, or neither")
     verb: Callable[..., Any] = relative
@@ -86,5 +70,7 @@ def relative_command(
         from minimax_cal.diagnosing.instruments import diagnose_relative
 
         verb = partial(diagnose_relative, exclude=exclude)
-    found = to.work(verb, robot, every, **chosen)
-    return to.finish(found, status=found.status)
+    files = record_of(PixelFiles, chosen)
+    if not files.given:
+        refuse(CAMERAS, "is about what cameras see, with pixels=, joints= and camera=")
+    return together(verb, robot, [*data], files, to, chosen)

@@ -12,13 +12,29 @@ from minimax_cal.cli import FAILED
 from minimax_cal.ground.words import one_line
 
 AS_JSON: ContextVar[bool] = ContextVar("AS_JSON", default=False)  # of the command that is at work
+TAKEN: ContextVar[list[str]] = ContextVar("TAKEN")  # what files were taken for, not told yet
 
 
 def tell(event: str, text: str, **more: Any) -> None:
-    """Say what happened on stderr.
+    """Say what happened on stderr, what files were taken for before it; an error stands alone.
 
     event: "progress", "notice", "written", "error" or "summary".  more: what else the JSON holds.
     """
+    if event == "error":
+        TAKEN.set([])
+    tell_taken()
+    say(event, text, **more)
+
+
+def tell_taken() -> None:
+    """Say what files were taken for, if that is not told yet."""
+    every = TAKEN.get([])
+    while every:
+        say("taken", every.pop(0))
+
+
+def say(event: str, text: str, **more: Any) -> None:
+    """A line on stderr."""
     line = one_line(text)
     if AS_JSON.get():
         click.echo(json.dumps({"event": event, "text": line, **more}), err=True)

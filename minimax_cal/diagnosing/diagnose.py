@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -55,6 +56,9 @@ from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.judged import doubts
 from minimax_cal.fitting.options import Options, Progress, silent
 from minimax_cal.fitting.second_visits import contradictions
+from minimax_cal.fitting.several.checks import check_no_others, with_others
+from minimax_cal.fitting.several.kinds import READ
+from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
@@ -62,8 +66,8 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.options import check_left_out, grouped, takes
 from minimax_cal.ground.stages import name_rung, number_step
 from minimax_cal.ground.words import name_first
+from minimax_cal.instruments.file import Given, taken
 from minimax_cal.measuring import checks
-from minimax_cal.measuring.campaigns import measured
 from minimax_cal.measuring.faults import (
     Fault,
     find_faults,
@@ -133,12 +137,18 @@ class DiagnosisOptions:
         return number_step(progress, STEPS.index(name) + 1, len(STEPS) - self.quick, name)
 
 
-@takes(options=DiagnosisOptions, read={"exclude": list})
+OF_OTHERS = ("offset", "known_distances", "lever", "noises")
+
+
+@takes(
+    options=DiagnosisOptions, others=(RelativeOptions, OF_OTHERS), read={**READ, "exclude": list}
+)
 def diagnose(
     robot: Robot | str | Path,
-    data: Measurements | str | Path | Sequence[str | Path],
+    data: Given | Sequence[Given],
     *,
     options: DiagnosisOptions,
+    others: RelativeOptions,
     jobs: int = 1,
     cluster: str = "",
     progress: Progress = silent,
@@ -149,9 +159,12 @@ def diagnose(
     ----------
     robot, data
         Loaded, or a name or path; data also as a list of paths, the campaigns of one arm,
-        each a session.
+        each a session.  Lengths, closures, contacts and poses, alone or in a list, are diagnosed
+        as `diagnose_relative` does.
     options
         See `DiagnosisOptions`.
+    others
+        Of other instruments: see `RelativeOptions`.
     jobs
         Processes that search parts of the poses, -1 for one a core.
     cluster
@@ -162,7 +175,8 @@ def diagnose(
     Returns
     -------
     Diagnosis
-        The causes and the error budget. Its lengths are in m, in mm where a name says so.
+        The causes and the error budget. Its lengths are in m, in mm where a name says so.  A
+        `RelativeDiagnosis` where the data are not points of trackers alone.
 
     Raises
     ------
@@ -175,7 +189,13 @@ def diagnose(
     """
     began = time.perf_counter()
     robot = load_robot(robot)
-    given = measured(data)
+    given = taken(data)
+    if not isinstance(given, Measurements):
+        from minimax_cal.diagnosing.instruments import diagnosed
+
+        chosen = with_others(given, replace(options, exclude=()), others)
+        return cast(Diagnosis, diagnosed(robot, given, options.exclude, chosen, progress))
+    check_no_others(given, others)
     check_left_out(options.exclude, EFFECTS)
     given = checks.check_joints(robot, given)
     checks.check_spread(robot, given)

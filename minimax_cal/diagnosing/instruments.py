@@ -29,7 +29,7 @@ from minimax_cal.evidence.limits import HELPS, MAX_JOINT_JITTER, MINOR
 from minimax_cal.evidence.remains import Remains
 from minimax_cal.evidence.selection import Choice, select
 from minimax_cal.fitting.several.fit import InstrumentFit, remaining
-from minimax_cal.fitting.several.kinds import READ, Asked, Given, asked_of, result_of
+from minimax_cal.fitting.several.kinds import READ, Asked, asked_of, result_of
 from minimax_cal.fitting.several.laws import is_shared
 from minimax_cal.fitting.several.linear import StackRows, rows_of_all, scene_of_all
 from minimax_cal.fitting.several.options import Progress, RelativeOptions, silent
@@ -37,6 +37,7 @@ from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.options import check_left_out, takes
+from minimax_cal.instruments.file import Given
 from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
@@ -87,6 +88,17 @@ def diagnose_relative(
     --------
     >>> print(mc.diagnose_relative("irb2600", ["tracker.csv", "sockets.csv"]).headline())
     """
+    return diagnosed(robot, data, exclude, chosen, progress)
+
+
+def diagnosed(
+    robot: Robot | str | Path,
+    data: Given | Sequence[Given],
+    exclude: Sequence[str],
+    chosen: RelativeOptions,
+    progress: Progress,
+) -> RelativeDiagnosis:
+    """`diagnose_relative`, which calls this, with its options in one."""
     began = time.perf_counter()
     check_left_out(exclude, EFFECTS)
     if chosen.effects:

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,23 +15,26 @@ from numpy.typing import ArrayLike
 from minimax_cal.fitting.checks import check_plausible, coarse_joints
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.judged import Judged, Parts
-from minimax_cal.fitting.opened import listed_effects
 from minimax_cal.fitting.options import (
     Options,
     Progress,
     check_options,
-    listed,
     objective_of,
-    priors_of,
     silent,
     usable,
 )
+from minimax_cal.fitting.several.checks import check_no_others, only_others, with_others
+from minimax_cal.fitting.several.kinds import READ, relative_with
+from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.fitting.solve import LEAST_POSES, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning
 from minimax_cal.ground.options import takes
-from minimax_cal.measuring import campaigns, checks, faults
+from minimax_cal.instruments import file
+from minimax_cal.instruments.file import taken
+from minimax_cal.instruments.instrument import Instrument
+from minimax_cal.measuring import checks, faults
 from minimax_cal.measuring.aside import TOOL
 from minimax_cal.measuring.faults.declared import noise
 from minimax_cal.measuring.grouping import groups, mislabelled, split, with_groups
@@ -45,34 +49,40 @@ from minimax_cal.modelling.start import EVERYWHERE
 from minimax_cal.robots.robot import Robot, load_robot
 
 JUMP = (SESSION_JUMP.name, f"{SESSION_JUMP.name}:frame")  # without its moment
-Given = Measurements | str | Path | Sequence[str | Path] | tuple[ArrayLike, ArrayLike]
+Given = file.Given | Sequence[file.Given] | tuple[ArrayLike, ArrayLike]
 
 
 @takes(
-    "objective",
-    "qp",
-    options=Options,
-    read={"fix": listed, "free": listed, "priors": priors_of, "effects": listed_effects},
+    "objective", "qp", options=Options, others=(RelativeOptions, only_others(Options)), read=READ
 )
 def calibrate(
-    robot: Robot | str | Path, data: Given, *, options: Options, progress: Progress = silent
+    robot: Robot | str | Path,
+    data: Given,
+    *,
+    options: Options,
+    others: RelativeOptions,
+    progress: Progress = silent,
 ) -> Fit:
-    """Calibrate a robot from measurements.
+    """Calibrate a robot from measurements of any instruments.
 
     Parameters
     ----------
     robot, data
         Loaded, or a name or path; data also as joints (m, n) and points (m, 3) or (m, k,
-        3), or a list of paths: the campaigns of one arm, each a session.
+        3), or a list of paths: the campaigns of one arm, each a session.  Lengths, closures,
+        contacts and poses, alone or in a list, are calibrated as `relative` does.
     options
         See `Options`.
+    others
+        Of other instruments: see `RelativeOptions`.
     progress
         Called with a word on each stage.
 
     Returns
     -------
     Fit
-        The calibration; how the numbers ended is in its `status`.
+        The calibration; how the numbers ended is in its `status`.  A `RelativeCalibration`
+        where the data are not points of trackers alone.
 
     Raises
     ------
@@ -83,16 +93,21 @@ def calibrate(
     --------
     >>> print(mc.calibrate("irb2600", "poses.csv", objective="sum", holdout=0.3).summary())
     """
-    return calibrate_with(robot, data, options, progress)
+    given = measured(data)
+    if isinstance(given, Measurements):
+        check_no_others(given, others)
+        return calibrate_with(robot, given, options, progress)
+    asked = with_others(given, options, others)
+    return cast(Fit, relative_with(robot, given, asked, progress))  # as nearly all data have it
 
 
 def calibrate_with(
-    robot: Robot | str | Path, data: Given, options: Options, progress: Progress
+    robot: Robot | str | Path, data: Measurements, options: Options, progress: Progress
 ) -> Fit:
-    """`calibrate`, which calls this, with its options in one."""
+    """`calibrate` of points of trackers, with its options in one."""
     began = time.perf_counter()
     robot = load_robot(robot)
-    data = checked(robot, measured(data), options)
+    data = checked(robot, data, options)
     poses = parted(robot, data, options)
     progress("start")
     options = with_jump(robot, poses, options, progress)
@@ -103,11 +118,11 @@ def calibrate_with(
     return result.fit(began)
 
 
-def measured(data: Given) -> Measurements:
+def measured(data: Given) -> Measurements | list[Instrument]:
     """Measurements as they are, of files, or of joints (m, n) and points.  Raises DataError."""
-    if isinstance(data, tuple) and not all(isinstance(part, str | Path) for part in data):
+    if isinstance(data, tuple) and isinstance(data[0], np.ndarray | list | tuple):
         return measurements(*(np.asarray(part, dtype=float) for part in data))
-    return campaigns.measured(data)  # type: ignore[arg-type]
+    return taken(data)  # type: ignore[arg-type]
 
 
 def again(fit: Fit, progress: Progress = silent, **changes: object) -> Fit:

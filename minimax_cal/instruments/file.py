@@ -12,8 +12,12 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import csv_text, write_whole
 from minimax_cal.instruments.instrument import Columns, Instrument, checked
 from minimax_cal.instruments.table import INSTRUMENTS, instrument
-from minimax_cal.measuring.measurements import file_column
-from minimax_cal.reading.rows import read_rows
+from minimax_cal.instruments.tracker import Points, points
+from minimax_cal.measuring.campaigns import measured
+from minimax_cal.measuring.measurements import Measurements, file_column, measurements_in
+from minimax_cal.reading.rows import TARGET, Rows, read_rows
+
+Given = Instrument | Measurements | str | Path
 
 
 def columns_of(path: Path | str, header: Sequence[str]) -> Columns:
@@ -40,10 +44,49 @@ def columns_of(path: Path | str, header: Sequence[str]) -> Columns:
     return first[0][1]
 
 
+def taken(data: Given | Sequence[Given]) -> Measurements | list[Instrument]:
+    """What data, or their files, hold: points of trackers alone, or measurements of instruments.
+
+    Several files of trackers are campaigns of one arm.  Raises DataError.
+    """
+    given = [data] if isinstance(data, Given) else list(data)
+    every = [read_rows(one) if isinstance(one, str | Path) else one for one in given]
+    if not all(map(of_tracker, every)):
+        return [as_instrument(one) for one in every]
+    if len(every) > 1:
+        return measured(given)  # type: ignore[arg-type]  # refuses what is no file
+    lone = every[0]
+    if isinstance(lone, Instrument):
+        return lone.at
+    return measurements_in(lone) if isinstance(lone, Rows) else lone
+
+
+def of_tracker(data: Rows | Instrument | Measurements) -> bool:
+    """Whether data are points of a tracker, or of nothing that is known."""
+    if isinstance(data, Rows):
+        return any(map(TARGET.fullmatch, data.header)) or not is_announced(data.header)
+    return isinstance(data, Measurements) or data.kind == Points.kind
+
+
+def is_announced(header: Sequence[str]) -> bool:
+    """Whether a header says which instrument it is of."""
+    every = [one.file.announce for one in map(instrument, INSTRUMENTS) if one.file]
+    return any(announce.fullmatch(name) for announce in every for name in header)
+
+
+def as_instrument(data: Rows | Instrument | Measurements | Path | str) -> Instrument:
+    """The measurements of an instrument, as they are or of a file.  Raises DataError."""
+    if isinstance(data, Instrument):
+        return data
+    rows = read_rows(data) if isinstance(data, str | Path) else data
+    if isinstance(rows, Rows) and (is_announced(rows.header) or rows.own):
+        return checked(columns_of(rows.path, rows.header).read(rows))
+    return points(measurements_in(rows) if isinstance(rows, Rows) else rows)
+
+
 def read_relative(path: Path | str) -> Instrument:
     """Read a CSV file of any instrument, by its columns.  Raises DataError."""
-    file = read_rows(path)
-    return checked(columns_of(path, file.header).read(file))
+    return as_instrument(path)
 
 
 def write_relative(path: Path | str, data: Instrument) -> None:

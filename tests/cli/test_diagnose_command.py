@@ -50,7 +50,8 @@ def test_details_are_words_then_tables(here: Path, capsys: pytest.CaptureFixture
     assert places == sorted(places)
     assert f"{found.ladder[-1].holdout.rms_mm:.4f}" in out
     assert "\x1b" not in out + err
-    notice, written = err.splitlines()
+    taken, notice, written = err.splitlines()
+    assert taken == "taken: gap.csv holds points at 60 poses"
     assert notice.startswith("notice: only 18 poses are held out")
     assert written == "written: gap.json"
 

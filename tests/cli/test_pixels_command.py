@@ -99,7 +99,7 @@ def test_the_drawn_arm_is_kept_where_it_is_known_better(
     [
         ((), "Missing argument 'DATA...', or --pixels with --joints and --camera"),
         (("--pixels", "d.csv"), "cameras need all three of --pixels, --joints and --camera"),
-        (("d.csv", "--pixels", "d.csv"), "DATA and pixels are one fit in minimax-cal relative"),
+        (("d.csv", "--pixels", "d.csv"), "d.csv: cannot be read"),
         (("--pixels", "d", "--joints", "j", "--camera", "left"), "--camera left: give a name"),
         (("--pixels", "d", "--joints", "j", "--camera", "a=b", "--trim", "0.1"), "--trim is not "),
         (

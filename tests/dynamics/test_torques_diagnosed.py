@@ -293,6 +293,10 @@ def test_the_command_writes_what_evaluate_reads(
     assert run("torques", tmp_path / "arm.json", *learn) == 0
     out = capsys.readouterr().out
     assert "friction in proportion to the load at J2" in out
+    assert run("diagnose", tmp_path / "arm.json", *learn) == 0
+    again, err = capsys.readouterr()
+    assert again.splitlines()[:8] == out.splitlines()[:8]
+    assert err.startswith(f"taken: {learn[0]} holds torques of 3 joints")
     assert run("evaluate", motion, new) == 0
     assert "usual friction refitted" in capsys.readouterr().out
 

@@ -15,10 +15,10 @@ from minimax_cal.evidence.noise import restricted
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.fitting.several import relative
 from minimax_cal.fitting.several.fit import InstrumentFit, Train, fit_instruments, laws_of
-from minimax_cal.fitting.several.kinds import loaded
 from minimax_cal.fitting.several.linear import rows_of_all, scene_of_all
 from minimax_cal.fitting.several.options import RelativeOptions, silent
 from minimax_cal.instruments import Instrument, Surface, contacts
+from minimax_cal.instruments.file import as_instrument
 from minimax_cal.measuring.history import with_history
 from minimax_cal.robots.gravity import tubes
 from minimax_cal.robots.sampling import random_poses
@@ -39,7 +39,7 @@ def tracker(arm: Arm, rng: np.random.Generator, poses: int) -> Instrument:
     q = random_poses(arm.robot, poses, rng)
     turn, shift = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
     y = arm.place(q) @ turn.T + shift + NOISE * rng.normal(size=(poses, 3))
-    return loaded(mc.measurements(q, y))
+    return as_instrument(mc.measurements(q, y))
 
 
 def plates(arm: Arm, rng: np.random.Generator, count: int) -> Instrument:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import grouped
+from minimax_cal.reading.rows import read_rows
 
 SUM, WORST_TARGET, WORST_CAMERA = OBJECTIVES = ("sum", "minimax", "camera")
 # How well a camera's file knows its lens: a share of the focal length, pixels of the centre, and
@@ -24,6 +25,7 @@ SHARES = {  # of each intrinsic: which doubt it has, and how many times
     "k2": ("k", 5.0), "k3": ("k", 10.0), "p1": ("p", 1.0), "p2": ("p", 1.0),
 }  # fmt: skip
 UNITS = {"f": ("%", 0.01), "c": ("px", 1.0), "k": ("", 1.0), "p": ("", 1.0)}
+PIXELS = {"u_px", "v_px"}  # columns of what cameras saw
 ITEM = re.compile(r"\s*([fckp])\s+([\d.]+(?:[eE][-+]?\d+)?)\s*(%|px)?\s*")
 
 
@@ -92,6 +94,12 @@ class PixelFiles:
     def given(self) -> bool:
         """Whether anything is."""
         return any(vars(self).values())
+
+    def among(self, data: Sequence[Path]) -> tuple[PixelFiles, list[Path]]:
+        """The same with what cameras saw where it is a file of the data, and the other files."""
+        seen = [] if self.pixels else [path for path in data if {*read_rows(path).given} >= PIXELS]
+        rest = [path for path in data if path not in seen]
+        return (replace(self, pixels=seen[0]) if seen else self), [*seen[1:], *rest]
 
     def paths(self) -> tuple[Path, Path, dict[str, str], Path | None]:
         """Detections, joints, cameras by name, board.  Raises OptionError."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +13,8 @@ from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.instruments.table import INSTRUMENTS, instrument
+from minimax_cal.instruments.tracker import points
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.solvers.least_squares import AUTO, METHODS
 
 
@@ -33,10 +37,14 @@ def check_options(every: Sequence[Instrument], options: RelativeOptions) -> None
         mine = [data for data in every if data.kind == found.kind]
         for name in found.options:
             if not mine and getattr(options, name) != getattr(default, name):
-                holds = " and ".join(f"{data.at.source} holds {data.kind}" for data in every)
-                raise OptionError(f"{name}= is for {found.kind}; {holds}: leave it out")
+                raise OptionError(f"{name}= is for {found.kind}; {held_by(every)}: leave it out")
         if mine:
             found.check_options(mine, options)
+
+
+def held_by(every: Sequence[Instrument]) -> str:
+    """What each file holds."""
+    return " and ".join(f"{data.at.source} holds {data.kind}" for data in every)
 
 
 def check_noises(
@@ -53,3 +61,31 @@ def check_noises(
             )
         if not (np.isfinite(sigma) and sigma > 0.0):
             raise OptionError(f"noise {name}: sigma {sigma:g} must be positive")
+
+
+def only_others(kind: type) -> list[str]:
+    """Options of other instruments than trackers, which those of a tracker's verb lack."""
+    own = {one.name for one in fields(kind)}
+    return [one.name for one in fields(RelativeOptions) if one.name not in own]
+
+
+def with_others(
+    every: Sequence[Instrument], options: Any, others: RelativeOptions
+) -> RelativeOptions:
+    """What is chosen of a verb for trackers, and of other instruments, which are given.
+
+    Raises OptionError for what they do not know.  All have the objective sum.
+    """
+    default, known = type(options)(), {one.name for one in fields(RelativeOptions)}
+    chosen = {one.name: getattr(options, one.name) for one in fields(options)}
+    for name, value in chosen.items():
+        if name not in known and value not in (getattr(default, name), "sum"):
+            raise OptionError(f"{name}= is for points of a tracker; {held_by(every)}: leave it out")
+    return replace(others, **{name: value for name, value in chosen.items() if name in known})
+
+
+def check_no_others(data: Measurements, others: RelativeOptions) -> None:
+    """Raise OptionError for what is chosen of other instruments beside points of a tracker."""
+    check_options([points(data)], others)
+    if others.noises:
+        raise OptionError("noises= is for several instruments; of one say instrument=")

@@ -34,16 +34,14 @@ from minimax_cal.fitting.several.result import (
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.options import takes
 from minimax_cal.instruments.check import check_instrument
-from minimax_cal.instruments.file import read_relative
+from minimax_cal.instruments.file import Given, as_instrument
 from minimax_cal.instruments.instrument import Instrument, checked
 from minimax_cal.instruments.table import is_registered
-from minimax_cal.instruments.tracker import points
 from minimax_cal.measuring.accuracy import HELD
 from minimax_cal.measuring.campaigns import session_names
 from minimax_cal.measuring.checks import check_joints, limit_notices
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.history import Clock, with_history
-from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Sessions
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
@@ -52,9 +50,6 @@ from minimax_cal.modelling.model import TARGET
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.status import Status
-
-Given = Instrument | Measurements | str | Path
-
 
 READ: Mapping[str, Callable[[Any], Any]] = {  # what people give of an option, as its record has it
     "fix": listed,
@@ -102,6 +97,16 @@ def relative(
     --------
     >>> print(mc.relative("irb2600", "wires.csv", holdout=0.1).headline())
     """
+    return relative_with(robot, data, options, progress)
+
+
+def relative_with(
+    robot: Robot | str | Path,
+    data: Given | Sequence[Given],
+    options: RelativeOptions,
+    progress: Progress,
+) -> RelativeCalibration:
+    """`relative`, which calls this, with its options in one."""
     return asked_of(robot, data, options).calibrated(progress)
 
 
@@ -144,7 +149,7 @@ def asked_of(
     """Data loaded and checked, and split.  Raises CalibrationError."""
     robot = load_robot(robot)
     given = [data] if isinstance(data, Given) else list(data)
-    every = sorted(map(loaded, given), key=lambda data: not data.on_arm)
+    every = sorted(map(as_instrument, given), key=lambda data: not data.on_arm)
     check_given(every)
     check_options(every, options)
     every = [replace(each, at=with_history(check_joints(robot, each.at))) for each in every]
@@ -155,13 +160,6 @@ def asked_of(
         plausible.check_slips(robot, each, options)
     splits = [each.held_back(options) for each in every]
     return Asked(robot, every, options, splits)
-
-
-def loaded(data: Given) -> Instrument:
-    """Data as they are, or of a file."""
-    if isinstance(data, Measurements):
-        return points(data)
-    return data if isinstance(data, Instrument) else read_relative(data)
 
 
 def labels_of(every: Sequence[Instrument]) -> list[str]:
