@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from typing import TypeVar
 
@@ -11,6 +12,7 @@ import scipy
 from minimax_cal.fitting.common_scale import LEAST_SHARE, scale_of, with_links
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.checks import best_orders, swapped
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.slips import (
@@ -26,12 +28,17 @@ from minimax_cal.measuring.slips import (
     with_points_moved,
 )
 from minimax_cal.modelling.model import Model, in_base, model_of
-from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.parameters import Names, State, links_of
 from minimax_cal.modelling.start import BaseFit, fit_base
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kernels.choice import work
 from minimax_cal.robots.robot import Robot
 
+WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
+WILD_LENGTH = 0.02  # nor a length, of its reach
+LARGE_LENGTH = 0.05  # of the reach: with an identified length so far off it is another arm
+LARGE_TWIST, LARGE_ZERO = math.radians(5.0), math.radians(30.0)  # alpha, beta; theta, as well
+MAX_NAMED = 5  # changes that are told one by one
 POOR_FIT = 5e-3  # errors above this share of the arm's reach are not what calibration is about
 EXPLAINED = 0.04  # of the mean square: a slip that leaves no more is the cause
 MAX_ROUNDS = 5
@@ -344,3 +351,49 @@ def put_right(data: Measurements, rows: Array, source: Array) -> Measurements:
     kept = np.ones(data.poses, dtype=bool)
     kept[rows[rows == source]] = False
     return data.with_y(y).take(kept)
+
+
+def wild(names: Names, change: Array, reach: float) -> str:
+    """Links that no whole arm changes so much, by name and how much; empty where there is none.
+
+    change: (5n,) of the link parameters [m, rad].  reach: of the arm [m].
+    """
+    length = names.linear[: len(change)]
+    far = np.flatnonzero(np.abs(change) > np.where(length, WILD_LENGTH * reach, WILD_ANGLE))
+    return ", ".join(
+        f"{names.all[i]} by {1e3 * change[i]:+.4g} {'mm' if length[i] else 'mrad'}"
+        for i in far[:MAX_NAMED]
+    )
+
+
+def too_changed(robot: Robot, after: Robot, active: Array) -> str:
+    """Why a result is of another arm than the one drawn, by its links; empty where it is not.
+
+    after: calibrated.  active: (5n,) True for link parameters that were identified.  What moves all
+    points as the base or the tool does (d and theta of the first joint, the last link) may be
+    anywhere.
+    """
+    kinds = np.arange(5 * robot.joints).reshape(5, -1)  # a, d, theta, alpha, beta of each joint
+    counts = active.copy()
+    counts[[kinds[1, 0], kinds[2, 0], *kinds[:, -1]]] = False
+    change = links_of(after.mdh - robot.mdh)
+    change[2 * robot.joints :] = np.angle(np.exp(1j * change[2 * robot.joints :]))
+    zero = kinds[2]
+    most = np.full(len(change), LARGE_TWIST)
+    most[: 2 * robot.joints], most[zero] = LARGE_LENGTH * robot.reach(), LARGE_ZERO
+    far = np.flatnonzero(counts & (np.abs(change) > most))
+    if robot.rough or not len(far):
+        return ""
+    far = far[np.argsort(-np.abs(change[far]) / most[far])]
+    names, lengths = Names.of(robot, ()).all, 2 * robot.joints
+    named = [
+        f"{names[i]} by {1e3 * change[i]:+.3g} mm" if i < lengths
+        else f"{names[i]} by {math.degrees(change[i]):+.3g} degrees"
+        for i in far
+    ]  # fmt: skip
+    return (
+        f"the measured arm is not the one that {robot.name} draws: {name_first(named, MAX_NAMED)} "
+        f"(at most {1e3 * LARGE_LENGTH * robot.reach():.3g} mm, 5 % of the reach; 5 degrees of "
+        "alpha and beta, 30 of theta): check the robot file, joint signs and units; where the "
+        "drawing is rough, give allow_large_changes=True"
+    )

@@ -11,7 +11,7 @@ import numpy as np
 
 from minimax_cal.fitting.between_sessions import between_sessions
 from minimax_cal.fitting.changed import Change
-from minimax_cal.fitting.checks import POOR_FIT
+from minimax_cal.fitting.checks import POOR_FIT, wild
 from minimax_cal.fitting.claims import (
     bad_rows,
     beyond_of,
@@ -35,7 +35,6 @@ from minimax_cal.fitting.outcome import (
     impossible,
     said_of_exchanged,
 )
-from minimax_cal.fitting.same_arm import wild
 from minimax_cal.fitting.second_visits import contradictions
 from minimax_cal.fitting.set_aside import judged_with
 from minimax_cal.fitting.solve import PER, Solved

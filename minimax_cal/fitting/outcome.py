@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from minimax_cal.fitting.checks import MIN_STRAY_OF_REACH, exchanged
+from minimax_cal.fitting.checks import MIN_STRAY_OF_REACH, exchanged, too_changed
 from minimax_cal.fitting.claims import contradiction
 from minimax_cal.fitting.improvement import Improvement, improvement
 from minimax_cal.fitting.minimax_problem import MIN_TRUSTED_WEIGHT
 from minimax_cal.fitting.options import Options, objective_of
-from minimax_cal.fitting.same_arm import computed, least_noise, residual, too_changed
+from minimax_cal.fitting.same_arm import computed, least_noise, residual
 from minimax_cal.fitting.solve import Solved
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.ground.arrays import Array

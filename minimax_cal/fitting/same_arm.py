@@ -12,70 +12,18 @@ from minimax_cal.fitting.solve import LEAST_POSES
 from minimax_cal.fitting.stations import stationed
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.floor import SIGMAS, declared
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.joint_fit import refitted
-from minimax_cal.modelling.parameters import Names, links_of, zero_positions
+from minimax_cal.modelling.parameters import Names, zero_positions
 from minimax_cal.robots.robot import Robot
 
-WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
-WILD_LENGTH = 0.02  # nor a length, of its reach
-LARGE_LENGTH = 0.05  # of the reach: with an identified length so far off it is another arm
-LARGE_TWIST, LARGE_ZERO = math.radians(5.0), math.radians(30.0)  # alpha, beta; theta, as well
-MAX_NAMED = 5  # changes that are told one by one
 FRACTION = 20.0  # errors of less than this part of the noise are none of an instrument
 # Where nothing is declared: laser trackers, the most exact instruments of these distances, promise
 # 15 um of a coordinate (u95).  A twentieth, 0.7 um in space, is above what three decimals of a
 # millimetre leave by rounding (0.5 um) and far below the repeatability of any arm (5 um).
 LEAST_U95 = 15e-6
-
-
-def wild(names: Names, change: Array, reach: float) -> str:
-    """Links that no whole arm changes so much, by name and how much; empty where there is none.
-
-    change: (5n,) of the link parameters [m, rad].  reach: of the arm [m].
-    """
-    length = names.linear[: len(change)]
-    far = np.flatnonzero(np.abs(change) > np.where(length, WILD_LENGTH * reach, WILD_ANGLE))
-    return ", ".join(
-        f"{names.all[i]} by {1e3 * change[i]:+.4g} {'mm' if length[i] else 'mrad'}"
-        for i in far[:MAX_NAMED]
-    )
-
-
-def too_changed(robot: Robot, after: Robot, active: Array) -> str:
-    """Why a result is of another arm than the one drawn, by its links; empty where it is not.
-
-    after: calibrated.  active: (5n,) True for link parameters that were identified.  What moves all
-    points as the base or the tool does (d and theta of the first joint, the last link) may be
-    anywhere.
-    """
-    kinds = np.arange(5 * robot.joints).reshape(5, -1)  # a, d, theta, alpha, beta of each joint
-    counts = active.copy()
-    counts[[kinds[1, 0], kinds[2, 0], *kinds[:, -1]]] = False
-    change = links_of(after.mdh - robot.mdh)
-    change[2 * robot.joints :] = np.angle(np.exp(1j * change[2 * robot.joints :]))
-    zero = kinds[2]
-    most = np.full(len(change), LARGE_TWIST)
-    most[: 2 * robot.joints], most[zero] = LARGE_LENGTH * robot.reach(), LARGE_ZERO
-    far = np.flatnonzero(counts & (np.abs(change) > most))
-    if robot.rough or not len(far):
-        return ""
-    far = far[np.argsort(-np.abs(change[far]) / most[far])]
-    names, lengths = Names.of(robot, ()).all, 2 * robot.joints
-    named = [
-        f"{names[i]} by {1e3 * change[i]:+.3g} mm" if i < lengths
-        else f"{names[i]} by {math.degrees(change[i]):+.3g} degrees"
-        for i in far
-    ]  # fmt: skip
-    return (
-        f"the measured arm is not the one that {robot.name} draws: {name_first(named, MAX_NAMED)} "
-        f"(at most {1e3 * LARGE_LENGTH * robot.reach():.3g} mm, 5 % of the reach; 5 degrees of "
-        "alpha and beta, 30 of theta): check the robot file, joint signs and units; where the "
-        "drawing is rough, give allow_large_changes=True"
-    )
 
 
 def check_arm(robot: Robot, data: Measurements) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from minimax_cal.fitting import identify
 from minimax_cal.fitting.certificate import Certificate, certify
-from minimax_cal.fitting.checks import POOR_FIT
+from minimax_cal.fitting.checks import POOR_FIT, too_changed
 from minimax_cal.fitting.identify import MAX_NAMED, Because, Identification, Reason
 from minimax_cal.fitting.minimax_problem import Distances, minimax_problem, trusted_distances
 from minimax_cal.fitting.options import (
@@ -522,7 +522,11 @@ def worst_case(
     problem = minimax_problem(model, state, distances, options.distance, per)
     qp, notices = solver_of(options.qp, QP_TOLERANCE)
     settings = Sqp(hessian=options.hessian)
-    if problem.size > (MIN_HOPELESS_MISS * task.robot.reach()) ** 2:
+    links = model.active[: 5 * task.robot.joints]
+    other = not options.allow_large_changes and too_changed(
+        task.robot, task.robot.with_mdh(state.mdh), links
+    )
+    if other or problem.size > (MIN_HOPELESS_MISS * task.robot.reach()) ** 2:
         settings = replace(settings, iterations=min(settings.iterations, LAST_STEPS))
     optimum = minimax.solve(problem, state, qp, settings)
     if len(model.room):

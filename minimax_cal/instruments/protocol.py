@@ -5,7 +5,7 @@ The arm's columns and those of its laws are made here, once for every instrument
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -104,6 +104,8 @@ class ResidualRows(NamedTuple):
 
 def by_arm(arm: FlangePoses, rows: ResidualRows) -> Array:
     """(p, r) slopes of any instrument's predictions by the arm's parameters."""
+    if not len(arm.linear):
+        return np.zeros((0, len(rows.residual)))
     along = np.einsum("rc,prc->pr", rows.by_point, arm.linear[:, rows.pose])
     turned = np.einsum("rc,prc->pr", by_turns(arm, rows), arm.angular[:, rows.pose])
     return np.asarray(along + turned)
@@ -175,18 +177,23 @@ class Arm:
     """An arm at its poses.
 
     q: (m, n) joint values with signs applied.  prismatic: (n,).  reach: [m].  given: laws by which
-    it gives way.
+    it gives way.  still: its poses where no parameter of it moves any more.
     """
 
     q: Array
     prismatic: Array
     reach: float
     given: Given
+    still: FlangePoses | None = None
 
     @staticmethod
     def of(robot: Robot, q: Array) -> Arm:
         """A stiff one at joint values (m, n), as the controller gives them."""
         return Arm(robot.turned(q), robot.prismatic, robot.reach(), Given.none(len(q)))
+
+    def stopped(self, mdh: Array) -> Arm:
+        """The same with links (n, 5) that stay."""
+        return replace(self, still=self.at(mdh))
 
     def at(
         self, mdh: Array, values: Array | None = None, active: Array | None = None
@@ -196,6 +203,8 @@ class Arm:
         mdh: (n, 5).  values: (d,) of the laws, stiff unless given.  active: (5n + d,) the
         parameters of which motions are asked, none unless given.
         """
+        if self.still:
+            return self.still
         given = self.given if values is not None else Given.none(len(self.q))
         values = values if values is not None else np.zeros(0)
         links = kinematics.chain(mdh, self.q, self.prismatic)

@@ -10,8 +10,9 @@ import numpy as np
 
 from minimax_cal.evidence.noise import Noise, restricted
 from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.checks import wild
 from minimax_cal.fitting.opened import Result, open_result
-from minimax_cal.fitting.same_arm import check_arm, wild
+from minimax_cal.fitting.same_arm import check_arm
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.measurements import Measurements, read_measurements

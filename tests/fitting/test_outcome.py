@@ -10,9 +10,10 @@ from conftest import SHARED, run
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
+from minimax_cal.fitting.checks import LARGE_LENGTH, too_changed
 from minimax_cal.fitting.improvement import compare_arms, improvement
 from minimax_cal.fitting.intervals import Interval, told
-from minimax_cal.fitting.same_arm import FRACTION, LARGE_LENGTH, least_noise, too_changed
+from minimax_cal.fitting.same_arm import FRACTION, least_noise
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import Measurements
@@ -53,6 +54,16 @@ def test_the_file_of_another_arm_has_failed_and_names_links(tmp_path: Path) -> N
     assert mc.calibrate("ur10", data, "sum", allow_large_changes=True).status == "converged"
     rough = replace(mc.load_robot("ur10"), rough=True)
     assert mc.calibrate(rough, data, "sum").status == "converged"
+
+
+def test_another_arm_is_not_polished() -> None:
+    """Its minimax took a minute: links of a kilometre, and QPs that no backend answers."""
+    other = simulate("ur10", 24, 3, 1, Truth(compliance=0.0)).data
+    with pytest.warns(mc.CalibrationWarning, match="implausibly large changes"):
+        fit = mc.calibrate("irb2600", other)
+    assert fit.status == "failed"
+    assert fit.minimax
+    assert fit.minimax.iterations <= 20
 
 
 def test_a_real_arm_under_the_name_of_another_has_failed() -> None:

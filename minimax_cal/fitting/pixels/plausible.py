@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
-from minimax_cal.fitting.checks import POOR_FIT, check_mends
+from minimax_cal.fitting.checks import POOR_FIT, check_mends, too_changed
 from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
 from minimax_cal.fitting.pixels.camera import INTRINSICS
 from minimax_cal.fitting.pixels.data import PixelData
@@ -16,7 +16,6 @@ from minimax_cal.fitting.pixels.drawing import Scale
 from minimax_cal.fitting.pixels.fit import FAR_LENS, PixelFit
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import IMAGES, Started, is_flat, poses_of_images, start_scene
-from minimax_cal.fitting.same_arm import too_changed
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.robot import Robot
 

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.checks import POOR_FIT
+from minimax_cal.fitting.checks import POOR_FIT, WILD_ANGLE
 from minimax_cal.fitting.identify import Because
-from minimax_cal.fitting.same_arm import WILD_ANGLE
 from minimax_cal.fitting.several.fit import InstrumentFit, allowed_of, fit_instruments
 from minimax_cal.fitting.several.identify import identified
 from minimax_cal.fitting.several.options import RelativeOptions, silent

@@ -146,6 +146,11 @@ class Stack:
         blocks, count = tuple(Block.of(robot, one) for one in every), len(every)
         return Stack(blocks, tuple(labels), names, np.ones(count), np.full(count, np.nan))
 
+    def stopped(self, mdh: Array) -> Stack:
+        """The same with links (n, 5) that stay."""
+        still = (replace(block, arm=block.arm.stopped(mdh)) for block in self.blocks)
+        return replace(self, blocks=tuple(still))
+
     @property
     def instruments(self) -> tuple[Instrument, ...]:
         """Of the blocks."""
@@ -373,7 +378,9 @@ def started(robot: Robot, one: Instrument, free: Array) -> Array:
     if not one.refines:
         return np.asarray(starts[0])
     active = np.concatenate([np.zeros(5 * robot.joints + 6, dtype=bool), free])
-    few, whole = (Stack.of(robot, [some], [""]) for some in (one.take(one.screened()), one))
+    few, whole = (
+        Stack.of(robot, [some], [""]).stopped(robot.mdh) for some in (one.take(one.screened()), one)
+    )
     x = own_state(robot.mdh, starts[0]).repeat(len(starts))
     x.effects[:] = starts
     if len(starts) > 1:

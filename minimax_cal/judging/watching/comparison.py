@@ -18,8 +18,8 @@ import numpy as np
 
 from minimax_cal.fitting import identify
 from minimax_cal.fitting.beyond import needed, step_without
+from minimax_cal.fitting.checks import wild
 from minimax_cal.fitting.fit import Fit, load_fit
-from minimax_cal.fitting.same_arm import wild
 from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError

@@ -12,9 +12,9 @@ import numpy as np
 from minimax_cal.diagnosing.result import Diagnosis, Finding
 from minimax_cal.diagnosing.sentences import NOTHING_MM, OPENINGS
 from minimax_cal.fitting.beyond import Beyond
+from minimax_cal.fitting.checks import wild
 from minimax_cal.fitting.crossed import intervals_of
 from minimax_cal.fitting.fit import Fit
-from minimax_cal.fitting.same_arm import wild
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import capitalise
