@@ -34,7 +34,7 @@ from minimax_cal.judging.watching.health import check
     ),
     seed=Option("The seed of samples behind the intervals."),
     simulated=Option(
-        "The points are of a simulation and may be exact; a file that begins with # simulated says "
+        "The points are of a simulation and may be exact; a file with a column simulated says "
         "so itself.",
     ),
 )

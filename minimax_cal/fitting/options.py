@@ -182,7 +182,7 @@ class Options:
     )
     simulated: bool = known(
         False,
-        "The points are of a simulation and may be exact; a file that begins with # simulated says "
+        "The points are of a simulation and may be exact; a file with a column simulated says "
         "so itself.",
     )
     resolution: float = identify.RESOLUTION

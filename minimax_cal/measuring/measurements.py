@@ -21,7 +21,7 @@ from minimax_cal.reading.rows import (
     header_check,
     read_rows,
 )
-from minimax_cal.reading.sheet import SIMULATED, Lines
+from minimax_cal.reading.sheet import Lines
 from minimax_cal.reading.words import OWN, joints_of, kind_of, stems_of
 
 APPROACH = re.compile(r"approach\d+")
@@ -35,6 +35,7 @@ PLAUSIBLE = {  # least and largest value in SI of columns of a kind
     "base": (-FARTHEST, FARTHEST),
     "qread": (-1e3, 1e3),
 }
+MARK = "simulated"  # the column of 1 where points were computed
 NAMED = re.compile(r"smr\d+_target")  # what the tracker calls it
 U95 = re.compile(OWN["u95"].pattern)
 
@@ -352,7 +353,7 @@ def measurements_in(file: Rows) -> Measurements:
         digest=file.digest,
         simulated=file.simulated,
     )
-    data = check_finite(data)
+    data = marked(check_finite(data))
     again, said = pasted(file, np.asarray(data.seen.any(axis=1)))
     data = without_blind(replace(data, notices=(*data.notices, *notices)), again)
     data = replace(data, notices=(*data.notices, *said))
@@ -360,6 +361,15 @@ def measurements_in(file: Rows) -> Measurements:
     from minimax_cal.measuring.tools import by_tool
 
     return from_column(by_tool(data))
+
+
+def marked(data: Measurements) -> Measurements:
+    """The same with the mark of computed points, where the file has it as a column of its own."""
+    columns = dict(data.columns)
+    mark = columns.pop(MARK, None)
+    if mark is None:
+        return data
+    return replace(data, columns=columns, simulated=data.simulated or bool((mark == 1.0).all()))
 
 
 def without_blind(data: Measurements, again: Array) -> Measurements:
@@ -418,7 +428,7 @@ def write_measurements(path: Path | str, data: Measurements) -> None:
 
 
 def measurements_text(data: Measurements) -> str:
-    """The CSV of measurements, points set aside with why, `SIMULATED` above it where they are."""
+    """The CSV of measurements, points set aside with why, computed ones marked."""
     from minimax_cal.measuring.set_aside import whole  # which makes measurements itself
     from minimax_cal.measuring.tools import side_by_side
 
@@ -428,7 +438,8 @@ def measurements_text(data: Measurements) -> str:
     header += [f"{name}_{axis}_mm" for name in data.target_names for axis in "xyz"]
     named = {name: file_column(name) for name in data.columns}
     header += [name for name, _ in named.values()]
-    rows = [header]
+    mark = [MARK] * data.simulated
+    rows = [header + mark]
     for j in range(data.poses):
         q = data.q[j] * np.where(data.sliding, 1e3, 1.0)
         y = data.y[j].reshape(3 * k) * 1e3
@@ -441,8 +452,8 @@ def measurements_text(data: Measurements) -> str:
             else:
                 number = float(value) * named[name][1]
                 row.append("" if np.isnan(number) else f"{number:.9g}")
-        rows.append(row)
-    return (f"{SIMULATED}\n" if data.simulated else "") + csv_text(rows)
+        rows.append(row + ["1"] * len(mark))
+    return csv_text(rows)
 
 
 def file_column(stem: str) -> tuple[str, float]:

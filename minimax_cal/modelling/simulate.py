@@ -129,7 +129,7 @@ def simulate(
         y=y,
         target_names=cell.target_names,
         sliding=robot.prismatic,
-        line=np.arange(poses) + 3,  # of a file: after the mark and the header
+        line=np.arange(poses) + 2,  # of a file: after the header
         columns={"order": np.arange(poses)},
         source=f"simulated {robot.name}",
         simulated=True,

@@ -48,6 +48,7 @@ OWN = {  # columns of measurements, by kind
     "pose": Kind("pose", text=True),
     "split": Kind("split", text=True),
     "set_aside": Kind("set_aside", text=True),
+    "simulated": Kind("simulated"),
     "qread": Kind(r"qread\d+", ANY),
     "base": Kind(r"base\d+_[xyz]", SIZES),
 }

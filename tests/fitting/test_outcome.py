@@ -1,5 +1,6 @@
 """A calibration that cannot be has failed, and one that does not help says so."""
 
+import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -171,23 +172,29 @@ def test_the_limit_is_a_twentieth_of_what_is_declared(robot: mc.Robot) -> None:
     assert mc.calibrate(robot, data, "sum", instrument="10um").status == "converged"
 
 
-def test_a_simulated_file_says_so_in_its_first_line(tmp_path: Path, clean: Simulation) -> None:
-    path = tmp_path / "d.csv"
+def test_a_simulated_file_says_so_in_a_column(tmp_path: Path, clean: Simulation) -> None:
+    path, plain, older = (tmp_path / name for name in ("d.csv", "plain.csv", "older.csv"))
     mc.write_measurements(path, clean.data)
-    first, _, rest = path.read_text().partition("\n")
-    assert first == "# simulated"
+    header, *rows = path.read_text().splitlines()
+    assert header.endswith(",simulated")
+    assert all(row.endswith(",1") for row in rows)
     data = mc.read_measurements(path)
     assert data.simulated
-    assert data.line.tolist() == clean.data.line.tolist()
+    assert "simulated" not in data.columns
+    assert not data.notices
     assert mc.calibrate("irb2600", data, "sum").status == "converged"
     assert mc.import_files([path]).data.simulated
-    path.write_text(rest)
-    assert not mc.read_measurements(path).simulated
-    assert run("calibrate", "irb2600", path, "--objective", "sum") == 1
-    assert run("calibrate", "irb2600", path, "--objective", "sum", "--simulated") == 0
+    mc.write_measurements(plain, replace(clean.data, simulated=False))
+    assert not mc.read_measurements(plain).simulated
+    assert run("calibrate", "irb2600", plain, "--objective", "sum") == 1
+    assert run("calibrate", "irb2600", plain, "--objective", "sum", "--simulated") == 0
+    older.write_text(f"# simulated\n{plain.read_text()}")
+    assert mc.read_measurements(older).simulated
     made = tmp_path / "made.csv"
     assert run("simulate", "ur10", "--poses", 9, "-o", made) == 0
-    assert made.read_text().startswith("# simulated\n")
+    assert mc.read_measurements(made).simulated
+    with made.open() as file:
+        assert len({len(row) for row in csv.reader(file)}) == 1  # no line above the header
 
 
 # ---- no better than the drawn arm ----------------------------------------------------------------

@@ -76,9 +76,10 @@ def make() -> None:
     Path("robot.toml").write_text(toml(plain))
     few = ("simulate", "irb120", "--poses", str(POSES), "--seed", "3")
     done(*few, "-o", "data.csv", "--truth", "truth.json")
-    simulated = Path("data.csv")  # as a tracker's file: without the mark in its first line
-    simulated.write_text(simulated.read_text().partition("\n")[2])
-    rows = list(csv.reader(simulated.read_text().splitlines()))
+    measured = Path("data.csv")  # as a tracker's file: without the mark of computed points
+    rows = (row.rpartition(",")[0] for row in measured.read_text().splitlines())
+    measured.write_text("".join(f"{row}\n" for row in rows))
+    rows = list(csv.reader(measured.read_text().splitlines()))
     write("later.csv", [rows[0], *(later(row, 40.0) for row in rows[1:])])
     done("calibrate", "robot.json", "data.csv", "-o", "fit.json")
     sums = ("calibrate", "robot.json", "data.csv", "--objective", "sum")

@@ -13,7 +13,7 @@ from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.instruments.table import INSTRUMENTS, instrument
-from minimax_cal.instruments.tracker import points
+from minimax_cal.instruments.tracker import Points
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.solvers.least_squares import AUTO, METHODS
 
@@ -86,6 +86,6 @@ def with_others(
 
 def check_no_others(data: Measurements, others: RelativeOptions) -> None:
     """Raise OptionError for what is chosen of other instruments beside points of a tracker."""
-    check_options([points(data)], others)
+    check_options([Points(data)], others)
     if others.noises:
         raise OptionError("noises= is for several instruments; of one say instrument=")

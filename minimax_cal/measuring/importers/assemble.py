@@ -23,7 +23,7 @@ from minimax_cal.measuring.importers.join import (
 from minimax_cal.measuring.importers.reading import Column, Given, Reading
 from minimax_cal.measuring.importers.times import STAMPED, celsius, seconds
 from minimax_cal.measuring.importers.units import decide
-from minimax_cal.measuring.measurements import Measurements, check_finite
+from minimax_cal.measuring.measurements import Measurements, check_finite, marked
 from minimax_cal.measuring.set_aside import COLUMN, from_column, set_aside, sound
 from minimax_cal.measuring.tools import by_tool
 from minimax_cal.reading.words import ANGLES, LENGTHS
@@ -149,7 +149,7 @@ def assemble(points: Sequence[Reading], joints: Reading, given: Given) -> Assemb
         simulated=any(r.sheet.simulated for r in readings),
     )
     matched = (*(spot.how for spot in places), "")[: len(readings)]
-    data = by_tool(without_marked(from_column(data), points, places))
+    data = by_tool(without_marked(from_column(marked(data)), points, places))
     return Assembly(check_finite(data), readings, meanings, matched)
 
 
