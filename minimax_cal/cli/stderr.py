@@ -27,7 +27,7 @@ def tell(event: str, text: str, **more: Any) -> None:
 
 
 def tell_taken() -> None:
-    """Say what files were taken for, if that is not told yet."""
+    """Say what files were taken for, unless stderr says so already."""
     every = TAKEN.get([])
     while every:
         say("taken", every.pop(0))
