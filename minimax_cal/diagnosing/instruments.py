@@ -246,12 +246,12 @@ def budget_of(asked: Asked, fit: InstrumentFit, effects: Sequence[Finding]) -> B
 
 def missed(result: RelativeCalibration, fit: InstrumentFit, noise: Array) -> float:
     """RMS of the held-out errors, each file's relative to its noise (b,) [m]."""
-    files = result.instruments or (result,)
     rough = noise / [one.row_noise for one in fit.stack.instruments]
     square = [
-        np.nansum((one.errors["holdout"] / r) ** 2) for one, r in zip(files, rough, strict=True)
+        np.nansum((one.errors["holdout"] / r) ** 2)
+        for one, r in zip(result.instruments, rough, strict=True)
     ]
-    return float(np.sqrt(sum(square) / sum(one.numbers["holdout"] for one in files)))
+    return float(np.sqrt(sum(square) / sum(one.numbers["holdout"] for one in result.instruments)))
 
 
 def with_shares(scene: Scene, ladder: Budget) -> list[Finding]:

@@ -35,7 +35,8 @@ class RelativeStep:
     def of(name: str, found: RelativeCalibration, *, nominal: bool = False) -> RelativeStep:
         """Of a calibration, or of the drawn arm with its instruments fitted."""
         key = "nominal" if nominal else "holdout"
-        files = {one.name: one.accuracy[key] for one in found.instruments}
+        several = found.instruments if len(found.instruments) > 1 else ()
+        files = {one.name: one.accuracy[key] for one in several}
         return RelativeStep(name, found.accuracy[key], files)
 
 

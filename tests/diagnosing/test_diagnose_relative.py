@@ -54,7 +54,7 @@ def test_the_last_step_is_the_calibration_with_the_effects(title: str) -> None:
     for step, effects in ((found.steps[1], ()), (found.steps[-1], terms)):
         fit = relative(arm.robot, data, effects=effects)
         assert_allclose(step.holdout.rms_mm, fit.accuracy["holdout"].rms_mm, rtol=1e-12)
-        for one in fit.instruments:
+        for one in fit.instruments if len(fit.instruments) > 1 else ():
             assert_allclose(step.files[one.name].rms_mm, one.accuracy["holdout"].rms_mm, rtol=1e-12)
     values = [p.value for p in fit.parameters if p.of_effect]
     assert_allclose([v for f in found.effects for v in f.values], values, rtol=1e-12)

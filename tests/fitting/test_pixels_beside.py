@@ -170,8 +170,8 @@ def test_from_files_to_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert run("relative", "ur5", points, *files, "--json", "-o", result) == 0
     content = json.loads(capsys.readouterr().out)
     assert [one["name"] for one in content["instruments"]] == ["tracker", "detections"]
-    assert [one["measured"] for one in content["instruments"]] == ["points", "pixels"]
-    assert {"alone", "directions_alone", "noise_mm"} <= set(content["instruments"][1])
+    assert [one["kind"] for one in content["instruments"]] == ["points", "pixels"]
+    assert {"alone", "directions_alone", "file", "noise", "unit"} <= set(content["instruments"][1])
     assert arm_error(cell, mc.load_robot(result)) < 0.03
     assert run("report", result, "-o", tmp_path / "report.html") == 0
     cameras = {"cam0": tmp_path / "cam0.yaml"}

@@ -173,7 +173,7 @@ def test_the_result_lists_each_file_and_comes_back(tmp_path: Path) -> None:
         low, high = held["rms_ci95_mm"]
         assert low < held["rms_mm"] < high
         assert held["rms_mm"] < 0.1 * one["accuracy"]["nominal"]["rms_mm"]
-        assert one["noise_mm"] == pytest.approx(1e3 * NOISE, rel=0.5)
+        assert one["noise"] == pytest.approx(1e3 * NOISE, rel=0.5)
     again = RelativeCalibration.from_dict(content)
     assert [one.name for one in again.instruments] == [one.name for one in fit.instruments]
     assert again.files_table().text(100) == fit.files_table().text(100)

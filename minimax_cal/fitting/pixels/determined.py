@@ -170,6 +170,12 @@ def table_of(model: PixelModel, data: PixelData, x: Scene, counts: Array) -> tup
     return out, error
 
 
+def metre_of(fit: PixelFit) -> float:
+    """What a pixel is at a typical target [m]."""
+    depth = fit.model.seen(fit.nominal).point[2]
+    return float(np.median(depth / fit.model.intrinsic[fit.model.camera, 0]))
+
+
 def placed(data: PixelData, fit: PixelFit, scale: Scale | None) -> dict[str, Any]:
     """For JSON: the cameras, the lenses, and the board or the targets."""
     x = fit.scene

@@ -16,7 +16,13 @@ import numpy as np
 
 from minimax_cal.fitting.pixels.camera import read_camera, slopes
 from minimax_cal.fitting.pixels.data import PixelData, read_pixels
-from minimax_cal.fitting.pixels.determined import fitted_on, judged_pixels, placed, table_of
+from minimax_cal.fitting.pixels.determined import (
+    fitted_on,
+    judged_pixels,
+    metre_of,
+    placed,
+    table_of,
+)
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.pixels.identify import reference_of
 from minimax_cal.fitting.pixels.model import LENS, PixelModel, Scene, imaged, turned, units_of
@@ -90,9 +96,7 @@ class Images(Instrument):
             holdout=0.0, **{name: getattr(options, name) for name in self.options}
         )
         fit = fitted_on(robot, self.images, chosen, lambda stage: None)
-        depth = fit.model.seen(fit.nominal).point[2]
-        metre = float(np.median(depth / fit.model.intrinsic[fit.model.camera, 0]))
-        return replace(self, robot=robot, fit=fit, model=fit.model, metre=metre)
+        return replace(self, robot=robot, fit=fit, model=fit.model, metre=metre_of(fit))
 
     @property
     def names(self) -> tuple[str, ...]:

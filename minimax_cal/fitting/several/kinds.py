@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.fitting.intervals import rms_interval, told
 from minimax_cal.fitting.opened import listed_effects
 from minimax_cal.fitting.options import listed, priors_of
 from minimax_cal.fitting.positions import lacking, position_sigma, positions_by
 from minimax_cal.fitting.several import fit, plausible, remarks
 from minimax_cal.fitting.several.checks import check_given, check_noises, check_options
 from minimax_cal.fitting.several.fit import InstrumentFit, Train
+from minimax_cal.fitting.several.identify import Alone
 from minimax_cal.fitting.several.options import (
     Progress,
     RelativeOptions,
@@ -40,7 +40,6 @@ from minimax_cal.instruments.table import is_registered
 from minimax_cal.measuring.accuracy import HELD
 from minimax_cal.measuring.campaigns import session_names
 from minimax_cal.measuring.checks import check_joints, limit_notices
-from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.history import Clock, with_history
 from minimax_cal.measuring.stations import Sessions
 from minimax_cal.modelling.cell import Cell
@@ -209,7 +208,7 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
         beyond=remarks.beyond(robot, found, options) if single else (),
         notices=tuple(dict.fromkeys(notices)),
         provenance=Provenance.of(robot, source, settings),
-        instruments=() if single else instruments_of(found, every, splits, measured),
+        instruments=instruments_of(found, every, splits, measured),
         cell=cell_of(robot, found) if found.stiff else None,
     )
     return judged(asked, found, measured, result, sigma)
@@ -243,6 +242,7 @@ def judged(
     return replace(
         result,
         status=Status.FAILED if wrong else result.status,
+        reason=wrong,
         notices=tuple(dict.fromkeys((*result.notices, *said))),
     )
 
@@ -319,22 +319,14 @@ def instruments_of(
     measured: Sequence[Measured],
 ) -> tuple[InstrumentResult, ...]:
     """Each file's own figures."""
-    out = []
-    for i, (data, (held, _), each) in enumerate(zip(every, splits, measured, strict=True)):
-        error = each.errors["holdout"]
-        interval = rms_interval(error, groups(data.at)[held], rng=np.random.default_rng(0))
-        alone = found.alone[i]
-        out.append(
-            InstrumentResult(
-                **vars(each),
-                name=found.stack.labels[i],
-                interval=told(interval, 1e-3 * each.accuracy["holdout"].rms_mm),
-                noise=float(found.noise[i]) / found.stack.instruments[i].row_noise,
-                alone=alone.names,
-                directions_alone=alone.directions,
-            )
-        )
-    return tuple(out)
+    names, fitted = found.stack.labels, found.stack.instruments
+    alone = found.alone or (Alone(0, ()),)
+    noise = [float(s) / one.row_noise for s, one in zip(found.noise, fitted, strict=True)]
+    told = zip(names, measured, every, splits, noise, alone, strict=True)
+    return tuple(
+        InstrumentResult.of(name, seen, data.at, held, sigma, own)
+        for name, seen, data, (held, _), sigma, own in told
+    )
 
 
 def sigma_of_positions(robot: Robot, found: InstrumentFit) -> float:

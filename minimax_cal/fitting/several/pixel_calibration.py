@@ -14,14 +14,22 @@ from minimax_cal.fitting.found import Parameter, link_by_link
 from minimax_cal.fitting.options import listed, qp_name
 from minimax_cal.fitting.pixels.camera import FLANGE, read_camera
 from minimax_cal.fitting.pixels.data import PixelData, read_pixels
-from minimax_cal.fitting.pixels.determined import Determined, determined, judged_pixels, placed
+from minimax_cal.fitting.pixels.determined import (
+    Determined,
+    determined,
+    judged_pixels,
+    metre_of,
+    placed,
+)
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.pixels.judge import Claim, arms_apart, drawn_sigma, position_sigma
 from minimax_cal.fitting.pixels.model import Scene, units_of
 from minimax_cal.fitting.pixels.options import PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import contradiction, file_notices, outlier_notices
 from minimax_cal.fitting.pixels.uncertainty import Uncertainty
+from minimax_cal.fitting.several.identify import Alone
 from minimax_cal.fitting.several.pixel_result import PIXELS, PixelCalibration
+from minimax_cal.fitting.several.result import InstrumentResult, Measured
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
@@ -114,19 +122,21 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
         status = Status.FAILED
     elif not claim.is_better and status is not Status.FAILED:
         status, reason = Status.NO_BETTER, kept_because(claim)
+    numbers = {key: 2 * sum(accuracy(error).counts) for key, error in seen.errors.items()}
+    measured = Measured(
+        kind=PIXELS, parts=data.parts, errors=seen.errors, numbers=numbers, turns={},
+        instrument=placed(data, fit, scale),
+    )  # fmt: skip
+    at, noise = replace(data.at, source=data.source, digest=data.digest), metre_of(fit) * fit.noise
     return PixelCalibration(
-        kind=PIXELS,
+        **vars(measured),
         robot=robot if status is Status.NO_BETTER else arm,
         nominal=robot,
-        parts=data.parts,
         status=status,
         iterations=int(fit.found.iterations[0]),
         seconds=time.perf_counter() - began,
         parameters=parameters_of(robot, fit, sure.covariance),
-        errors=seen.errors,
-        numbers={key: 2 * sum(accuracy(error).counts) for key, error in seen.errors.items()},
-        turns={},
-        instrument=placed(data, fit, scale),
+        instruments=(InstrumentResult.of(PIXELS, measured, at, held, noise, Alone(0, ())),),
         identification=fit.identification,
         position_sigma=claim.sigma,
         beyond=(),
@@ -134,9 +144,7 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
             *data.notices, *limit_notices(robot, data.at), *one.notices, *notices_of(fit, held),
             *told, *outlier_notices(data, seen.aside),
         ),
-        provenance=Provenance.of(
-            robot, replace(data.at, source=data.source, digest=data.digest), options.settings()
-        ),
+        provenance=Provenance.of(robot, at, options.settings()),
         calibrated=arm,
         pixels=seen.pixels,
         claim=claim,

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 from minimax_cal.fitting.fit import ACCURACIES
 from minimax_cal.fitting.found import parameter_table
 from minimax_cal.fitting.pixels.judge import Claim
-from minimax_cal.fitting.pixels.options import SUM
 from minimax_cal.fitting.pixels.worst import WorstPixels
 from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.ground.facts import APART, Fact
@@ -19,7 +18,6 @@ from minimax_cal.ground.results import merged
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import capitalise
 from minimax_cal.measuring.accuracy import NO_ENDS, Accuracy
-from minimax_cal.measuring.aside import SetAside
 from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.solvers.status import Status
 
@@ -38,14 +36,10 @@ class PixelCalibration(RelativeCalibration):
     """
 
     calibrated: Annotated[Robot | None, APART] = None
-    objective: str = SUM
-    qp: str = ""
     worst: Annotated[WorstPixels | None, Fact(key="minimax")] = None
     pixels: Annotated[Mapping[str, tuple[float, float]], APART] = field(default_factory=dict)
     claim: Annotated[Claim, Fact(key="arm_position")] = NO_CLAIM
-    set_aside: tuple[SetAside, ...] = ()
     with_them: Annotated[Accuracy | None, Fact(key="accuracy.holdout_with_them", brief=True)] = None
-    reason: str = ""
 
     @property
     def is_no_better(self) -> bool:

@@ -12,8 +12,9 @@ import numpy as np
 from minimax_cal.fitting.fit import ACCURACIES, Provenance
 from minimax_cal.fitting.found import Parameter, parameter_table, table_of_effects
 from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.intervals import Interval
+from minimax_cal.fitting.intervals import Interval, rms_interval, told
 from minimax_cal.fitting.opened import RELATIVE
+from minimax_cal.fitting.several.identify import Alone
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.facts import APART, Fact, Mm, derived, in_file, scaled
 from minimax_cal.ground.files import plain
@@ -24,6 +25,9 @@ from minimax_cal.ground.words import name_first
 from minimax_cal.instruments.instrument import Words
 from minimax_cal.instruments.table import INSTRUMENTS, instrument
 from minimax_cal.measuring.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
+from minimax_cal.measuring.aside import SetAside
+from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, cell_from_dict, pose_from_dict
 from minimax_cal.modelling.frames import paired, tables_of
 from minimax_cal.robots.frames import CONVENTION, Frame
@@ -162,18 +166,43 @@ class Measured:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class InstrumentResult(Measured):
-    """One of several files.
+    """One of the files.
 
     interval: 95 % of the held-out RMS [m].  noise: sigma of a number by what the fit leaves [m].
-    alone: link parameters that only this file
+    alone: link parameters that of several files only this one
     determines; directions_alone: the number of independent directions in which it does.
     """
 
+    kind: str
     name: str
+    file: str
     interval: Annotated[Interval, APART]
-    noise: Mm
+    noise: Annotated[float, Fact(key="noise", scale=1e3)]
     alone: tuple[str, ...]
     directions_alone: int
+
+    @staticmethod
+    def of(
+        name: str, seen: Measured, at: Measurements, held: Array, noise: float, alone: Alone
+    ) -> InstrumentResult:
+        """Of what was seen at poses.  at: with its source.  held: (m,).  noise: [m]."""
+        own = {one.name: getattr(seen, one.name) for one in fields(Measured)}
+        group, after = groups(at)[held], seen.accuracy["holdout"]
+        interval = rms_interval(seen.errors["holdout"], group, rng=np.random.default_rng(0))
+        return InstrumentResult(
+            **own,
+            name=name,
+            file=at.source,
+            interval=told(interval, 1e-3 * after.rms_mm),
+            noise=noise,
+            alone=alone.names,
+            directions_alone=alone.directions,
+        )
+
+    @derived()
+    def unit(self) -> str:
+        """Of its noise in a file."""
+        return "mm"
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -184,7 +213,8 @@ class InstrumentResult(Measured):
     @staticmethod
     def from_dict(content: Any, at: str) -> InstrumentResult:
         """From `to_dict`.  Raises ValueError."""
-        told, apart = stored(InstrumentResult, content, at), Measured.fields_of(content, f"{at}.")
+        told = stored(InstrumentResult, content, at)
+        apart = Measured.fields_of({**content, "measured": told["kind"]}, f"{at}.")
         ends = scaled(apart["stated"]["holdout"].rms_ci95_mm or NO_ENDS, 1e-3)
         return InstrumentResult(**told, **apart, interval=Interval(*ends))
 
@@ -197,9 +227,9 @@ class RelativeCalibration(Measured, Result):
     joints' range, by the parameters' sigmas alone, the base fitted [m]; NaN while a direction that
     moves positions is open.  positions_open: parameters that positions depend on and that the
     measurements do not determine.
-    beyond: parameters that whole poses tell and one reflector does not.  instruments: each of
-    several files.  cell: the arm with its effects, fitted together; None without any.  robot is
-    then of a fit without them.
+    beyond: parameters that whole poses tell and one reflector does not.  instruments: each file.
+    cell: the arm with its effects, fitted together; None without any.  robot is then of a fit
+    without them.
     """
 
     KIND = RELATIVE
@@ -216,8 +246,12 @@ class RelativeCalibration(Measured, Result):
     beyond: Annotated[tuple[str, ...], Fact(key="beyond_one_reflector")]
     notices: tuple[str, ...]
     provenance: Provenance
-    instruments: Annotated[tuple[InstrumentResult, ...], Fact(brief=True)] = ()
+    instruments: tuple[InstrumentResult, ...] = ()
     positions_open: tuple[str, ...] = ()
+    objective: str = "sum"
+    qp: str = ""
+    set_aside: tuple[SetAside, ...] = ()
+    reason: str = ""
     cell: Annotated[Cell | None, APART] = None
 
     @derived()
@@ -258,17 +292,17 @@ class RelativeCalibration(Measured, Result):
     def first_tables(self) -> tuple[Table, ...]:
         """What stands on the first screen."""
         first = [self.accuracy_table().brief("poses", "count", "RMS mm", "max mm")]
-        if self.instruments:
+        if self.kind == SEVERAL:
             first = [self.files_table(), self.alone_table()]
         return filled(*first, table_of_effects(self.parameters))
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
         first = self.first_tables()
-        if not self.instruments:
+        if self.kind != SEVERAL:
             first = (self.accuracy_table(), *first[1:], self.parts_table(f"by {self.words.part}"))
         every = [*first, *tables_of(self.frames)]
-        for one in self.instruments:
+        for one in self.instruments if self.kind == SEVERAL else ():
             every += [one.scores(f"{one.name}: {one.words.quantity}"), *tables_of(one.frames),
                       one.parts_table(f"{one.name}, by {one.words.part}")]  # fmt: skip
         return (*filled(*every), parameter_table(self.parameters))
