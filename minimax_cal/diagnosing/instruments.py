@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from scipy.special import chdtri
-from threadpoolctl import threadpool_limits
 
 from minimax_cal.diagnosing.causes import (
     Causes,
@@ -37,6 +36,7 @@ from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.options import check_left_out, takes
+from minimax_cal.ground.threads import on_one_thread
 from minimax_cal.instruments.file import Given
 from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.scene import Scene
@@ -112,10 +112,10 @@ def diagnosed(
             "a diagnosis needs held-out rows in every file: measure more, or hold out more "
             "(holdout)"
         )
-    with threadpool_limits(limits=1, user_api="blas"):
-        return examined(asked, tuple(exclude), progress, began)
+    return examined(asked, tuple(exclude), progress, began)
 
 
+@on_one_thread
 def examined(
     asked: Asked, exclude: tuple[str, ...], progress: Progress, began: float
 ) -> RelativeDiagnosis:

@@ -31,6 +31,7 @@ from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning
 from minimax_cal.ground.options import takes
+from minimax_cal.ground.threads import on_one_thread
 from minimax_cal.instruments import file
 from minimax_cal.instruments.file import taken
 from minimax_cal.instruments.instrument import Instrument
@@ -101,6 +102,7 @@ def calibrate(
     return cast(Fit, relative_with(robot, given, asked, progress))  # as nearly all data have it
 
 
+@on_one_thread
 def calibrate_with(
     robot: Robot | str | Path, data: Measurements, options: Options, progress: Progress
 ) -> Fit:
@@ -114,7 +116,7 @@ def calibrate_with(
     solved = fit_cell(robot, poses.train, options, progress, poses.near)
     result = Judged(robot, options, poses, solved)
     for doubt in result.alarming:
-        warnings.warn(doubt, CalibrationWarning, stacklevel=4)
+        warnings.warn(doubt, CalibrationWarning, stacklevel=5)
     return result.fit(began)
 
 

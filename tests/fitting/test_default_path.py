@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import qpsolvers
+import threadpoolctl
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
@@ -121,3 +122,19 @@ def test_the_papers_subgradient_answers_by_itself(arm: str, method: str, least: 
         offered = float(told[0].split(" fall by ")[1].split()[0])
         assert 200.0 * over <= offered <= 5.0
     assert f"by subgradient:{method} (used as they are, relative residual up to" in found.headline()
+
+
+def test_small_matrices_get_one_thread(robot: mc.Robot) -> None:
+    """Two of them wait for each other: a fit took twice as long, its starts thirty times."""
+    seen: list[int] = []
+
+    def threads(_: object = None) -> list[int]:
+        found = threadpoolctl.threadpool_info()
+        return [each["num_threads"] for each in found if each["user_api"] == "blas"]
+
+    with threadpoolctl.threadpool_limits(2, "blas"):
+        before = threads()
+        mc.calibrate(robot, mc.simulate(robot, 30, 2, seed=1).data, "sum",
+                     progress=lambda _: seen.extend(threads()))  # fmt: skip
+        assert threads() == before
+    assert set(seen) == {1}
