@@ -171,6 +171,7 @@ PLAIN = {"mm", "deg", "mrad", "um"}  # units
 RUN = [
     "index.md", "tutorial.md", "backends.md", "own_effect.md", "from_matlab.md",
     "several_instruments.md", "own_instrument.md", "mjcf_to_mjcf.md", "controller_pose.md",
+    "hand_eye.md",
 ]  # fmt: skip
 
 

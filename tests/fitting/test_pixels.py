@@ -448,6 +448,16 @@ def test_a_drawing_that_is_known_better_is_kept(ground: Cell) -> None:
     )
 
 
+def test_hand_eye_alone_is_a_result() -> None:
+    """With every link fixed there is no arm to keep back; the camera is found to its sigma."""
+    cell = cell_of(5, off=(0.0, 0.0))
+    fit = fitted(cell.drawn, data_of(cell), PixelOptions(fix=("[ad]*", "theta*", "beta*")))
+    assert fit.status is Status.CONVERGED
+    assert not fit.reason
+    assert_allclose(fit.robot.mdh, cell.drawn.mdh)
+    assert "The arm stays as drawn" in fit.headline()
+
+
 def test_a_change_that_noise_makes_up_is_kept_back(ground: Cell) -> None:
     still = make_cell(
         np.random.default_rng(5), points=board_points(SMALL, WIDE), poses=30, off=(0.0, 0.0),

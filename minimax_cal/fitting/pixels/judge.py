@@ -24,6 +24,7 @@ from minimax_cal.robots.sampling import random_joints
 
 POSES = 300  # over the joints' whole range
 MARGIN = 2.0 / 3.0  # of the drawing's sigma: an arm less sure may be worse than drawn
+SAME = 1e-9  # arms so far apart are one and the same [m]
 TOOL = np.array([0.0, 0.0, 0.1])  # a point beside the last axes, in the flange [m]
 
 
@@ -133,6 +134,11 @@ class Claim:
     def sentence(self) -> str:
         """For people."""
         mm = self.texts()
+        if self.change < SAME:
+            return (
+                "The arm stays as drawn: cameras and targets go with it, whose positions the "
+                f"drawing knows to {mm['drawn']} RMS (drawn_within)."
+            )
         said = (
             f"These pixels determine a position of the arm to {mm['sigma']} RMS (sigma over the "
             "joints' whole range, lack of fit and the lenses' doubt included); the drawing knows "
