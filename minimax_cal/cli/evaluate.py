@@ -49,7 +49,8 @@ def evaluate_command(
 ) -> int:
     """Accuracy of a saved calibration FIT on the measurements in DATA; nothing is fitted.
 
-    FIT is a calibration, a diagnosis or a relative calibration, as -o wrote it.  Of a motion
+    DATA of other instruments than a tracker is as `calibrate` takes it; what they have of their own
+    is fitted.  FIT is a calibration, a diagnosis or a relative calibration, as -o wrote it.  Of a motion
     diagnosis, DATA and MORE are logs, and its torques are judged.
     """
     found: Evaluation | MotionEvaluation

@@ -244,8 +244,10 @@ def of_relative(content: Mapping[str, Any], source: str) -> Opened:
     known = whole.effects.causes
     firm = {term.text for term in established(content, source)} if "diagnosis" in content else None
     possible = frozenset(term.text for term in known) - firm if firm is not None else frozenset()
+    digest = str(content.get("provenance", {}).get("data_sha256", ""))
     return Opened(
-        source, rungs, 1, placed=False, status=status, geometric=alone, possible=possible
+        source, rungs, 1, digest=digest, placed=False, status=status, geometric=alone,
+        possible=possible,
     )  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,12 +14,17 @@ from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.opened import Opened, open_result
 from minimax_cal.fitting.opened import Result as Given
 from minimax_cal.fitting.set_aside import aside_sentence, errors_of, with_them
+from minimax_cal.fitting.several.fit import Train, allowed_of, stack_of, start_of
+from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationError, DataError
+from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
 from minimax_cal.ground.facts import Apart, Fact
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
+from minimax_cal.instruments.file import Given as Measured
+from minimax_cal.instruments.file import taken
+from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.checks import check_joints, outliers
@@ -55,7 +60,7 @@ class Saved:
 
 def evaluate(
     source: Given,
-    data: Measurements | Path | str,
+    data: Measured,
     rung: int | None = None,
     new_frame: bool = False,
 ) -> Accuracy:
@@ -67,7 +72,8 @@ def evaluate(
         A calibration, its cell, a diagnosis, a relative calibration, or the file of one.
     data
         Points, and the columns that effects look at; nothing is fitted to them, but for
-        base and targets of a relative calibration, which knows none.
+        base and targets of a relative calibration, which knows none.  Lengths, closures, contacts
+        or poses: what their instrument has of its own (anchors, frames ...) is fitted to them.
     rung
         Of a diagnosis (0 nominal, 1 geometric ...), the last unless given.
     new_frame
@@ -129,10 +135,13 @@ class Evaluation(Result):
 
 
 def evaluated(
-    source: Given, data: Measurements | Path | str, rung: int | None, new_frame: bool = False
+    source: Given, data: Measured, rung: int | None, new_frame: bool = False
 ) -> Evaluation:
     """As `evaluate`, with what the reader should know."""
-    data = read_measurements(data)
+    given = taken(data)
+    if isinstance(given, list):
+        return of_instrument(source, given[0], rung)
+    data = given
     opened = open_result(source, rung)
     cell, _, said = opened.placed_by(data, new_frame)
     error = cell.error(data)
@@ -170,6 +179,39 @@ def evaluated(
         with_them=gone,
         shown=found.table(f"{name} on {data.source}", data.target_names),
         notices=(*data.notices, *said, *strangers(cell, data), *mixed, *doubts),
+    )
+
+
+def of_instrument(source: Given, one: Instrument, rung: int | None) -> Evaluation:
+    """How well an arm fits what an instrument measured, whose own unknowns are fitted to it."""
+    opened = open_result(source, rung)
+    robot, step = opened.cell.robot, opened.rungs[opened.number].name
+    if opened.cell.effects.terms:
+        raise OptionError(
+            f"{opened.source}: its effects are judged by points of a tracker alone; take a step "
+            "without them (rung=1)"
+        )
+    one, options = replace(one, at=check_joints(robot, one.at)), RelativeOptions()
+    stack = stack_of(robot, [Train("", one)], options)
+    x, block = start_of(robot, stack, allowed_of(stack, options)[0]), stack.blocks[0]
+    error = block.instrument.errors(block.flange(x), block.own(x), np.zeros(one.poses, dtype=bool))
+    found, data = accuracy(error), one.at
+    seen = bool(data.digest) and data.digest in opened.digest.split()
+    said = [f"{data.source}: what the instrument has of its own is fitted to these rows"]
+    said += [f"{data.source}: the fit was made of these rows"] * seen
+    return Evaluation(
+        fit=opened.source,
+        rung=step,
+        data=data.source,
+        data_sha256=data.digest,
+        training_poses=data.poses if seen else 0,
+        outside=int(outside(opened.spans, data.q)[0].sum()),
+        narrow=tuple(span.joint for span in narrow(opened.spans)),
+        accuracy=found,
+        set_aside=data.set_aside,
+        with_them=None,
+        shown=found.table(f"{one.words.quantity} on {data.source}", block.instrument.parts),
+        notices=(*data.notices, *said),
     )
 
 

@@ -110,6 +110,28 @@ def test_one_verb_diagnoses_all(files: dict[str, Path], capsys: pytest.CaptureFi
     assert "--quick is for points of a tracker" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("kind", ["wires_3", "poses"])
+def test_a_fit_is_judged_by_any_instrument(
+    kind: str, files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What the instrument has of its own is fitted, so that all of it is what the arm leaves."""
+    fit = tmp_path / "fit.json"
+    made, _ = answered(capsys, "calibrate", "irb2600", files[kind], "-o", fit)
+    found, said = answered(capsys, "evaluate", fit, files[kind])
+    spent = found["accuracy"]["sse_mm2"], made["accuracy"]["train"]["sse_mm2"]
+    assert sum(spent[1]) < sum(spent[0])
+    assert found["accuracy"]["rms_mm"] < 1.2 * made["accuracy"]["holdout"]["rms_mm"]
+    assert found["training_poses"] == 80
+    assert any("the fit was made of these rows" in line for line in said)
+    drawn, _ = answered(capsys, "evaluate", fit, files[kind], "--step", 0)
+    assert drawn["accuracy"]["rms_mm"] > 5.0 * found["accuracy"]["rms_mm"]
+    by_tracker = tmp_path / "tracker.json"
+    answered(capsys, "calibrate", "irb2600", files["tracker"], "-o", by_tracker)
+    other, _ = answered(capsys, "evaluate", by_tracker, files[kind])
+    assert other["accuracy"]["rms_mm"] < 0.2 * drawn["accuracy"]["rms_mm"]
+    assert other["training_poses"] == 0
+
+
 def test_detections_are_data_where_cameras_are_given(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
