@@ -103,7 +103,7 @@ def test_a_law_of_any_domain_is_found_again_and_a_faint_one_less_often(
     whole = select(straight(rng, {3: 1.0, 7: 0.25}))
     names = [c.key for c in whole.chosen]
     assert ("law 3", "x") in names
-    found = repeated(whole, whole.library.rows.group)
+    found = repeated(whole, subsamples(whole.library.rows.group))
     assert len(found.names) == PARTS * ROUNDS
     assert found.frequency({("law 3", "x")}) == 1.0
     assert found.frequency({("law 7", "x")}) < 1.0
@@ -112,7 +112,7 @@ def test_a_law_of_any_domain_is_found_again_and_a_faint_one_less_often(
 
 def test_rows_too_few_for_their_geometry_are_not_asked(rng: np.random.Generator) -> None:
     whole = select(straight(rng, {3: 5.0}, rows=27))
-    found = repeated(whole, whole.library.rows.group)
+    found = repeated(whole, subsamples(whole.library.rows.group))
     assert found.names == ()
     assert np.isnan(found.frequency({("law 3", "x")}))
 
