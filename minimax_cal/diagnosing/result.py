@@ -321,20 +321,26 @@ class Untestable(NamedTuple):
     needs: str
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Explained:
     """What was explained, of whatever instruments: a verdict and its effects.
 
     status: of the fit of geometry.  verdict: one of VERDICTS.  effects: the largest first.
+    jitter: of a joint [rad].
     structure: probability that what remains is unrelated to what structure_in names.
     not_testable: effects, and what the data lack for them.
+    meets_floor: whether the remaining error is down to the known noise, None where that is not
+    known.
     """
 
     status: Status
-    verdict: str
-    effects: tuple[Finding, ...]
-    structure: float
-    structure_in: str
+    verdict: Annotated[str, Fact(among=VERDICTS)]
+    effects: Annotated[tuple[Finding, ...], APART]
+    jitter: Annotated[float, Fact(key="noise.joint_jitter_mrad", scale=1e3)]
+    structure: Annotated[float, Fact(key="structure.p")]
+    structure_in: Annotated[str, Fact(key="structure.in")]
     not_testable: tuple[Untestable, ...]
+    meets_floor: bool | None = None
 
     @property
     def excess(self) -> str:
@@ -398,17 +404,14 @@ class Explained:
 class Diagnosis(Explained, Result):
     """What is still wrong with a calibrated robot.
 
-    status: of the geometric fit.  verdict: one of VERDICTS.  effects: by share of the gap.
     ladder: nominal, geometric, then with each effect.  beyond: on whole parts left out, effects
     searched again without each.  floor: RMS that noise alone would leave.
     closed: share of the gap closed, 0 to 1, with its interval, NaN where it says nothing.
-    noise: of a coordinate [m].  jitter: of a joint [rad].
-    structure: probability that what remains is unrelated to pose and time.
+    noise: of a coordinate [m].
     where: see `where.Where.to_dict`.  data: as it was fitted, faults mended; held: (m,) True where
     held out.  cells: geometric, then with each effect.  nominal: before, None in an old file.
     set_aside: points that no fit counts; with_them: how the last step does where they count.
-    remainder: what free functions still predict, None in an old file.  meets_floor: whether the
-    remaining error is down to the known noise, None where that is not known.
+    remainder: what free functions still predict, None in an old file.
     stated_errors, stated_curves: as they stand in the file that the diagnosis was read from.
     """
 
@@ -416,20 +419,13 @@ class Diagnosis(Explained, Result):
     COMMAND = "diagnose"
 
     robot: str
-    status: Status
-    verdict: Annotated[str, Fact(among=VERDICTS)]
-    effects: Annotated[tuple[Finding, ...], APART]
     ladder: Annotated[tuple[Step, ...], Fact(key="gap.ladder", fewest=2)]
     floor: Annotated[Floor, APART]
     closed: Annotated[float, Fact(key="gap.closed")]
     closed_ci: Annotated[tuple[float, float], APART]
     beyond: Annotated[Beyond, Fact(key="gap.beyond")]
     noise: Annotated[float, Fact(key="noise.instrument_mm", scale=1e3)]
-    jitter: Annotated[float, Fact(key="noise.joint_jitter_mrad", scale=1e3)]
-    structure: Annotated[float, Fact(key="structure.p")]
-    structure_in: Annotated[str, Fact(key="structure.in")]
     where: Mapping[str, Any]
-    not_testable: tuple[Untestable, ...]
     notices: tuple[str, ...]
     provenance: Provenance
     seconds: float
@@ -442,7 +438,6 @@ class Diagnosis(Explained, Result):
     remainder: Remainder | None = None
     set_aside: tuple[SetAside, ...] = ()
     with_them: Annotated[Accuracy | None, Fact(key="accuracy.holdout_with_them", brief=True)] = None
-    meets_floor: bool | None = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis of {self.robot}: {self.verdict}. {self.headline()}>"

@@ -65,11 +65,11 @@ def made() -> Diagnosis:
              replace(base, effects=Fitted((PLAY, SOFT), (play, soft)))]  # fmt: skip
     error = np.zeros((2, 30, 3))
     return Diagnosis(
-        "arm", Status.CONVERGED, "named", FINDINGS, RUNGS, Floor(0.1, 0.05, 0.2, DECLARED), 0.9,
-        (0.8, 0.95), Beyond(), 2e-5, 4e-6, 0.25, "pose", {},
-        (Untestable("thermal", "temperatures"),),
+        "arm", RUNGS, Floor(0.1, 0.05, 0.2, DECLARED), 0.9, (0.8, 0.95), Beyond(), 2e-5, {},
         ("a notice",), Provenance("arm"), 1.5, sim.data, np.arange(30) % 5 == 0, tuple(cells),
         stated_errors=(error + 1e-3, error + 5e-4), stated_curves={}, nominal=base,
+        status=Status.CONVERGED, verdict="named", effects=FINDINGS, jitter=4e-6, structure=0.25,
+        structure_in="pose", not_testable=(Untestable("thermal", "temperatures"),),
     )  # fmt: skip
 
 
