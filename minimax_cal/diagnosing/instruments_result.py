@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from minimax_cal.diagnosing.result import FOUND, Explained, Finding
+from minimax_cal.diagnosing.result import FOUND, Explained, Finding, ends_of
 from minimax_cal.diagnosing.sentences import explained
 from minimax_cal.evidence.limits import LEVEL
 from minimax_cal.fitting.opened import RELATIVE
@@ -120,17 +120,12 @@ class RelativeDiagnosis(Explained, Result):
 
     def to_dict(self, *, poses: bool = True) -> dict[str, Any]:
         """The JSON of the calibration, with the key diagnosis, as `Diagnosis` where it means so."""
-
-        def held(kind: str) -> dict[str, float]:
-            ends = {"nominal": 0, "geometric": 1, "final": -1}
-            return {name: getattr(self.steps[at].holdout, kind) for name, at in ends.items()}
-
         remaining, highest = self.floor_mm
         more = {
             "floor_known": self.meets_floor is not None,
             "floor": {"remaining_mm": remaining, "noise_floor_mm": highest},
             "effects": self.effects,
-            "gap": {"holdout_rms_mm": held("rms_mm"), "holdout_max_mm": held("max_mm")},
+            "gap": {f"holdout_{kind}": ends for kind, ends in ends_of(self.steps).items()},
         }
         own = merged(plain(in_file(self)), plain(more))
         return {**self.calibration.to_dict(), "diagnosis": own}

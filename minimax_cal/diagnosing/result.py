@@ -16,19 +16,19 @@ from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual
 from minimax_cal.evidence.limits import BAND, CONFIRMED, ENOUGH, LEVEL
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.fitting.found import Parameter
 from minimax_cal.fitting.set_aside import aside_sentence
 from minimax_cal.fitting.told_poses import measured_poses
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import CalibrationError
-from minimax_cal.ground.facts import APART, Fact, derived, in_file
-from minimax_cal.ground.files import finite, number, plain
+from minimax_cal.ground.facts import APART, Fact, derived
+from minimax_cal.ground.files import finite, number
 from minimax_cal.ground.records import AGAIN, array, as_kind, stored
-from minimax_cal.ground.results import Result
+from minimax_cal.ground.results import Record, Result
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.units import in_files
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.aside import SetAside
+from minimax_cal.measuring.faults import Amount
 from minimax_cal.measuring.faults.nests import RESEAT
 from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.history import with_history
@@ -105,7 +105,7 @@ class Alternative:
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
+class Finding(Record):
     """One effect found, or a fault of the data.
 
     terms: what is fitted; several lines of one gear are one effect.  values, sigmas, names, units:
@@ -141,16 +141,26 @@ class Finding:
     shown: Annotated[tuple[Term, ...], APART] = ()
 
     @derived()
+    def effect(self) -> str:
+        """Its name in the library, or of a fault."""
+        return self.term.effect
+
+    @derived()
+    def place(self) -> str:
+        """As J2."""
+        return self.term.place
+
+    @derived()
     def established(self) -> bool:
         """Whether it is found again in nearly all subsamples of the poses."""
         return not self.why_tentative
 
-    @property
-    def why_tentative(self) -> str:
-        """What keeps it from being confirmed; '' if nothing does."""
+    @derived()
+    def why_tentative(self) -> str | None:
+        """What keeps it from being confirmed; None if nothing does."""
         if math.isnan(self.again):
             return "poses too few to leave any out"
-        return "not found again without some of the poses" if self.again < CONFIRMED else ""
+        return "not found again without some of the poses" if self.again < CONFIRMED else None
 
     @property
     def evidence(self) -> str:
@@ -197,6 +207,7 @@ class Finding:
         p = self.p_value
         return "-" if math.isnan(p) else f"< {SURE:g}" if p < SURE else f"{p:.1g}"
 
+    @derived()
     def parameters(self) -> list[dict[str, Any]]:
         """Each with value, sigma and unit, for JSON: lengths in millimetres.
 
@@ -221,24 +232,10 @@ class Finding:
             )
         ]
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return dict(
-            plain(
-                {
-                    "effect": self.term.effect,
-                    "place": self.term.place,
-                    **in_file(self),
-                    "why_tentative": self.why_tentative or None,
-                    "parameters": self.parameters(),
-                    **(
-                        {"curve": dict(zip(CURVE, self.curve, strict=True))}
-                        if self.curve.size
-                        else {}
-                    ),
-                }
-            )
-        )
+    @derived(key="curve", brief=True)
+    def curve_columns(self) -> Mapping[str, Array]:
+        """The curve of an error map by its columns."""
+        return dict(zip(CURVE, self.curve, strict=True)) if self.curve.size else {}
 
     @staticmethod
     def told(content: Any, at: str, known: Sequence[Term]) -> Finding:
@@ -249,11 +246,8 @@ class Finding:
         told = stored(Finding, content, at)
         key = as_kind(tuple[str, str], [content["effect"], content["place"]], Fact(), at)
         own = tuple(term for term in known if term.key == key) or (Term(*key),)
-        every = as_kind(
-            tuple[Parameter, ...],
-            [{"nominal": None} | each for each in content.get("parameters", [])],
-            Fact(), f"{at}.parameters",
-        )  # fmt: skip
+        listed = content.get("parameters", [])
+        every = as_kind(tuple[Amount, ...], listed, Fact(), f"{at}.parameters")
         again, curve = told.get("again", math.nan), content.get("curve", {})
         if content.get("established", True) != (again >= CONFIRMED):
             told["again"] = 1.0 if content.get("established", True) else BELOW
@@ -312,6 +306,13 @@ class Step:
     train: Accuracy
     holdout: Accuracy
     trusted: Accuracy
+
+
+def ends_of(steps: Sequence[Any], of: str = "holdout") -> dict[str, dict[str, float]]:
+    """RMS and largest error of the first steps and the last, for JSON.  of: which poses."""
+    ends = {"nominal": steps[0], "geometric": steps[1], "final": steps[-1]}
+    return {kind: {name: getattr(getattr(step, of), kind) for name, step in ends.items()}
+            for kind in ("rms_mm", "max_mm")}  # fmt: skip
 
 
 class Untestable(NamedTuple):
@@ -376,7 +377,7 @@ class Explained:
         rows = (
             (f.name, p["name"], scale * p["value"], scale * number(p["sigma"]), unit)
             for f in self.by_rung
-            for p in f.parameters()
+            for p in f.parameters
             for scale, unit in (PEOPLES.get(p["unit"], (1.0, p["unit"])),)
         )
         columns = "effect | parameter | value .4g | sigma .2g | unit"
@@ -496,21 +497,15 @@ class Diagnosis(Explained, Result):
 
     def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """The error budget in short, the arms, the poses."""
-
-        def held(kind: str, of: str = "holdout") -> dict[str, float]:
-            chosen = {"nominal": self.ladder[0], "geometric": self.ladder[1],
-                      "final": self.ladder[-1]}  # fmt: skip
-            return {k: getattr(getattr(step, of), kind) for k, step in chosen.items()}
-
+        held = {f"holdout_{kind}": ends for kind, ends in ends_of(self.ladder).items()}
         explained, gain = self.minor_sizes
         errors = dict(zip(("geometric", "final"), self.errors, strict=True))
         return {
             "floor_known": self.floor.certain,
             "effects": self.effects,
             "gap": {
-                "holdout_rms_mm": held("rms_mm"),
-                "holdout_max_mm": held("max_mm"),
-                "trusted_rms_mm": held("rms_mm", "trusted"),
+                **held,
+                "trusted_rms_mm": ends_of(self.ladder, "trusted")["rms_mm"],
                 "noise_floor_mm": self.floor.value,
                 "noise_floor_range_mm": [self.floor.low, self.floor.high],
                 "noise_floor_from": self.floor.source,

@@ -34,7 +34,6 @@ from minimax_cal.dynamics.result import (
     MotionEffect,
     MotionStep,
     NotTestable,
-    Parameter,
     Verdict,
     best_worth,
     worth_by_joint,
@@ -46,19 +45,19 @@ from minimax_cal.dynamics.search import FRICTION, RIGID, Columns, dictionary_of,
 from minimax_cal.dynamics.softness import softened
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Library
-from minimax_cal.evidence.limits import LEVEL
+from minimax_cal.evidence.limits import LEVEL, MINOR
 from minimax_cal.evidence.selection import Choice, select
 from minimax_cal.evidence.stability import Repeats, halves, repeated
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import check_left_out, takes
 from minimax_cal.ground.stages import Progress, silent
+from minimax_cal.measuring.faults import Amount
 from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.robot import Robot, load_robot
 
 LEAST_SECONDS = 25.0  # of trajectories: in less, laws stand in for each other
 LEAST_PEAK = 0.25  # speed that some joint must reach [rad/s, m/s]: slower, most laws are invisible
-MINOR = 0.05  # of the squared error that the step before leaves at a joint: worth less, it is minor
 MATTERS = 0.28  # of the remaining error's square at a joint, 15 % of its RMS: more has no name
 FOLD = 0.2  # about this share of the trajectories is left out in turn to judge a law
 HALVINGS = 2  # of the groups, in whose halves names are sought again
@@ -336,15 +335,15 @@ def laws_found(found: Found, judge: LeftOut, again: Repeats) -> Iterator[MotionE
         )
 
 
-def parameters_of(term: Term, value: Array, sigma: Array, scene: Scene) -> tuple[Parameter, ...]:
+def parameters_of(term: Term, value: Array, sigma: Array, scene: Scene) -> tuple[Amount, ...]:
     """The numbers of a law in the unit of the log, and those that were tuned."""
     said = {"t": scene.logs.unit, "": "1"}
     law = term.law
     fitted_ones = [
-        Parameter(name, float(v), float(s), said.get(unit, unit.replace("t", scene.logs.unit, 1)))
+        Amount(name, float(v), said.get(unit, unit.replace("t", scene.logs.unit, 1)), float(s))
         for name, unit, v, s in zip(law.names, law.units, value, sigma, strict=False)
     ]
-    tuned = [Parameter(name, v, float("nan"), law.tuned[name].unit if name in law.tuned else "1")
+    tuned = [Amount(name, v, law.tuned[name].unit if name in law.tuned else "1")
              for name, v in term.tuned.items()]  # fmt: skip
     return (*fitted_ones, *tuned)
 
@@ -368,7 +367,7 @@ def usual_found(judge: LeftOut) -> Iterator[MotionEffect]:
             continue
         worth = judge.worth(judge.missed(judge.every, without=(at,)))
         unit = logs.unit if kind == "coulomb" else f"{logs.unit} s/rad"
-        parameter = Parameter("friction", float(value[at]), float(sigma[at]), unit)
+        parameter = Amount("friction", float(value[at]), unit, float(sigma[at]))
         yield MotionEffect(kind, f"J{joint + 1}", (parameter,), worth,
                            minor=is_minor(worth, before), family=CURVE)  # fmt: skip
 
@@ -381,7 +380,7 @@ def with_delay(
     more = next((e for e in effects if e.effect == "delay"), None)
     sigma = more.parameters[0].sigma if more else unsure
     whole = late + (more.parameters[0].value if more else 0.0)
-    shifted = MotionEffect("delay", "all", (Parameter("time", whole, sigma, "s"),), worth,
+    shifted = MotionEffect("delay", "all", (Amount("time", whole, "s", sigma),), worth,
                            minor=is_minor(worth, judge.usual))  # fmt: skip
     return [shifted, *(e for e in effects if e.effect != "delay")]
 
@@ -392,7 +391,7 @@ def changed_link(change: LinkChange) -> MotionEffect:
     effect = "payload" if change.link == count - 1 else "link_inertia"
     law = LAWS["payload"]
     parameters = tuple(
-        Parameter(name, float(v), float(s), unit)
+        Amount(name, float(v), unit, float(s))
         for name, unit, v, s in zip(law.names, law.units, change.value, change.sigma, strict=True)
     )
     worth = worth_by_joint(change.before, change.after)

@@ -20,6 +20,7 @@ from minimax_cal.ground.facts import APART, Fact
 from minimax_cal.ground.records import stored
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table, filled
+from minimax_cal.measuring.faults import Amount
 from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.robots.robot import robot_from_dict
 
@@ -31,16 +32,6 @@ SENTENCES: dict[Verdict, str] = {
     "unknown": "Unexplained",
     "none": "No cause beyond the rigid body",
 }
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """A number of an effect, with its standard deviation."""
-
-    name: str
-    value: float
-    sigma: float
-    unit: str
 
 
 @dataclass(frozen=True)
@@ -64,7 +55,7 @@ class MotionEffect:
 
     effect: str
     place: str
-    parameters: Annotated[tuple[Parameter, ...], Fact(fewest=1)]
+    parameters: Annotated[tuple[Amount, ...], Fact(fewest=1)]
     worth: Mapping[str, tuple[float, float]]
     alternatives: tuple[Alternative, ...] = ()
     frequency: float = math.nan
