@@ -66,6 +66,7 @@ SHOWN_ROWS = 750  # of the held-out run that is drawn
 CURVE_POINTS = 61
 MAX_GAIN_ERROR = 0.3  # of a drive: what is off by more has another unit or sign
 LATE = 1e-4  # delays below it move no row [s]
+GIVEN, REFITTED, USUALLY = "model as given", "rigid body refitted", "usual friction refitted"
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +230,8 @@ def examined(
     arm: Arm, logs: Logs, fold: Array, exclude: Sequence[str], progress: Progress
 ) -> MotionDiagnosis:
     """The diagnosis of runs whose rows are judged in folds.  fold: (R,)."""
-    learning = [r for r in range(len(logs.names)) if named_free(fold, logs, r)]
+    learns = fold < 0 if (fold < 0).any() else np.ones_like(fold, dtype=bool)
+    learning = np.unique(logs.run[learns]).tolist()  # all, but runs that alone judge
     too_little = tuple(motion_lacking(logs.only(learning)))
     progress("searching for causes")
     found = search(arm, logs.only(learning), exclude)
@@ -290,12 +292,6 @@ def examined(
         notices=(*units, *body_notices(arm, given, change, logs)),
         seconds=0.0,
     )
-
-
-def named_free(fold: Array, logs: Logs, run: int) -> bool:
-    """Whether the search sees a run: all are, but those that alone judge."""
-    only_some_judge = bool((fold < 0).any())
-    return not (only_some_judge and fold[logs.run == run][0] >= 0)
 
 
 def held_words(logs: Logs, fold: Array, whole: Array) -> str:
@@ -411,27 +407,21 @@ def steps(
     context: Body, judge: LeftOut, late: float, before: Array
 ) -> tuple[tuple[TorqueModel, ...], tuple[MotionStep, ...]]:
     """The models of all steps, and the budget."""
-    normal, budget = judge.normal, []
-
-    def judged(name: str, missed: Array) -> None:
-        ends = judge.rms(missed), judge.rms(missed, judge.logs.moving)
-        budget.append(MotionStep(name, *(tuple(map(float, end)) for end in ends)))
-
-    judged("model as given", drawn_missed(normal.columns, before))
-    judged("rigid body refitted", judge.missed([RIGID], delayed=not late))
-    judged("usual friction refitted", judge.missed(parts_of(()), delayed=not late))
-    models = [
-        normal.rigid_model("rigid body refitted", context),
-        normal.model("usual friction refitted", (), context, 0.0),
+    normal, moving = judge.normal, judge.logs.moving
+    later: list[tuple[str, Sequence[Term]]] = [("+ delay", ())] if late else []
+    later += [(f"+ {effect}", terms) for effect, terms in steps_of(normal.terms)]
+    missed = [
+        (GIVEN, drawn_missed(normal.columns, before)),
+        (REFITTED, judge.missed([RIGID], delayed=not late)),
+        (USUALLY, judge.missed(parts_of(()), delayed=not late)),
+        *((name, judge.missed(parts_of(terms))) for name, terms in later),
     ]
-    if late:
-        judged("+ delay", judge.missed(parts_of(())))
-        models.append(normal.model("+ delay", (), context, late))
-    for effect, terms in steps_of(normal.terms):
-        name = f"+ {effect}"
-        judged(name, judge.missed(parts_of(terms)))
-        models.append(normal.model(name, terms, context, late))
-    return tuple(models), tuple(budget)
+    budget = (MotionStep(name, tuple(judge.rms(each).tolist()),
+                         tuple(judge.rms(each, moving).tolist()))
+              for name, each in missed)  # fmt: skip
+    models = (normal.model(name, terms, context, late) for name, terms in later)
+    first = normal.rigid_model(REFITTED, context), normal.model(USUALLY, (), context, 0.0)
+    return (*first, *models), tuple(budget)
 
 
 def verdict_of(
