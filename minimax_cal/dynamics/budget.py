@@ -79,9 +79,8 @@ class LeftOut:
 
         missed: (R, n) by fits without it.
         """
-        ends = (self.rms(each, self.logs.moving) for each in (missed, self.whole))
-        every = worth_by_joint(*ends)
-        return changed_joints(every) or every
+        ends = [self.rms(each, self.logs.moving) for each in (missed, self.whole)]
+        return changed_joints(*ends) or worth_by_joint(*ends)
 
     @property
     def judged(self) -> Array:

@@ -159,11 +159,7 @@ class MotionDiagnosis(Result):
         if self.main:
             said += f": {grouped(self.main)}"
         if self.unexplained and self.verdict in ("named", "unknown"):
-            worst = self.unexplained[0]
-            said += (
-                f". {worst.size:.3g} {self.unit} at {worst.place} follow the {worst.follows} and "
-                "have no name"
-            )
+            said += f". {self.unexplained[0].sentence(self.unit)}"
         return f"{said}."
 
     def sentences(self) -> tuple[str, ...]:
@@ -235,9 +231,10 @@ def worth_by_joint(without: Array, with_it: Array) -> dict[str, tuple[float, flo
     return {f"J{j + 1}": (before, after) for j, (before, after) in enumerate(pairs)}
 
 
-def changed_joints(worth: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-    """Of the joints that something changes by a thousandth or more."""
-    return {joint: (a, b) for joint, (a, b) in worth.items() if abs(a - b) > SHOWN * a}
+def changed_joints(without: Array, with_it: Array) -> dict[str, tuple[float, float]]:
+    """`worth_by_joint` of the joints that something changes by a thousandth or more."""
+    worth = worth_by_joint(without, with_it).items()
+    return {joint: (a, b) for joint, (a, b) in worth if abs(a - b) > SHOWN * a}
 
 
 def best_worth(one: MotionEffect) -> tuple[str, tuple[float, float]]:
