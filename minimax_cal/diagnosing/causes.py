@@ -22,6 +22,7 @@ from minimax_cal.evidence.limits import ENOUGH
 from minimax_cal.evidence.remains import Remains, rest_of
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
+from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.modelling.dictionary import arm_library
@@ -90,12 +91,20 @@ def causes_of(
 
 
 def found_again(study: Study, causes: Causes) -> Causes:
-    """The causes with their effects as findings: rivals, and how often each is found again."""
-    choice = causes.choice
-    site = Site(study.scene, study.model, study.fit.state, choice.noise)
-    found = merged(findings(study.scene, choice, site))
-    found = [with_untested(one, study.scene, causes.exclude) for one in found]
+    """`sought_again`, with what would tell rivals apart."""
+    site = Site(study.scene, study.model, study.fit.state, causes.choice.noise)
     group = np.repeat(clusters(study.data), study.rows.width)
+    return sought_again(study.scene, causes, group, site)
+
+
+def sought_again(scene: Scene, causes: Causes, group: Array, site: Site | None = None) -> Causes:
+    """The causes with their effects as findings: rivals, and how often each is found again.
+
+    group: (N,) of rows that stay together.  site: as `findings` has it.
+    """
+    choice = causes.choice
+    found = merged(findings(scene, choice, site))
+    found = [with_untested(one, scene, causes.exclude) for one in found]
     effects = judged_again(found, choice, group, causes.jobs, causes.cluster)
     change = asked(effects) and mostly_loose(effects, [f for f in effects if f.established])
     guessed = change or loudest(causes.left) is not None

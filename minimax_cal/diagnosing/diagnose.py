@@ -37,15 +37,15 @@ from minimax_cal.diagnosing.gap import (
     with_shares,
 )
 from minimax_cal.diagnosing.joint import Joint
-from minimax_cal.diagnosing.last_question import answered, known_noise
+from minimax_cal.diagnosing.last_question import known_noise
 from minimax_cal.diagnosing.moved import session_notices
 from minimax_cal.diagnosing.remainder import remainder
 from minimax_cal.diagnosing.reseats import sized, with_targets
-from minimax_cal.diagnosing.result import Diagnosis, Finding, Step, Untestable
+from minimax_cal.diagnosing.result import Diagnosis, Finding, Step
 from minimax_cal.diagnosing.set_aside import judged_with
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.diagnosing.tails import are_wrong, unpulled, wrong_rows
-from minimax_cal.diagnosing.verdict import judged
+from minimax_cal.diagnosing.verdict import explanation
 from minimax_cal.diagnosing.where import Where, where
 from minimax_cal.evidence.alternatives import resemblances
 from minimax_cal.fitting.beyond import Beyond
@@ -88,7 +88,6 @@ from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.modelling.effects.time import TARGET_SHIFT
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.robots.robot import Robot, load_robot
-from minimax_cal.solvers.status import Status
 
 FAULTY, CAUSES, BUDGET = "faults of the data", "testing causes", "error budget"
 REMAINING, PARTS = "remaining error", "regions held out"
@@ -259,28 +258,20 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.least)
     step_of(REMAINING)
     rest = remainder(ladder.last, floor)
-    verdict, structure_left = judged(findings, causes)
     known = known_noise(ladder.last, floor, clean.data, robot.repeatability)
-    verdict, unexplained = answered(verdict, structure_left[0], findings, known)
     beyond = NOT_ASKED if options.quick else beyond_of(study, causes, judges, step_of(PARTS))
     wrong = against(robot, floor, steps[-1])
     gone, counted = judged_with(asked.data, clean.data, clean.left, judges.held, ladder.last.cell)
     return Diagnosis(
+        **explanation(findings, causes, known, study.fit.status, failed=bool(wrong)),
         robot=robot.name,
-        status=Status.FAILED if wrong else study.fit.status,
-        verdict="unknown" if wrong else verdict,
-        effects=tuple(findings),
         ladder=tuple(steps),
         floor=floor,
         closed=share,
         closed_ci=interval,
         beyond=beyond,
         noise=float(np.sqrt(study.uneven * causes.choice.noise.variance)),  # of a mean coordinate
-        jitter=causes.choice.noise.jitter,
-        structure=structure_left[1],
-        structure_in=unexplained,
         where=located(study).to_dict(),
-        not_testable=tuple(Untestable(*each) for each in causes.untestable),
         notices=(
             *asked.data.notices,
             *notices,
@@ -296,7 +287,6 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         remainder=rest,
         set_aside=gone,
         with_them=counted,
-        meets_floor=known.meets_floor,
     )
 
 

@@ -11,7 +11,7 @@ from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.evidence.dictionary import Key
 from minimax_cal.evidence.limits import CERTAIN, FREQUENT, HALF
 from minimax_cal.evidence.selection import Choice
-from minimax_cal.evidence.stability import Repeats, repeated
+from minimax_cal.evidence.stability import Repeats, repeated, subsamples
 from minimax_cal.ground.arrays import Array
 
 
@@ -25,7 +25,7 @@ def judged_again(
     """
     if not findings:
         return ()
-    found = repeated(whole, group, jobs=jobs, cluster=cluster)
+    found = repeated(whole, subsamples(group), jobs=jobs, cluster=cluster)
     return tuple(judged(one, whole, found) for one in findings)
 
 

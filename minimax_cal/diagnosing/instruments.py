@@ -10,27 +10,21 @@ from pathlib import Path
 import numpy as np
 from scipy.special import chdtri
 
-from minimax_cal.diagnosing.causes import (
-    Causes,
-    findings,
-    merged,
-    whole,
-    with_untested,
-)
-from minimax_cal.diagnosing.established import judged_again, often
+from minimax_cal.diagnosing.causes import Causes, sought_again, whole
+from minimax_cal.diagnosing.established import often
 from minimax_cal.diagnosing.gap import motions as motions_of
 from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis, RelativeStep
-from minimax_cal.diagnosing.last_question import Known, answered
-from minimax_cal.diagnosing.result import Finding, Untestable
-from minimax_cal.diagnosing.verdict import judged
+from minimax_cal.diagnosing.last_question import Known
+from minimax_cal.diagnosing.result import Finding
+from minimax_cal.diagnosing.verdict import explanation
 from minimax_cal.diagnosing.what_remains import NOTHING, left_over, motions
 from minimax_cal.evidence.limits import HELPS, MAX_JOINT_JITTER, MINOR
 from minimax_cal.evidence.remains import Remains
-from minimax_cal.evidence.selection import Choice, select
+from minimax_cal.evidence.selection import select
 from minimax_cal.fitting.several.fit import InstrumentFit, remaining
 from minimax_cal.fitting.several.kinds import READ, Asked, asked_of, result_of
 from minimax_cal.fitting.several.laws import is_shared
-from minimax_cal.fitting.several.linear import StackRows, rows_of_all, scene_of_all
+from minimax_cal.fitting.several.linear import rows_of_all, scene_of_all
 from minimax_cal.fitting.several.options import Progress, RelativeOptions, silent
 from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.ground.arrays import Array
@@ -126,27 +120,18 @@ def examined(
     progress("error budget")
     ladder = budget_of(asked, fit, often(causes.effects))
     effects = with_shares(scene, ladder)
-    verdict, structure = judged(effects, causes)
     last = ladder.calibrations[-1]
     known, file = known_noise(scene, ladder.fits[-1])
-    verdict, unexplained = answered(verdict, structure[0], effects, known)
     failed = last.status is Status.FAILED or ladder.calibrations[0].status is Status.FAILED
     steps = [RelativeStep.of("nominal", ladder.calibrations[0], nominal=True)]
     names = ["geometric", *(found.term.step for found in ladder.findings)]
     steps += [RelativeStep.of(n, c) for n, c in zip(names, ladder.calibrations, strict=True)]
     return RelativeDiagnosis(
+        **explanation(effects, causes, known, last.status, failed=failed),
         calibration=last,
-        status=Status.FAILED if failed else last.status,
-        verdict="unknown" if failed else verdict,
-        effects=tuple(effects),
         steps=tuple(steps),
-        structure=structure[1],
-        structure_in=unexplained,
-        jitter=causes.choice.noise.jitter,
-        meets_floor=known.meets_floor,
         floor_file=file,
         floor_mm=(known.remaining, known.highest),
-        not_testable=tuple(Untestable(*each) for each in causes.untestable),
         seconds=time.perf_counter() - began,
     )
 
@@ -174,8 +159,9 @@ def causes_of(asked: Asked, fit: InstrumentFit, exclude: tuple[str, ...]) -> tup
     if choice.noise.variance >= rows.exact**2:
         left = left_over(scene, rows, choice.doubted, motions(choice))
     untestable = (*choice.library.untestable, *lacking.items())
-    causes = Causes((), exclude, choice, (), left, untestable)
-    return scene, replace(causes, effects=findings_of(scene, rows, choice, left_out))
+    return scene, sought_again(
+        scene, Causes((), left_out, choice, (), left, untestable), rows.group
+    )
 
 
 def not_testable(robot: Robot, fit: InstrumentFit) -> Iterator[tuple[str, str]]:
@@ -192,14 +178,6 @@ def not_testable(robot: Robot, fit: InstrumentFit) -> Iterator[tuple[str, str]]:
                                      for place in effect.places(scenes[0])
                                      for choice in effect.choices(scenes[0], place)):  # fmt: skip
             yield name, CLOCKS
-
-
-def findings_of(
-    scene: Scene, rows: StackRows, choice: Choice, exclude: Sequence[str]
-) -> tuple[Finding, ...]:
-    """The effects with their rivals, and how often each is found again."""
-    found = [with_untested(one, scene, exclude) for one in merged(findings(scene, choice))]
-    return judged_again(found, choice, rows.group)
 
 
 # ---- what the effects are worth ----------------------------------------------------------------

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from minimax_cal.diagnosing.result import FOUND, VERDICTS, Explained, Finding, Untestable
+from minimax_cal.diagnosing.result import FOUND, Explained, Finding, ends_of
 from minimax_cal.diagnosing.sentences import explained
 from minimax_cal.evidence.limits import LEVEL
 from minimax_cal.fitting.opened import RELATIVE
@@ -18,7 +18,6 @@ from minimax_cal.ground.results import Result, merged
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.modelling.effects.words import name_step
-from minimax_cal.solvers.status import Status
 
 RIVALS = ("effect", "alternative", "similarity", "power", "fits worse by")
 
@@ -45,9 +44,7 @@ class RelativeDiagnosis(Explained, Result):
     """What is still wrong with an arm that several instruments measured.
 
     calibration: with the effects that the budget took.  steps: nominal, geometric, then with each
-    effect.  structure: probability that what remains is unrelated to what structure_in names.
-    jitter: of a joint [rad].  meets_floor: whether the remaining error is down to the noise that
-    was given, None where none was.  floor_file: that exceeds it most; floor_mm: what its numbers
+    effect.  floor_file: that exceeds the noise that was given most; floor_mm: what its numbers
     leave at least, and what noise and sound joints may add up to [mm].
     """
 
@@ -55,17 +52,9 @@ class RelativeDiagnosis(Explained, Result):
     COMMAND = "relative"
 
     calibration: Annotated[RelativeCalibration, APART]
-    status: Status
-    verdict: Annotated[str, Fact(among=VERDICTS)]
-    effects: Annotated[tuple[Finding, ...], APART]
     steps: Annotated[tuple[RelativeStep, ...], Fact(key="gap.ladder", fewest=2)]
-    structure: Annotated[float, Fact(key="structure.p")]
-    structure_in: Annotated[str, Fact(key="structure.in")]
-    jitter: Annotated[float, Fact(key="noise.joint_jitter_mrad", scale=1e3)]
-    meets_floor: bool | None
     floor_file: Annotated[str, Fact(key="floor.file")]
     floor_mm: Annotated[tuple[float, float], APART]
-    not_testable: tuple[Untestable, ...]
     seconds: float
 
     def __repr__(self) -> str:
@@ -132,17 +121,12 @@ class RelativeDiagnosis(Explained, Result):
 
     def to_dict(self, *, poses: bool = True) -> dict[str, Any]:
         """The JSON of the calibration, with the key diagnosis, as `Diagnosis` where it means so."""
-
-        def held(kind: str) -> dict[str, float]:
-            ends = {"nominal": 0, "geometric": 1, "final": -1}
-            return {name: getattr(self.steps[at].holdout, kind) for name, at in ends.items()}
-
         remaining, highest = self.floor_mm
         more = {
             "floor_known": self.meets_floor is not None,
             "floor": {"remaining_mm": remaining, "noise_floor_mm": highest},
             "effects": self.effects,
-            "gap": {"holdout_rms_mm": held("rms_mm"), "holdout_max_mm": held("max_mm")},
+            "gap": {f"holdout_{kind}": ends for kind, ends in ends_of(self.steps).items()},
         }
         own = merged(plain(in_file(self)), plain(more))
         return {**self.calibration.to_dict(), "diagnosis": own}

@@ -16,19 +16,19 @@ from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual
 from minimax_cal.evidence.limits import BAND, CONFIRMED, ENOUGH, LEVEL
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.fitting.found import Parameter
 from minimax_cal.fitting.set_aside import aside_sentence
 from minimax_cal.fitting.told_poses import measured_poses
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import CalibrationError
-from minimax_cal.ground.facts import APART, Fact, derived, in_file
-from minimax_cal.ground.files import finite, number, plain
+from minimax_cal.ground.facts import APART, Fact, derived
+from minimax_cal.ground.files import finite, number
 from minimax_cal.ground.records import AGAIN, array, as_kind, stored
-from minimax_cal.ground.results import Result
+from minimax_cal.ground.results import Record, Result
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.units import in_files
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.aside import SetAside
+from minimax_cal.measuring.faults import Amount
 from minimax_cal.measuring.faults.nests import RESEAT
 from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.history import with_history
@@ -105,7 +105,7 @@ class Alternative:
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
+class Finding(Record):
     """One effect found, or a fault of the data.
 
     terms: what is fitted; several lines of one gear are one effect.  values, sigmas, names, units:
@@ -141,16 +141,26 @@ class Finding:
     shown: Annotated[tuple[Term, ...], APART] = ()
 
     @derived()
+    def effect(self) -> str:
+        """Its name in the library, or of a fault."""
+        return self.term.effect
+
+    @derived()
+    def place(self) -> str:
+        """As J2."""
+        return self.term.place
+
+    @derived()
     def established(self) -> bool:
         """Whether it is found again in nearly all subsamples of the poses."""
         return not self.why_tentative
 
-    @property
-    def why_tentative(self) -> str:
-        """What keeps it from being confirmed; '' if nothing does."""
+    @derived()
+    def why_tentative(self) -> str | None:
+        """What keeps it from being confirmed; None if nothing does."""
         if math.isnan(self.again):
             return "poses too few to leave any out"
-        return "not found again without some of the poses" if self.again < CONFIRMED else ""
+        return "not found again without some of the poses" if self.again < CONFIRMED else None
 
     @property
     def evidence(self) -> str:
@@ -197,6 +207,7 @@ class Finding:
         p = self.p_value
         return "-" if math.isnan(p) else f"< {SURE:g}" if p < SURE else f"{p:.1g}"
 
+    @derived()
     def parameters(self) -> list[dict[str, Any]]:
         """Each with value, sigma and unit, for JSON: lengths in millimetres.
 
@@ -221,24 +232,10 @@ class Finding:
             )
         ]
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return dict(
-            plain(
-                {
-                    "effect": self.term.effect,
-                    "place": self.term.place,
-                    **in_file(self),
-                    "why_tentative": self.why_tentative or None,
-                    "parameters": self.parameters(),
-                    **(
-                        {"curve": dict(zip(CURVE, self.curve, strict=True))}
-                        if self.curve.size
-                        else {}
-                    ),
-                }
-            )
-        )
+    @derived(key="curve", brief=True)
+    def curve_columns(self) -> Mapping[str, Array]:
+        """The curve of an error map by its columns."""
+        return dict(zip(CURVE, self.curve, strict=True)) if self.curve.size else {}
 
     @staticmethod
     def told(content: Any, at: str, known: Sequence[Term]) -> Finding:
@@ -249,11 +246,8 @@ class Finding:
         told = stored(Finding, content, at)
         key = as_kind(tuple[str, str], [content["effect"], content["place"]], Fact(), at)
         own = tuple(term for term in known if term.key == key) or (Term(*key),)
-        every = as_kind(
-            tuple[Parameter, ...],
-            [{"nominal": None} | each for each in content.get("parameters", [])],
-            Fact(), f"{at}.parameters",
-        )  # fmt: skip
+        listed = content.get("parameters", [])
+        every = as_kind(tuple[Amount, ...], listed, Fact(), f"{at}.parameters")
         again, curve = told.get("again", math.nan), content.get("curve", {})
         if content.get("established", True) != (again >= CONFIRMED):
             told["again"] = 1.0 if content.get("established", True) else BELOW
@@ -314,6 +308,13 @@ class Step:
     trusted: Accuracy
 
 
+def ends_of(steps: Sequence[Any], of: str = "holdout") -> dict[str, dict[str, float]]:
+    """RMS and largest error of the first steps and the last, for JSON.  of: which poses."""
+    ends = {"nominal": steps[0], "geometric": steps[1], "final": steps[-1]}
+    return {kind: {name: getattr(getattr(step, of), kind) for name, step in ends.items()}
+            for kind in ("rms_mm", "max_mm")}  # fmt: skip
+
+
 class Untestable(NamedTuple):
     """An effect that the data cannot test, and what they lack for it."""
 
@@ -321,20 +322,26 @@ class Untestable(NamedTuple):
     needs: str
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Explained:
     """What was explained, of whatever instruments: a verdict and its effects.
 
     status: of the fit of geometry.  verdict: one of VERDICTS.  effects: the largest first.
+    jitter: of a joint [rad].
     structure: probability that what remains is unrelated to what structure_in names.
     not_testable: effects, and what the data lack for them.
+    meets_floor: whether the remaining error is down to the known noise, None where that is not
+    known.
     """
 
     status: Status
-    verdict: str
-    effects: tuple[Finding, ...]
-    structure: float
-    structure_in: str
+    verdict: Annotated[str, Fact(among=VERDICTS)]
+    effects: Annotated[tuple[Finding, ...], APART]
+    jitter: Annotated[float, Fact(key="noise.joint_jitter_mrad", scale=1e3)]
+    structure: Annotated[float, Fact(key="structure.p")]
+    structure_in: Annotated[str, Fact(key="structure.in")]
     not_testable: tuple[Untestable, ...]
+    meets_floor: bool | None = None
 
     @property
     def excess(self) -> str:
@@ -370,7 +377,7 @@ class Explained:
         rows = (
             (f.name, p["name"], scale * p["value"], scale * number(p["sigma"]), unit)
             for f in self.by_rung
-            for p in f.parameters()
+            for p in f.parameters
             for scale, unit in (PEOPLES.get(p["unit"], (1.0, p["unit"])),)
         )
         columns = "effect | parameter | value .4g | sigma .2g | unit"
@@ -398,17 +405,14 @@ class Explained:
 class Diagnosis(Explained, Result):
     """What is still wrong with a calibrated robot.
 
-    status: of the geometric fit.  verdict: one of VERDICTS.  effects: by share of the gap.
     ladder: nominal, geometric, then with each effect.  beyond: on whole parts left out, effects
     searched again without each.  floor: RMS that noise alone would leave.
     closed: share of the gap closed, 0 to 1, with its interval, NaN where it says nothing.
-    noise: of a coordinate [m].  jitter: of a joint [rad].
-    structure: probability that what remains is unrelated to pose and time.
+    noise: of a coordinate [m].
     where: see `where.Where.to_dict`.  data: as it was fitted, faults mended; held: (m,) True where
     held out.  cells: geometric, then with each effect.  nominal: before, None in an old file.
     set_aside: points that no fit counts; with_them: how the last step does where they count.
-    remainder: what free functions still predict, None in an old file.  meets_floor: whether the
-    remaining error is down to the known noise, None where that is not known.
+    remainder: what free functions still predict, None in an old file.
     stated_errors, stated_curves: as they stand in the file that the diagnosis was read from.
     """
 
@@ -416,20 +420,13 @@ class Diagnosis(Explained, Result):
     COMMAND = "diagnose"
 
     robot: str
-    status: Status
-    verdict: Annotated[str, Fact(among=VERDICTS)]
-    effects: Annotated[tuple[Finding, ...], APART]
     ladder: Annotated[tuple[Step, ...], Fact(key="gap.ladder", fewest=2)]
     floor: Annotated[Floor, APART]
     closed: Annotated[float, Fact(key="gap.closed")]
     closed_ci: Annotated[tuple[float, float], APART]
     beyond: Annotated[Beyond, Fact(key="gap.beyond")]
     noise: Annotated[float, Fact(key="noise.instrument_mm", scale=1e3)]
-    jitter: Annotated[float, Fact(key="noise.joint_jitter_mrad", scale=1e3)]
-    structure: Annotated[float, Fact(key="structure.p")]
-    structure_in: Annotated[str, Fact(key="structure.in")]
     where: Mapping[str, Any]
-    not_testable: tuple[Untestable, ...]
     notices: tuple[str, ...]
     provenance: Provenance
     seconds: float
@@ -442,7 +439,6 @@ class Diagnosis(Explained, Result):
     remainder: Remainder | None = None
     set_aside: tuple[SetAside, ...] = ()
     with_them: Annotated[Accuracy | None, Fact(key="accuracy.holdout_with_them", brief=True)] = None
-    meets_floor: bool | None = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis of {self.robot}: {self.verdict}. {self.headline()}>"
@@ -501,21 +497,15 @@ class Diagnosis(Explained, Result):
 
     def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """The error budget in short, the arms, the poses."""
-
-        def held(kind: str, of: str = "holdout") -> dict[str, float]:
-            chosen = {"nominal": self.ladder[0], "geometric": self.ladder[1],
-                      "final": self.ladder[-1]}  # fmt: skip
-            return {k: getattr(getattr(step, of), kind) for k, step in chosen.items()}
-
+        held = {f"holdout_{kind}": ends for kind, ends in ends_of(self.ladder).items()}
         explained, gain = self.minor_sizes
         errors = dict(zip(("geometric", "final"), self.errors, strict=True))
         return {
             "floor_known": self.floor.certain,
             "effects": self.effects,
             "gap": {
-                "holdout_rms_mm": held("rms_mm"),
-                "holdout_max_mm": held("max_mm"),
-                "trusted_rms_mm": held("rms_mm", "trusted"),
+                **held,
+                "trusted_rms_mm": ends_of(self.ladder, "trusted")["rms_mm"],
                 "noise_floor_mm": self.floor.value,
                 "noise_floor_range_mm": [self.floor.low, self.floor.high],
                 "noise_floor_from": self.floor.source,

@@ -3,20 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from minimax_cal.diagnosing.causes import Causes
 from minimax_cal.diagnosing.established import asked, loose_among, mostly_loose
-from minimax_cal.diagnosing.result import Finding
+from minimax_cal.diagnosing.last_question import Known, answered
+from minimax_cal.diagnosing.result import Finding, Untestable
 from minimax_cal.diagnosing.what_remains import loudest
 from minimax_cal.evidence.limits import HALF
+from minimax_cal.solvers.status import Status
 
 UNSURE = "the causes found change with the choice of poses"
 UNASKED = "too few poses to confirm the causes found"
 UNHELPFUL = "the causes found do not improve held-out poses"
 
 Structure = tuple[str, float]
+
+
+def explanation(
+    findings: Sequence[Finding], causes: Causes, known: Known, status: Status, *, failed: bool
+) -> dict[str, Any]:
+    """The fields of `result.Explained`.
+
+    findings: as the ladder took them, with the faults.  known: noise.  status: of the geometric
+    fit.  failed: whether the last fit contradicts the data.
+    """
+    verdict, (where, p) = judged(findings, causes)
+    verdict, where = answered(verdict, where, findings, known)
+    return {
+        "status": Status.FAILED if failed else status,
+        "verdict": "unknown" if failed else verdict,
+        "effects": tuple(findings),
+        "jitter": causes.choice.noise.jitter,
+        "structure": p,
+        "structure_in": where,
+        "not_testable": tuple(Untestable(*each) for each in causes.untestable),
+        "meets_floor": known.meets_floor,
+    }
 
 
 def judged(findings: Sequence[Finding], causes: Causes) -> tuple[str, Structure]:

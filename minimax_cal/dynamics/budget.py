@@ -10,6 +10,7 @@ import numpy as np
 
 from minimax_cal.dynamics.laws import Term
 from minimax_cal.dynamics.model import Normal, held_friction
+from minimax_cal.dynamics.result import changed_joints, worth_by_joint
 from minimax_cal.dynamics.rows import QUARTERS, Logs, rms_by_joint
 from minimax_cal.dynamics.search import FRICTION, RIGID, Columns, solve_scaled
 from minimax_cal.ground.arrays import Array
@@ -42,6 +43,44 @@ class LeftOut:
         gram, pull = (np.array([each[k] for each in products]) for k in (0, 1))
         return LeftOut(normal, normal.raw, error, early, fold,
                        gram.sum(axis=0) - gram[1:], pull.sum(axis=0) - pull[1:])  # fmt: skip
+
+    @property
+    def logs(self) -> Logs:
+        """Whose rows are judged."""
+        return self.normal.columns.scene.logs
+
+    @property
+    def every(self) -> list[str]:
+        """The parts of the fit of all laws."""
+        return parts_of(self.normal.terms)
+
+    @cached_property
+    def value(self) -> Array:
+        """(p,) of the fit of all laws to all rows."""
+        return self.normal.solve(self.every)
+
+    @cached_property
+    def sigma(self) -> Array:
+        """(p,) their standard deviations."""
+        return self.normal.spread(self.every, self.value)
+
+    @cached_property
+    def whole(self) -> Array:
+        """(R, n) what fits of all laws miss."""
+        return self.missed(self.every)
+
+    @cached_property
+    def usual(self) -> Array:
+        """(n,) RMS of moving rows beside usual friction alone."""
+        return self.rms(self.missed(parts_of(())), self.logs.moving)
+
+    def worth(self, missed: Array) -> dict[str, tuple[float, float]]:
+        """Of each joint that changes by a thousandth, the RMS of moving rows without and with it.
+
+        missed: (R, n) by fits without it.
+        """
+        ends = [self.rms(each, self.logs.moving) for each in (missed, self.whole)]
+        return changed_joints(*ends) or worth_by_joint(*ends)
 
     @property
     def judged(self) -> Array:
@@ -121,7 +160,7 @@ def without_harmful(judge: LeftOut, terms: Sequence[Term]) -> list[Term]:
     by a standard error, paired over the quarters of the trajectories.  The surest goes first; all
     together may harm, too.
     """
-    logs, kept = judge.normal.columns.scene.logs, list(terms)
+    logs, kept = judge.logs, list(terms)
     quarters = np.eye(int(logs.quarter.max()) + 1)[:, logs.quarter]
     rows = logs.moving & judge.judged[:, None]
 

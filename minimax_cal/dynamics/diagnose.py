@@ -34,10 +34,8 @@ from minimax_cal.dynamics.result import (
     MotionEffect,
     MotionStep,
     NotTestable,
-    Parameter,
     Verdict,
     best_worth,
-    changed_joints,
     worth_by_joint,
 )
 from minimax_cal.dynamics.rows import ROW_HZ, Logs, prepare, whitening
@@ -47,27 +45,28 @@ from minimax_cal.dynamics.search import FRICTION, RIGID, Columns, dictionary_of,
 from minimax_cal.dynamics.softness import softened
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Library
-from minimax_cal.evidence.limits import LEVEL
+from minimax_cal.evidence.limits import LEVEL, MINOR
 from minimax_cal.evidence.selection import Choice, select
+from minimax_cal.evidence.stability import Repeats, halves, repeated
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import check_left_out, takes
 from minimax_cal.ground.stages import Progress, silent
+from minimax_cal.measuring.faults import Amount
 from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.robot import Robot, load_robot
 
 LEAST_SECONDS = 25.0  # of trajectories: in less, laws stand in for each other
 LEAST_PEAK = 0.25  # speed that some joint must reach [rad/s, m/s]: slower, most laws are invisible
-MINOR = 0.05  # of the squared error that the step before leaves at a joint: worth less, it is minor
 MATTERS = 0.28  # of the remaining error's square at a joint, 15 % of its RMS: more has no name
 FOLD = 0.2  # about this share of the trajectories is left out in turn to judge a law
-SPLITS = 2  # of the groups in complementary halves, in which names are sought again
+HALVINGS = 2  # of the groups, in whose halves names are sought again
 FOUND_AGAIN = 0.75  # share of the halves in which a confirmed name is found
-SEED = 0  # of the halves
 SHOWN_ROWS = 750  # of the held-out run that is drawn
 CURVE_POINTS = 61
 MAX_GAIN_ERROR = 0.3  # of a drive: what is off by more has another unit or sign
 LATE = 1e-4  # delays below it move no row [s]
+GIVEN, REFITTED, USUALLY = "model as given", "rigid body refitted", "usual friction refitted"
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,20 +223,6 @@ def helpful(found: Found) -> Found:
     return replace(found, choice=choice, terms=tuple(kept))
 
 
-def frequencies(choice: Choice) -> dict[tuple[str, str], float]:
-    """In which share of complementary halves of the groups each name is found again."""
-    group = choice.library.rows.group
-    count = int(group.max()) + 1
-    rng, found = np.random.default_rng(SEED), list[set[tuple[str, str]]]()
-    for _ in range(SPLITS):
-        half = rng.permutation(count) < count // 2
-        for kept in (half[group], ~half[group]):
-            part = select(choice.part(kept))
-            found.append({one.key for one in part.chosen})
-    keys = {one.key for one in choice.chosen}
-    return {key: float(np.mean([key in one for one in found])) for key in keys}
-
-
 # ---- the answer --------------------------------------------------------------------------------
 
 
@@ -245,7 +230,8 @@ def examined(
     arm: Arm, logs: Logs, fold: Array, exclude: Sequence[str], progress: Progress
 ) -> MotionDiagnosis:
     """The diagnosis of runs whose rows are judged in folds.  fold: (R,)."""
-    learning = [r for r in range(len(logs.names)) if named_free(fold, logs, r)]
+    learns = fold < 0 if (fold < 0).any() else np.ones_like(fold, dtype=bool)
+    learning = np.unique(logs.run[learns]).tolist()  # all, but runs that alone judge
     too_little = tuple(motion_lacking(logs.only(learning)))
     progress("searching for causes")
     found = search(arm, logs.only(learning), exclude)
@@ -276,19 +262,19 @@ def examined(
     known = columns.error
     before = known + (early.y - logs.y).T
     judge = LeftOut.of(normal, known, before, fold)
-    again = frequencies(found.choice)
+    group = found.choice.library.rows.group
+    again = repeated(found.choice, halves(group, HALVINGS), level=LEVEL)
     given, change = body_as_given(normal)
-    value = normal.solve(parts_of(found.terms))
-    left = tuple(unexplained(normal, value))
+    left = tuple(unexplained(normal, judge.value))
     if any(one.share > MATTERS for one in left):
         change = None  # what has no name could be what makes the masses look wrong
-    effects = [*laws_found(found, normal, judge, again), *usual_found(normal, judge)]
+    effects = [*laws_found(found, judge, again), *usual_found(judge)]
     if late:
-        effects = with_delay(effects, judge, late, unsure, found.terms)
+        effects = with_delay(effects, judge, late, unsure)
     if change is not None:
         effects.insert(0, changed_link(change))
     effects.sort(key=lambda one: (one.minor, -gain_of(one)))
-    models, budget = steps(found, normal, judge, late, before)
+    models, budget = steps(found.context, judge, late, before)
     return MotionDiagnosis(
         arm=arm,
         unit=logs.unit,
@@ -301,17 +287,11 @@ def examined(
         models=models,
         runs=logs.names,
         held_out=held_words(logs, fold, whole),
-        held_run=held_run(judge, logs, parts_of(found.terms)),
-        curves=tuple(curves(found, normal, judge)),
+        held_run=held_run(judge, logs),
+        curves=tuple(curves(judge)),
         notices=(*units, *body_notices(arm, given, change, logs)),
         seconds=0.0,
     )
-
-
-def named_free(fold: Array, logs: Logs, run: int) -> bool:
-    """Whether the search sees a run: all are, but those that alone judge."""
-    only_some_judge = bool((fold < 0).any())
-    return not (only_some_judge and fold[logs.run == run][0] >= 0)
 
 
 def held_words(logs: Logs, fold: Array, whole: Array) -> str:
@@ -326,14 +306,6 @@ def held_words(logs: Logs, fold: Array, whole: Array) -> str:
     return f"runs left out in turn{quarters}"
 
 
-def worth_of(judge: LeftOut, whole: Array, missed: Array) -> dict[str, tuple[float, float]]:
-    """Of each joint that changes by a thousandth, the RMS of moving rows without and with it."""
-    moving = judge.normal.columns.scene.logs.moving
-    ends = judge.rms(missed, moving), judge.rms(whole, moving)
-    every = worth_by_joint(*ends)
-    return changed_joints(every) or every
-
-
 def is_minor(worth: dict[str, tuple[float, float]], before: Array) -> bool:
     """Whether an effect closes little of what the step before its kind leaves (n,)."""
     shares = ((a**2 - b**2) / max(before[int(key[1:]) - 1] ** 2, 1e-300)
@@ -341,40 +313,33 @@ def is_minor(worth: dict[str, tuple[float, float]], before: Array) -> bool:
     return bool(max(shares) < MINOR)
 
 
-def laws_found(
-    found: Found, normal: Normal, judge: LeftOut, again: dict[tuple[str, str], float]
-) -> Iterator[MotionEffect]:
+def laws_found(found: Found, judge: LeftOut, again: Repeats) -> Iterator[MotionEffect]:
     """The laws that were found, with what each is worth."""
-    every = parts_of(found.terms)
-    value = normal.solve(every)
-    sigma, whole = normal.spread(every, value), judge.missed(every)
-    moving = normal.columns.scene.logs.moving
-    usual = judge.rms(judge.missed(parts_of(())), moving)
     for number, term in enumerate(found.terms):
-        worth = worth_of(judge, whole, judge.missed([p for p in every if p != term.text]))
-        place = normal.place[term.text]
+        worth = judge.worth(judge.missed([p for p in judge.every if p != term.text]))
+        place, often = judge.normal.place[term.text], again.frequency([term.key])
         yield MotionEffect(
             term.effect,
             term.place,
-            parameters_of(term, value[place], sigma[place], normal.columns.scene),
+            parameters_of(term, judge.value[place], judge.sigma[place], found.columns.scene),
             worth,
             others_of(found.choice, number),
-            again[term.key],
-            bool(again[term.key] >= FOUND_AGAIN),
-            is_minor(worth, usual),
+            often,
+            often >= FOUND_AGAIN,
+            is_minor(worth, judge.usual),
             term.law.family,
         )
 
 
-def parameters_of(term: Term, value: Array, sigma: Array, scene: Scene) -> tuple[Parameter, ...]:
+def parameters_of(term: Term, value: Array, sigma: Array, scene: Scene) -> tuple[Amount, ...]:
     """The numbers of a law in the unit of the log, and those that were tuned."""
     said = {"t": scene.logs.unit, "": "1"}
     law = term.law
     fitted_ones = [
-        Parameter(name, float(v), float(s), said.get(unit, unit.replace("t", scene.logs.unit, 1)))
+        Amount(name, float(v), said.get(unit, unit.replace("t", scene.logs.unit, 1)), float(s))
         for name, unit, v, s in zip(law.names, law.units, value, sigma, strict=False)
     ]
-    tuned = [Parameter(name, v, float("nan"), law.tuned[name].unit if name in law.tuned else "1")
+    tuned = [Amount(name, v, law.tuned[name].unit if name in law.tuned else "1")
              for name, v in term.tuned.items()]  # fmt: skip
     return (*fitted_ones, *tuned)
 
@@ -386,43 +351,33 @@ def others_of(choice: Choice, number: int) -> tuple[Alternative, ...]:
     return tuple(Alternative(t.effect, t.place, rho2, t.law.separate) for t, rho2 in terms)
 
 
-def usual_found(normal: Normal, judge: LeftOut) -> Iterator[MotionEffect]:
+def usual_found(judge: LeftOut) -> Iterator[MotionEffect]:
     """Coulomb and viscous friction of each joint, where the rows show them."""
-    terms = normal.terms
-    every = parts_of(terms)
-    value = normal.solve(every)
-    sigma, whole = normal.spread(every, value), judge.missed(every)
-    logs = normal.columns.scene.logs
+    value, sigma, logs = judge.value, judge.sigma, judge.logs
     before = judge.rms(judge.missed([RIGID]), logs.moving)
-    start = normal.place[FRICTION].start
+    start = judge.normal.place[FRICTION].start
     for number in range(2 * logs.joints):
         at, joint, kind = start + number, number // 2, USUAL[number % 2]
         z = value[at] / sigma[at] if sigma[at] > 0.0 else 0.0
         if float(ndtr(-z)) * 2 * logs.joints > LEVEL:
             continue
-        worth = worth_of(judge, whole, judge.missed(every, without=(at,)))
+        worth = judge.worth(judge.missed(judge.every, without=(at,)))
         unit = logs.unit if kind == "coulomb" else f"{logs.unit} s/rad"
-        parameter = Parameter("friction", float(value[at]), float(sigma[at]), unit)
+        parameter = Amount("friction", float(value[at]), unit, float(sigma[at]))
         yield MotionEffect(kind, f"J{joint + 1}", (parameter,), worth,
                            minor=is_minor(worth, before), family=CURVE)  # fmt: skip
 
 
 def with_delay(
-    effects: list[MotionEffect],
-    judge: LeftOut,
-    late: float,
-    unsure: float,
-    terms: tuple[Term, ...],
+    effects: list[MotionEffect], judge: LeftOut, late: float, unsure: float
 ) -> list[MotionEffect]:
     """The effects with a delay by which the rows were shifted, and its standard deviation [s]."""
-    every = parts_of(terms)
-    worth = worth_of(judge, judge.missed(every), judge.missed(every, delayed=False))
+    worth = judge.worth(judge.missed(judge.every, delayed=False))
     more = next((e for e in effects if e.effect == "delay"), None)
     sigma = more.parameters[0].sigma if more else unsure
     whole = late + (more.parameters[0].value if more else 0.0)
-    usual = judge.rms(judge.missed(parts_of(())), judge.normal.columns.scene.logs.moving)
-    shifted = MotionEffect("delay", "all", (Parameter("time", whole, sigma, "s"),), worth,
-                           minor=is_minor(worth, usual))  # fmt: skip
+    shifted = MotionEffect("delay", "all", (Amount("time", whole, "s", sigma),), worth,
+                           minor=is_minor(worth, judge.usual))  # fmt: skip
     return [shifted, *(e for e in effects if e.effect != "delay")]
 
 
@@ -432,7 +387,7 @@ def changed_link(change: LinkChange) -> MotionEffect:
     effect = "payload" if change.link == count - 1 else "link_inertia"
     law = LAWS["payload"]
     parameters = tuple(
-        Parameter(name, float(v), float(s), unit)
+        Amount(name, float(v), unit, float(s))
         for name, unit, v, s in zip(law.names, law.units, change.value, change.sigma, strict=True)
     )
     worth = worth_by_joint(change.before, change.after)
@@ -449,32 +404,24 @@ def gain_of(one: MotionEffect) -> float:
 
 
 def steps(
-    found: Found, normal: Normal, judge: LeftOut, late: float, before: Array
+    context: Body, judge: LeftOut, late: float, before: Array
 ) -> tuple[tuple[TorqueModel, ...], tuple[MotionStep, ...]]:
     """The models of all steps, and the budget."""
-    moving = normal.columns.scene.logs.moving
-    context = found.context
-    budget = []
-
-    def judged(name: str, missed: Array) -> None:
-        ends = judge.rms(missed), judge.rms(missed, moving)
-        budget.append(MotionStep(name, *(tuple(map(float, end)) for end in ends)))
-
-    judged("model as given", drawn_missed(normal.columns, before))
-    judged("rigid body refitted", judge.missed([RIGID], delayed=not late))
-    judged("usual friction refitted", judge.missed(parts_of(()), delayed=not late))
-    models = [
-        normal.rigid_model("rigid body refitted", context),
-        normal.model("usual friction refitted", (), context, 0.0),
+    normal, moving = judge.normal, judge.logs.moving
+    later: list[tuple[str, Sequence[Term]]] = [("+ delay", ())] if late else []
+    later += [(f"+ {effect}", terms) for effect, terms in steps_of(normal.terms)]
+    missed = [
+        (GIVEN, drawn_missed(normal.columns, before)),
+        (REFITTED, judge.missed([RIGID], delayed=not late)),
+        (USUALLY, judge.missed(parts_of(()), delayed=not late)),
+        *((name, judge.missed(parts_of(terms))) for name, terms in later),
     ]
-    if late:
-        judged("+ delay", judge.missed(parts_of(())))
-        models.append(normal.model("+ delay", (), context, late))
-    for effect, terms in steps_of(found.terms):
-        name = f"+ {effect}"
-        judged(name, judge.missed(parts_of(terms)))
-        models.append(normal.model(name, terms, context, late))
-    return tuple(models), tuple(budget)
+    budget = (MotionStep(name, tuple(judge.rms(each).tolist()),
+                         tuple(judge.rms(each, moving).tolist()))
+              for name, each in missed)  # fmt: skip
+    models = (normal.model(name, terms, context, late) for name, terms in later)
+    first = normal.rigid_model(REFITTED, context), normal.model(USUALLY, (), context, 0.0)
+    return (*first, *models), tuple(budget)
 
 
 def verdict_of(
@@ -533,12 +480,12 @@ def body_notices(arm: Arm, given: bool, change: LinkChange | None, logs: Logs) -
         yield "the masses of the model are not this arm's: the rigid body was refitted"
 
 
-def held_run(judge: LeftOut, logs: Logs, parts: Sequence[str]) -> HeldRun:
+def held_run(judge: LeftOut, logs: Logs) -> HeldRun:
     """A stretch of a run as a fit without it predicts it."""
     run = int(logs.run[np.argmax(judge.judged)])
     rows = np.flatnonzero((logs.run == run) & judge.judged)[:SHOWN_ROWS]
     measured = judge.error[:, rows]
-    predicted = measured - judge.missed(parts)[rows].T
+    predicted = measured - judge.whole[rows].T
 
     def brief(values: Array) -> Array:
         return np.array([[float(f"{value:.5g}") for value in row] for row in values])
@@ -547,16 +494,16 @@ def held_run(judge: LeftOut, logs: Logs, parts: Sequence[str]) -> HeldRun:
     return HeldRun(logs.names[run], time_s, brief(measured), brief(predicted))
 
 
-def curves(found: Found, normal: Normal, judge: LeftOut) -> Iterator[FrictionCurve]:
+def curves(judge: LeftOut) -> Iterator[FrictionCurve]:
     """Friction over the speed of each joint, and its spread over fits without each fold."""
-    arm, every = normal.columns.scene.arm, parts_of(found.terms)
-    values = np.array([normal.solve(every), *judge.values(normal.index(every))])
+    normal, arm = judge.normal, judge.normal.columns.scene.arm
+    values = np.array([judge.value, *judge.values(normal.index(judge.every))])
     for j in range(arm.robot.joints):
         v = np.linspace(-1.0, 1.0, CURVE_POINTS) * arm.fastest[j]
         sense = sense_of(v, arm.soft[j])
         at = normal.place[FRICTION].start + 2 * j
         drawn = np.outer(values[:, at], sense) + np.outer(values[:, at + 1], v)
-        for term in (t for t in found.terms if t.place == f"J{j + 1}"):
+        for term in (t for t in normal.terms if t.place == f"J{j + 1}"):
             amounts = values[:, normal.place[term.text]].T
             for amount, form in zip(
                 amounts, term.law.curve(v / arm.fastest[j], sense, term.tuned), strict=False

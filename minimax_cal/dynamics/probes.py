@@ -48,6 +48,11 @@ class Unexplained:
     share: float
     p: float
 
+    def sentence(self, unit: str) -> str:
+        """For people, without its full stop.  unit: of the log."""
+        size = f"{self.size:.3g} {unit}"
+        return f"{size} at {self.place} follow the {self.follows} and have no name"
+
 
 # ---- what drivers are functions of ---------------------------------------------------------------
 

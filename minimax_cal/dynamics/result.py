@@ -20,6 +20,7 @@ from minimax_cal.ground.facts import APART, Fact
 from minimax_cal.ground.records import stored
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table, filled
+from minimax_cal.measuring.faults import Amount
 from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.robots.robot import robot_from_dict
 
@@ -31,16 +32,6 @@ SENTENCES: dict[Verdict, str] = {
     "unknown": "Unexplained",
     "none": "No cause beyond the rigid body",
 }
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """A number of an effect, with its standard deviation."""
-
-    name: str
-    value: float
-    sigma: float
-    unit: str
 
 
 @dataclass(frozen=True)
@@ -64,7 +55,7 @@ class MotionEffect:
 
     effect: str
     place: str
-    parameters: Annotated[tuple[Parameter, ...], Fact(fewest=1)]
+    parameters: Annotated[tuple[Amount, ...], Fact(fewest=1)]
     worth: Mapping[str, tuple[float, float]]
     alternatives: tuple[Alternative, ...] = ()
     frequency: float = math.nan
@@ -168,11 +159,7 @@ class MotionDiagnosis(Result):
         if self.main:
             said += f": {grouped(self.main)}"
         if self.unexplained and self.verdict in ("named", "unknown"):
-            worst = self.unexplained[0]
-            said += (
-                f". {worst.size:.3g} {self.unit} at {worst.place} follow the {worst.follows} and "
-                "have no name"
-            )
+            said += f". {self.unexplained[0].sentence(self.unit)}"
         return f"{said}."
 
     def sentences(self) -> tuple[str, ...]:
@@ -244,9 +231,10 @@ def worth_by_joint(without: Array, with_it: Array) -> dict[str, tuple[float, flo
     return {f"J{j + 1}": (before, after) for j, (before, after) in enumerate(pairs)}
 
 
-def changed_joints(worth: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-    """Of the joints that something changes by a thousandth or more."""
-    return {joint: (a, b) for joint, (a, b) in worth.items() if abs(a - b) > SHOWN * a}
+def changed_joints(without: Array, with_it: Array) -> dict[str, tuple[float, float]]:
+    """`worth_by_joint` of the joints that something changes by a thousandth or more."""
+    worth = worth_by_joint(without, with_it).items()
+    return {joint: (a, b) for joint, (a, b) in worth if abs(a - b) > SHOWN * a}
 
 
 def best_worth(one: MotionEffect) -> tuple[str, tuple[float, float]]:

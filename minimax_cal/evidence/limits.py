@@ -51,7 +51,7 @@ HELPS = 1e-6  # relative fall of the error of groups left out that is one
 MAX_RISE = 1e-3  # of the training error, relative: more is worse
 END = 0.2  # of the poses at an end of what drives an effect (machine_gap of seed 7001: the rule
 # mends five of the eight arms that met new poses 5 % worse than geometry)
-MINOR = 0.05  # of the squared held-out error that geometry leaves: less makes a cause minor
+MINOR = 0.05  # of the squared held-out error that the step before leaves: less is minor
 SAYS_NOTHING = 0.95  # width of the 95 % interval of a share of which nothing is known
 
 # ---- curves and waves without a name -------------------------------------------------------------

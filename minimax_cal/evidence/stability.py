@@ -7,7 +7,7 @@ often asked as any other.  A name's frequency is the share of the subsamples tha
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,6 +47,13 @@ class Repeats:
         return [key for key in every if seldom[key] and counts[key] >= INSTEAD * len(self.names)]
 
 
+def halves(group: Array, rounds: int) -> list[Array]:
+    """Masks (N,) of the rows of complementary halves.  group: as `subsamples` has it."""
+    rng, count = np.random.default_rng(0), int(group.max()) + 1
+    first = [(rng.permutation(count) < count // 2)[group] for _ in range(rounds)]
+    return [kept for half in first for kept in (half, ~half)]
+
+
 def subsamples(group: Array) -> list[Array]:
     """Masks (N,) of the rows of each subsample.  group: (N,) from 0, of rows that stay together."""
     rng, count = np.random.default_rng(0), int(group.max()) + 1
@@ -54,22 +61,29 @@ def subsamples(group: Array) -> list[Array]:
     return [part != left for part in parts for left in range(PARTS)]
 
 
-def repeated(whole: Choice, group: Array, *, jobs: int = 1, cluster: str = "") -> Repeats:
+def repeated(
+    whole: Choice,
+    masks: Sequence[Array],
+    *,
+    level: float = REPEATED_LEVEL,
+    jobs: int = 1,
+    cluster: str = "",
+) -> Repeats:
     """The search of subsamples, each choosing among what that of all rows tuned.
 
-    jobs: processes, -1 for one a core.  cluster: address of a Dask scheduler instead.
+    masks: (N,) of the rows of each.  level: chance of a false name in one.  jobs: processes, -1 for
+    one a core.  cluster: address of a Dask scheduler instead.
     """
-    masks = subsamples(group)
     one = whole.portable()
-    calls = [(one, kept) for kept in masks]
+    calls = [(one, kept, level) for kept in masks]
     found = dict(share(names_in, calls, processes=jobs, cluster=cluster))
     names = [found[number] for number in range(len(masks))]
     return Repeats(tuple(keys for keys in names if keys is not None), len(masks))
 
 
-def names_in(whole: Choice, kept: Array) -> frozenset[Key] | None:
+def names_in(whole: Choice, kept: Array, level: float) -> frozenset[Key] | None:
     """What the search of a part finds; None where its rows are too few.  kept: (N,) of its rows."""
     part = whole.part(kept)
     if part.products.dof(NOTHING) < LEAST_DOF:
         return None
-    return frozenset(c.key for c in select(part, level=REPEATED_LEVEL).chosen)
+    return frozenset(c.key for c in select(part, level=level).chosen)

@@ -74,7 +74,8 @@ def changes(robot: Robot, data: Measurements, solved: Solved) -> tuple[Change, .
     choice = selection.select(lib)
     if not any("session" in found.candidate.term.choice for found in choice.found):
         return ()
-    again = stability.repeated(choice, np.repeat(clusters(data), rows.width))
+    group = np.repeat(clusters(data), rows.width)
+    again = stability.repeated(choice, stability.subsamples(group))
     names, out = list(data.frames), []
     for number, candidate in enumerate(choice.chosen):
         term = candidate.term

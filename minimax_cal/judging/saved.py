@@ -189,7 +189,7 @@ def of_instrument(source: Given, one: Instrument, rung: int | None) -> Evaluatio
     if opened.cell.effects.terms:
         raise OptionError(
             f"{opened.source}: its effects are judged by points of a tracker alone; take a step "
-            "without them (rung=1)"
+            "without them (step 1)"
         )
     one, options = replace(one, at=check_joints(robot, one.at)), RelativeOptions()
     stack = stack_of(robot, [Train("", one)], options)

@@ -133,7 +133,7 @@ def test_a_diagnosis_tells_the_curve_and_a_fit_compensates_it(robot: Robot, tmp_
     inside = (x > q[:, 1].min()) & (x < q[:, 1].max())
     off = (y - bumps(x))[inside]  # geometry may take a constant turn
     assert np.mean(np.abs(off - off.mean()) < 3.0 * band[inside]) > 0.9
-    assert [p["name"] for p in found.parameters()] == ["RMS", "largest"]
+    assert [p["name"] for p in found.parameters] == ["RMS", "largest"]
     again = mc.Diagnosis.from_dict(json.loads(told.json()))
     assert json.loads(again.json())["effects"] == json.loads(told.json())["effects"]
 

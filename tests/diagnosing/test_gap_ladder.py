@@ -203,7 +203,7 @@ def test_a_unit_that_rests_on_masses_is_told_as_a_motion(play: Study) -> None:
     tilt = replace(finding("base_flex", "frame", unit="rad/(N m)"), terms=(foot,))
     moved = foot.columns(scene).displacement(scene)
     assert_allclose(motions(scene, tilt), np.sqrt((moved**2).sum(axis=2)).max(axis=(1, 2)))
-    units = [one.parameters()[0]["unit"] for one in (
+    units = [one.parameters[0]["unit"] for one in (
         replace(f, motion=motions(scene, f)) for f in (soft, long, tilt))]  # fmt: skip
     assert units == ["mrad at most", "mm at most", "mm at most"]
     assert motions(scene, replace(finding("backlash", "J2"), terms=(PLAY,))) == ()

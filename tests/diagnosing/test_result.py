@@ -65,11 +65,11 @@ def made() -> Diagnosis:
              replace(base, effects=Fitted((PLAY, SOFT), (play, soft)))]  # fmt: skip
     error = np.zeros((2, 30, 3))
     return Diagnosis(
-        "arm", Status.CONVERGED, "named", FINDINGS, RUNGS, Floor(0.1, 0.05, 0.2, DECLARED), 0.9,
-        (0.8, 0.95), Beyond(), 2e-5, 4e-6, 0.25, "pose", {},
-        (Untestable("thermal", "temperatures"),),
+        "arm", RUNGS, Floor(0.1, 0.05, 0.2, DECLARED), 0.9, (0.8, 0.95), Beyond(), 2e-5, {},
         ("a notice",), Provenance("arm"), 1.5, sim.data, np.arange(30) % 5 == 0, tuple(cells),
         stated_errors=(error + 1e-3, error + 5e-4), stated_curves={}, nominal=base,
+        status=Status.CONVERGED, verdict="named", effects=FINDINGS, jitter=4e-6, structure=0.25,
+        structure_in="pose", not_testable=(Untestable("thermal", "temperatures"),),
     )  # fmt: skip
 
 
@@ -109,14 +109,14 @@ def test_it_is_established_if_every_part_finds_it_again() -> None:
 
 
 def test_parameters_are_told_in_units_of_files() -> None:
-    soft, play, fault = (f.parameters()[0] for f in FINDINGS)
+    soft, play, fault = (f.parameters[0] for f in FINDINGS)
     assert (soft["value"], soft["unit"]) == (2e-6, "rad/(N m)")
     assert (play["name"], play["value"], play["sigma"], play["unit"]) == ("c", 3e-5, 2e-6, "rad")
     assert (fault["value"], fault["sigma"], fault["unit"]) == (2.0, None, "mm")
-    assumed = replace(FINDINGS[0], motion=(200.0,)).parameters()[0]
+    assumed = replace(FINDINGS[0], motion=(200.0,)).parameters[0]
     assert_allclose([assumed["value"], assumed["sigma"]], [0.4, 0.02])
     assert assumed["unit"] == "mrad at most"
-    bent = replace(FINDINGS[0], units=("1/(N m^2)",), motion=(50.0,)).parameters()[0]
+    bent = replace(FINDINGS[0], units=("1/(N m^2)",), motion=(50.0,)).parameters[0]
     assert_allclose(bent["value"], 0.1)
     assert bent["unit"] == "mm at most"
 
@@ -129,7 +129,7 @@ def test_an_error_map_is_told_in_two_numbers() -> None:
     rms = [math.sqrt(sum(v * v for v in row) / 3.0) for row in curve[1:].tolist()]
     assert_allclose([[p["value"], p["sigma"]] for p in told], [rms, [5e-4, 2e-5]])
     drawn = replace(FINDINGS[1], curve=curve)
-    assert drawn.parameters() == told
+    assert drawn.parameters == told
     said = drawn.to_dict()
     assert said["curve"] == {"q_rad": [-1.0, 0.0, 1.0], "turn_rad": [1e-4, -5e-4, 2e-4],
                              "sigma_rad": [1e-5, 2e-5, 3e-5]}  # fmt: skip

@@ -15,7 +15,7 @@ from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import PARTS, ROUNDS
 from minimax_cal.evidence.noise import Noise, Problem, orthonormal
 from minimax_cal.evidence.selection import select
-from minimax_cal.evidence.stability import Repeats, repeated, subsamples
+from minimax_cal.evidence.stability import Repeats, halves, repeated, subsamples
 from minimax_cal.ground.arrays import Array
 
 A, B, C = ("a", "x"), ("b", "x"), ("c", "x")
@@ -47,6 +47,13 @@ def test_every_group_is_left_out_as_often_and_stays_together() -> None:
     assert np.all(masks.reshape(ROUNDS, PARTS, -1).sum(axis=1) == PARTS - 1)
     assert np.all(masks.reshape(len(masks), 30, 4) == masks.reshape(len(masks), 30, 4)[..., :1])
     assert np.all(masks.sum(axis=1) == 80)
+
+
+def test_halves_keep_groups_together_and_every_group_is_in_one_of_a_pair() -> None:
+    masks = np.array(halves(np.repeat(np.arange(9), 4), 2)).reshape(2, 2, 9, 4)
+    assert np.all(masks[:, 0] != masks[:, 1])
+    assert np.all(masks == masks[..., :1])
+    assert np.all(masks[..., 0].sum(axis=2) == [4, 5])
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +110,7 @@ def test_a_law_of_any_domain_is_found_again_and_a_faint_one_less_often(
     whole = select(straight(rng, {3: 1.0, 7: 0.25}))
     names = [c.key for c in whole.chosen]
     assert ("law 3", "x") in names
-    found = repeated(whole, whole.library.rows.group)
+    found = repeated(whole, subsamples(whole.library.rows.group))
     assert len(found.names) == PARTS * ROUNDS
     assert found.frequency({("law 3", "x")}) == 1.0
     assert found.frequency({("law 7", "x")}) < 1.0
@@ -112,7 +119,7 @@ def test_a_law_of_any_domain_is_found_again_and_a_faint_one_less_often(
 
 def test_rows_too_few_for_their_geometry_are_not_asked(rng: np.random.Generator) -> None:
     whole = select(straight(rng, {3: 5.0}, rows=27))
-    found = repeated(whole, whole.library.rows.group)
+    found = repeated(whole, subsamples(whole.library.rows.group))
     assert found.names == ()
     assert np.isnan(found.frequency({("law 3", "x")}))
 

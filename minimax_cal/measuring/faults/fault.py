@@ -14,7 +14,7 @@ NONE: Array = np.zeros(0, dtype=int)
 
 @dataclass(frozen=True)
 class Amount:
-    """A number about a fault.  value, sigma: in `unit`, SI; sigma is NaN where not known."""
+    """A number of a fault or an effect.  value, sigma: in `unit`, SI; sigma NaN if not known."""
 
     name: str
     value: float

@@ -31,7 +31,6 @@ from minimax_cal.dynamics.result import (
     MotionEffect,
     best_worth,
     changed_joints,
-    worth_by_joint,
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress
@@ -333,7 +332,7 @@ def worths(bench: Bench, plain: Candidate) -> Iterator[WrittenElement]:
             bare = bench.candidate(plain.asked.without(name))
             rows = "whole" if name == BRISTLES else "moving"
             ends = (getattr(one.missed, rows) for one in (bare, plain))
-            worth = changed_joints(worth_by_joint(*ends))
+            worth = changed_joints(*ends)
             yield WrittenElement(name, "file", attributes, worth)
 
 
@@ -342,7 +341,7 @@ def law_worths(bench: Bench, plain: Candidate, full: Candidate) -> Iterator[Writ
     for effect in effects_of(full.asked.laws):
         bare = bench.beside(plain, without_law(full.asked, effect).laws)
         where = ", ".join(t.place for t in full.asked.laws if t.effect == effect)
-        worth = changed_joints(worth_by_joint(bare.missed.moving, full.missed.moving))
+        worth = changed_joints(bare.missed.moving, full.missed.moving)
         yield WrittenElement(WORDS[effect], "module", f"at {where}", worth)
 
 
@@ -375,9 +374,7 @@ def left_out(found: MotionDiagnosis, geared: Sequence[int]) -> Iterator[str]:
             joint, (without, with_it) = best_worth(one)
             cost = f"{joint} {without:.3g} in place of {with_it:.3g} {found.unit}"
             yield f"{one.words}: {law.why} (costs {cost})"
-    for rest in (one for one in found.unexplained if one.share > MATTERS):
-        size = f"{rest.size:.3g} {found.unit}"
-        yield f"{size} at {rest.place} follow the {rest.follows} and have no name"
+    yield from (one.sentence(found.unit) for one in found.unexplained if one.share > MATTERS)
 
 
 def is_body(one: MotionEffect) -> bool:
