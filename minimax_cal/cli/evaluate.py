@@ -50,8 +50,8 @@ def evaluate_command(
     """Accuracy of a saved calibration FIT on the measurements in DATA; nothing is fitted.
 
     DATA of other instruments than a tracker is as `calibrate` takes it; what they have of their own
-    is fitted.  FIT is a calibration, a diagnosis or a relative calibration, as -o wrote it.  Of a motion
-    diagnosis, DATA and MORE are logs, and its torques are judged.
+    is fitted.  FIT is a calibration, a diagnosis or a relative calibration, as -o wrote it.  Of a
+    motion diagnosis, DATA and MORE are logs, and its torques are judged.
     """
     found: Evaluation | MotionEvaluation
     if kind_of_file(fit) == MotionDiagnosis.KIND:
