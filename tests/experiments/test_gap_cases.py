@@ -13,6 +13,7 @@ import minimax_cal as mc
 from experiments import blind_gap, gap_cases
 from experiments.gap_cases import ARMS, FAULTS, LAWS, Case, Cause, Sealed, Truth, World
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import plain
 
 ROBOTS = tuple(ARMS)
 
@@ -326,7 +327,7 @@ def test_score_of_single_answers() -> None:
     assert (row["all_right"], row["all_in_sets"], row["strange"]) == (False, True, 1)
     row = blind_gap.score(case, truth_of(J2), answer("unknown"))
     assert (row["match"], row["in_set"], row["set_size"]) == ("", False, 0)
-    json.dumps(blind_gap.clean(row), allow_nan=False)
+    json.dumps(plain(row), allow_nan=False)
 
 
 def test_score_of_several_effects() -> None:

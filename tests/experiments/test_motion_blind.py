@@ -12,7 +12,6 @@ from experiments.motion_blind import (
     SINGLE,
     SOUND,
     Told,
-    interval,
     oracle,
     place_of,
     plan,
@@ -174,11 +173,6 @@ def test_the_plan_holds_every_cause_by_both_generators() -> None:
     assert place_of("link_inertia", 1, 3) == ("link_inertia", "L2")
     assert place_of("delay", 2, 3) == ("delay", "all")
     assert place_of("cable", 5, 4) == ("cable", "J2")
-
-
-def test_an_interval_of_none_of_sixty() -> None:
-    assert interval(0, 60) == pytest.approx((0.0, 5.96), abs=0.01)
-    assert interval(60, 60) == pytest.approx((94.04, 100.0), abs=0.01)
 
 
 def test_a_rotor_that_nobody_told_is_named() -> None:

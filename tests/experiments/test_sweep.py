@@ -235,7 +235,6 @@ def test_functions_and_options_that_cannot_work(tmp_path: Path) -> None:
 # ---- options of a study ----------------------------------------------------------------------
 
 
-@click.command()
 @study_options("toy")
 @click.option("--more", default=1)
 def toy(study: Study, more: int) -> None:
@@ -299,7 +298,7 @@ HOSTILE = "<script>alert('x')</script> & \"quoted\" | bar"
 def fake(name: str, monkeypatch: pytest.MonkeyPatch, body: Any) -> None:
     """A module with a command `main` that does body(study)."""
     made = ModuleType(name)
-    made.main = click.command()(study_options(name)(body))
+    made.main = study_options(name)(body)
     monkeypatch.setitem(sys.modules, name, made)
 
 
