@@ -89,12 +89,12 @@ def differing(one: Any, other: Any, rel: float, at: str = "") -> Iterator[str]:
         yield f"{at}: {one!r:.60} {other!r:.60}"
 
 
-def test_every_kind_is_made() -> None:
+def test_every_kind_is_made():
     assert {name.partition(",")[0] for name in MAKERS} == KINDS.keys() - {"robot"}
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_a_file_comes_back(name: str) -> None:
+def test_a_file_comes_back(name):
     """As it was to what a difference of 15 digits leaves; then to what a turn of a frame does."""
     made = result_of(name)
     content = json.loads(made.json())
@@ -108,14 +108,14 @@ def test_a_file_comes_back(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_a_file_is_as_its_schema_says(name: str) -> None:
+def test_a_file_is_as_its_schema_says(name):
     jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
     made = jsonschema.Draft202012Validator(schema_of(name.partition(",")[0]))
     assert not [fault.message for fault in made.iter_errors(json.loads(result_of(name).json()))]
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_a_slip_in_a_file_is_one_line_or_does_no_harm(name: str) -> None:
+def test_a_slip_in_a_file_is_one_line_or_does_no_harm(name):
     made, rng = result_of(name), np.random.default_rng(3)
     whole = json.loads(made.json())
     every = spots(whole)

@@ -67,7 +67,7 @@ def without(fit: Path, folder: Path, *keys: str, **put: object) -> Path:
     return path
 
 
-def test_tables_on_stdout(fit: Path) -> None:
+def test_tables_on_stdout(fit):
     code, out, notes = run(iso9283_command, fit)
     assert code == 0
     assert not notes
@@ -78,7 +78,7 @@ def test_tables_on_stdout(fit: Path) -> None:
     assert "every pose" in run(iso9283_command, fit, "--poses")[1]
 
 
-def test_held_out_stays_apart_as_in_the_fit(fit: Path) -> None:
+def test_held_out_stays_apart_as_in_the_fit(fit):
     told = json.loads(fit.read_text())["accuracy"]
     found = values(fit)["parts"]
     for part, keys in (("holdout", ("nominal", "holdout")), ("train", ("nominal_train", "train"))):
@@ -90,7 +90,7 @@ def test_held_out_stays_apart_as_in_the_fit(fit: Path) -> None:
             assert mean == pytest.approx(told[key]["mean_mm"])
 
 
-def test_the_file_of_the_fit_says_the_same(fit: Path, poses: Path, tmp_path: Path) -> None:
+def test_the_file_of_the_fit_says_the_same(fit, poses, tmp_path):
     own, named = values(fit), values(fit, poses)
     for part in ("holdout", "train"):
         assert len(own["parts"][part]["poses"]) == len(named["parts"][part]["poses"])
@@ -105,7 +105,7 @@ def test_the_file_of_the_fit_says_the_same(fit: Path, poses: Path, tmp_path: Pat
     assert any("is not the file of the fit; 48 of its 60 rows" in n for n in again["notices"])
 
 
-def test_a_nominal_arm_is_placed_where_the_fit_placed_it(fit: Path) -> None:
+def test_a_nominal_arm_is_placed_where_the_fit_placed_it(fit):
     """A robot that is named is placed as the fit placed its own."""
     told = values(fit)["parts"]["holdout"]["cells"]["before"]["AP_mm"]
     found = values(fit, "--nominal", "irb2600")
@@ -113,9 +113,7 @@ def test_a_nominal_arm_is_placed_where_the_fit_placed_it(fit: Path) -> None:
     assert found["parts"]["holdout"]["cells"]["before"]["AP_mm"] == pytest.approx(told)
 
 
-def test_new_poses_are_all_held_out(
-    fit: Path, poses: Path, tmp_path: Path, noisy: Simulation, rng: np.random.Generator
-) -> None:
+def test_new_poses_are_all_held_out(fit, poses, tmp_path, noisy, rng):
     q = np.tile(noisy.data.q[:5] + 0.02, (6, 1))
     y = noisy.cell.predict(q) + 2e-5 * rng.normal(size=(30, 3, 3))
     labels = np.tile([f"P{i}" for i in range(1, 6)], 6)
@@ -132,7 +130,7 @@ def test_new_poses_are_all_held_out(
     assert run(iso9283_command, fit, path, "-q")[2] == ""
 
 
-def test_tcp_by_name_and_by_place(fit: Path) -> None:
+def test_tcp_by_name_and_by_place(fit):
     spot = json.loads(fit.read_text())["targets_mm"]["smr2"]
     named = values(fit, "--tcp", "smr2")["parts"]["holdout"]["cells"]["after"]["AP_mm"]
     there = values(fit, "--tcp", ",".join(map(str, spot)))["parts"]["holdout"]["cells"]["after"]
@@ -150,7 +148,7 @@ def test_tcp_by_name_and_by_place(fit: Path) -> None:
         (("-o", "/nowhere/iso.json"), "no such folder"),
     ],
 )
-def test_mistakes_are_one_line(fit: Path, arguments: tuple[str, ...], words: str) -> None:
+def test_mistakes_are_one_line(fit, arguments, words):
     code, out, message = run(iso9283_command, fit, *arguments)
     assert code == 2
     assert not out
@@ -158,7 +156,7 @@ def test_mistakes_are_one_line(fit: Path, arguments: tuple[str, ...], words: str
     assert "\n" not in message
 
 
-def test_files_that_are_no_fit(fit: Path, folder: Path, poses: Path) -> None:
+def test_files_that_are_no_fit(fit, folder, poses):
     for path, words in (
         (poses, "is not JSON"),
         (folder / "none.json", "cannot be read"),
@@ -175,7 +173,7 @@ def test_files_that_are_no_fit(fit: Path, folder: Path, poses: Path) -> None:
     assert "nominal_robot" in run(iso9283_command, gone)[2]
 
 
-def test_poses_that_cannot_give_back_their_errors_are_refused(fit: Path, folder: Path) -> None:
+def test_poses_that_cannot_give_back_their_errors_are_refused(fit, folder):
     stored = json.loads(fit.read_text())["poses"]
     stored["errors_mm"]["final"][3][0][0] += 0.01
     code, _, message = run(iso9283_command, without(fit, folder, poses=stored))
@@ -183,16 +181,14 @@ def test_poses_that_cannot_give_back_their_errors_are_refused(fit: Path, folder:
     assert "its effects need columns of the measurements" in message
 
 
-def test_data_of_another_frame_are_doubted(fit: Path, noisy: Simulation, tmp_path: Path) -> None:
+def test_data_of_another_frame_are_doubted(fit, noisy, tmp_path):
     path = tmp_path / "moved.csv"
     mc.write_measurements(path, noisy.data.with_y(noisy.data.y + 0.5))
     _, _, notes = run(iso9283_command, fit, path)
     assert "check that data and fit belong to the same robot, measurement frame" in notes
 
 
-def test_targets_that_the_fit_left_out_are_left_out(
-    fit: Path, folder: Path, poses: Path, noisy: Simulation
-) -> None:
+def test_targets_that_the_fit_left_out_are_left_out(fit, folder, poses, noisy):
     two = mc.read_measurements(poses).keep(np.array([True, True, False]))
     path = folder / "two.json"
     mc.calibrate("irb2600", two).save(path)
@@ -201,7 +197,7 @@ def test_targets_that_the_fit_left_out_are_left_out(
     assert any("smr3 left out" in n for n in found["notices"])
 
 
-def test_effects_are_part_of_what_is_commanded(folder: Path, poses: Path, robot: mc.Robot) -> None:
+def test_effects_are_part_of_what_is_commanded(folder, poses, robot):
     fitted = mc.calibrate(robot, poses, "sum", effects=["joint_compliance:all"])
     path = folder / "effects.json"
     fitted.save(path)
@@ -214,9 +210,7 @@ def test_effects_are_part_of_what_is_commanded(folder: Path, poses: Path, robot:
     assert rms == pytest.approx(fitted.accuracy["holdout"].rms_mm, rel=1e-6)
 
 
-def test_the_page_quotes_what_its_commands_print(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_page_quotes_what_its_commands_print(tmp_path, monkeypatch):
     page = (ROOT / "docs" / "iso9283.md").read_text().partition("## An example")[2]
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.S)
@@ -241,7 +235,7 @@ def test_the_page_quotes_what_its_commands_print(
 # ---- map -----------------------------------------------------------------------------------------
 
 
-def test_map_draws_and_tells(fit: Path, tmp_path: Path) -> None:
+def test_map_draws_and_tells(fit, tmp_path):
     path = tmp_path / "map.png"
     code, out, _ = run(map_command, fit, "-o", path, *FAST)
     assert code == 0
@@ -256,9 +250,7 @@ def test_map_draws_and_tells(fit: Path, tmp_path: Path) -> None:
     assert sum(content["observed"]["held_out"]) == 12
 
 
-def test_map_predicts_by_the_covariance_in_the_file(
-    fit: Path, folder: Path, robot: mc.Robot, poses: Path
-) -> None:
+def test_map_predicts_by_the_covariance_in_the_file(fit, folder, robot, poses):
     found = mc.calibrate(robot, poses)
     names = Names(6, found.cell.target_names)
     units = tuple("m" if length else "rad" for length in names.linear)
@@ -295,9 +287,7 @@ def test_map_predicts_by_the_covariance_in_the_file(
         (("--seed", -1), "seed -1"),
     ],
 )
-def test_map_refuses_what_makes_no_sense(
-    fit: Path, arguments: tuple[object, ...], words: str
-) -> None:
+def test_map_refuses_what_makes_no_sense(fit, arguments, words):
     code, _, message = run(map_command, fit, *arguments)
     assert code == 2
     assert words in message

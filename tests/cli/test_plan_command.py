@@ -86,7 +86,7 @@ def rows_of(path: Path) -> tuple[list[str], list[list[str]]]:
     return header, rows
 
 
-def test_the_file_says_its_units(planned: Path) -> None:
+def test_the_file_says_its_units(planned):
     header, rows = rows_of(planned)
     assert header[:3] == ["order", "pose", "q1_deg"]
     assert header[14] == "via"
@@ -98,14 +98,14 @@ def test_the_file_says_its_units(planned: Path) -> None:
     assert all(cell == "" for row in via for cell in row[15:])  # nothing is measured there
 
 
-def test_compensate_reads_the_stops(planned: Path) -> None:
+def test_compensate_reads_the_stops(planned):
     _, rows = rows_of(planned)
     given = read_targets(planned)
     assert_allclose(np.degrees(given.data.q), np.array([row[2:8] for row in rows], dtype=float))
     assert given.data.columns["approach3"].tolist() == [float(row[10]) for row in rows]
 
 
-def test_calibrate_reads_the_stops_once_they_are_measured(planned: Path, folder: Path) -> None:
+def test_calibrate_reads_the_stops_once_they_are_measured(planned, folder):
     """What the plan expects is where the nominal arm is: measured so, nothing is left to fit."""
     header, rows = rows_of(planned)
     expected = [i for i, name in enumerate(header) if name.startswith("expected_")]
@@ -134,7 +134,7 @@ def base_of(data: mc.Measurements) -> np.ndarray:
     return base
 
 
-def test_radians_and_slides(folder: Path) -> None:
+def test_radians_and_slides(folder):
     path = folder / "scara.csv"
     code, _, _ = run("scara_600", "--poses", 8, "--unit", "rad", "--targets", 1, "-o", path, *FEW,
                      *WIDE)  # fmt: skip
@@ -149,7 +149,7 @@ def test_radians_and_slides(folder: Path) -> None:
     assert set(ANGLES) == {"deg", "rad"}
 
 
-def test_json_alone_on_stdout() -> None:
+def test_json_alone_on_stdout():
     code, out, _ = run("irb2600", "--poses", 10, "--json", "--targets", 1, "--tracker",
                        "2500,-500,800", "--criterion", "D", "--joint", "J2=-20:40", *FEW,
                        *WIDE)  # fmt: skip
@@ -168,7 +168,7 @@ def test_json_alone_on_stdout() -> None:
                           *WIDE)[1])["q"] == content["q"]  # fmt: skip
 
 
-def test_a_fit_and_its_poses(fit: Path, poses: Path) -> None:
+def test_a_fit_and_its_poses(fit, poses):
     """The file of a calibration holds its poses: they count, as they do with --data."""
     found = []
     for more in (("--fit", fit), ("--fit", fit, "--data", poses), ("--data", poses)):
@@ -183,7 +183,7 @@ def test_a_fit_and_its_poses(fit: Path, poses: Path) -> None:
     assert_allclose(noise[0], noise[1], rtol=1e-6)
 
 
-def test_separate(poses: Path) -> None:
+def test_separate(poses):
     code, out, _ = run("irb2600", "--poses", 5, "--data", poses, "--separate", "encoder_gain:J3",
                        "gear_error:J3:turns=1", "--details", *FEW, *WIDE)  # fmt: skip
     assert code == 0
@@ -222,7 +222,7 @@ def test_separate(poses: Path) -> None:
         ((), "poses"),
     ],
 )
-def test_mistakes_are_told_in_one_line(arguments: tuple[object, ...], message: str) -> None:
+def test_mistakes_are_told_in_one_line(arguments, message):
     code, out, err = run("irb2600", *arguments, *FEW)
     assert code == 2
     assert out == ""

@@ -43,7 +43,7 @@ def lib(rough: Study) -> Library:
 
 
 @pytest.mark.parametrize("decade", [-3, 0, 4])
-def test_polynomials_of_a_decade_give_every_weight(decade: int) -> None:
+def test_polynomials_of_a_decade_give_every_weight(decade):
     ratios = 10.0 ** np.linspace(decade, decade + 1, 101)
     variance = np.concatenate([[0.0], np.logspace(-9, 6, 301)])
 
@@ -55,7 +55,7 @@ def test_polynomials_of_a_decade_give_every_weight(decade: int) -> None:
     assert_allclose(found, weights(ratios), rtol=1e-9)
 
 
-def test_products_are_the_sums_over_rows(rough: Study) -> None:
+def test_products_are_the_sums_over_rows(rough):
     """Of what weighted least squares on the geometry leave of the columns."""
     products = arm_library(rough.scene, rough.rows).products
     index, sets = np.array([3, 17, 18]), np.array([[0, 5], [7, 30]])
@@ -86,7 +86,7 @@ def test_products_are_the_sums_over_rows(rough: Study) -> None:
         assert_allclose(lower @ found.part[i], shared, rtol=ROUNDING, atol=ROUNDING * size.max())
 
 
-def test_columns_are_stored_without_what_geometry_imitates(lib: Library, rough: Study) -> None:
+def test_columns_are_stored_without_what_geometry_imitates(lib, rough):
     clear = lib.products.clear(np.arange(lib.products.columns.count))
     size = np.linalg.norm(lib.columns, axis=0)
     assert np.all(ROUNDING * size >= np.abs(clear @ rough.rows.basis).T)
@@ -94,7 +94,7 @@ def test_columns_are_stored_without_what_geometry_imitates(lib: Library, rough: 
                     rtol=0, atol=ROUNDING * np.abs(lib.columns).max())  # fmt: skip
 
 
-def test_what_is_left_of_a_column_is_that_of_the_column_and_geometry(rough: Study) -> None:
+def test_what_is_left_of_a_column_is_that_of_the_column_and_geometry(rough):
     """A thousand times as much geometry in it changes no product; geometry alone leaves least."""
     products = arm_library(rough.scene, rough.rows).products
     columns, basis = products.columns, rough.rows.basis
@@ -109,7 +109,7 @@ def test_what_is_left_of_a_column_is_that_of_the_column_and_geometry(rough: Stud
     assert gram[0, 0, 0] == pytest.approx(LEAST * more @ more, rel=ROUNDING)
 
 
-def test_candidates_stored_nowhere_compare_as_stored_ones(lib: Library) -> None:
+def test_candidates_stored_nowhere_compare_as_stored_ones(lib):
     chosen = [next(c for c in lib.candidates if c.key == ("joint_compliance", "all"))]
     term = Term("gear_ripple", "J4", {"turns": 33.3})
     table = bench(lib, chosen)
@@ -121,13 +121,13 @@ def test_candidates_stored_nowhere_compare_as_stored_ones(lib: Library) -> None:
     assert_allclose([loose.gain, loose.evidence], [held.gain, held.evidence], rtol=1e-8)
 
 
-def test_where_no_line_is_sought_none_is_compared(lib: Library) -> None:
+def test_where_no_line_is_sought_none_is_compared(lib):
     """No joint moves enough for a line: nothing aside, with and without effects chosen."""
     for chosen in ([], list(lib.candidates[:1])):
         assert bench(lib, chosen).beside(lib.aside(())).ranked(()) == []
 
 
-def test_waves_on_a_grid_are_sums_over_poses(rng: np.random.Generator) -> None:
+def test_waves_on_a_grid_are_sums_over_poses(rng):
     q, score, size = rng.uniform(-3, 3, 40), rng.normal(size=40), rng.uniform(size=40)
     turns = np.arange(8.0, 260.0, 0.31)
     pull, square, whole = sums(turns, q, score, size)
@@ -137,7 +137,7 @@ def test_waves_on_a_grid_are_sums_over_poses(rng: np.random.Generator) -> None:
     assert whole == pytest.approx(size.sum())
 
 
-def test_products_know_no_order_of_columns(rng: np.random.Generator) -> None:
+def test_products_know_no_order_of_columns(rng):
     """Columns that come later have the same products as those that were there before."""
     quiet = study(6e-6, 1.0, 0)
     early = arm_library(quiet.scene, quiet.rows)
@@ -155,7 +155,7 @@ def test_products_know_no_order_of_columns(rng: np.random.Generator) -> None:
     assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12 * np.abs(theirs).max())
 
 
-def test_laws_leave_no_scene_behind(rough: Study) -> None:
+def test_laws_leave_no_scene_behind(rough):
     """A scene keeps its laws, and its laws not the scene: it goes with the last name for it."""
     scene = replace(rough.scene)
     Term("link_bending", "L2").columns(scene).doubts(scene)

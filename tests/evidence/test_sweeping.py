@@ -55,7 +55,7 @@ def some_rows(rows: Problem, kept: Array) -> Problem:
                    rows.size, rows.group[kept], rows.measured[kept], rows.exact)  # fmt: skip
 
 
-def test_products_of_a_part_are_sums_over_its_rows(swept: Swept, rough: Study, kept: Array) -> None:
+def test_products_of_a_part_are_sums_over_its_rows(swept, rough, kept):
     """Of what weighted least squares on the geometry leave of the columns."""
     index, sets = np.array([3, 17, 18]), np.array([[0, 5], [7, 30]])
     columns = swept.columns
@@ -89,9 +89,7 @@ def test_products_of_a_part_are_sums_over_its_rows(swept: Swept, rough: Study, k
     assert_allclose(span.T @ basis.T @ basis @ span, np.eye(span.shape[1]), rtol=0, atol=ROUNDING)
 
 
-def test_the_noise_of_a_part_is_that_of_its_rows_alone(
-    swept: Swept, rough: Study, kept: Array
-) -> None:
+def test_the_noise_of_a_part_is_that_of_its_rows_alone(swept, rough, kept):
     alone = some_rows(rough.rows, kept)
     index = np.array([4, 9])
     expected = restricted(alone, swept.columns.raw[kept][:, index])
@@ -102,7 +100,7 @@ def test_the_noise_of_a_part_is_that_of_its_rows_alone(
     assert swept.dof(index) == alone.count - alone.basis.shape[1] - 2
 
 
-def test_ratios_lie_about_those_of_the_whole() -> None:
+def test_ratios_lie_about_those_of_the_whole():
     found = ratios_about([Noise(2.0, 1.0, 1.0), Noise(0.01, 1.0, 1.0)])
     assert found[0] == 0.0
     assert len(found) == COUNT + 1
@@ -110,7 +108,7 @@ def test_ratios_lie_about_those_of_the_whole() -> None:
     assert np.all(np.diff(ratios_about([Noise(0.0, 1.0, 0.0)])) > 0.0)
 
 
-def test_few_rows_have_the_noise_of_their_mean_square(whole: Choice, rough: Study) -> None:
+def test_few_rows_have_the_noise_of_their_mean_square(whole, rough):
     """Fewer than `LEAST_NOISE_DOF` degrees of freedom tell no two noises apart."""
     number = np.arange(rough.scene.poses)
     parts = [Swept(whole.grams, rough.rows.at(number < count)) for count in (1, 2, 3)]
@@ -120,9 +118,7 @@ def test_few_rows_have_the_noise_of_their_mean_square(whole: Choice, rough: Stud
     assert_allclose(noise.variance, float(error @ error) / few.kept.sum(), rtol=1e-6)
 
 
-def test_a_candidate_beside_others_is_least_squares_on_the_rows_that_count(
-    whole: Choice, rough: Study, kept: Array
-) -> None:
+def test_a_candidate_beside_others_is_least_squares_on_the_rows_that_count(whole, rough, kept):
     some = whole.part(kept)
     first, second = (next(c for c in some.candidates if c.key == key and not len(c.doubt))
                      for key in (("backlash", "J2"), ("gear_error", "J3")))  # fmt: skip
@@ -171,7 +167,7 @@ class Some:
         ((Cause("backlash", "J1", 300.0), Cause("thermal_growth", "all", 1000.0)), 60),
     ],
 )
-def test_a_part_names_what_its_rows_alone_name(causes: tuple[Cause, ...], poses: int) -> None:
+def test_a_part_names_what_its_rows_alone_name(causes, poses):
     """From the same candidates, at the likeliest ratio of all and not of few."""
     made = study_of(make(Case("irb2600", "single", causes, seed=5, poses=poses)))
     choice = select(arm_library(made.scene, made.rows))
@@ -192,9 +188,7 @@ def left_by(choice: Choice) -> Array:
     return remaining(rows, weight, choice.known)
 
 
-def test_a_part_is_searched_whatever_the_other_rows_hold(
-    whole: Choice, rough: Study, kept: Array, rng: np.random.Generator
-) -> None:
+def test_a_part_is_searched_whatever_the_other_rows_hold(whole, rough, kept, rng):
     choice = select(whole.part(kept))
     names = {("backlash", "J2"), ("gear_ripple", "J4")}
     assert {c.key for c in choice.chosen} == names
@@ -209,7 +203,7 @@ def test_a_part_is_searched_whatever_the_other_rows_hold(
     assert outside < 0.9 * np.sqrt(np.mean(rough.rows.error[~kept] ** 2))
 
 
-def test_a_part_tunes_again_what_it_ends_with() -> None:
+def test_a_part_tunes_again_what_it_ends_with():
     """By its own rows: a nest that moved late is dated by those poses alone."""
     sealed = study_of(make(Case("irb2600", "single", (Cause("target_shift", "smr2", 1000.0),))))
     choice = select(arm_library(sealed.scene, sealed.rows))
@@ -226,7 +220,7 @@ def test_a_part_tunes_again_what_it_ends_with() -> None:
     assert len(part.library.columns.T) == before
 
 
-def test_a_part_that_shows_hardly_anything_of_a_cause_does_not_test_it() -> None:
+def test_a_part_that_shows_hardly_anything_of_a_cause_does_not_test_it():
     """A nest that moved late, and poses from before: rounding is left of its columns."""
     made = study(jitter=0.0, noise=1.0, seed=3)
     choice = select(arm_library(made.scene, made.rows))
@@ -237,7 +231,7 @@ def test_a_part_that_shows_hardly_anything_of_a_cause_does_not_test_it() -> None
     select(part)  # and no warning
 
 
-def test_parts_leave_no_memory_behind(whole: Choice, kept: Array) -> None:
+def test_parts_leave_no_memory_behind(whole, kept):
     """Products are large: they go with the last name for them, not when a collector comes."""
     part = whole.part(kept)
     choice = select(part)

@@ -364,7 +364,7 @@ MAKERS: tuple[Maker, ...] = (
 
 
 @pytest.mark.parametrize("make", MAKERS)
-def test_an_export_is_read_as_it_is(make: Maker, tmp_path: Path, rng: np.random.Generator) -> None:
+def test_an_export_is_read_as_it_is(make, tmp_path, rng):
     """No option: every joint, every point, the gap left empty, and all that is left out listed."""
     truth = mc.simulate("irb2600", POSES, TARGETS, 5).data
     export = make(tmp_path, np.degrees(truth.q), 1e3 * truth.y, rng)
@@ -390,9 +390,7 @@ def test_an_export_is_read_as_it_is(make: Maker, tmp_path: Path, rng: np.random.
         (leica_kuka, "kalib.dat", "DECL E6AXIS", "set twice"),
     ],
 )
-def test_a_line_that_is_there_twice_is_named(
-    make: Maker, name: str, line: str, words: str, tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_a_line_that_is_there_twice_is_named(make, name, line, words, tmp_path, rng):
     truth = mc.simulate("irb2600", POSES, TARGETS, 5).data
     export = make(tmp_path, np.degrees(truth.q), 1e3 * truth.y, rng)
     lines = (tmp_path / name).read_text().splitlines()
