@@ -9,12 +9,16 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MINIMAX_CAL_LOOPS", "plain")  # half a minute of compiling for brief loops
 os.environ.setdefault("MINIMAX_CAL_NO_FSYNC", "1")  # what tests write outlives no power cut
 
+import click
 import numpy as np
 import pytest
 from browsing import browsing  # stands beside this
+from click.testing import CliRunner
 
 import minimax_cal as mc
 from minimax_cal.cli import main, progress
+from minimax_cal.cli.options import in_flags
+from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 from minimax_cal.planning import outlook, plan
 
@@ -114,7 +118,6 @@ def driver(downloads: Path) -> Iterator[Any]:
 @pytest.fixture(scope="session")
 def browser() -> None:
     """Skips where no browser can print a page."""
-    from minimax_cal.ground.errors import CalibrationError
     from minimax_cal.reporting.html import find_browser
 
     try:
@@ -137,6 +140,16 @@ def run(*arguments: object) -> int:
         main([str(a) for a in arguments])
     code = ended.value.code
     return code if isinstance(code, int) else 0
+
+
+def invoked(command: click.Command, *arguments: object) -> tuple[int, str, str]:
+    """Exit code, stdout, stderr of a command as `main` would run it."""
+    result = CliRunner().invoke(command, [str(a) for a in arguments], standalone_mode=False)
+    if isinstance(result.exception, CalibrationError | click.ClickException):
+        return 2, result.stdout, in_flags(str(result.exception), command)
+    if result.exception:
+        raise result.exception
+    return int(result.return_value), result.stdout, result.stderr
 
 
 def spots(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:

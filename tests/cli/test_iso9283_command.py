@@ -4,11 +4,9 @@ import json
 import re
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from conftest import ROOT
+from conftest import ROOT, invoked
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
@@ -16,7 +14,6 @@ from minimax_cal.cli.iso9283 import iso9283_command
 from minimax_cal.cli.map import map_command
 from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting.uncertainty import Uncertainty
-from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.judging.saved import open_saved
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.modelling.simulate import Simulation
@@ -43,18 +40,8 @@ def fit(folder: Path, poses: Path) -> Path:
     return path
 
 
-def run(command: click.Command, *arguments: object) -> tuple[int, str, str]:
-    """Exit code, stdout, stderr of a command as `main` would run it."""
-    result = CliRunner().invoke(command, [str(a) for a in arguments], standalone_mode=False)
-    if isinstance(result.exception, (CalibrationError, click.ClickException)):
-        return 2, result.stdout, str(result.exception)
-    if result.exception:
-        raise result.exception
-    return int(result.return_value), result.stdout, result.stderr
-
-
 def values(*arguments: object) -> dict:  # type: ignore[type-arg]
-    code, out, _ = run(iso9283_command, *arguments, "--json")
+    code, out, _ = invoked(iso9283_command, *arguments, "--json")
     assert code == 0
     return dict(json.loads(out))
 
@@ -68,14 +55,14 @@ def without(fit: Path, folder: Path, *keys: str, **put: object) -> Path:
 
 
 def test_tables_on_stdout(fit):
-    code, out, notes = run(iso9283_command, fit)
+    code, out, notes = invoked(iso9283_command, fit)
     assert code == 0
     assert not notes
     for words in ("by the formulas of ISO 9283", "held out", "training", "before", "after",
                   "AO' mean", "|AD| mean mm", "no test by ISO 9283", "30 cycles"):  # fmt: skip
         assert words in out
     assert "every pose" not in out
-    assert "every pose" in run(iso9283_command, fit, "--poses")[1]
+    assert "every pose" in invoked(iso9283_command, fit, "--poses")[1]
 
 
 def test_held_out_stays_apart_as_in_the_fit(fit):
@@ -120,14 +107,14 @@ def test_new_poses_are_all_held_out(fit, poses, tmp_path, noisy, rng):
     path = tmp_path / "again.csv"
     mc.write_measurements(path, mc.measurements(q, y, pose=labels, order=np.arange(30)))
     out = tmp_path / "iso.json"
-    code, text, notes = run(iso9283_command, fit, path, "-o", out)
+    code, text, notes = invoked(iso9283_command, fit, path, "-o", out)
     assert code == 0
     assert "0 of its 30 rows" in notes
     content = json.loads(out.read_text())
     assert list(content["parts"]) == ["holdout"]
     assert [p["visits"] for p in content["parts"]["holdout"]["poses"]] == [6] * 5
     assert f"{content['parts']['holdout']['poses'][0]['RP_all_mm']:.4f}" in text
-    assert run(iso9283_command, fit, path, "-q")[2] == ""
+    assert invoked(iso9283_command, fit, path, "-q")[2] == ""
 
 
 def test_tcp_by_name_and_by_place(fit):
@@ -149,7 +136,7 @@ def test_tcp_by_name_and_by_place(fit):
     ],
 )
 def test_mistakes_are_one_line(fit, arguments, words):
-    code, out, message = run(iso9283_command, fit, *arguments)
+    code, out, message = invoked(iso9283_command, fit, *arguments)
     assert code == 2
     assert not out
     assert words in message
@@ -162,7 +149,7 @@ def test_files_that_are_no_fit(fit, folder, poses):
         (folder / "none.json", "cannot be read"),
         (without(fit, folder, "poses"), "name the file of measurements too"),
     ):
-        code, _, message = run(iso9283_command, path)
+        code, _, message = invoked(iso9283_command, path)
         assert code == 2
         assert words in message
     bare = without(fit, folder, "poses")
@@ -170,13 +157,13 @@ def test_files_that_are_no_fit(fit, folder, poses):
     assert list(found["parts"]) == ["train"]
     assert any("all count as training poses" in n for n in found["notices"])
     gone = without(fit, folder, "nominal_robot")
-    assert "nominal_robot" in run(iso9283_command, gone)[2]
+    assert "nominal_robot" in invoked(iso9283_command, gone)[2]
 
 
 def test_poses_that_cannot_give_back_their_errors_are_refused(fit, folder):
     stored = json.loads(fit.read_text())["poses"]
     stored["errors_mm"]["final"][3][0][0] += 0.01
-    code, _, message = run(iso9283_command, without(fit, folder, poses=stored))
+    code, _, message = invoked(iso9283_command, without(fit, folder, poses=stored))
     assert code == 2
     assert "its effects need columns of the measurements" in message
 
@@ -184,7 +171,7 @@ def test_poses_that_cannot_give_back_their_errors_are_refused(fit, folder):
 def test_data_of_another_frame_are_doubted(fit, noisy, tmp_path):
     path = tmp_path / "moved.csv"
     mc.write_measurements(path, noisy.data.with_y(noisy.data.y + 0.5))
-    _, _, notes = run(iso9283_command, fit, path)
+    _, _, notes = invoked(iso9283_command, fit, path)
     assert "check that data and fit belong to the same robot, measurement frame" in notes
 
 
@@ -217,7 +204,7 @@ def test_the_page_quotes_what_its_commands_print(tmp_path, monkeypatch):
     exec(compile(code, "iso9283.md", "exec"), {})
     mc.calibrate("irb2600", "poses.csv").save("fit.json")
     assert "minimax-cal iso9283 fit.json revisits.csv" in page
-    _, out, _ = run(iso9283_command, "fit.json", "revisits.csv")
+    _, out, _ = invoked(iso9283_command, "fit.json", "revisits.csv")
     printed = out.split()
     quoted = [part for text in re.findall(r"```text\n(.*?)```", page, flags=re.S)
               for part in re.split(r"\n\n(?=\w)", text)]  # fmt: skip
@@ -237,12 +224,12 @@ def test_the_page_quotes_what_its_commands_print(tmp_path, monkeypatch):
 
 def test_map_draws_and_tells(fit, tmp_path):
     path = tmp_path / "map.png"
-    code, out, _ = run(map_command, fit, "-o", path, *FAST)
+    code, out, _ = invoked(map_command, fit, "-o", path, *FAST)
     assert code == 0
     assert path.read_bytes().startswith(b"\x89PNG")
     for words in ("beyond", "observed before, held-out poses", "95 % mm"):
         assert words in out
-    code, out, _ = run(map_command, fit, *FAST, "--json", "--height", 1000, "--slab", 300)
+    code, out, _ = invoked(map_command, fit, *FAST, "--json", "--height", 1000, "--slab", 300)
     assert code == 0
     content = json.loads(out)
     assert content["height_mm"] == 1000.0
@@ -259,7 +246,7 @@ def test_map_predicts_by_the_covariance_in_the_file(fit, folder, robot, poses):
     file = without(fit, folder, covariance=known.to_dict())
     maps = []
     for frame in ("measurement", "base"):
-        code, out, notes = run(map_command, file, *FAST, "--json", "--frame", frame)
+        code, out, notes = invoked(map_command, file, *FAST, "--json", "--frame", frame)
         assert code == 0
         assert "the predicted radius, made wider" in notes  # joints give way: not in the covariance
         maps.append(json.loads(out))
@@ -271,7 +258,7 @@ def test_map_predicts_by_the_covariance_in_the_file(fit, folder, robot, poses):
         without(fit, folder, "covariance"),
         without(fit, folder, covariance={"names": ["a9"]}),
     ):
-        code, _, notes = run(map_command, broken, *FAST)
+        code, _, notes = invoked(map_command, broken, *FAST)
         assert code == 2
         assert "covariance" in notes
 
@@ -288,6 +275,6 @@ def test_map_predicts_by_the_covariance_in_the_file(fit, folder, robot, poses):
     ],
 )
 def test_map_refuses_what_makes_no_sense(fit, arguments, words):
-    code, _, message = run(map_command, fit, *arguments)
+    code, _, message = invoked(map_command, fit, *arguments)
     assert code == 2
     assert words in message

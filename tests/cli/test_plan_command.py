@@ -3,19 +3,17 @@
 import csv
 import json
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from conftest import invoked
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.cli.compensate import read_targets
-from minimax_cal.cli.options import in_flags
 from minimax_cal.cli.plan import plan_command
-from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.planning import outlook, task
 from minimax_cal.planning import plan as module
@@ -25,14 +23,7 @@ FEW = ("--candidates", 80, "-q")
 WIDE = ("--acceptance", 180)
 
 
-def run(*arguments: object) -> tuple[int, str, str]:
-    """Exit code, stdout, stderr of the command as `main` would run it."""
-    result = CliRunner().invoke(plan_command, [str(a) for a in arguments], standalone_mode=False)
-    if isinstance(result.exception, (CalibrationError, click.ClickException)):
-        return 2, result.stdout, in_flags(str(result.exception), plan_command)
-    if result.exception:
-        raise result.exception
-    return int(result.return_value), result.stdout, result.stderr
+run = partial(invoked, plan_command)
 
 
 @pytest.fixture(scope="module", autouse=True)

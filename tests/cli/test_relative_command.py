@@ -5,20 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import run
 
 import minimax_cal as mc
 from experiments.relative import SIMULATORS, Arm
-from minimax_cal.cli import main
 from minimax_cal.instruments import write_relative
 from minimax_cal.robots.robot import robot_from_dict
 from minimax_cal.robots.sampling import random_poses
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(a) for a in arguments])
-    code = ended.value.code
-    return code if isinstance(code, int) else 0
 
 
 @pytest.fixture(scope="module")

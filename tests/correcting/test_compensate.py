@@ -2,12 +2,12 @@ import csv
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from conftest import invoked
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -426,18 +426,7 @@ def write(path: Path, header: str, *rows: str) -> Path:
     return path
 
 
-def run(*arguments: object) -> tuple[int, str, str]:
-    """Exit code, stdout, stderr of the command as `main` would run it."""
-    result = CliRunner().invoke(
-        compensate_command, [str(a) for a in arguments], standalone_mode=False
-    )
-    if isinstance(result.exception, (mc.CalibrationError, click.ClickException)):
-        return 2, result.stdout, str(result.exception)
-    if result.exception:
-        raise result.exception
-    return int(result.return_value), result.stdout, result.stderr
-
-
+run = partial(invoked, compensate_command)
 DEGREES = "name,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,payload_kg,speed"
 
 
@@ -528,7 +517,7 @@ def test_command_tells_wrong_files(saved, tmp_path):
     alone.write_text(json.dumps(mc.load_fit(saved).cell.whole()))
     code, _, said = run(alone, targets)
     assert code == 2
-    assert f"{alone}: does not tell its nominal robot; give nominal=" in said
+    assert f"{alone}: does not tell its nominal robot; give --robot" in said
     assert run(alone, targets, "--robot", "irb2600", "-q")[0] == 0
 
 

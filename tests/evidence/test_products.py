@@ -7,34 +7,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from problems_fit import study
+from problems_fit import ROUNDING, check_products, rough_study, study
 
-from experiments.gap_cases import Case, Cause, make
-from minimax_cal.diagnosing.study import Study, studied
+from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.bench import bench
 from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.products import LEAST
 from minimax_cal.evidence.ratios import NODES, interpolation, nodes
-from minimax_cal.fitting.options import Options, silent
-from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.dictionary import ArmLaws, arm_library
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.periodogram import sums
 
 RATIOS = np.array([0.0, 0.013, 0.4, 3.7, 1.0e4])
-ROUNDING = 1e-9  # of products, relative to the largest of their columns
 
 
 @pytest.fixture(scope="module")
 def rough() -> Study:
-    """100 poses with play in a joint, a gear's line, and joints that do not come back."""
-    causes = (Cause("backlash", "J2", 400.0), Cause("gear_ripple", "J4", 400.0))
-    sealed = make(Case("irb2600", "pair", causes, seed=4))
-    data = with_history(sealed.data)
-    fit = fit_cell(sealed.robot, data, Options(objective="sum"), silent)
-    return studied(sealed.robot, data, fit)
+    return rough_study()
 
 
 @pytest.fixture(scope="module")
@@ -62,28 +52,10 @@ def test_products_are_the_sums_over_rows(rough):
     clear, raw = products.columns.clear, products.columns.raw
     p = products.columns.fixed - 1
     found = products.at(RATIOS, index)
-    within = found.among(sets)
     for i, ratio in enumerate(RATIOS):
         weight = 1.0 / (1.0 + ratio * rough.rows.variance_ratio)
-        geometry, root = products.geometry * np.sqrt(weight), np.sqrt(weight)
-        basis = np.linalg.qr(geometry.T)[0]
-        every = clear[p:] * root
-        rest = every - (every @ basis) @ basis.T
-        size = np.linalg.norm(clear[p:], axis=1)
-        gram, atol = rest @ rest.T, ROUNDING * np.outer(size, size)
-        assert np.all(np.abs(found.lines[i] - gram[1 + index, 1:]) <= atol[1 + index, 1:])
-        assert np.all(np.abs(found.error[i] - gram[0]) <= atol[0])
-        assert np.all(np.abs(found.pull[i] - gram[1 + index, 0]) <= atol[1 + index, 0])
-        for c, pair in enumerate(1 + sets):
-            off = np.abs(within[i, c] - gram[np.ix_(pair, pair)])
-            assert np.all(off <= atol[np.ix_(pair, pair)])
-        assert_allclose(found.whole[i], weight @ raw**2, rtol=ROUNDING)
-        assert_allclose(found.square[i], every[0] @ every[0], rtol=ROUNDING)
-        assert_allclose(found.logs[i], np.linalg.slogdet(geometry @ geometry.T)[1], atol=1e-8)
-        lower = found.factor[i]
-        assert_allclose(lower @ lower.T, geometry @ geometry.T, rtol=ROUNDING, atol=1e-9)
-        shared = geometry @ every[np.concatenate([[0], 1 + index])].T
-        assert_allclose(lower @ found.part[i], shared, rtol=ROUNDING, atol=ROUNDING * size.max())
+        geometry = products.geometry * np.sqrt(weight)
+        check_products(found, i, index, sets, clear[p:], geometry, weight, raw)
 
 
 def test_columns_are_stored_without_what_geometry_imitates(lib, rough):

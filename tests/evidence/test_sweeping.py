@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from problems_fit import study, study_of
+from problems_fit import ROUNDING, check_products, rough_study, study, study_of
 
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.study import Study
@@ -23,15 +23,12 @@ from minimax_cal.evidence.sweeping import COUNT, Swept, ratios_about
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.dictionary import arm_library
 
-ROUNDING = 1e-9  # of products, relative to the largest of their columns
 NEAR = 0.5  # relative difference of a ratio among few from the likeliest of all
 
 
 @pytest.fixture(scope="module")
 def rough() -> Study:
-    """100 poses with play in a joint, a gear's line, and joints that do not come back."""
-    causes = (Cause("backlash", "J2", 400.0), Cause("gear_ripple", "J4", 400.0))
-    return study_of(make(Case("irb2600", "pair", causes, seed=4)))
+    return rough_study()
 
 
 @pytest.fixture(scope="module")
@@ -62,29 +59,10 @@ def test_products_of_a_part_are_sums_over_its_rows(swept, rough, kept):
     p = columns.fixed - 1
     ratios = swept.ratios[[0, 3, 1]]
     found = swept.at(ratios, index)
-    within = found.among(sets)
     for i, ratio in enumerate(ratios):
         weight = kept / (1.0 + ratio * rough.rows.variance_ratio)
-        root = np.sqrt(weight)
-        geometry = swept.geometry * root
-        basis = np.linalg.qr(geometry.T)[0]
-        every = columns.clear[p:] * root
-        rest = every - (every @ basis) @ basis.T
-        size = np.linalg.norm(columns.clear[p:], axis=1)
-        gram, atol = rest @ rest.T, ROUNDING * np.outer(size, size)
-        assert np.all(np.abs(found.lines[i] - gram[1 + index, 1:]) <= atol[1 + index, 1:])
-        assert np.all(np.abs(found.error[i] - gram[0]) <= atol[0])
-        assert np.all(np.abs(found.pull[i] - gram[1 + index, 0]) <= atol[1 + index, 0])
-        for c, pair in enumerate(1 + sets):
-            off = np.abs(within[i, c] - gram[np.ix_(pair, pair)])
-            assert np.all(off <= atol[np.ix_(pair, pair)])
-        assert_allclose(found.whole[i], weight @ columns.raw**2, rtol=ROUNDING)
-        assert_allclose(found.square[i], every[0] @ every[0], rtol=ROUNDING)
-        assert_allclose(found.logs[i], np.linalg.slogdet(geometry @ geometry.T)[1], atol=1e-8)
-        lower = found.factor[i]
-        assert_allclose(lower @ lower.T, geometry @ geometry.T, rtol=ROUNDING, atol=1e-9)
-        shared = geometry @ every[np.concatenate([[0], 1 + index])].T
-        assert_allclose(lower @ found.part[i], shared, rtol=ROUNDING, atol=ROUNDING * size.max())
+        geometry = swept.geometry * np.sqrt(weight)
+        check_products(found, i, index, sets, columns.clear[p:], geometry, weight, columns.raw)
     span, basis = swept.swept.span, rough.rows.basis[kept]
     assert_allclose(span.T @ basis.T @ basis @ span, np.eye(span.shape[1]), rtol=0, atol=ROUNDING)
 
