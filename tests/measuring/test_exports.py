@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import escape
 
 import numpy as np
 import pytest
@@ -142,36 +143,47 @@ def chinese(d: mc.Measurements) -> Export:
                   {"units": "smr=mm"})  # fmt: skip
 
 
-def workbook(rows: list[list[object]]) -> bytes:
-    """A workbook of one sheet, in as little XML as a reader takes.  Skips without a reader."""
+def workbook(rows: list[list[object]] | dict[str, list[list[object]]]) -> bytes:
+    """A workbook of one sheet or several, in as little XML as a reader takes.
+
+    Skips without a reader.
+    """
     pytest.importorskip("python_calamine", reason="python-calamine is not installed")
+    sheets = rows if isinstance(rows, dict) else {"Tabelle1": rows}
 
     def cell(value: object) -> str:
         if isinstance(value, str):
-            return f'<c t="inlineStr"><is><t>{value}</t></is></c>'
-        return f"<c><v>{value!r}</v></c>"
+            return f'<c t="inlineStr"><is><t>{escape(value)}</t></is></c>'
+        return "<c/>" if value is None else f"<c><v>{value!r}</v></c>"
 
-    sheet = "".join(f"<row>{''.join(map(cell, row))}</row>" for row in rows)
+    numbers = range(1, len(sheets) + 1)
     main = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
     office = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
     package = "http://schemas.openxmlformats.org/package/2006"
     kind = "application/vnd.openxmlformats-officedocument.spreadsheetml"
+    named = "".join(f'<sheet name="{name}" sheetId="{i}" r:id="r{i}"/>'
+                    for i, name in zip(numbers, sheets, strict=True))  # fmt: skip
+    types = "".join(f'<Override PartName="/xl/worksheets/sheet{i}.xml" ContentType='
+                    f'"{kind}.worksheet+xml"/>' for i in numbers)  # fmt: skip
+    related = "".join(f'<Relationship Id="r{i}" Type="{office}/worksheet" Target='
+                      f'"worksheets/sheet{i}.xml"/>' for i in numbers)  # fmt: skip
     parts = {
         "[Content_Types].xml": f'<Types xmlns="{package}/content-types"><Default Extension="xml" '
         'ContentType="application/xml"/><Default Extension="rels" ContentType='
         '"application/vnd.openxmlformats-package.relationships+xml"/><Override PartName='
-        f'"/xl/workbook.xml" ContentType="{kind}.sheet.main+xml"/><Override PartName='
-        f'"/xl/worksheets/sheet1.xml" ContentType="{kind}.worksheet+xml"/></Types>',
+        f'"/xl/workbook.xml" ContentType="{kind}.sheet.main+xml"/>{types}</Types>',
         "_rels/.rels": f'<Relationships xmlns="{package}/relationships"><Relationship Id="r1" '
         f'Type="{office}/officeDocument" Target="xl/workbook.xml"/></Relationships>',
-        "xl/workbook.xml": f'<workbook xmlns="{main}" xmlns:r="{office}"><sheets>'
-        '<sheet name="Tabelle1" sheetId="1" r:id="r1"/></sheets></workbook>',
-        "xl/_rels/workbook.xml.rels": f'<Relationships xmlns="{package}/relationships">'
-        f'<Relationship Id="r1" Type="{office}/worksheet" Target="worksheets/sheet1.xml"/>'
+        "xl/workbook.xml": f'<workbook xmlns="{main}" xmlns:r="{office}"><sheets>{named}</sheets>'
+        "</workbook>",
+        "xl/_rels/workbook.xml.rels": f'<Relationships xmlns="{package}/relationships">{related}'
         "</Relationships>",
-        "xl/worksheets/sheet1.xml": f'<worksheet xmlns="{main}"><sheetData>{sheet}</sheetData>'
-        "</worksheet>",
     }
+    for i, sheet in zip(numbers, sheets.values(), strict=True):
+        data = "".join(f"<row>{''.join(map(cell, row))}</row>" for row in sheet)
+        parts[f"xl/worksheets/sheet{i}.xml"] = (
+            f'<worksheet xmlns="{main}"><sheetData>{data}</sheetData></worksheet>'
+        )
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as file:
         for name, text in parts.items():
