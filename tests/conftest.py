@@ -1,6 +1,9 @@
+import copy
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +65,11 @@ def noisy(robot: mc.Robot) -> Simulation:
     """Geometric errors, compliance and tracker noise; its files look as those of a tracker."""
     made = simulate(robot, 60, 3, seed=5)
     return replace(made, data=replace(made.data, simulated=False))
+
+
+@pytest.fixture(scope="session")
+def fit(robot: mc.Robot, noisy: Simulation) -> mc.Fit:
+    return mc.calibrate(robot, noisy.data, "sum")
 
 
 @pytest.fixture(scope="session")
@@ -150,6 +158,18 @@ def invoked(command: click.Command, *arguments: object) -> tuple[int, str, str]:
     if result.exception:
         raise result.exception
     return int(result.return_value), result.stdout, result.stderr
+
+
+def slipped(whole: Any, rng: np.random.Generator, odd: Sequence[Any], gone: float) -> Any:
+    """A JSON with an odd value at one place, or its key gone in a share of the cases."""
+    content, every = copy.deepcopy(whole), spots(whole)
+    *way, last = every[rng.integers(len(every))]
+    part = reduce(getitem, way, content)
+    if gone and rng.random() < gone and isinstance(last, str):
+        del part[last]
+    else:
+        part[last] = odd[rng.integers(len(odd))]
+    return content
 
 
 def spots(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:

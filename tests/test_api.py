@@ -17,7 +17,6 @@ import minimax_cal as mc
 from minimax_cal.cli.commands import ENTRIES, said_of
 from minimax_cal.cli.running import cli
 from minimax_cal.fitting.several import RelativeOptions
-from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.planning.options import PlanOptions
 
 FUNCTIONS = [name for name in mc.__all__ if inspect.isfunction(getattr(mc, name))]
@@ -126,11 +125,6 @@ def test_keywords_are_those_of_the_options(function, options):  # type: ignore[n
 
 
 # ---- functions beside the commands -------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def fit(noisy: Simulation) -> mc.Fit:
-    return mc.calibrate("irb2600", noisy.data, "sum")
 
 
 def test_simulate_takes_a_name(robot):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import math
 from collections.abc import Callable, Iterator
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import ROOT, spots
+from conftest import ROOT, slipped
 
 import minimax_cal as mc
 from minimax_cal.cli.schemas import KINDS, schema_of
@@ -118,20 +117,11 @@ def test_a_file_is_as_its_schema_says(name):
 def test_a_slip_in_a_file_is_one_line_or_does_no_harm(name):
     made, rng = result_of(name), np.random.default_rng(3)
     whole = json.loads(made.json())
-    every = spots(whole)
-    for _ in range(SLIPS):
-        content = copy.deepcopy(whole)
-        *way, last = every[rng.integers(len(every))]
-        part = content
-        for key in way:
-            part = part[key]
-        if rng.random() < 0.3 and isinstance(last, str):
-            del part[last]
-        else:
-            part[last] = ODD[rng.integers(len(ODD))]
+    for number in range(SLIPS):
+        content = slipped(whole, rng, ODD, 0.3)
         said = ""
         try:
             type(made).from_dict(content, "slip.json").summary()
         except CalibrationError as error:
             said = str(error)
-        assert "\n" not in said, (way, last)
+        assert "\n" not in said, number

@@ -15,17 +15,11 @@ from minimax_cal.correcting.compensate import compensate
 from minimax_cal.correcting.programs import krl, rapid
 from minimax_cal.correcting.programs.points import MARK
 from minimax_cal.correcting.programs.program import Program, read_program
-from minimax_cal.modelling.simulate import Simulation
 
 Q = np.array([0.3, 0.2, 0.1, 0.5, 0.8, 0.4])
 TOOL = "PERS tooldata tGrip:=[TRUE,[[20,0,150],[1,0,0,0]],[1,[0,0,1],[1,0,0,0],0,0,0]];"
 NOWHERE = "0,0,0,1,0,0,0"
 JOINTS = "{A1 10,A2 20,A3 -10,A4 30,A5 40,A6 50}"
-
-
-@pytest.fixture(scope="module")
-def fit(noisy: Simulation) -> mc.Fit:
-    return mc.calibrate("irb2600", noisy.data, "sum")
 
 
 @pytest.fixture

@@ -14,7 +14,6 @@ from minimax_cal.correcting.programs import krl, rapid
 from minimax_cal.correcting.programs.points import MARK
 from minimax_cal.correcting.programs.program import read_program
 from minimax_cal.ground.errors import DataError
-from minimax_cal.modelling.simulate import Simulation
 
 JOINTS = np.array(
     [
@@ -92,11 +91,6 @@ def unmarked(made: bytes) -> bytes:
     rest = [line for line in lines if MARK.encode() not in line]
     assert len(rest) == len(lines) - 1
     return b"".join(rest)
-
-
-@pytest.fixture(scope="module")
-def fit(noisy: Simulation) -> mc.Fit:
-    return mc.calibrate("irb2600", noisy.data, "sum")
 
 
 @pytest.mark.parametrize("language", ["rapid", "krl"])

@@ -273,32 +273,3 @@ def test_what_is_written_is_read_back(kind, tmp_path):
         assert (one.label, one.kind) == (other.label, other.kind)
         assert_allclose(one.size, other.size, rtol=0, atol=1e-12)
         assert_allclose(one.normal, other.normal, rtol=0, atol=1e-12)
-
-
-HEADER = "q1_rad,q2_rad,q3_rad,surface,kind"
-
-
-@pytest.mark.parametrize(
-    ("header", "rows", "words"),
-    [
-        ("q1_rad,q2_rad,q3_rad,surface", ["A"] * 5, ":1: column kind is missing"),
-        (HEADER, ["A,cone"] * 5, ": column kind: 'cone' of surface 'A'; write plane or sphere"),
-        (HEADER, ["A,plane"] * 3, ": column surface: 'A' is touched at 3 different poses"),
-        (HEADER, ["A,sphere"] * 4, "touch a sphere at 5 or more"),
-        (HEADER, ["A,plane"] * 5 + ["A,sphere"], ":7: surface 'A' has another kind, size"),
-        (f"{HEADER},radius_mm", ["A,sphere,-3"] * 6, ": a radius must be positive"),
-        (f"{HEADER},ball_radius_mm", ["A,plane,3"] * 5 + ["A,plane,4"], "2 values; a probe has"),
-        (f"{HEADER},normal_x", ["A,plane,1"] * 6, ":1: a face has normal_x, normal_y and normal_z"),
-        (f"{HEADER},socket", ["A,plane,1"] * 6, "columns socket and surface are of different"),
-        (HEADER, [","] * 6, "nothing was measured at any pose"),
-    ],
-)  # fmt: skip
-def test_bad_columns_are_one_line(header, rows, words, tmp_path):
-    path = tmp_path / "bad.csv"
-    lines = [f"0.{i},0.2,-0.{i},{row}" for i, row in enumerate(rows)]
-    path.write_text("\n".join([header, *lines]))
-    with pytest.raises(mc.DataError) as caught:
-        read_relative(path)
-    assert str(caught.value).startswith(str(path))
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)

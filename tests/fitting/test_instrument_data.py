@@ -126,6 +126,7 @@ GOOD = {
     ],
 }
 WIRE, SOCKET, VECTOR, QUATERNION = GOOD
+TOUCH = "surface,kind"
 
 
 def changed(header: str, row: int, text: str) -> list[str]:
@@ -159,6 +160,16 @@ def changed(header: str, row: int, text: str) -> list[str]:
         ("flange_x_mm,flange_y_mm,flange_z_mm", ["1,2,3"] * 6, ":1:", "give the flange's orien"),
         ("flange_rx_rad,flange_ry_rad,flange_rz_rad", ["1,2,3"] * 6, ":1:", "flange_x_mm is miss"),
         ("flange_x_cm", ["1"] * 6, ":1:", "column flange_x_cm is not understood"),
+        ("surface", ["A"] * 5, ":1:", "column kind is missing"),
+        (TOUCH, ["A,cone"] * 5, ":", "kind: 'cone' of surface 'A'; write plane or sphere"),
+        (TOUCH, ["A,plane"] * 3, ":", "column surface: 'A' is touched at 3 different poses"),
+        (TOUCH, ["A,sphere"] * 4, ":", "touch a sphere at 5 or more"),
+        (TOUCH, ["A,plane"] * 5 + ["A,sphere"], ":7:", "surface 'A' has another kind, size"),
+        (f"{TOUCH},radius_mm", ["A,sphere,-3"] * 6, ":", "a radius must be positive"),
+        (f"{TOUCH},ball_radius_mm", ["A,plane,3"] * 5 + ["A,plane,4"], ":", "2 values; a probe"),
+        (f"{TOUCH},normal_x", ["A,plane,1"] * 6, ":1:", "a face has normal_x, normal_y and nor"),
+        (f"{TOUCH},socket", ["A,plane,1"] * 6, ":", "columns socket and surface are of different"),
+        (TOUCH, [","] * 6, ":", "nothing was measured at any pose"),
     ],
 )  # fmt: skip
 def test_bad_columns_are_one_line_with_place_and_mend(header, cells, place, words, tmp_path):

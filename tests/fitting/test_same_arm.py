@@ -8,12 +8,6 @@ from conftest import run
 
 import minimax_cal as mc
 from minimax_cal.fitting.same_arm import check_arm
-from minimax_cal.modelling.simulate import Simulation
-
-
-@pytest.fixture(scope="module")
-def fit(robot: mc.Robot, noisy: Simulation) -> mc.Fit:
-    return mc.calibrate(robot, noisy.data, "sum")
 
 
 def turned(data: mc.Measurements, joint: int, angle: float) -> mc.Measurements:

@@ -26,15 +26,10 @@ from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import SumOfSquares, with_poses
 from minimax_cal.modelling.parameters import State
-from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.solvers import least_squares
 
 SAME = 2e-3  # of a sigma: what two Gauss-Newton steps leave [60 poses, errors of 0.2 mm]
-
-
-@pytest.fixture(scope="module")
-def fit(robot: mc.Robot, noisy: Simulation) -> mc.Fit:
-    return mc.calibrate(robot, noisy.data, "sum")
 
 
 @pytest.fixture(scope="module")

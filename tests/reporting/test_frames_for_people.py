@@ -15,18 +15,13 @@ from minimax_cal.fitting.several import RelativeCalibration, relative
 from minimax_cal.instruments import flange_poses
 from minimax_cal.judging.bootstrap import bootstrap
 from minimax_cal.modelling.frames import frames_of, tables_of
-from minimax_cal.modelling.simulate import Simulation, simulate
+from minimax_cal.modelling.simulate import simulate
 from minimax_cal.robots.frames import Frame
 from minimax_cal.robots.transforms import transform
 
 BASE = ("base", "base_nominal", "base_correction")
 TOOL = ("tool", "tool_nominal", "tool_correction")
 KEYS = {"xyz_mm", "abc_deg", "quaternion_wxyz", "rotation_vector_rad"}
-
-
-@pytest.fixture(scope="module")
-def fit(robot: mc.Robot, noisy: Simulation) -> mc.Fit:
-    return mc.calibrate(robot, noisy.data, "sum")
 
 
 def test_the_base_is_where_it_stands(fit):

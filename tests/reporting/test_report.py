@@ -19,7 +19,7 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 from click.testing import CliRunner, Result
-from conftest import SHARED, run, spots
+from conftest import SHARED, run, slipped
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
@@ -703,16 +703,9 @@ def test_what_is_no_json_is_said(text, tmp_path, capsys):
 def test_no_slip_in_a_file_is_a_traceback(name, slips, results, tmp_path):
     rng = np.random.default_rng(1)
     whole = json.loads((results / name).read_text())
-    every = spots(whole)
     odd = [None, "x", -1, 1e30, [], {}, [None], True]
     for _ in range(slips):
-        content = copy.deepcopy(whole)
-        *way, last = every[rng.integers(len(every))]
-        part = content
-        for key in way:
-            part = part[key]
-        part[last] = odd[rng.integers(len(odd))]
-        path = write(tmp_path / "slip.json", content)
+        path = write(tmp_path / "slip.json", slipped(whole, rng, odd, 0.0))
         with suppress(CalibrationError):
             compose(read_sources([path]), WORDING)
 
