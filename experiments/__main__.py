@@ -196,7 +196,6 @@ def numbers(study: Study, outcome: Outcome) -> object:
     return json.loads(path.read_text(encoding="utf-8")) if path in outcome.files else {}
 
 
-@click.command(name="all")
 @study_options("all")
 def everything(study: Study) -> None:
     """Run every study into a folder of its own, with one page about all."""

@@ -21,12 +21,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-import click
 import numpy as np
 
 from experiments import sweep
 from experiments.conditions import FOLDERS, ROBOTS
 from experiments.real import here
+from experiments.record import canvas
 from experiments.speed import fitted
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.minimax_problem import (
@@ -217,9 +217,7 @@ def reached(values: tuple[float, ...], step: int) -> float:
 
 def picture(found: Mapping[Job, Course]) -> Figure:
     """Course of every arm."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    figure = canvas(9.0, 3.6)
     for axes, way in zip(figure.subplots(1, 2, sharey=True), WAYS, strict=True):
         for job, course in found.items():
             axes.semilogy(np.maximum(course.ways[way], 1e-13), label=job.arm)
@@ -237,7 +235,6 @@ def save(study: Study, found: Mapping[Job, Course]) -> None:
     study.save([table_of(found)], content, {"algorithm_1": picture(found)})
 
 
-@click.command()
 @study_options("algorithm_1")
 def main(study: Study) -> None:
     """Paper M's Algorithm 1 to the letter, on simulated and real arms."""

@@ -137,20 +137,19 @@ def study_of(study: Study, count: int = 200) -> dict[float, list[Result]]:
 
 def save(study: Study, found: dict[float, list[Result]]) -> None:
     """The table."""
-    table = Table(
+    table = Table.made(
         "random base poses x random deviations of theta_2, alpha_3 within 3.1 rad: share of trials "
         "that reach the global minimum",
-        ("poses within rad", "trials", "SNLGN, paper's start %", "SNLLM, paper's start %",
-         "our search %", "paper ms", "ours ms", "our worst RMS / least"),
-        tuple(row_of(span, results) for span, results in found.items()),
-        (".2f", "d", ".1f", ".1f", ".1f", ".0f", ".0f", ".6f"),
-    )  # fmt: skip
+        (row_of(span, results) for span, results in found.items()),
+        "poses within rad .2f | trials d | SNLGN, paper's start % .1f | "
+        "SNLLM, paper's start % .1f | our search % .1f | paper ms .0f | ours ms .0f | "
+        "our worst RMS / least .6f",
+    )
     names = ("span_rad", "trials", "snlgn_percent", "snllm_percent", "ours_percent", "paper_ms",
              "ours_ms", "worst_ratio")  # fmt: skip
-    study.save([table], {"rows": [dict(zip(names, row, strict=True)) for row in table.rows]})
+    study.save([table], {"rows": table.records(*names)})
 
 
-@click.command()
 @study_options("any_base")
 @click.option("--trials", "count", type=int, default=200, show_default=True)
 def main(study: Study, count: int) -> None:

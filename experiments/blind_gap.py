@@ -18,11 +18,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import click
 import numpy as np
-from scipy import stats
 
 import minimax_cal as mc
 from experiments import gap_cases, sweep
@@ -41,6 +40,7 @@ from experiments.gap_cases import (
     spec,
     write,
 )
+from experiments.record import canvas, interval
 from experiments.sweep import Study, study_options
 from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.ground.arrays import Array
@@ -276,14 +276,19 @@ def pairing(truth: Sequence[Name], sets: Sequence[Sequence[Name]]) -> int:
     return best
 
 
+def answers(said: Row) -> list[list[Name]]:
+    """Each confirmed cause of a diagnosis, before its alternatives."""
+    sure = [effect for effect in said.get("effects", []) if effect.get("established", True)]
+    return [
+        [(str(e["effect"]), str(e["place"])) for e in (one, *one.get("alternatives", []))]
+        for one in sure
+    ]
+
+
 def score(case: Case, truth: Truth, said: Row) -> Row:
     """What an answer is worth, as plain data.  said: the JSON of a diagnosis."""
-    effects = [effect for effect in said.get("effects", []) if effect.get("established", True)]
-    names = [(str(e["effect"]), str(e["place"])) for e in effects]
-    sets = [
-        [name, *((str(a["effect"]), str(a["place"])) for a in e.get("alternatives", []))]
-        for name, e in zip(names, effects, strict=True)
-    ]
+    sets = answers(said)
+    names = [options[0] for options in sets]
     main = truth.truth[0] if truth.truth else ("", "")
     gap = said.get("gap", {})
     count = len(truth.truth)
@@ -353,7 +358,7 @@ class Criterion:
         n = len(self.rows)
         hits = sum(map(self.hit, self.rows))
         share = hits / n if n else float("nan")
-        low, high = interval(hits, n)
+        low, high = interval(hits, n) if n else (share, share)
         kept = share >= self.limit if self.good else share <= self.limit
         bound = f"{'>=' if self.good else '<='} {100.0 * self.limit:.3g} %"
         shown = bound if np.isfinite(self.limit) else ""
@@ -365,14 +370,6 @@ class Criterion:
         if not np.isfinite(self.limit):
             return []
         return [row for row in self.rows if self.hit(row) != self.good]
-
-
-def interval(hits: int, n: int) -> tuple[float, float]:
-    """Clopper and Pearson's 95 % interval of a share."""
-    if not n:
-        return float("nan"), float("nan")
-    found = stats.binomtest(hits, n).proportion_ci(0.95, "exact")
-    return float(found.low), float(found.high)
 
 
 def named(row: Row) -> bool:
@@ -480,11 +477,10 @@ def headline(rows: Sequence[Row], all_criteria: Sequence[Criterion]) -> Table:
         lines.append((text, len(values), value, low, high,
                       f"{'<=' if limit == 2.0 else '<'} {limit:g}",
                       ("met" if kept else "MISSED") if len(values) else ""))  # fmt: skip
-    return Table(
+    return Table.made(
         "blind study: shares [%] with 95 % intervals, and the limits",
-        ("criterion", "runs", "found", "from", "to", "limit", "verdict"),
-        tuple(lines),
-        ("", "d", ".1f", ".1f", ".1f", "", ""),
+        lines,
+        "criterion | runs d | found .1f | from .1f | to .1f | limit | verdict",
     )
 
 
@@ -536,11 +532,10 @@ def confusion_table(rows: Sequence[Row]) -> Table:
         order = [int(i) for i in np.argsort(-row, kind="stable") if row[i]]
         return ", ".join(f"{columns[i]} {row[i]}" for i in order)
 
-    return Table(
+    return Table.made(
         "true effect x first name, visible single effects",
-        ("truth", "runs", "first name, and how often"),
-        tuple((line, int(c.sum()), answers(c)) for line, c in zip(lines, counts, strict=True)),
-        ("", "d", ""),
+        ((line, int(c.sum()), answers(c)) for line, c in zip(lines, counts, strict=True)),
+        "truth | runs d | first name, and how often",
     )
 
 
@@ -565,13 +560,12 @@ def per_effect(rows: Sequence[Row]) -> Table:
                 float(np.median(rho2)) if rho2 else float("nan"),
                 rivals.most_common(1)[0][0] if rivals else "",
             ))  # fmt: skip
-    return Table(
+    return Table.made(
         "each effect, lambda >= 50 [%]",
-        ("effect", "runs", "right", "all/one", "in set", "set size", "one_of", "unknown", "none",
-         "median rho^2", "usual alternative"),
-        tuple(lines),
-        ("", "d", ".1f", ".1f", ".1f", ".2f", ".1f", ".1f", ".1f", ".3f", ""),
-    )  # fmt: skip
+        lines,
+        "effect | runs d | right .1f | all/one .1f | in set .1f | set size .2f | "
+        "one_of .1f | unknown .1f | none .1f | median rho^2 .3f | usual alternative",
+    )
 
 
 def by_power(rows: Sequence[Row]) -> list[tuple[float, list[Row]]]:
@@ -619,11 +613,10 @@ def shrink(rows: Sequence[Row]) -> Table:
                 quantiles = np.quantile(ratio, (0.05, 0.5, 0.95, 0.99))
                 lines.append((text, condition, len(ratio), *map(float, quantiles),
                               float(ratio.max())))  # fmt: skip
-    return Table(
+    return Table.made(
         "gap closed: quantiles of ratios",
-        ("ratio", "condition", "runs", "5 %", "50 %", "95 %", "99 %", "largest"),
-        tuple(lines),
-        ("", "", "d", ".3f", ".3f", ".3f", ".3f", ".3f"),
+        lines,
+        "ratio | condition | runs d | 5 % .3f | 50 % .3f | 95 % .3f | 99 % .3f | largest .3f",
     )
 
 
@@ -664,18 +657,17 @@ def misses(all_criteria: Sequence[Criterion]) -> Table:
             ))  # fmt: skip
     total = sum(len(criterion.misses()) for criterion in all_criteria)
     shown = lines[:MOST_MISSES]
-    return Table(
+    return Table.made(
         f"misses: {len(shown)} of {total}",
-        ("what", "robot, poses, seed", "truth", "said", "lambda", "rho^2", "RMS/oracle"),
-        tuple(shown),
-        ("", "", "", "", ".0f", ".3f", ".3f"),
+        shown,
+        "what | robot, poses, seed | truth | said | lambda .0f | rho^2 .3f | RMS/oracle .3f",
     )
 
 
 def troubles(rows: Sequence[Row]) -> Table:
     """What went wrong in the diagnosis or in the judge, the most frequent first."""
     counts = Counter(row["trouble"][:120] for row in rows if row["trouble"])
-    return Table("troubles", ("message", "runs"), tuple(counts.most_common(10)), ("", "d"))
+    return Table.made("troubles", counts.most_common(10), "message | runs d")
 
 
 # ---- pictures ------------------------------------------------------------------------------------
@@ -685,9 +677,7 @@ COLOURS = ("#0072b2", "#009e73", "#d55e00")  # told apart by colour-blind eyes t
 
 def detectability_picture(rows: Sequence[Row]) -> Figure:
     """Shares against lambda with binomial bands."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    figure = canvas(7, 4.2)
     axes = figure.subplots()
     groups = by_power(rows)
     powers = [power for power, _ in groups]
@@ -706,10 +696,8 @@ def detectability_picture(rows: Sequence[Row]) -> Figure:
 
 def confusion_picture(rows: Sequence[Row]) -> Figure:
     """The confusion matrix, each line as shares of its truth."""
-    from matplotlib.figure import Figure
-
     lines, columns, counts = confusion(rows)
-    figure = Figure(figsize=(9.5, 7.5), layout="constrained")
+    figure = canvas(9.5, 7.5)
     axes = figure.subplots()
     shares = 100.0 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=100.0)
@@ -726,9 +714,7 @@ def confusion_picture(rows: Sequence[Row]) -> Figure:
 
 def shrink_picture(rows: Sequence[Row]) -> Figure:
     """Distribution of the held-out RMS over the oracle's, before and after naming."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    figure = canvas(7, 4.2)
     axes = figure.subplots()
     judged = [row for row in rows if np.isfinite(row["oracle_mm"])]
     for key, text, colour in (
@@ -748,25 +734,42 @@ def shrink_picture(rows: Sequence[Row]) -> Figure:
 
 # ---- the study -----------------------------------------------------------------------------------
 
+
+class Conditioned(Protocol):
+    """A case of a condition."""
+
+    @property
+    def condition(self) -> str:
+        """What it is run for."""
+
+
+C = TypeVar("C", bound=Conditioned)
+
+
+def chosen(
+    study: Study, cases: Sequence[C], only: Sequence[str], every: int | None, sparse: int
+) -> list[C]:
+    """Cases of some conditions, each so many-th.  sparse: of --quick.  Raises OptionError."""
+    conditions = tuple(dict.fromkeys(case.condition for case in cases))
+    for name in only:
+        if name not in conditions:
+            raise OptionError(f"--only {name}: choose {', '.join(conditions)}")
+    step = (sparse if study.quick else 1) if every is None else every
+    if step < 1:
+        raise OptionError(f"--every {every}: give a whole number, 1 or more")
+    return [case for case in cases if not only or case.condition in only][::step]
+
+
 SPARSE = 4  # of the cases of --quick, each so many-th by itself
 
 
-@click.command()
 @study_options("blind_gap")
 @click.option("--only", multiple=True, help="A condition to run, such as pair; may be repeated.")
 @click.option("--every", type=int, help="Run each N-th case alone [default: 1; with --quick 4].")
 def main(study: Study, only: tuple[str, ...], every: int | None) -> None:
     """Blind judgement of diagnose."""
     cases = plan(study.seed, QUICK if study.quick else Size())
-    conditions = tuple(dict.fromkeys(case.condition for case in cases))
-    for name in only:
-        if name not in conditions:
-            raise OptionError(f"--only {name}: choose {', '.join(conditions)}")
-    every = (SPARSE if study.quick else 1) if every is None else every
-    if every < 1:
-        raise OptionError(f"--every {every}: give a whole number, 1 or more")
-    cases = [case for case in cases if not only or case.condition in only][::every]
-    rows = study.sweep(run, cases, "diagnoses")
+    rows = study.sweep(run, chosen(study, cases, only, every, SPARSE), "diagnoses")
     found = criteria(rows)
     tables = [
         headline(rows, found),
@@ -784,17 +787,7 @@ def main(study: Study, only: tuple[str, ...], every: int | None) -> None:
         "blind_gap_oracle": shrink_picture(rows),
     }
     names = ("criterion", "runs", "found", "low", "high", "limit", "verdict")
-    lines = [dict(zip(names, row, strict=True)) for row in tables[0].rows]
-    study.save(tables, {"criteria": clean(lines), "rows": clean(rows)}, figures)
-
-
-def clean(content: Any) -> Any:
-    """The same for JSON, which knows no NaN."""
-    if isinstance(content, dict):
-        return {key: clean(value) for key, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [clean(value) for value in content]
-    return None if isinstance(content, float) and not np.isfinite(content) else content
+    study.save(tables, {"criteria": tables[0].records(*names), "rows": rows}, figures)
 
 
 if __name__ == "__main__":

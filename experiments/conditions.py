@@ -20,6 +20,7 @@ import minimax_cal as mc
 from experiments import sweep
 from experiments.poses import euler_deviation, orientation_error, poses_of, triangle
 from experiments.real import here, real
+from experiments.record import canvas
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell as TableCell
@@ -145,13 +146,13 @@ def table_of(title: str, found: dict[str, Outcome]) -> Table:
                     outcome.status,
                 )
             )
-    return Table(
+    return Table.made(
         title,
-        ("condition", "poses", "count", "F_1 mm^2", "F_2 mm^2", "F_3 mm^2", "RMSE(phi) mm",
-         "AP rms mm", "AP max mm", "AO max mrad", "AO' rms mrad", "AO' max mrad", "status"),
-        tuple(rows),
-        ("", "", "d", *[".2f"] * 3, *[".4f"] * 3, *[".3f"] * 3, ""),
-    )  # fmt: skip
+        rows,
+        "condition | poses | count d | F_1 mm^2 .2f | F_2 mm^2 .2f | F_3 mm^2 .2f | "
+        "RMSE(phi) mm .4f | AP rms mm .4f | AP max mm .4f | AO max mrad .3f | "
+        "AO' rms mrad .3f | AO' max mrad .3f | status",
+    )
 
 
 def papers_table() -> Table:
@@ -159,19 +160,16 @@ def papers_table() -> Table:
     rows = tuple(
         (f"{number} {name}", *values) for number, (name, values) in enumerate(PAPER.items())
     )
-    return Table(
+    return Table.made(
         "paper M, Table 3 (IRB 2600, 100 poses, training)",
-        ("condition", "F_1 mm^2", "F_2 mm^2", "F_3 mm^2", "RMSE(phi) mm"),
         rows,
-        ("", ".2f", ".2f", ".2f", ".3f"),
+        "condition | F_1 mm^2 .2f | F_2 mm^2 .2f | F_3 mm^2 .2f | RMSE(phi) mm .3f",
     )
 
 
 def boxes(title: str, found: dict[str, Outcome]) -> Figure:
     """Fig. 2-4 and 6: AP, AO and AO' per condition, training and held out."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12, 6), layout="constrained")
+    figure = canvas(12, 6)
     panels = figure.subplots(2, 3, sharex=True)
     for row, where in zip(panels, ("train", "held"), strict=True):
         for axes, (kind, name) in zip(row, KINDS, strict=True):
@@ -186,9 +184,7 @@ def boxes(title: str, found: dict[str, Outcome]) -> Figure:
 
 def pose_by_pose(title: str, found: dict[str, Outcome]) -> Figure:
     """The right halves of Fig. 2-4: training poses in their order, a dot a reflector."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12, 3.2), layout="constrained")
+    figure = canvas(12, 3.2)
     for axes, (kind, name) in zip(figure.subplots(1, 3), KINDS, strict=True):
         for condition, colour in (("nominal", BEFORE), ("minimax", AFTER)):
             errors = found[condition].train
@@ -204,9 +200,7 @@ def pose_by_pose(title: str, found: dict[str, Outcome]) -> Figure:
 
 def sums_figure(title: str, found: dict[str, Outcome]) -> Figure:
     """Fig. 5: F_i per condition (training), the nominal left out."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4), layout="constrained")
+    figure = canvas(7, 4)
     axes = figure.subplots()
     names = [name for name in found if name != "nominal"]
     for i in range(3):
@@ -239,11 +233,10 @@ def claims(robots: Sequence[str], found: dict[str, dict[str, Outcome]]) -> Table
                     best,
                 )
             )
-    return Table(
+    return Table.made(
         "is minimax the smallest RMSE(phi)?",
-        ("robot", "poses", "minimax mm", "best other mm", "ratio", "smallest"),
-        tuple(rows),
-        ("", "", ".4f", ".4f", ".4f", ""),
+        rows,
+        "robot | poses | minimax mm .4f | best other mm .4f | ratio .4f | smallest",
     )
 
 
@@ -281,7 +274,6 @@ def save(study: Study, found: Found) -> None:
     study.save([*tables, papers_table(), summary], {"rows": rows}, figures)
 
 
-@click.command()
 @study_options("conditions")
 def main(study: Study) -> None:
     """Single SMR, sum, minimax, pose and worst point: paper M, Table 3, Fig. 2-6."""

@@ -28,10 +28,10 @@ import numpy as np
 
 from experiments import pseudo_inverse, sweep
 from experiments.pseudo_inverse import ROUNDING
+from experiments.record import canvas
 from experiments.speed import identified
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.model import Model, SumOfSquares
@@ -353,13 +353,12 @@ def moved_of(row: Row, moved: Row) -> Moved:
 
 def moved_table(found: Sequence[Moved]) -> Table:
     """What rounding does to Table 2."""
-    return Table(
+    return Table.made(
         "all, mm: the same starts, each value moved by a unit of rounding (relative 2e-16) or none",
-        ("method", "starts", "converged %", "moved %", "to the minimum %", "moved, %",
-         "end otherwise %"),
-        tuple((m.method.upper(), m.starts, *m.converged, *m.minimum, m.otherwise) for m in found),
-        ("", "d", *(".2f",) * 5),
-    )  # fmt: skip
+        ((m.method.upper(), m.starts, *m.converged, *m.minimum, m.otherwise) for m in found),
+        "method | starts d | converged % .2f | moved % .2f | to the minimum % .2f | "
+        "moved, % .2f | end otherwise % .2f",
+    )
 
 
 def separable_shares(study: Study, setting: Setting, every: int) -> tuple[int, float, float]:
@@ -387,12 +386,11 @@ def span_table(study: Study, setting: Setting, every: int) -> Table:
         for angle in (0.0, 0.5):
             wider = replace(setting, span=span, base_angle=angle)
             rows.append((span, angle, *separable_shares(study, wider, every)))
-    return Table(
+    return Table.made(
         "separable methods on the identifiable parameters, from the paper's start: share of starts "
         "that reach the minimum",
-        ("poses within rad", "base turned rad", "starts", "SNLGN %", "SNLLM %"),
-        tuple(rows),
-        (".2f", ".1f", "d", ".1f", ".1f"),
+        rows,
+        "poses within rad .2f | base turned rad .1f | starts d | SNLGN % .1f | SNLLM % .1f",
     )
 
 
@@ -403,21 +401,19 @@ def seed_table(study: Study, setting: Setting, every: int) -> Table:
         for angle in (0.0, 0.5):
             other = replace(setting, seed=seed, base_angle=angle)
             rows.append((seed, angle, *separable_shares(study, other, max(every, 2))))
-    return Table(
+    return Table.made(
         "separable methods on the identifiable parameters, other simulated arms: share of starts "
         "that reach the minimum",
-        ("seed", "base turned rad", "starts", "SNLGN %", "SNLLM %"),
-        tuple(rows),
-        ("d", ".1f", "d", ".2f", ".2f"),
+        rows,
+        "seed d | base turned rad .1f | starts d | SNLGN % .2f | SNLLM % .2f",
     )
 
 
 def maps(rows: Sequence[Row], what: str) -> Figure:
     """Paper S, Fig. 3: a value over the grid of deviations, a panel a method."""
     from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(4.2 * len(rows), 4), layout="constrained")
+    figure = canvas(4.2 * len(rows), 4)
     panels = np.atleast_1d(figure.subplots(1, len(rows), sharey=True))
     for axes, row in zip(panels, rows, strict=True):
         theta, alpha = grid(row.every)
@@ -437,9 +433,7 @@ def maps(rows: Sequence[Row], what: str) -> Figure:
 
 def surface(rows: Sequence[Row]) -> Figure:
     """The RMS at the end over the deviations; starts that do not converge are left out."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(4.2 * len(rows), 4), layout="constrained")
+    figure = canvas(4.2 * len(rows), 4)
     for number, row in enumerate(rows, start=1):
         axes = figure.add_subplot(1, len(rows), number, projection="3d")
         theta, alpha = grid(row.every)
@@ -504,13 +498,12 @@ def save(study: Study, found: Found) -> None:
     ]
     names = [name.replace(" ", "_").replace("%", "percent") for name in HEADER]
     content = {
-        "rows": plain([dict(zip(names, row.cells(), strict=True)) for row in rows]),
+        "rows": [dict(zip(names, row.cells(), strict=True)) for row in rows],
         "least_rms_mm": float(1e3 * np.sqrt(least_cost(setting) / setting.poses)),
     }
     study.save(tables, content, pictures(rows, not study.quick))
 
 
-@click.command()
 @study_options("convergence")
 @click.option("--base-angle", type=float, default=0.3, show_default=True, metavar="RAD")
 def main(study: Study, base_angle: float) -> None:

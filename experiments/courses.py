@@ -17,12 +17,12 @@ from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
 
-import click
 import numpy as np
 
 from experiments import pseudo_inverse, sweep
 from experiments.convergence import CAP, PAPER, SAME, Setting, flat, grid, letter, measured, nudged
 from experiments.real import here, real
+from experiments.record import canvas
 from experiments.speed import identified
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
@@ -203,13 +203,12 @@ def course_table(title: str, courses: dict[Job, Course]) -> Table:
         )
         for job, course in courses.items()
     ]
-    return Table(
+    return Table.made(
         title,
-        ("arm", "start rad", "method", "moved", "iterations", "end mm", "least known mm", "rises",
-         "ended"),
-        tuple(rows),
-        ("", "", "", "d", "d", ".4f", ".4f", "d", ""),
-    )  # fmt: skip
+        rows,
+        "arm | start rad | method | moved d | iterations d | end mm .4f | "
+        "least known mm .4f | rises d | ended",
+    )
 
 
 def rises(course: Course) -> int:
@@ -223,21 +222,19 @@ def gain_table(gains: Sequence[Gain]) -> Table:
     for g in gains:
         pairs = zip(g.nominal, g.calibrated, g.percent, strict=True)
         rows.append((g.arm, *(value for pair in pairs for value in pair)))
-    return Table(
+    return Table.made(
         "RMS position error before and after the calibration (paper: improved by 72.46 %)",
-        ("arm", "nominal mm, training", "calibrated mm, training", "improved %, training",
-         "nominal mm, held out", "calibrated mm, held out", "improved %, held out"),
-        tuple(rows),
-        ("", *(".4f", ".4f", ".2f") * 2),
-    )  # fmt: skip
+        rows,
+        "arm | nominal mm, training .4f | calibrated mm, training .4f | "
+        "improved %, training .2f | nominal mm, held out .4f | calibrated mm, held out .4f | "
+        "improved %, held out .2f",
+    )
 
 
 def picture(panels: dict[str, dict[str, Course]], across: int) -> Figure:
     """Error against iteration, a panel each."""
-    from matplotlib.figure import Figure
-
     down = -(-len(panels) // across)
-    figure = Figure(figsize=(4.2 * across, 3.2 * down), layout="constrained")
+    figure = canvas(4.2 * across, 3.2 * down)
     every = figure.subplots(down, across, squeeze=False).ravel()
     for axes in every[len(panels) :]:
         axes.set_axis_off()
@@ -281,7 +278,6 @@ def save(study: Study, found: Found) -> None:
     study.save(tables, content, pictures(found))
 
 
-@click.command()
 @study_options("courses")
 def main(study: Study) -> None:
     """Error against iteration from the paper's start: paper S, Fig. 4-7."""

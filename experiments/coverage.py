@@ -20,6 +20,7 @@ from scipy import stats
 
 import minimax_cal as mc
 from experiments import sweep
+from experiments.record import canvas
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.intervals import chance_of_larger, max_interval, rms_interval
 from minimax_cal.fitting.options import Options, silent
@@ -367,14 +368,13 @@ def parameters_table(found: dict[str, Runs]) -> Table:
                  float(share[least]), runs.names[least], float(share[most]), runs.names[most],
                  len(out), float(np.sqrt(np.mean(score**2))))
             )  # fmt: skip
-    return Table(
+    return Table.made(
         "coverage of 95 % intervals of the identified parameters: value +- Student's quantile "
         "times sigma, sigma by the scatter from pose to pose or by the noises alone",
-        ("case", "sigma by", "runs", "pooled %", "least %", "of", "most %", "of ",
-         "outside 99.9 % band", "RMS error / sigma"),
-        tuple(rows),
-        ("", "", "d", ".1f", ".1f", "", ".1f", "", "d", ".3f"),
-    )  # fmt: skip
+        rows,
+        "case | sigma by | runs d | pooled % .1f | least % .1f | of | most % .1f | of  | "
+        "outside 99.9 % band d | RMS error / sigma .3f",
+    )
 
 
 def positions_table(found: dict[str, Runs]) -> Table:
@@ -432,12 +432,12 @@ def held_table(found: dict[str, Runs], laws: dict[tuple[str, int], Array]) -> Ta
          100.0 * chance_of_larger(n))
         for name, n, held in sources
     )  # fmt: skip
-    return Table(
+    return Table.made(
         "held-out accuracy: 95 % intervals of the RMS and of the largest error of equally many new "
         "poses; how often the next pose is worse than all held-out ones",
-        ("errors of", "poses", "runs", "RMS %", "largest %", "next is worst %", "1/(n+1) %"),
         rows,
-        ("", "d", "d", *[".1f"] * 4),
+        "errors of | poses d | runs d | RMS % .1f | largest % .1f | next is worst % .1f | "
+        "1/(n+1) % .1f",
     )
 
 
@@ -448,11 +448,10 @@ def bootstrap_table(found: dict[str, tuple[Array, Array]]) -> Table:
          100.0 * float(share.mean()))
         for name, (held, share) in found.items()
     )  # fmt: skip
-    return Table(
+    return Table.made(
         "coverage of the bootstrap's 95 % percentiles",
-        ("case", "runs", "parameters, pooled %", "least %", "positions %"),
         rows,
-        ("", "d", ".1f", ".1f", ".1f"),
+        "case | runs d | parameters, pooled % .1f | least % .1f | positions % .1f",
     )
 
 
@@ -474,7 +473,7 @@ def verdicts(found: dict[str, Runs]) -> Table:
              f"outside: {', '.join(out) or 'none'}", not out),
         ):  # fmt: skip
             rows.append((case.name, what, value, "yes" if good else "NO"))
-    return Table("sigma as reported", ("case", "criterion", "found", "met"), tuple(rows))
+    return Table.made("sigma as reported", rows, "case | criterion | found | met")
 
 
 def between(share: float) -> bool:
@@ -484,10 +483,8 @@ def between(share: float) -> bool:
 
 def figure_of(found: dict[str, Runs]) -> Figure:
     """Coverage of every parameter, with the band of its binomial law."""
-    from matplotlib.figure import Figure
-
     shown = [case for case in CASES if case.objective == "sum" and case.share == 1.0]
-    figure = Figure(figsize=(12, 2.6 * len(shown)), layout="constrained")
+    figure = canvas(12, 2.6 * len(shown))
     for axes, case in zip(figure.subplots(len(shown), 1), shown, strict=True):
         runs = found[case.name]
         low, high = band(len(runs.error))
@@ -517,7 +514,6 @@ def batches(case: Case, seed: int, count: int, replicates: int = 0) -> list[Batc
     ]
 
 
-@click.command()
 @study_options("coverage")
 @click.option("--runs", "count", type=click.IntRange(4), default=400, show_default=True)
 @click.option("--resampled", "again", type=click.IntRange(1), default=60, show_default=True,

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import click
 import numpy as np
 
 from experiments import sweep
@@ -20,7 +19,7 @@ from experiments.conditions import PAPER
 from experiments.pseudo_inverse import arm, joint_rows, least_step, separable_rows
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import plain, write_whole
+from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.tables import Table
 from minimax_cal.robots.robot import load_robot
 
@@ -351,20 +350,17 @@ def page() -> str:
 
 def table() -> Table:
     """The numbers of the counter-examples."""
-    return Table(
+    return Table.made(
         "errata: what the printed formula gives, the mended one, and the truth",
-        ("where", "printed", "mended", "truth"),
-        tuple((one.where, *one.example()) for one in ERRATA),
-        ("", ".5g", ".5g", ".5g"),
+        ((one.where, *one.example()) for one in ERRATA),
+        "where | printed .5g | mended .5g | truth .5g",
     )
 
 
-@click.command()
 @study_options("errata")
 def main(study: Study) -> None:
     """Errata of both papers, each with its counter-example."""
-    rows = plain([dict(zip(table().header, row, strict=True)) for row in table().rows])
-    study.save([table()], {"rows": rows})
+    study.save([table()], {"rows": table().records()})
     write_whole(study.out / "list.md", page())
 
 

@@ -22,7 +22,6 @@ from experiments.real import here, real
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell as Entry
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import accuracy
@@ -194,15 +193,14 @@ def summary(jobs: Sequence[Job], claims: Sequence[Claim | None]) -> Table:
              float(np.nanmax(worst)) if len(new) else np.nan, 100.0 * middle(worst <= 1.25),
              100.0 * middle(plain <= 1.05))
         )  # fmt: skip
-    return Table(
+    return Table.made(
         "external over claimed",
-        ("arm", "way", "random halves", "over within 0.8-1.25 %", "of sound points %",
-         "external mm", "regions, ends",
-         "over typical, median", "over worst, median", "over worst, most", "worst <= 1.25 %",
-         "geometry <= 1.05 %"),
-        tuple(rows),
-        ("", "", "d", ".0f", ".0f", ".4f", "d", ".2f", ".2f", ".2f", ".0f", ".0f"),
-    )  # fmt: skip
+        rows,
+        "arm | way | random halves d | over within 0.8-1.25 % .0f | of sound points % .0f | "
+        "external mm .4f | regions, ends d | over typical, median .2f | "
+        "over worst, median .2f | over worst, most .2f | worst <= 1.25 % .0f | "
+        "geometry <= 1.05 % .0f",
+    )
 
 
 def near(ratios: Array) -> float:
@@ -215,7 +213,6 @@ def middle(of: Array) -> float:
     return float(np.mean(of)) if len(of) else float("nan")
 
 
-@click.command()
 @study_options("external")
 @click.option("--arms", default=",".join((*REAL, *SIMULATED)), show_default=True)
 @click.option("--ways", default=",".join(WAYS), show_default=True)
@@ -234,8 +231,7 @@ def main(study: Study, arms: str, ways: str, halves: int) -> None:
     claims = study.sweep(run, jobs, "poses set aside")
     every = Table("every split", HEADER, tuple(rows_of(jobs, claims)),
                   ("", "", "", "d", *[".4f"] * 5, *[".2f"] * 5))  # fmt: skip
-    content = [dict(plain(dict(zip(NAMES, row, strict=True)))) for row in every.rows]
-    study.save([summary(jobs, claims), every], {"rows": content})
+    study.save([summary(jobs, claims), every], {"rows": every.records(*NAMES)})
 
 
 if __name__ == "__main__":

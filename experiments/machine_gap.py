@@ -25,7 +25,8 @@ from experiments import sweep
 from experiments.blind_gap import (
     Criterion,
     Row,
-    clean,
+    answers,
+    chosen,
     is_right,
     number_of,
     pairing,
@@ -39,7 +40,6 @@ from experiments.machines import INSIDE, MAKES, MECHANISMS, OUTSIDE, Asked, Made
 from experiments.sweep import Study, study_options
 from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.measurements import write_measurements
 
@@ -149,13 +149,8 @@ def score(asked: Asked, made: Made, said: Row, alike: tuple[Array, Array]) -> Ro
 
     said: the JSON of a diagnosis.  alike: as `likeness` tells.
     """
-    effects = said.get("effects", [])
-    sure = [e for e in effects if e.get("established", True)]
-    names = [(str(e["effect"]), str(e["place"])) for e in sure]
-    sets = [
-        [name, *((str(a["effect"]), str(a["place"])) for a in e.get("alternatives", []))]
-        for name, e in zip(names, sure, strict=True)
-    ]
+    sets = answers(said)
+    names = [options[0] for options in sets]
     own, other = alike
     power = np.array(made.powers)
     gap = said.get("gap", {})
@@ -174,7 +169,8 @@ def score(asked: Asked, made: Made, said: Row, alike: tuple[Array, Array]) -> Ro
         "left": float((power * (1.0 - np.maximum(own, other))).min(initial=np.inf)),
         "verdict": str(said["verdict"]),
         "names": [list(name) for name in beside],
-        "tentative": [[str(e["effect"]), str(e["place"])] for e in effects if e not in sure],
+        "tentative": [[str(e["effect"]), str(e["place"])] for e in said.get("effects", [])
+                      if not e.get("established", True)],
         "strange": sum(not any(is_right(n, t) for t in made.truth) for n in beside),
         "all_right": len(beside) == count == pairing(made.truth, [[n] for n in beside]),
         "in_sets": pairing(made.truth, sets) == count,
@@ -264,11 +260,10 @@ def criteria(rows: Sequence[Row]) -> list[Criterion]:
 
 def headline(found: Sequence[Criterion]) -> Table:
     """The criteria."""
-    return Table(
+    return Table.made(
         "names on arms as shops have them: shares [%] with 95 % intervals, and the limits",
-        ("criterion", "runs", "found", "from", "to", "limit", "verdict"),
-        tuple(criterion.line() for criterion in found),
-        ("", "d", ".1f", ".1f", ".1f", "", ""),
+        (criterion.line() for criterion in found),
+        "criterion | runs d | found .1f | from .1f | to .1f | limit | verdict",
     )
 
 
@@ -287,11 +282,11 @@ def per_law(rows: Sequence[Row]) -> Table:
                 share_of(own, lambda r: r["strange"] > 0),
                 ", ".join(name for name, _ in wrong.most_common(2)),
             ))  # fmt: skip
-    return Table(
+    return Table.made(
         "separable single causes [%]",
-        ("law", "runs", "right", "unknown", "a strange name", "most often"),
-        tuple(lines), ("", "d", ".1f", ".1f", ".1f", ""),
-    )  # fmt: skip
+        lines,
+        "law | runs d | right .1f | unknown .1f | a strange name .1f | most often",
+    )
 
 
 def misses(found: Sequence[Criterion], each: int) -> Table:
@@ -308,16 +303,16 @@ def misses(found: Sequence[Criterion], each: int) -> Table:
                 row["trouble"][:60] or f"{row['verdict']} {text_of(row['names'])}",
                 row["lambda"], row["telling"], row["final_mm"] / row["geometric_mm"],
             ))  # fmt: skip
-    return Table(
-        "misses, some of each", ("what", "arm", "truth", "said", "lambda", "telling", "RMS"),
-        tuple(lines), ("", "", "", "", ".0f", ".0f", ".3f"),
-    )  # fmt: skip
+    return Table.made(
+        "misses, some of each",
+        lines,
+        "what | arm | truth | said | lambda .0f | telling .0f | RMS .3f",
+    )
 
 
 SPARSE = 40  # of the cases of --quick, each so many-th by itself
 
 
-@click.command()
 @study_options("machine_gap")
 @click.option("--only", multiple=True, help="A condition to run, such as pair; may be repeated.")
 @click.option(
@@ -326,21 +321,12 @@ SPARSE = 40  # of the cases of --quick, each so many-th by itself
 def main(study: Study, only: tuple[str, ...], every: int | None) -> None:
     """Names on arms as shops have them."""
     cases = plan(study.seed, QUICK if study.quick else Size())
-    conditions = tuple(dict.fromkeys(case.condition for case in cases))
-    for name in only:
-        if name not in conditions:
-            raise OptionError(f"--only {name}: choose {', '.join(conditions)}")
-    every = (SPARSE if study.quick else 1) if every is None else every
-    if every < 1:
-        raise OptionError(f"--every {every}: give a whole number, 1 or more")
-    cases = [case for case in cases if not only or case.condition in only][::every]
-    rows = study.sweep(run, cases, "diagnoses")
+    rows = study.sweep(run, chosen(study, cases, only, every, SPARSE), "diagnoses")
     found = criteria(rows)
     tables = [headline(found), verdicts(rows), per_law(rows), misses(found, 8),
               *([troubles(rows)] if any(row["trouble"] for row in rows) else [])]  # fmt: skip
     names = ("criterion", "runs", "found", "low", "high", "limit", "verdict")
-    lines = [dict(zip(names, row, strict=True)) for row in tables[0].rows]
-    study.save(tables, {"criteria": clean(lines), "rows": clean(rows)})
+    study.save(tables, {"criteria": tables[0].records(*names), "rows": rows})
 
 
 if __name__ == "__main__":

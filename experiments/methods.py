@@ -36,6 +36,7 @@ from experiments.poses import (
     position_error,
 )
 from experiments.real import SHARED
+from experiments.record import canvas
 from experiments.sweep import Study, start, study_options
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.ground.arrays import Array, rms
@@ -383,12 +384,11 @@ def cost_table(studies: Studies) -> Table:
                         ", ".join(sorted({outcome.status for outcome in outcomes})),
                     )
                 )
-    return Table(
+    return Table.made(
         "cost: median time of the splits, start included; identified: rank of the Jacobian, or "
         "parameters freed",
-        ("robot", "method", "parameters", "identified", "iterations", "ms", "ended"),
-        tuple(rows),
-        ("", "", "d", "", "", ".1f", ""),
+        rows,
+        "robot | method | parameters d | identified | iterations | ms .1f | ended",
     )
 
 
@@ -400,9 +400,7 @@ def span(values: Sequence[int]) -> str:
 
 def box_chart(case: Case, results: Results) -> Figure:
     """Box chart of errors, training beside held out; whiskers at 5 and 95 %, medians black."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12, 4.8), layout="constrained")
+    figure = canvas(12, 4.8)
     panels: dict[str, Callable[[Errors], Array]] = {
         "AP: position error of the SMRs (mm)": lambda e: 1e3 * e.distance.reshape(-1),
         "AO': orientation error (mrad)": lambda e: 1e3 * e.angle,
@@ -506,7 +504,6 @@ def numbers(studies: Studies) -> dict[str, object]:
     }
 
 
-@click.command()
 @study_options("methods")
 @click.option("--data", "folder", type=click.Path(path_type=Path), default=SHARED)
 def main(options: Study, folder: Path) -> None:

@@ -13,11 +13,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import click
 import numpy as np
-from scipy.stats import beta
 
 import minimax_cal as mc
 from experiments import sweep
@@ -32,6 +30,7 @@ from experiments.motion_cases import (
     Made,
     make,
 )
+from experiments.record import interval
 from experiments.sweep import Study, study_options
 from minimax_cal.dynamics.diagnose import family
 from minimax_cal.dynamics.given import MotionKnown
@@ -44,7 +43,6 @@ from minimax_cal.dynamics.scene import Arm, Scene
 from minimax_cal.dynamics.search import Columns, dictionary_of
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import finite
 from minimax_cal.ground.tables import Cell, Table
 
 VISIBLE = 50.0  # squared size, over the noise, from which a cause must be seen
@@ -234,13 +232,6 @@ def plan(seed: int, arms: int, cases: int) -> list[Case]:
     return out
 
 
-def interval(count: int, of: int) -> tuple[float, float]:
-    """95 % interval of a share, in percent [Clopper and Pearson 1934]."""
-    low = beta.ppf(0.025, count, of - count + 1) if count else 0.0
-    high = beta.ppf(0.975, count + 1, of - count) if count < of else 1.0
-    return 100.0 * float(low), 100.0 * float(high)
-
-
 def condition(told: Sequence[Told], name: str) -> list[Told]:
     """The cases of a condition."""
     return [one for one in told if one.case.condition == name]
@@ -291,11 +282,15 @@ def questions_table(told: Sequence[Told]) -> Table:
     for question, cases, holds, limit in QUESTIONS:
         own = cases(told)
         count = sum(holds(one) for one in own)
-        low, high = interval(count, len(own)) if own else (0.0, 100.0)
+        low, high = interval(count, len(own))
         share = 100.0 * count / len(own) if own else float("nan")
-        rows.append((question, len(own), count, share, f"{low:.0f} to {high:.0f}", limit))
-    header = ("question", "cases", "yes", "%", "95 % interval", "asked %")
-    return Table("Torques, blind", header, tuple(rows), ("", "d", "d", ".1f", "", ""))
+        rows.append(
+            (question, len(own), count, share, f"{100.0 * low:.0f} to {100.0 * high:.0f}", limit)
+        )
+
+    return Table.made(
+        "Torques, blind", rows, "question | cases d | yes d | % .1f | 95 % interval | asked %"
+    )
 
 
 def causes_table(told: Sequence[Told]) -> Table:
@@ -314,16 +309,23 @@ def causes_table(told: Sequence[Told]) -> Table:
                 sum(not one.main and one.verdict != "unknown" for one in own),
                 sum(false),
             ))  # fmt: skip
-    header = ("cause", "cases", "right", "family", "unexplained", "nothing said", "sure and wrong")
-    return Table("Causes that the logs show", header, tuple(rows), ("", *["d"] * 6))
+
+    return Table.made(
+        "Causes that the logs show",
+        rows,
+        "cause | cases d | right d | family d | unexplained d | nothing said d | sure and wrong d",
+    )
 
 
 def time_table(told: Sequence[Told]) -> Table:
     """CPU time of a diagnosis."""
     seconds = [one.seconds for one in told]
     middle, most = float(np.median(seconds)), float(np.max(seconds))
-    return Table("CPU time of a diagnosis [s]", ("cases", "median", "largest"),
-                 ((len(told), middle, most),), ("d", ".2f", ".2f"))  # fmt: skip
+    return Table.made(
+        "CPU time of a diagnosis [s]",
+        ((len(told), middle, most),),
+        "cases d | median .2f | largest .2f",
+    )
 
 
 def record(one: Told) -> dict[str, object]:
@@ -340,14 +342,6 @@ def record(one: Told) -> dict[str, object]:
     }  # fmt: skip
 
 
-def asked(row: Sequence[Cell]) -> dict[str, Any]:
-    """A row of the questions for JSON; a share of no cases is null."""
-    names = ("question", "cases", "yes", "percent", "interval", "asked")
-    plain = [finite(value) if isinstance(value, float) else value for value in row]
-    return dict(zip(names, plain, strict=True))
-
-
-@click.command()
 @study_options("motion_blind")
 @click.option("--arms", type=int, default=ARMS, show_default=True, help="Sound arms.")
 @click.option("--cases", type=int, default=CASES, show_default=True,
@@ -358,10 +352,8 @@ def main(study: Study, arms: int, cases: int) -> None:
         arms = cases = QUICK
     told = study.sweep(run, plan(study.seed, arms, cases), "diagnoses")
     tables = [questions_table(told), causes_table(told), time_table(told)]
-    study.save(tables, {
-        "questions": [asked(row) for row in tables[0].rows],
-        "cases": [record(one) for one in told],
-    })  # fmt: skip
+    keys = ("question", "cases", "yes", "percent", "interval", "asked")
+    study.save(tables, {"questions": tables[0].records(*keys), "cases": [*map(record, told)]})
 
 
 if __name__ == "__main__":

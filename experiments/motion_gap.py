@@ -164,10 +164,14 @@ def rest_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
     for i in range(0, len(cases), 2):
         plain, motor = found[i : i + 2]
         rows.append((cases[i].arm, plain.before, *shares(plain)[:2], *shares(motor)[:2]))
-    header = ("arm", "joint error as given mrad", "remains %", "worst torque %",
-              "with dcmotor %", "worst torque %")  # fmt: skip
+
     title = "Friction that builds up over 1 mrad, on a run that no log holds"
-    return Table(title, header, tuple(rows), ("", ".3g", ".3g", ".3g", ".3g", ".3g"))
+    return Table.made(
+        title,
+        rows,
+        "arm | joint error as given mrad .3g | remains % .3g | worst torque % .3g | "
+        "with dcmotor % .3g | worst torque % .3g",
+    )
 
 
 def closed_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
@@ -179,10 +183,14 @@ def closed_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
     each = np.array([shares(one) for one in found])
     rows.append(("median", float(np.median([one.before for one in found])),
                  *np.median(each, axis=0).tolist()))  # fmt: skip
-    header = ("withheld", "joint error as given mrad", "remains %", "worst torque %",
-              "with module %", "worst torque %")  # fmt: skip
+
     title = "Simulated arms on a run that no log holds: what remains after gap --write"
-    return Table(title, header, tuple(rows), ("", ".3g", ".3g", ".3g", ".3g", ".3g"))
+    return Table.made(
+        title,
+        rows,
+        "withheld | joint error as given mrad .3g | remains % .3g | worst torque % .3g | "
+        "with module % .3g | worst torque % .3g",
+    )
 
 
 def shares(one: Closed) -> tuple[float, float, float, float]:
@@ -207,7 +215,6 @@ def real_table(found: Sequence[Judged]) -> Table:
                  ("", *[".3g"] * n))  # fmt: skip
 
 
-@click.command()
 @study_options("motion_gap")
 def main(study: Study) -> None:
     """The dynamic gap in the simulator, before and after."""

@@ -214,11 +214,9 @@ def names_table(arm: str, told: Sequence[Told]) -> Table:
     """How often each effect is confirmed."""
     counts = Counter(name for one in told for name in one.confirmed)
     rows = tuple((name, count, len(told)) for name, count in counts.most_common())
-    return Table(f"{ARMS[arm]}: effects confirmed", ("effect", "runs left out", "of"), rows,
-                 ("", "d", "d"))  # fmt: skip
+    return Table.made(f"{ARMS[arm]}: effects confirmed", rows, "effect | runs left out d | of d")
 
 
-@click.command()
 @study_options("motion_real")
 def main(study: Study) -> None:
     """Torques along trajectories, judged by runs that no fit saw."""

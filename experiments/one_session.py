@@ -24,10 +24,10 @@ from dataclasses import dataclass, replace
 import click
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import beta
 
 from experiments import sweep
 from experiments.real import here, real
+from experiments.record import interval
 from experiments.sweep import Study, study_options
 from minimax_cal.diagnosing.diagnose import diagnose
 from minimax_cal.evidence.noise import orthonormal
@@ -334,9 +334,8 @@ def simulated_jobs(seed: int, count: int) -> Iterator[Job]:
 def share(hits: Sequence[bool]) -> tuple[float, float, float]:
     """Percent, and the 95 % interval of a share [Clopper and Pearson 1934]."""
     n, k = len(hits), sum(hits)
-    low = beta.ppf(0.025, k, n - k + 1) if k else 0.0
-    high = beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
-    return 100.0 * k / n, 100.0 * float(low), 100.0 * float(high)
+    low, high = interval(k, n)
+    return 100.0 * k / n, 100.0 * low, 100.0 * high
 
 
 def rows_of(jobs: Sequence[Job], results: Sequence[Found]) -> Iterator[tuple[TableCell, ...]]:
@@ -364,7 +363,6 @@ def rows_of(jobs: Sequence[Job], results: Sequence[Found]) -> Iterator[tuple[Tab
                 yield (kind, cut, command, len(some), *share(right), *share(other))
 
 
-@click.command()
 @study_options("one_session")
 @click.option("--arms", "count", type=int, default=200, show_default=True, help="Simulated ones.")
 @click.option("--real/--no-real", "with_real", default=True, help="Whether real arms, too.")
@@ -377,16 +375,15 @@ def main(study: Study, count: int, with_real: bool, drift: bool, commands: tuple
     jobs += list(real_jobs(study.seed)) if with_real and not study.quick else []
     jobs = [replace(job, commands=commands, drift=drift) for job in jobs]
     results = study.sweep(run, jobs, "halves of a session")
-    table = Table(
+    table = Table.made(
         f"halves of one session; a joint moved has a noncentrality of {LAMBDA:g}",
-        ("arms", "cut by", "command", "cuts", "right %", "95 % from", "to", "another named %",
-         "95 % from", "to"),
-        tuple(rows_of(jobs, results)),
-        ("", "", "", "d", *[".1f"] * 6),
-    )  # fmt: skip
+        rows_of(jobs, results),
+        "arms | cut by | command | cuts d | right % .1f | 95 % from .1f | to .1f | "
+        "another named % .1f | 95 % from .1f | to .1f",
+    )
     names = ("arms", "cut", "command", "cuts", "right_percent", "right_low", "right_high",
              "other_percent", "other_low", "other_high")  # fmt: skip
-    study.save([table], {"rows": [dict(zip(names, row, strict=True)) for row in table.rows]})
+    study.save([table], {"rows": table.records(*names)})
 
 
 if __name__ == "__main__":

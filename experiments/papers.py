@@ -21,8 +21,6 @@ from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
-import click
-
 from experiments import (
     algorithm_1,
     any_base,
@@ -114,14 +112,13 @@ def study_of(study: Study) -> list[Verdict]:
     return [of_quick(verdict) for verdict in verdicts] if study.quick else verdicts
 
 
-@click.command()
 @study_options("papers")
 def main(study: Study) -> None:
     """Every table and figure of the two papers, and a table of verdicts."""
     verdicts = study_of(study)
     table = table_of(verdicts)
     content = {
-        "verdicts": [dict(zip(HEADER, row, strict=True)) for row in table.rows],
+        "verdicts": table.records(*HEADER),
         "count": dict(Counter(verdict.verdict for verdict in verdicts)),
         "not_covered": [verdict.remark for verdict in verdicts if verdict.verdict == MISSING],
     }

@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-import click
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -46,7 +45,6 @@ from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import directions, from_far, poses_of_images, start_scene
 from minimax_cal.fitting.several.pixel_calibration import fitted
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import plain
 from minimax_cal.ground.stages import silent
 from minimax_cal.ground.tables import Table
 from minimax_cal.instruments import flange_poses
@@ -271,13 +269,13 @@ def ways_table(jobs: Sequence[Job], found: Sequence[Found]) -> Table:
         rows.append((way, root_mean(error), error.max(), *against_bound(mine),
                      root_mean(sigma), root_mean(over), over.max(), float(pixels.mean()),
                      mine[0].named))  # fmt: skip
-    return Table(
+    return Table.made(
         "arm errors over the joints' whole range, mm, base and tool fitted",
-        ("way", "RMS", "largest", "Cramer-Rao bound", "p of the largest", "claimed",
-         "RMS over claimed", "largest over claimed", "held out px", "named"),
-        tuple(rows),
-        ("", ".4f", ".4f", ".4f", ".2f", ".4f", ".2f", ".2f", ".3f", ""),
-    )  # fmt: skip
+        rows,
+        "way | RMS .4f | largest .4f | Cramer-Rao bound .4f | p of the largest .2f | "
+        "claimed .4f | RMS over claimed .2f | largest over claimed .2f | held out px .3f | "
+        "named",
+    )
 
 
 def root_mean(values: Array) -> float:
@@ -337,7 +335,7 @@ def starts_table(found: Sequence[tuple[float, float]]) -> Table:
         (name, sum(each[i] < REACHED for each in found), len(found)) for i, name in enumerate(names)
     )
     title = f"starts off by {BAD_ANGLE:g} rad (each zero) and {1e3 * BAD_LENGTH:g} mm (each length)"
-    return Table(title, ("way", "reach the arm", "of"), rows, ("", "d", "d"))
+    return Table.made(title, rows, "way | reach the arm d | of d")
 
 
 # ---- pixels too weak -------------------------------------------------------------------------
@@ -388,16 +386,15 @@ def weak_table(
         means = (drawn.mean(), calibrated.mean(), out.mean())
         rows.append((drawing, noise, *means, (out / drawn).max(), prior.mean(),
                      (prior / drawn).max(), kept, len(mine)))  # fmt: skip
-    return Table(
+    return Table.made(
         "one tag before a tele lens at 2 m, 0.25 mm a pixel: arm errors, RMS mm",
-        ("drawing off by", "noise px", "drawn", "fitted", "delivered", "worst over drawn",
-         "with the prior", "its worst over drawn", "drawn kept", "of"),
-        tuple(rows),
-        ("", "g", ".3f", ".3f", ".3f", ".3f", ".3f", ".3f", "d", "d"),
-    )  # fmt: skip
+        rows,
+        "drawing off by | noise px g | drawn .3f | fitted .3f | delivered .3f | "
+        "worst over drawn .3f | with the prior .3f | its worst over drawn .3f | "
+        "drawn kept d | of d",
+    )
 
 
-@click.command()
 @study_options("pixels")
 def main(study: Study) -> None:
     """What pixels tell of an arm."""
@@ -424,7 +421,7 @@ def main(study: Study) -> None:
             for drawn, own, out, prior, held in kept
         ],
     }  # fmt: skip
-    study.save(tables, plain(content))
+    study.save(tables, content)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import os
 import platform
 import subprocess
@@ -13,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from scipy.stats import beta
 
-from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.ground.tables import Table
 from minimax_cal.reporting.plots.figures import save
 
@@ -39,7 +39,7 @@ def environment(packages: Iterable[str] = ()) -> Table:
             rows.append((package, version(package)))
         except PackageNotFoundError:
             continue
-    return Table("made on", ("what", "value"), tuple(rows))
+    return Table.made("made on", rows, "what | value")
 
 
 @functools.cache
@@ -61,6 +61,13 @@ def processor() -> str:
     return platform.machine()
 
 
+def interval(hits: int, n: int) -> tuple[float, float]:
+    """95 % interval of a share [Clopper and Pearson 1934], all of it where n is 0."""
+    low = beta.ppf(0.025, hits, n - hits + 1) if hits else 0.0
+    high = beta.ppf(0.975, hits + 1, n - hits) if hits < n else 1.0
+    return float(low), float(high)
+
+
 def save_tables(folder: Path, name: str, tables: Sequence[Table]) -> None:
     """Write tables as name.md, name.tex and one CSV each, and show them."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -69,6 +76,13 @@ def save_tables(folder: Path, name: str, tables: Sequence[Table]) -> None:
     for number, table in enumerate(tables, start=1):
         write_whole(folder / f"{name}_{number}.csv", table.csv())
         click.echo(table.text(165) + "\n")
+
+
+def canvas(wide: float, high: float) -> Figure:
+    """An empty figure of so many inches."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(wide, high), layout="constrained")
 
 
 def save_figure(folder: Path, name: str, figure: Figure) -> None:
@@ -81,5 +95,4 @@ def save_figure(folder: Path, name: str, figure: Figure) -> None:
 def save_json(path: Path, content: Mapping[str, object]) -> None:
     """Write the figures of a study for other programs: null for what is not known (NaN)."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    known = json.loads(json.dumps(content), parse_constant=lambda _: None)
-    write_whole(path, json_text({"schema": 1, **known}))
+    write_whole(path, json_text({"schema": 1, **plain(content)}))

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from experiments import sweep
 from experiments.real import here, real
+from experiments.record import canvas
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.positions import position_sigma
@@ -471,13 +472,12 @@ def real_table(found: dict[tuple[str, str], list[RealOutcome]]) -> Table:
         )
         first = some[0]
         rows.append((REAL[robot], KINDS[kind], first.poses, first.identified, held, before, after))
-    return Table(
+    return Table.made(
         "real arms, a tracker's points as lengths: medians over the hold-outs",
-        ("robot", "measured", "training poses", "identified", "held out RMS mm",
-         "held-out position, nominal RMS mm", "held-out position RMS mm"),
-        tuple(rows),
-        ("", "", "d", "d", ".4f", ".3f", ".4f"),
-    )  # fmt: skip
+        rows,
+        "robot | measured | training poses d | identified d | held out RMS mm .4f | "
+        "held-out position, nominal RMS mm .3f | held-out position RMS mm .4f",
+    )
 
 
 Found = dict[tuple[str, str, float], list[Outcome]]
@@ -494,9 +494,13 @@ def identified_table(found: Found) -> Table:
             rows.append(
                 (ROBOTS[robot], KINDS[kind], first.numbers, *told, f"{agree}/{len(outcomes)}")
             )
-    header = ("robot", "measured", "numbers in training", "parameters", "identified",
-              "rank by differences", "agree")  # fmt: skip
-    return Table("what is identifiable", header, tuple(rows), ("", "", "d", "d", "d", "d", ""))
+
+    return Table.made(
+        "what is identifiable",
+        rows,
+        "robot | measured | numbers in training d | parameters d | identified d | "
+        "rank by differences d | agree",
+    )
 
 
 def middle(values: Sequence[float]) -> float:
@@ -529,21 +533,18 @@ def accuracy_table(found: Found, compliance: float) -> Table:
         )
     bends = f"joints bend by {1e6 * compliance:g} urad/(N m), not fitted"
     arms = bends if compliance else "stiff arms"
-    return Table(
+    return Table.made(
         f"{POSES} poses, {1e6 * NOISE:g} um, {arms}: medians over the seeds",
-        ("robot", "measured", "held out, nominal RMS mm", "held out RMS mm",
-         "true position, nominal RMS mm", "true position RMS mm", "over tracker's",
-         "largest mm", "scaled, too: RMS mm", "expected by sigmas mm", "converged"),
-        tuple(rows),
-        ("", "", ".3f", ".4f", ".3f", ".4f", ".2f", ".4f", ".4f", ".4f", ""),
-    )  # fmt: skip
+        rows,
+        "robot | measured | held out, nominal RMS mm .3f | held out RMS mm .4f | "
+        "true position, nominal RMS mm .3f | true position RMS mm .4f | over tracker's .2f | "
+        "largest mm .4f | scaled, too: RMS mm .4f | expected by sigmas mm .4f | converged",
+    )
 
 
 def figure_of(found: Found) -> Figure:
     """Held-out error of what was measured, and true error of positions, by kind."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 5), layout="constrained")
+    figure = canvas(11, 5)
     panels = np.atleast_1d(figure.subplots(1, len(ROBOTS), sharex=True, sharey=True))
     at = np.arange(len(KINDS))
     for axes, (robot, title) in zip(panels, ROBOTS.items(), strict=True):
@@ -563,7 +564,6 @@ def figure_of(found: Found) -> Figure:
     return figure
 
 
-@click.command()
 @study_options("relative")
 @click.option("--seeds", type=int, default=20, show_default=True, help="Arms of each kind.")
 def main(study: Study, seeds: int) -> None:

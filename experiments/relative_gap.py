@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import click
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -154,7 +153,6 @@ def table_of(jobs: list[Job], answers: list[Answer]) -> Table:
     )  # fmt: skip
 
 
-@click.command(name="relative_gap")
 @study_options("relative_gap")
 def main(study: Study) -> None:
     """Name the cause from several instruments."""

@@ -185,16 +185,14 @@ def rows_of(trial: Trial, result: Result) -> list[tuple[Cell, ...]]:
 def table_of(trials: Sequence[Trial], results: Sequence[Result]) -> Table:
     """All ladders."""
     rows = [row for t, r in zip(trials, results, strict=True) for row in rows_of(t, r)]
-    return Table(
+    return Table.made(
         "held-out errors in the simulator, step by step, and the fit's prediction of these poses",
-        ("arm", "model", "RMS mm", "max mm", "fit says mm", "off um", "joints off mrad",
-         "the file alone mm"),
-        tuple(rows),
-        ("", "", ".4f", ".4f", ".4f", "+.2f", ".3f", ".4f"),
-    )  # fmt: skip
+        rows,
+        "arm | model | RMS mm .4f | max mm .4f | fit says mm .4f | off um +.2f | "
+        "joints off mrad .3f | the file alone mm .4f",
+    )
 
 
-@click.command()
 @study_options("simulator_gap")
 @click.option("--poses", type=int, default=160, show_default=True)
 def main(study: Study, poses: int) -> None:

@@ -30,7 +30,7 @@ from scipy import sparse
 
 from experiments import sweep
 from experiments.qp_cases import SETS, Case
-from experiments.record import environment, save_figure, save_json, save_tables
+from experiments.record import canvas, environment, save_figure, save_json, save_tables
 from experiments.speed import fitted
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
@@ -256,13 +256,13 @@ def table_of(group: str, runs: Sequence[Run], reference: dict[str, float]) -> Ta
                 1e3 * shifted_mean([run.seconds for run in mine]),
             )
         )
-    return Table(
+    return Table.made(
         f"{group}: residuals are the largest over the problems solved",
-        ("backend", "setting", "problems", "right %", "wrongly claimed", "worst relative",
-         "primal abs", "dual abs", "gap abs", "objective error", "ms (shifted mean)"),
-        tuple(rows),
-        ("", "", "d", ".1f", "d", *[".1e"] * 5, ".3f"),
-    )  # fmt: skip
+        rows,
+        "backend | setting | problems d | right % .1f | wrongly claimed d | "
+        "worst relative .1e | primal abs .1e | dual abs .1e | gap abs .1e | "
+        "objective error .1e | ms (shifted mean) .3f",
+    )
 
 
 def detail(group: str, runs: Sequence[Run]) -> Table:
@@ -273,13 +273,12 @@ def detail(group: str, runs: Sequence[Run]) -> Table:
          1e3 * run.seconds)
         for run in mine
     )  # fmt: skip
-    return Table(
+    return Table.made(
         f"{group}, problem by problem: our fallback order at 1e-6",
-        ("problem", "status", "worst relative", "primal abs", "dual abs", "gap abs", "objective",
-         "ms"),
         rows,
-        ("", "", ".1e", ".1e", ".1e", ".1e", ".8g", ".2f"),
-    )  # fmt: skip
+        "problem | status | worst relative .1e | primal abs .1e | dual abs .1e | "
+        "gap abs .1e | objective .8g | ms .2f",
+    )
 
 
 def overhead(cases: Sequence[Case], backends: Sequence[str], repeats: int) -> Table:
@@ -310,11 +309,10 @@ def overhead(cases: Sequence[Case], backends: Sequence[str], repeats: int) -> Ta
                 statistics.median(ratios),
             )
         )
-    return Table(
+    return Table.made(
         "our solve with its check at 1e-6 against qpsolvers.solve_problem (small calibration QPs)",
-        ("backend", "ours us", "qpsolvers us", "ratio"),
-        tuple(rows),
-        ("", ".0f", ".0f", ".2f"),
+        rows,
+        "backend | ours us .0f | qpsolvers us .0f | ratio .2f",
     )
 
 
@@ -393,19 +391,17 @@ def sqp_values(backends: Sequence[str], seed: int) -> Table:
         best = value if np.isnan(best) else min(best, value)
         rows.append((backend, str(found.status), found.iterations, value, value / best - 1.0,
                      found.kkt.residual, 1e3 * seconds))  # fmt: skip
-    return Table(
+    return Table.made(
         "minimax calibration (IRB 2600, 100 poses, three targets) with each backend",
-        ("backend", "status", "QPs", "max F_i/m mm^2", "above the first", "KKT residual", "ms"),
-        tuple(rows),
-        ("", "", "d", ".9f", ".1e", ".1e", ".1f"),
+        rows,
+        "backend | status | QPs d | max F_i/m mm^2 .9f | above the first .1e | "
+        "KKT residual .1e | ms .1f",
     )
 
 
 def profile(group: str, runs: Sequence[Run]) -> Figure:
     """Performance profile: share of problems solved within a factor of the fastest time."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    figure = canvas(7, 4.5)
     axes = figure.subplots()
     ours = [run for run in runs if run.setting == "ours 1e-6"]
     names = dict.fromkeys(run.case for run in ours)
@@ -434,9 +430,7 @@ def profile(group: str, runs: Sequence[Run]) -> Figure:
 
 def convergence_figure(curves: dict[str, Array]) -> Figure:
     """Error of the subgradient methods against iterations: median and quartiles."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    figure = canvas(7, 4.5)
     axes = figure.subplots()
     marks = curves["iterations"]
     for method, errors in curves.items():
@@ -485,7 +479,6 @@ def study(quick: bool) -> tuple[dict[str, list[Run]], dict[str, list[Case]]]:
     return runs, problems
 
 
-@click.command()
 @study_options("solver_accuracy")
 def main(options: Study) -> None:
     """Tables and profiles of QP accuracy, reliability and time.

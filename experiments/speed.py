@@ -393,7 +393,6 @@ def timed(
     return seconds, memory
 
 
-@click.command()
 @study_options("speed")
 @click.option("--repeats", type=int, default=9, show_default=True)
 @click.option("--part", multiple=True, type=click.Choice(PARTS), help="These alone  [default: all]")
@@ -410,11 +409,12 @@ def main(study: Study, repeats: int, part: tuple[str, ...]) -> None:
     shown = tuple((k, "absent" if v is None else f"{v:.1f}") for k, v in over.items())
     spent = tuple((name, 1e3 * value) for name, value in seconds.items())
     tables = [
-        Table("the peer's time over ours", ("ratio", "times"), shown),
-        Table(f"processor time ({machine})", ("what", "ms"), spent, ("", ".2f")),
-        Table("peak memory of a whole calibration", ("poses x targets", "GB"),
-              tuple(memory.items()), ("", ".2f")),
-    ]  # fmt: skip
+        Table.made("the peer's time over ours", shown, "ratio | times"),
+        Table.made(f"processor time ({machine})", spent, "what | ms .2f"),
+        Table.made(
+            "peak memory of a whole calibration", memory.items(), "poses x targets | GB .2f"
+        ),
+    ]
     content = {"ratios": over, "seconds": seconds, "memory_gb": memory, "numba": numba}
     study.save(tables, content, packages=("numba", "casadi", "cvxpy", "daqp"))
 

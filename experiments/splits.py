@@ -14,17 +14,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import click
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from experiments import sweep
 from experiments.conditions import FOLDERS, ROBOTS
 from experiments.real import here
+from experiments.record import canvas
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.measurements import Measurements
 
@@ -159,21 +158,18 @@ def table_of(found: dict[Job, Held]) -> Table:
                 rows.append(
                     (ROBOTS[robot][0], way, measure, s.splits, s.median, s.low, s.high, s.wins)
                 )
-    return Table(
+    return Table.made(
         "minimax over sum on poses held out: below 1 minimax is better",
-        ("robot", "held out", "measure", "splits", "median", "lower quartile", "upper quartile",
-         "minimax wins"),
-        tuple(rows),
-        ("", "", "", "d", ".4f", ".4f", ".4f", "d"),
-    )  # fmt: skip
+        rows,
+        "robot | held out | measure | splits d | median .4f | lower quartile .4f | "
+        "upper quartile .4f | minimax wins d",
+    )
 
 
 def picture(found: dict[Job, Held]) -> Figure:
     """All ratios of RMSE(phi)."""
-    from matplotlib.figure import Figure
-
     rows = [(robot, way) for robot in robots_of(found) for way in WAYS]
-    figure = Figure(figsize=(7.0, 0.5 * len(rows) + 1.2), layout="constrained")
+    figure = canvas(7.0, 0.5 * len(rows) + 1.2)
     axes = figure.subplots()
     axes.boxplot(
         [ratios(found, robot, way, 0) for robot, way in rows],
@@ -189,11 +185,9 @@ def picture(found: dict[Job, Held]) -> Figure:
 def save(study: Study, found: dict[Job, Held]) -> None:
     """Table and picture."""
     table = table_of(found)
-    rows = plain([dict(zip(table.header, row, strict=True)) for row in table.rows])
-    study.save([table], {"rows": rows}, {"splits": picture(found)})
+    study.save([table], {"rows": table.records()}, {"splits": picture(found)})
 
 
-@click.command()
 @study_options("splits")
 def main(study: Study) -> None:
     """Minimax against the sum over many splits, at random and by groups."""

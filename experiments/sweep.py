@@ -317,8 +317,8 @@ class Misuse(click.ClickException):
         click.echo("error: " + " ".join(self.message.split()), file=file, err=True)
 
 
-def study_options(name: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Gives a command the options of every study, as its first argument: a `Study`."""
+def study_options(name: str) -> Callable[[Callable[..., None]], click.Command]:
+    """Makes a command with the options of every study, its first argument: a `Study`."""
     options = (
         click.option("--quick", is_flag=True, help="A small form of the study."),
         click.option("--json", type=click.Path(path_type=Path), help="Write its figures here."),
@@ -338,7 +338,7 @@ def study_options(name: str) -> Callable[[Callable[..., None]], Callable[..., No
     )
     fields = tuple(field.name for field in dataclasses.fields(Study))[1:]
 
-    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+    def decorate(function: Callable[..., None]) -> click.Command:
         @functools.wraps(function)
         def command(**given: Any) -> None:
             study = Study(name, **{field: given.pop(field) for field in fields})
@@ -349,7 +349,7 @@ def study_options(name: str) -> Callable[[Callable[..., None]], Callable[..., No
 
         for option in reversed(options):
             command = option(command)
-        return command
+        return click.command(name)(command)
 
     return decorate
 

@@ -1,6 +1,9 @@
+import copy
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +12,16 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MINIMAX_CAL_LOOPS", "plain")  # half a minute of compiling for brief loops
 os.environ.setdefault("MINIMAX_CAL_NO_FSYNC", "1")  # what tests write outlives no power cut
 
+import click
 import numpy as np
 import pytest
 from browsing import browsing  # stands beside this
+from click.testing import CliRunner
 
 import minimax_cal as mc
 from minimax_cal.cli import main, progress
+from minimax_cal.cli.options import in_flags
+from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 from minimax_cal.planning import outlook, plan
 
@@ -58,6 +65,11 @@ def noisy(robot: mc.Robot) -> Simulation:
     """Geometric errors, compliance and tracker noise; its files look as those of a tracker."""
     made = simulate(robot, 60, 3, seed=5)
     return replace(made, data=replace(made.data, simulated=False))
+
+
+@pytest.fixture(scope="session")
+def fit(robot: mc.Robot, noisy: Simulation) -> mc.Fit:
+    return mc.calibrate(robot, noisy.data, "sum")
 
 
 @pytest.fixture(scope="session")
@@ -114,7 +126,6 @@ def driver(downloads: Path) -> Iterator[Any]:
 @pytest.fixture(scope="session")
 def browser() -> None:
     """Skips where no browser can print a page."""
-    from minimax_cal.ground.errors import CalibrationError
     from minimax_cal.reporting.html import find_browser
 
     try:
@@ -137,6 +148,28 @@ def run(*arguments: object) -> int:
         main([str(a) for a in arguments])
     code = ended.value.code
     return code if isinstance(code, int) else 0
+
+
+def invoked(command: click.Command, *arguments: object) -> tuple[int, str, str]:
+    """Exit code, stdout, stderr of a command as `main` would run it."""
+    result = CliRunner().invoke(command, [str(a) for a in arguments], standalone_mode=False)
+    if isinstance(result.exception, CalibrationError | click.ClickException):
+        return 2, result.stdout, in_flags(str(result.exception), command)
+    if result.exception:
+        raise result.exception
+    return int(result.return_value), result.stdout, result.stderr
+
+
+def slipped(whole: Any, rng: np.random.Generator, odd: Sequence[Any], gone: float) -> Any:
+    """A JSON with an odd value at one place, or its key gone in a share of the cases."""
+    content, every = copy.deepcopy(whole), spots(whole)
+    *way, last = every[rng.integers(len(every))]
+    part = reduce(getitem, way, content)
+    if gone and rng.random() < gone and isinstance(last, str):
+        del part[last]
+    else:
+        part[last] = odd[rng.integers(len(odd))]
+    return content
 
 
 def spots(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:

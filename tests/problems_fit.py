@@ -1,15 +1,22 @@
 """Fits that several tests start from."""
 
-from experiments.gap_cases import Case, Sealed, make
+import numpy as np
+from numpy.testing import assert_allclose
+
+from experiments.gap_cases import Case, Cause, Sealed, make
 from minimax_cal.diagnosing.study import Study, studied
+from minimax_cal.evidence.products import At
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.model import Model, SumOfSquares
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import METHODS
+
+ROUNDING = 1e-9  # of products, relative to the largest of their columns
 
 
 def solve(model: Model, begin: State, method: str = "snllm", **kw: object):  # type: ignore[no-untyped-def]
@@ -24,7 +31,41 @@ def study(jitter: float, noise: float, seed: int, poses: int = 100) -> Study:
     )
 
 
+def rough_study() -> Study:
+    """100 poses with play in a joint, a gear's line, and joints that do not come back."""
+    causes = (Cause("backlash", "J2", 400.0), Cause("gear_ripple", "J4", 400.0))
+    return study_of(make(Case("irb2600", "pair", causes, seed=4)))
+
+
 def study_of(made: Sealed) -> Study:
     """The training poses of a made arm."""
     train, _, _ = split(with_history(made.data), 0.2, 0)
     return studied(made.robot, train, fit_cell(made.robot, train, Options(objective="sum"), silent))
+
+
+def check_products(
+    found: At, i: int, index: Array, sets: Array, columns: Array, geometry: Array,
+    weight: Array, raw: Array,
+) -> None:  # fmt: skip
+    """Products of a ratio are sums over rows of what weighted least squares leaves of columns.
+
+    i: the ratio's number.  geometry: times the root of the weight (r,) of each row.
+    """
+    basis = np.linalg.qr(geometry.T)[0]
+    every = columns * np.sqrt(weight)
+    rest = every - (every @ basis) @ basis.T
+    size = np.linalg.norm(columns, axis=1)
+    gram, atol = rest @ rest.T, ROUNDING * np.outer(size, size)
+    assert np.all(np.abs(found.lines[i] - gram[1 + index, 1:]) <= atol[1 + index, 1:])
+    assert np.all(np.abs(found.error[i] - gram[0]) <= atol[0])
+    assert np.all(np.abs(found.pull[i] - gram[1 + index, 0]) <= atol[1 + index, 0])
+    for c, pair in enumerate(1 + sets):
+        off = np.abs(found.among(sets)[i, c] - gram[np.ix_(pair, pair)])
+        assert np.all(off <= atol[np.ix_(pair, pair)])
+    assert_allclose(found.whole[i], weight @ raw**2, rtol=ROUNDING)
+    assert_allclose(found.square[i], every[0] @ every[0], rtol=ROUNDING)
+    assert_allclose(found.logs[i], np.linalg.slogdet(geometry @ geometry.T)[1], atol=1e-8)
+    lower = found.factor[i]
+    assert_allclose(lower @ lower.T, geometry @ geometry.T, rtol=ROUNDING, atol=1e-9)
+    shared = geometry @ every[np.concatenate([[0], 1 + index])].T
+    assert_allclose(lower @ found.part[i], shared, rtol=ROUNDING, atol=ROUNDING * size.max())

@@ -17,7 +17,6 @@ import minimax_cal as mc
 from minimax_cal.cli.commands import ENTRIES, said_of
 from minimax_cal.cli.running import cli
 from minimax_cal.fitting.several import RelativeOptions
-from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.planning.options import PlanOptions
 
 FUNCTIONS = [name for name in mc.__all__ if inspect.isfunction(getattr(mc, name))]
@@ -36,7 +35,7 @@ def after(code: str, *modules: str) -> dict[str, bool]:
 # ---- the package -------------------------------------------------------------------------------
 
 
-def test_every_name_is_there() -> None:
+def test_every_name_is_there():
     assert set(mc.MODULES) == set(mc.__all__)
     assert set(dir(mc)) == {*mc.__all__, "__version__"}
     for name in mc.__all__:
@@ -46,7 +45,7 @@ def test_every_name_is_there() -> None:
         mc.calibrat  # type: ignore[attr-defined] # noqa: B018
 
 
-def test_type_checkers_see_the_same_names() -> None:
+def test_type_checkers_see_the_same_names():
     """The imports under TYPE_CHECKING are those of the table."""
     text = Path(mc.__file__).read_text()
     block = text.partition("if TYPE_CHECKING:")[2].partition("\n__all__")[0]
@@ -57,20 +56,20 @@ def test_type_checkers_see_the_same_names() -> None:
     assert found == mc.MODULES
 
 
-def test_a_calibration_imports_no_statistics_and_no_pictures() -> None:
+def test_a_calibration_imports_no_statistics_and_no_pictures():
     heavy = ("scipy.stats", "pandas", "matplotlib", "cvxpy", "plotly", "jinja2")
     assert not any(after("from minimax_cal.fitting.calibrate import calibrate", *heavy).values())
     heavy += ("scipy.signal", "scipy.ndimage", "numba", "minimax_cal.fitting.fit")
     assert not any(after("from minimax_cal.cli.torques import torques_command", *heavy).values())
 
 
-def test_importing_is_quick_work() -> None:
+def test_importing_is_quick_work():
     code = "import minimax_cal"
     assert not any(after(code, "numpy", "scipy", "pydantic", "click").values())
     assert after("import minimax_cal\nminimax_cal.Robot", "numpy")["numpy"]
 
 
-def test_no_module_shadows_a_public_name() -> None:
+def test_no_module_shadows_a_public_name():
     pytest.importorskip("mujoco", reason="a module is one that MuJoCo's users import")
     for found in pkgutil.walk_packages(mc.__path__, "minimax_cal."):
         importlib.import_module(found.name)
@@ -86,7 +85,7 @@ def test_no_module_shadows_a_public_name() -> None:
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_help_explains_the_arguments_and_shows_an_example(name: str) -> None:
+def test_help_explains_the_arguments_and_shows_an_example(name):
     function = getattr(mc, name)
     text = inspect.getdoc(function) or ""
     assert re.search(rf"^>>> .*\bmc\.{name}\(", text, re.M)
@@ -111,7 +110,7 @@ def test_help_explains_the_arguments_and_shows_an_example(name: str) -> None:
         (mc.iso9283, ("fit.json",)),
     ],
 )
-def test_a_typo_is_told_by_its_name(function, given) -> None:  # type: ignore[no-untyped-def]
+def test_a_typo_is_told_by_its_name(function, given):  # type: ignore[no-untyped-def]
     with pytest.raises(TypeError, match="holdot"):
         function(*given, holdot=0.1)
 
@@ -119,7 +118,7 @@ def test_a_typo_is_told_by_its_name(function, given) -> None:  # type: ignore[no
 @pytest.mark.parametrize(
     ("function", "options"), [(mc.plan, PlanOptions), (mc.relative, RelativeOptions)]
 )
-def test_keywords_are_those_of_the_options(function, options) -> None:  # type: ignore[no-untyped-def]
+def test_keywords_are_those_of_the_options(function, options):  # type: ignore[no-untyped-def]
     said = inspect.signature(function).parameters
     for name, default in vars(options()).items():
         assert said[name].default == (default if default != {} else None), name
@@ -128,17 +127,12 @@ def test_keywords_are_those_of_the_options(function, options) -> None:  # type: 
 # ---- functions beside the commands -------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def fit(noisy: Simulation) -> mc.Fit:
-    return mc.calibrate("irb2600", noisy.data, "sum")
-
-
-def test_simulate_takes_a_name(robot: mc.Robot) -> None:
+def test_simulate_takes_a_name(robot):
     one, other = (mc.simulate(arm, 5, seed=3).data for arm in (robot, "irb2600"))
     assert (one.y == other.y).all()
 
 
-def test_export_takes_what_there_is(fit: mc.Fit, tmp_path: Path) -> None:
+def test_export_takes_what_there_is(fit, tmp_path):
     fit.save(tmp_path / "fit.json")
     saved = mc.export(tmp_path / "fit.json", "json", tmp_path / "arm.json")
     assert (tmp_path / "arm.json").read_text() == saved
@@ -153,7 +147,7 @@ def test_export_takes_what_there_is(fit: mc.Fit, tmp_path: Path) -> None:
         mc.export(fit, "step")
 
 
-def test_iso9283_of_a_fit_is_that_of_its_file(fit: mc.Fit, tmp_path: Path) -> None:
+def test_iso9283_of_a_fit_is_that_of_its_file(fit, tmp_path):
     path = tmp_path / "fit.json"
     fit.save(path)
     one, other = (mc.iso9283(given, tcp="smr1").parts for given in (fit, path))
@@ -165,7 +159,7 @@ def test_iso9283_of_a_fit_is_that_of_its_file(fit: mc.Fit, tmp_path: Path) -> No
         mc.iso9283(fit, "poses.csv")
 
 
-def test_report_of_a_fit_is_that_of_its_file(fit: mc.Fit, tmp_path: Path) -> None:
+def test_report_of_a_fit_is_that_of_its_file(fit, tmp_path):
     pytest.importorskip("plotly", reason="a report needs pip install minimax-cal[report]")
     path = tmp_path / "fit.json"
     fit.save(path)
@@ -180,7 +174,7 @@ def test_report_of_a_fit_is_that_of_its_file(fit: mc.Fit, tmp_path: Path) -> Non
 # ---- the command line --------------------------------------------------------------------------
 
 
-def test_version_and_help_import_no_command() -> None:
+def test_version_and_help_import_no_command():
     heavy = ("numpy", "scipy", "pydantic", "rich", "minimax_cal.cli.calibrate")
     for option in ("--version", "--help"):
         code = (
@@ -190,7 +184,7 @@ def test_version_and_help_import_no_command() -> None:
         assert not any(after(code, *heavy).values()), option
 
 
-def test_no_command_waits_for_what_its_help_does_not_need() -> None:
+def test_no_command_waits_for_what_its_help_does_not_need():
     heavy = ("scipy.stats", "scipy.optimize", "scipy.interpolate", "scipy.signal", "scipy.ndimage")
     heavy += ("cvxpy", "qpsolvers", "numba", "matplotlib", "plotly", "jinja2", "mujoco", "pandas")
     code = "import minimax_cal.cli.running as r\nfor name in r.ENTRIES:\n    r.cli.commands[name]"
@@ -198,7 +192,7 @@ def test_no_command_waits_for_what_its_help_does_not_need() -> None:
     assert [name for name, here in imported.items() if here] == ["minimax_cal.cli.diagnose"]
 
 
-def test_the_list_says_what_the_commands_say() -> None:
+def test_the_list_says_what_the_commands_say():
     context = click.Context(cli)
     assert cli.list_commands(context) == list(cli.commands) == list(ENTRIES)
     for name in ENTRIES:
@@ -210,7 +204,7 @@ def test_the_list_says_what_the_commands_say() -> None:
     assert cli.get_command(context, "callibrate") is None
 
 
-def test_an_interrupted_import_is_one_line() -> None:
+def test_an_interrupted_import_is_one_line():
     code = (
         "import sys\n"
         "class Stopped:\n"

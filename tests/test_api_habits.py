@@ -6,7 +6,6 @@ from numpy.testing import assert_allclose
 from scipy.optimize import Bounds
 
 import minimax_cal as mc
-from minimax_cal.modelling.simulate import Simulation
 from qp_backends import Problem, Solution, solve
 
 EXACT = 1e-12
@@ -16,7 +15,7 @@ def largest(x: np.ndarray) -> np.ndarray:
     return np.array([x[0] ** 2 + x[1] ** 4, (2 - x[0]) ** 2 + (2 - x[1]) ** 2])
 
 
-def test_bounds_as_pairs_are_bounds() -> None:
+def test_bounds_as_pairs_are_bounds():
     told = mc.minimize_max(largest, [2.0, 2.0], bounds=[(None, 0.8), (0.9, None)])
     same = mc.minimize_max(largest, [2.0, 2.0], bounds=Bounds([-np.inf, 0.9], [0.8, np.inf]))
     assert_allclose(told.x, same.x, rtol=0, atol=EXACT)
@@ -26,7 +25,7 @@ def test_bounds_as_pairs_are_bounds() -> None:
             mc.minimize_max(largest, [2.0, 2.0], bounds=wrong)  # type: ignore[arg-type]
 
 
-def test_central_differences_are_nearer_than_forward_ones() -> None:
+def test_central_differences_are_nearer_than_forward_ones():
     exact = mc.minimize_max(largest, [2.0, 2.0], jac="cs")
     central = mc.minimize_max(largest, [2.0, 2.0], jac="3-point")
     assert_allclose(central.fun, exact.fun, rtol=1e-9)
@@ -35,7 +34,7 @@ def test_central_differences_are_nearer_than_forward_ones() -> None:
         mc.minimize_max(largest, [2.0, 2.0], jac="4-point")
 
 
-def test_a_qp_solver_may_be_a_function(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_qp_solver_may_be_a_function(robot, noisy):
     asked = []
 
     def counting(problem: Problem) -> Solution:
@@ -51,7 +50,7 @@ def test_a_qp_solver_may_be_a_function(robot: mc.Robot, noisy: Simulation) -> No
     assert again.options.qp == "function counting"
 
 
-def test_priors_have_units_as_text(robot: mc.Robot, noisy: Simulation) -> None:
+def test_priors_have_units_as_text(robot, noisy):
     told = mc.calibrate(robot, noisy.data, "sum", priors={"a*": "0.5mm", "theta2": "1mrad"})
     same = mc.calibrate(robot, noisy.data, "sum", priors={"a*": 5e-4, "theta2": 1e-3})
     assert_allclose(told.parameters.value, same.parameters.value, rtol=0, atol=EXACT)
@@ -59,7 +58,7 @@ def test_priors_have_units_as_text(robot: mc.Robot, noisy: Simulation) -> None:
         mc.calibrate(robot, noisy.data, priors={"a1": "1mrad"})
 
 
-def test_arrays_are_measurements(robot: mc.Robot, noisy: Simulation) -> None:
+def test_arrays_are_measurements(robot, noisy):
     fit = mc.calibrate(robot, (noisy.data.q, noisy.data.y), "sum")
     same = mc.calibrate(robot, noisy.data, "sum")
     assert_allclose(fit.parameters.value, same.parameters.value, rtol=0, atol=EXACT)
@@ -67,7 +66,7 @@ def test_arrays_are_measurements(robot: mc.Robot, noisy: Simulation) -> None:
         mc.calibrate(robot, (noisy.data.q[:3], noisy.data.y))
 
 
-def test_a_fit_draws_itself_and_is_short(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_fit_draws_itself_and_is_short(robot, noisy):
     pytest.importorskip("matplotlib")
     fit = mc.calibrate(robot, noisy.data, "sum")
     left, right = mc.plot_errors(fit).axes
@@ -81,7 +80,7 @@ def test_a_fit_draws_itself_and_is_short(robot: mc.Robot, noisy: Simulation) -> 
     assert f"RMS {fit.within.after.rms_mm:.3f} mm" in repr(fit)
 
 
-def test_one_target_alone_is_told(robot: mc.Robot, noisy: Simulation) -> None:
+def test_one_target_alone_is_told(robot, noisy):
     fit = mc.calibrate(robot, noisy.data, "smr:1")
     said = "objective smr:1: smr1 alone is fitted; smr2, smr3 took no part"
     assert said in fit.notices

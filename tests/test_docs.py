@@ -37,7 +37,7 @@ CONTRIBUTING = ROOT / "CONTRIBUTING.md"
 @pytest.mark.parametrize(
     "page", [ROOT / "README.md", CONTRIBUTING, *PAGES], ids=lambda path: path.stem
 )
-def test_links_lead_to_files_and_headings(page: Path) -> None:
+def test_links_lead_to_files_and_headings(page):
     text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
     for link in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`]*`", "code", text)):
         path, _, anchor = link.partition("#")
@@ -51,7 +51,7 @@ def test_links_lead_to_files_and_headings(page: Path) -> None:
             assert anchor in headings, f"{page.name}: {link}"
 
 
-def test_the_files_named_in_the_mathematics_are_there() -> None:
+def test_the_files_named_in_the_mathematics_are_there():
     text = (DOCS / "mathematics.md").read_text()
     named = re.findall(r"`([\w/]+\.py)`", text)
     assert len(named) > 10
@@ -66,12 +66,12 @@ def test_the_files_named_in_the_mathematics_are_there() -> None:
         assert callable(getattr(module, function)), f"{name}.{function}"
 
 
-def test_the_rooms_are_those_of_the_folders() -> None:
+def test_the_rooms_are_those_of_the_folders():
     named = re.findall(r"^\| `(\w+)/` \|", CONTRIBUTING.read_text(), re.M)
     assert tuple(named) == FOLDERS
 
 
-def test_an_owner_stands_where_it_is_said_to_stand() -> None:
+def test_an_owner_stands_where_it_is_said_to_stand():
     rows = CONTRIBUTING.read_text().partition("| thing | owner | where |")[2].partition("\n\n")[0]
     for row in rows.splitlines()[2:]:
         _, _, owner, where, _ = row.split("|")
@@ -84,7 +84,7 @@ def test_an_owner_stands_where_it_is_said_to_stand() -> None:
             assert files[0].stem == name or re.search(said, text, re.M), row
 
 
-def test_what_is_to_be_copied_and_entered_is_there() -> None:
+def test_what_is_to_be_copied_and_entered_is_there():
     text = CONTRIBUTING.read_text().partition("## Add an effect")[2]
     ours = ("minimax_cal", "qp_backends", "experiments", "tests", "docs", "examples")
     every = (path for folder in ours for path in (ROOT / folder).rglob("*.py"))
@@ -176,13 +176,7 @@ RUN = [
 
 
 @pytest.mark.parametrize("name", RUN)
-def test_pages_print_what_they_say(
-    name: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    own_registries: None,
-) -> None:
+def test_pages_print_what_they_say(name, tmp_path, monkeypatch, capsys, own_registries):
     pytest.importorskip("matplotlib", reason="pictures need pip install minimax-cal[plot]")
     if name == "mjcf_to_mjcf.md":
         pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
@@ -220,9 +214,7 @@ def test_pages_print_what_they_say(
             assert (tmp_path / made).stat().st_size > 1000, made
 
 
-def test_what_corrected_targets_are_worth_is_what_the_page_prints(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_corrected_targets_are_worth_is_what_the_page_prints(capsys):
     code, said = (
         next(
             text
@@ -235,7 +227,7 @@ def test_what_corrected_targets_are_worth_is_what_the_page_prints(
     assert printed(words(said), words(capsys.readouterr().out))
 
 
-def test_numbers_in_the_words_of_the_tutorial_stand_in_what_it_prints() -> None:
+def test_numbers_in_the_words_of_the_tutorial_stand_in_what_it_prints():
     text = (DOCS / "tutorial.md").read_text()
     printed_numbers = [
         float(number)
@@ -251,7 +243,7 @@ def test_numbers_in_the_words_of_the_tutorial_stand_in_what_it_prints() -> None:
         assert float(number) in rounded, f"tutorial.md: no command prints {number}"
 
 
-def test_a_wrong_number_is_noticed() -> None:
+def test_a_wrong_number_is_noticed():
     assert same("0.5741", "0.5742")
     assert not same("0.5741", "0.5751")
     assert not same("2.59e-06", "2.59e-07")
@@ -259,7 +251,7 @@ def test_a_wrong_number_is_noticed() -> None:
     assert not printed(["RMS", "1.653"], ["RMS", "error", "1.653"])
 
 
-def test_every_picture_is_made_by_a_command() -> None:
+def test_every_picture_is_made_by_a_command():
     """README's and the pages' pictures stand in `docs/pictures.py`; those of studies are theirs."""
     scope = runpy.run_path(str(DOCS / "pictures.py"), run_name="pictures")
     pages = "".join(page.read_text() for page in (*PAGES, ROOT / "README.md"))
@@ -287,13 +279,13 @@ def figured_pages() -> dict[str, str]:
     return {name: texts[name] for name in shown if name not in ("errata", "mathematics", "data")}
 
 
-def test_every_page_of_figures_is_of_one_version() -> None:
+def test_every_page_of_figures_is_of_one_version():
     stamps = {name: STAMP.findall(text) for name, text in figured_pages().items()}
     assert {name: len(found) for name, found in stamps.items() if len(found) != 1} == {}
     assert {name for name, ((kind, _),) in stamps.items() if kind != "version"} == SEVERAL
 
 
-def test_the_versions_of_figures_are_commits() -> None:
+def test_the_versions_of_figures_are_commits():
     if not (ROOT / ".git").exists():
         pytest.skip("no git repository here")
     stamps = {stamp for text in figured_pages().values() for _, stamp in STAMP.findall(text)}
@@ -306,7 +298,7 @@ def test_the_versions_of_figures_are_commits() -> None:
     assert {stamp for stamp in stamps if not any(one.startswith(stamp) for one in known)} == set()
 
 
-def test_the_glossary_has_every_word_that_heads_a_table() -> None:
+def test_the_glossary_has_every_word_that_heads_a_table():
     """Some word of each header that the code writes out is in an entry."""
     heads: set[str] = set()
     for path in (ROOT / "minimax_cal").rglob("*.py"):

@@ -42,13 +42,13 @@ def imported(path: Path) -> set[str]:
     return found
 
 
-def test_every_folder_has_its_place() -> None:
+def test_every_folder_has_its_place():
     inside = (ROOT / "minimax_cal").iterdir()
     assert {p.name for p in inside if p.is_dir() and p.name != "__pycache__"} == set(FOLDERS)
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT / "minimax_cal")))
-def test_imports_point_down(path: Path) -> None:
+def test_imports_point_down(path):
     folder = path.relative_to(ROOT / "minimax_cal").parts[0]
     allowed = {*FOLDERS[: FOLDERS.index(folder) + 1], "__init__"} if folder in FOLDERS else FOLDERS
     for module in imported(path):
@@ -58,7 +58,7 @@ def test_imports_point_down(path: Path) -> None:
             assert inner.partition(".")[0] in allowed, f"{folder} imports {module}"
 
 
-def test_no_name_of_an_effect_is_compared() -> None:
+def test_no_name_of_an_effect_is_compared():
     """What an effect does, it states; who must speak of one takes the name from its law."""
     above = {  # name their own: torques have laws of the same names
         "faults/nests.py", "faults/sessions.py", "modelling/periodogram.py", "dynamics/laws.py",
@@ -74,5 +74,5 @@ def test_no_name_of_an_effect_is_compared() -> None:
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "qp_backends").glob("*.py")), ids=lambda p: p.stem)
-def test_qp_backends_knows_no_robot(path: Path) -> None:
+def test_qp_backends_knows_no_robot(path):
     assert not any(module.startswith(("minimax_cal", "experiments")) for module in imported(path))

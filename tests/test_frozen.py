@@ -32,12 +32,12 @@ def found(one: Any, other: Any) -> list[str]:
         ([1.0, float("nan")], [1.0, 2.0], "case[1]: nan and 2.0"),
     ],
 )
-def test_a_difference_is_named(one: Any, other: Any, where: str) -> None:
+def test_a_difference_is_named(one, other, where):
     assert found(one, other) == [where]
     assert found(one, one) == found(other, other) == []
 
 
-def test_rounding_is_relative_to_the_largest_beside() -> None:
+def test_rounding_is_relative_to_the_largest_beside():
     assert found([4e3, 1e-15], [4e3, 3e-15]) == []
     assert found([4e3, 1e-15], [4e3, 5e-6]) != []
     assert found({"a": 1e-15, "b": 4e3}, {"a": 3e-15, "b": 4e3}) != []
@@ -46,7 +46,7 @@ def test_rounding_is_relative_to_the_largest_beside() -> None:
     assert found({"a": {"rms_mm": 1e-12}}, {"a": {"rms_mm": 1e-8}}) != []
 
 
-def test_text_is_words_and_numbers() -> None:
+def test_text_is_words_and_numbers():
     one = frozen.content("", TEXT)
     assert (
         found(one, frozen.content("", TEXT.replace("3 s", "4 s").replace("1.5 s", "2.5 s"))) == []
@@ -61,7 +61,7 @@ def test_text_is_words_and_numbers() -> None:
     assert found(page, frozen.content("a.html", PAGE.replace("[1, 2]", "[1, 3]"))) != []
 
 
-def test_bytes_of_exports_alone_are_compared(tmp_path: Path) -> None:
+def test_bytes_of_exports_alone_are_compared(tmp_path):
     for name, file in (("export a", "a.json"), ("calibrate a", "a.json"), ("gap a", "a.xml")):
         sides = []
         for text in ('{"a": 1.0}', '{"a":1.0}'):
@@ -72,7 +72,7 @@ def test_bytes_of_exports_alone_are_compared(tmp_path: Path) -> None:
         assert [line.split(":")[0] for line in found(*sides) if "bytes" in line] == expected
 
 
-def test_what_changes_on_purpose_stands_in_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_changes_on_purpose_stands_in_tables(monkeypatch):
     monkeypatch.setattr(frozen, "GONE", {"case/*/old": "no longer told"})
     monkeypatch.setattr(frozen, "ADDED", {"case/new": "told now"})
     monkeypatch.setattr(frozen, "CHANGED", {"case/a*": "a better cutoff"})
@@ -85,7 +85,7 @@ def test_what_changes_on_purpose_stands_in_tables(monkeypatch: pytest.MonkeyPatc
     assert found({"x": {"old": 1}}, {"x": {"old": 2}}) == ["case/x/old: 1 and 2"]
 
 
-def test_every_command_format_and_input_is_in_it() -> None:
+def test_every_command_format_and_input_is_in_it():
     asked = frozen.cases(Path("nowhere"))
     without = {
         "serve",
@@ -100,6 +100,6 @@ def test_every_command_format_and_input_is_in_it() -> None:
     assert {p for p in kept if not any(str(p) in word for word in words)} == set()
 
 
-def test_a_choice_brings_what_it_reads() -> None:
+def test_a_choice_brings_what_it_reads():
     chosen = frozen.chosen_cases(frozen.cases(Path("nowhere")), "evaluate diagnosis")
     assert list(chosen) == ["diagnose compliance", "evaluate diagnosis"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import click
 import pytest
@@ -37,7 +36,7 @@ def strings(tree: ast.AST) -> Iterator[ast.Constant]:
             yield node
 
 
-def test_messages_of_python_speak_of_no_flag() -> None:
+def test_messages_of_python_speak_of_no_flag():
     theirs = {"cli", "serving"}  # the page writes the command lines that do the same
     rooms = [path for path in PACKAGE.rglob("*.py") if not theirs & set(path.parts)]
     found = [
@@ -51,9 +50,7 @@ def test_messages_of_python_speak_of_no_flag() -> None:
     assert not found, "\n".join(found)
 
 
-def test_the_command_line_calls_arguments_by_its_options(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_line_calls_arguments_by_its_options(tmp_path, capsys):
     plan = cli.commands["plan"]
     for said, shown in (
         ("candidates=5: give more", "--candidates 5: give more"),
@@ -80,9 +77,7 @@ def test_the_command_line_calls_arguments_by_its_options(
 
 
 @pytest.mark.parametrize("name", ENTRIES)
-def test_help_is_in_groups_and_whole_sentences(
-    name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help_is_in_groups_and_whole_sentences(name, capsys):
     command = cli.commands[name]
     assert isinstance(command, InGroups)
     assert run(name, "--help") == 0

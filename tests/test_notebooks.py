@@ -1,7 +1,6 @@
 """The examples as notebooks: whole, and they run from end to end."""
 
 import runpy
-from pathlib import Path
 
 import pytest
 from conftest import ROOT
@@ -11,7 +10,7 @@ EXAMPLES = MADE["EXAMPLES"]
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_cells_hold_all_of_the_script(name: str) -> None:
+def test_cells_hold_all_of_the_script(name):
     """Code cells one after the other are the script without its comments between them."""
     source = (ROOT / "examples" / f"{name}.py").read_text()
     cells = MADE["notebook"](source)["cells"]
@@ -28,7 +27,7 @@ def test_cells_hold_all_of_the_script(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_notebooks_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_notebooks_run(name, tmp_path, monkeypatch):
     for package in ("nbclient", "nbformat", "ipykernel", "matplotlib", "plotly"):
         pytest.importorskip(package, reason="notebooks need pip install -e .[dev]")
     import nbformat

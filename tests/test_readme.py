@@ -3,7 +3,6 @@
 import re
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
 from conftest import ROOT, run
@@ -13,7 +12,7 @@ import minimax_cal as mc
 README = (ROOT / "README.md").read_text()
 
 
-def test_the_result_is_the_one_of_the_first_command() -> None:
+def test_the_result_is_the_one_of_the_first_command():
     quoted = " ".join(
         line.removeprefix("> ") for line in README.splitlines() if line.startswith("> ")
     )
@@ -21,9 +20,7 @@ def test_the_result_is_the_one_of_the_first_command() -> None:
     assert quoted in fit.headline()
 
 
-def test_the_three_commands_print_what_is_quoted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_three_commands_print_what_is_quoted(tmp_path, monkeypatch, capsys):
     mujoco = pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
@@ -57,11 +54,11 @@ def is_quoted(quoted: list[str], printed: list[str]) -> bool:
     )
 
 
-def test_it_is_short() -> None:
+def test_it_is_short():
     assert len(re.sub(r"```.*?```", "", README, flags=re.S).split()) <= 450
 
 
-def test_the_python_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_python_examples_run(tmp_path, monkeypatch):
     pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
@@ -74,7 +71,7 @@ def test_the_python_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert f"{scope['found'].fun:.6f}" == blocks[-1][1].strip()  # type: ignore[attr-defined]
 
 
-def test_all_brings_what_every_page_needs() -> None:
+def test_all_brings_what_every_page_needs():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
         "optional-dependencies"
     ]
@@ -88,9 +85,7 @@ def test_all_brings_what_every_page_needs() -> None:
     assert parts("all") >= {"plot", "backends", "report", "fleet", "app", "fast", "mujoco"}
 
 
-def test_the_example_is_what_its_script_makes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_example_is_what_its_script_makes(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
     import make
 
@@ -104,6 +99,6 @@ def test_the_example_is_what_its_script_makes(
     sys.modules.pop("make")
 
 
-def test_there_are_two_set_up_commands() -> None:
+def test_there_are_two_set_up_commands():
     (block,) = re.findall(r"```bash setup\n(.*?)```", README, flags=re.S)
     assert len(block.strip().splitlines()) == 2

@@ -18,7 +18,7 @@ MADE = ("pyproject.toml", "CITATION.cff", "codemeta.json", ".zenodo.json", "pape
         "README.md", "CODE_OF_CONDUCT.md", "SECURITY.md", "packaging/conda/meta.yaml")  # fmt: skip
 
 
-def test_what_the_extra_test_lacks_is_marked() -> None:
+def test_what_the_extra_test_lacks_is_marked():
     """`.ci/run` runs by their mark the tests that skip after the README's second command."""
     extras = PROJECT["optional-dependencies"]
     alone = {re.split("[>;[]", need)[0] for need in extras["dev"]} - {"minimax-cal"}
@@ -50,7 +50,7 @@ def filled(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_release_with_a_placeholder_is_refused(filled: Path) -> None:
+def test_a_release_with_a_placeholder_is_refused(filled):
     version = PROJECT["version"]
     code, faults = checked(ROOT)
     assert code == 1
@@ -67,7 +67,7 @@ def test_a_release_with_a_placeholder_is_refused(filled: Path) -> None:
         (filled / name).write_text(before)
 
 
-def test_every_file_names_one_version(filled: Path) -> None:
+def test_every_file_names_one_version(filled):
     code, faults = checked(filled, "--tag", "v99.0")
     assert code == 1
     assert len(faults) == 5
@@ -78,7 +78,7 @@ def test_every_file_names_one_version(filled: Path) -> None:
     assert checked(filled)[1] == [f"CITATION.cff: is of version 9, not {PROJECT['version']}"]
 
 
-def test_the_workflow_checks_before_it_publishes() -> None:
+def test_the_workflow_checks_before_it_publishes():
     jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text())["jobs"]
     assert any(".ci/placeholders" in step.get("run", "") for step in jobs["check"]["steps"])
     chain = [jobs[name].get("needs") for name in ("publish", "try", "build")]
@@ -92,14 +92,14 @@ def test_the_workflow_checks_before_it_publishes() -> None:
     )
 
 
-def test_every_workflow_and_form_is_yaml() -> None:
+def test_every_workflow_and_form_is_yaml():
     files = [*(ROOT / ".github").rglob("*.yml"), ROOT / ".readthedocs.yaml", ROOT / "CITATION.cff"]
     assert len(files) >= 7
     for path in files:
         assert yaml.safe_load(path.read_text()), path
 
 
-def test_descriptions_are_one() -> None:
+def test_descriptions_are_one():
     codemeta, zenodo = (
         json.loads((ROOT / n).read_text()) for n in ("codemeta.json", ".zenodo.json")
     )
@@ -111,21 +111,21 @@ def test_descriptions_are_one() -> None:
     assert set(PROJECT["urls"]) >= {"Documentation", "Repository", "Issues", "Changelog"}
 
 
-def test_the_recipe_needs_what_the_wheel_needs() -> None:
+def test_the_recipe_needs_what_the_wheel_needs():
     text = (ROOT / "packaging" / "conda" / "meta.yaml").read_text()
     run = text.partition("  run:\n")[2].partition("\ntest:")[0]
     found = {"".join(line.strip(" -").split()) for line in run.splitlines() if line.strip()}
     assert found == {*PROJECT["dependencies"], "python>=3.11"}
 
 
-def test_the_container_runs_both_commands() -> None:
+def test_the_container_runs_both_commands():
     (block,) = re.findall(r"```bash setup\n(.*?)```", README, flags=re.S)
     text = (ROOT / "Dockerfile").read_text()
     assert re.findall(r"^RUN (.*)$", text, re.MULTILINE) == block.strip().splitlines()
     assert text.count("\nFROM ") == 1
 
 
-def test_the_paper_cites_what_its_bibliography_holds() -> None:
+def test_the_paper_cites_what_its_bibliography_holds():
     paper, listed = (ROOT / "paper.md").read_text(), (ROOT / "paper.bib").read_text()
     head, body = paper.split("---\n", 2)[1:]
     assert yaml.safe_load(head)["bibliography"] == "paper.bib"

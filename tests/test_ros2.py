@@ -4,7 +4,6 @@ import configparser
 import runpy
 import sys
 import xml.etree.ElementTree as Xml
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, ClassVar
 
@@ -27,7 +26,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delitem(sys.modules, name)
 
 
-def test_an_arm_stands_after_a_second_without_moving() -> None:
+def test_an_arm_stands_after_a_second_without_moving():
     from minimax_cal_ros2.sheet import Rest
 
     rest = Rest(["a", "b"])
@@ -69,9 +68,7 @@ def standing_in(monkeypatch: pytest.MonkeyPatch, **modules: dict[str, Any]) -> N
         monkeypatch.setitem(sys.modules, made.__name__, made)
 
 
-def test_what_the_node_writes_is_a_measurement_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_node_writes_is_a_measurement_file(tmp_path, monkeypatch):
     data = mc.simulate("irb120", 12, 2, seed=1).data
     path = tmp_path / "poses.csv"
     standing_in(
@@ -106,9 +103,7 @@ def test_what_the_node_writes_is_a_measurement_file(
         main()
 
 
-def test_the_launch_file_publishes_the_urdf(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_launch_file_publishes_the_urdf(tmp_path, monkeypatch):
     urdf = tmp_path / "corrected.urdf"
     urdf.write_text("<robot name='arm'/>")
     perform = SimpleNamespace(perform=lambda context: str(urdf))
@@ -128,7 +123,7 @@ def test_the_launch_file_publishes_the_urdf(
     assert node["parameters"] == [{"robot_description": "<robot name='arm'/>"}]
 
 
-def test_the_package_is_whole() -> None:
+def test_the_package_is_whole():
     package = Xml.parse(HERE / "package.xml").getroot()
     assert package.findtext("name") == "minimax_cal_ros2"
     assert package.findtext("export/build_type") == "ament_python"

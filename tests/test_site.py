@@ -88,7 +88,7 @@ def built(site: Path) -> dict[Path, Anchors]:
     return {path: Anchors(path) for path in site.rglob("*.html")}
 
 
-def test_every_page_is_reached_from_the_start(site: Path, built: dict[Path, Anchors]) -> None:
+def test_every_page_is_reached_from_the_start(site, built):
     waiting, reached = [site / "index.html"], set()
     while waiting:
         page = waiting.pop()
@@ -102,7 +102,7 @@ def test_every_page_is_reached_from_the_start(site: Path, built: dict[Path, Anch
     assert site / "examples" / "diagnose_a_gap.html" in reached
 
 
-def test_links_of_the_site_lead_somewhere(site: Path, built: dict[Path, Anchors]) -> None:
+def test_links_of_the_site_lead_somewhere(site, built):
     for page, found in built.items():
         for link in found.links:
             parts = urlsplit(link)
@@ -114,7 +114,7 @@ def test_links_of_the_site_lead_somewhere(site: Path, built: dict[Path, Anchors]
                 assert unquote(parts.fragment) in built[target].ids, f"{page.name}: {link}"
 
 
-def test_the_site_loads_nothing_from_outside(site: Path, built: dict[Path, Anchors]) -> None:
+def test_the_site_loads_nothing_from_outside(site, built):
     for page, found in built.items():
         for load in found.loads:
             assert not urlsplit(load).netloc, f"{page.name} loads {load}"
@@ -124,7 +124,7 @@ def test_the_site_loads_nothing_from_outside(site: Path, built: dict[Path, Ancho
         assert not re.search(r"(url\(|@import)\s*['\"]?(https?:)?//", style.read_text()), style
 
 
-def test_formulas_are_drawn(site: Path) -> None:
+def test_formulas_are_drawn(site):
     page, text = (site / "mathematics.html").read_text(), (DOCS / "mathematics.md").read_text()
     assert (
         len(re.findall(r'<div class="math">\s*<svg', page))
@@ -147,7 +147,7 @@ def public(thing: object) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("package", [mc, qp_backends], ids=lambda package: package.__name__)
-def test_every_public_name_is_in_the_reference(site: Path, package: object) -> None:
+def test_every_public_name_is_in_the_reference(site, package):
     name = package.__name__  # type: ignore[attr-defined]
     ids = Anchors(site / "api" / f"{name}.html").ids
     for public_name in package.__all__:  # type: ignore[attr-defined]
@@ -157,7 +157,7 @@ def test_every_public_name_is_in_the_reference(site: Path, package: object) -> N
             assert f"{full}.{member}" in ids, f"{full}.{member}"
 
 
-def test_docstrings_keep_their_words(site: Path) -> None:
+def test_docstrings_keep_their_words(site):
     page = re.sub(r"<[^>]+>", "", (site / "api" / "minimax_cal.html").read_text())
     assert "Names or patterns as beta*" in page  # a star is no emphasis here
     assert "Errors (k, m, 3) by the keys of accuracy [m]" in page  # quoted, with its brackets
@@ -172,7 +172,7 @@ def commands(group: click.Group, path: str) -> Iterator[tuple[str, click.Command
             yield from commands(command, f"{path}-{name}")
 
 
-def test_every_command_and_option_is_in_the_reference(site: Path) -> None:
+def test_every_command_and_option_is_in_the_reference(site):
     page = Anchors(site / "api" / "cli.html")
     for path, command in commands(cli, "minimax-cal"):
         assert path in page.ids
@@ -191,7 +191,7 @@ def numbers(page: Path, row: str) -> list[list[float]]:
     ]
 
 
-def test_what_the_first_example_says_is_what_it_prints(site: Path) -> None:
+def test_what_the_first_example_says_is_what_it_prints(site):
     page = site / "examples" / "calibrate_and_judge.html"
     (right, wrong), (right_point, wrong_point) = (numbers(page, row) for row in ("sum", "point"))
     for least, point in ((right, right_point), (wrong, wrong_point)):
@@ -203,7 +203,7 @@ def test_what_the_first_example_says_is_what_it_prints(site: Path) -> None:
     assert list((site / "_images").glob("sphx_glr_calibrate_and_judge_*.png"))
 
 
-def test_what_the_second_example_says_is_what_it_prints(site: Path) -> None:
+def test_what_the_second_example_says_is_what_it_prints(site):
     page = re.sub(r"<[^>]+>", "", (site / "examples" / "diagnose_a_gap.html").read_text())
     found = re.findall(r"verdict (\w+), held-out RMS ([\d.]+) mm, ([\w:, ]+)", page)
     (named, left, which), (without, more, _) = found

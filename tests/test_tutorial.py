@@ -34,7 +34,7 @@ def shell(line: str, folder: Path, environment: dict[str, str]) -> str:
     return done.stdout
 
 
-def test_all_that_the_tutorial_runs_is_told_to_be_installed() -> None:
+def test_all_that_the_tutorial_runs_is_told_to_be_installed():
     """Pictures need [plot] and the report [report]; this form needs no network."""
     text = TUTORIAL.read_text()
     for used, extra in (
@@ -47,7 +47,7 @@ def test_all_that_the_tutorial_runs_is_told_to_be_installed() -> None:
 
 
 @pytest.mark.slow
-def test_the_tutorial_runs_to_its_last_line(tmp_path: Path) -> None:
+def test_the_tutorial_runs_to_its_last_line(tmp_path):
     tree, place, folder = (tmp_path / name for name in ("tree", "venv", "work"))
     folder.mkdir()
     files = call("git", "-C", ROOT, "archive", "--format=tar", "-o", tmp_path / "tree.tar", "HEAD")

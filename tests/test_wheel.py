@@ -75,7 +75,7 @@ def installed(built: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Ca
     return run
 
 
-def test_wheel_and_sdist_are_whole(built: list[Path]) -> None:
+def test_wheel_and_sdist_are_whole(built):
     pytest.importorskip("twine")
     done = call(sys.executable, "-m", "twine", "check", "--strict", *built)
     assert done.returncode == 0, done.stdout
@@ -89,7 +89,7 @@ def test_wheel_and_sdist_are_whole(built: list[Path]) -> None:
     assert not [name for name in wheel if name.startswith(("tests", "experiments", "docs"))]
 
 
-def test_every_command_runs_or_names_its_extra(installed: Callable[..., Ran]) -> None:
+def test_every_command_runs_or_names_its_extra(installed):
     """Required packages only: everything but pictures, report and some backends."""
     run = installed
     robots = json.loads(run("robots", "--json").stdout)

@@ -90,7 +90,7 @@ def shown(path: Path) -> Iterator[tuple[int, str]]:
 
 
 @pytest.mark.parametrize("folder", CODE)
-def test_strings_of_the_code_are_in_plain_words(folder: str) -> None:
+def test_strings_of_the_code_are_in_plain_words(folder):
     found = [
         fault
         for path in sorted((ROOT / folder).rglob("*.py"))
@@ -107,7 +107,7 @@ def pages() -> Iterator[Path]:
             yield from sorted((ROOT / folder).rglob(kind))
 
 
-def test_pages_are_in_plain_words() -> None:
+def test_pages_are_in_plain_words():
     found = [
         fault
         for path in pages()
@@ -116,7 +116,7 @@ def test_pages_are_in_plain_words() -> None:
     assert not found, "\n".join(found)
 
 
-def test_texts_of_web_pages_are_in_plain_words() -> None:
+def test_texts_of_web_pages_are_in_plain_words():
     paths = [path for folder in CODE for path in sorted((ROOT / folder).rglob("*.jinja"))]
     assert len(paths) > 4
     found = [
@@ -127,7 +127,7 @@ def test_texts_of_web_pages_are_in_plain_words() -> None:
     assert not found, "\n".join(found)
 
 
-def test_a_word_that_must_go_is_noticed_and_code_is_not() -> None:
+def test_a_word_that_must_go_is_noticed_and_code_is_not():
     assert [*faults(prose("one\nof the rungs"), "x")] == [
         f"x:2: 'rungs' in ...one of the rungs...: {INSTEAD['rungs?']}"
     ]

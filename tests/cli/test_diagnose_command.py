@@ -30,7 +30,7 @@ def here(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_details_are_words_then_tables(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_details_are_words_then_tables(here, capsys):
     options = ("--seed", 3, "--holdout", 0.3, "--quick", "--details", "-o", "gap.json")
     assert run("diagnose", "ur10", "gap.csv", *options) == 0
     out, err = capsys.readouterr()
@@ -56,7 +56,7 @@ def test_details_are_words_then_tables(here: Path, capsys: pytest.CaptureFixture
     assert written == "written: gap.json"
 
 
-def test_json_is_alone_and_as_agreed(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_is_alone_and_as_agreed(here, capsys):
     files = ("-o", "gap.json", "--figure", "gap.png")
     assert run("diagnose", "ur10", "gap.csv", "--quick", "--json", "-q", *files) == 0
     out, err = capsys.readouterr()
@@ -92,7 +92,7 @@ def test_json_is_alone_and_as_agreed(here: Path, capsys: pytest.CaptureFixture[s
     assert all(entry.keys() == {"effect", "needs"} for entry in content["not_testable"])
 
 
-def test_a_suspect_can_be_left_out(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_suspect_can_be_left_out(here, capsys):
     options = ("--without", "joint_compliance,link_bending", "--without", "base_flex")
     assert run("diagnose", "ur10", "gap.csv", *options, "--quick", "--json") == 0
     content = json.loads(capsys.readouterr().out)
@@ -103,7 +103,7 @@ def test_a_suspect_can_be_left_out(here: Path, capsys: pytest.CaptureFixture[str
     assert not named & set(out)
 
 
-def test_notices_go_to_stderr_unless_quiet(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_notices_go_to_stderr_unless_quiet(here, capsys):
     header, *rows = Path("gap.csv").read_text().splitlines()
     noted = [f"{header},colour", *(f"{row},red" for row in rows)]
     Path("noted.csv").write_text("\n".join(noted) + "\n")
@@ -138,9 +138,7 @@ def test_notices_go_to_stderr_unless_quiet(here: Path, capsys: pytest.CaptureFix
         (("effects", "ur10", "absent.csv"), "absent.csv"),
     ],
 )
-def test_wrong_input_is_one_line_and_exit_2(
-    arguments: tuple[str, ...], say: str, here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_input_is_one_line_and_exit_2(arguments, say, here, capsys):
     lines = Path("gap.csv").read_text().splitlines()
     cells = lines[2].split(",")
     (here / "bad.csv").write_text("\n".join([*lines[:2], ",".join(["oops", *cells[1:]])]))
@@ -155,9 +153,7 @@ def test_wrong_input_is_one_line_and_exit_2(
     assert set(here.iterdir()) == before
 
 
-def test_numbers_that_break_down_are_exit_1(
-    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_numbers_that_break_down_are_exit_1(here, capsys, monkeypatch):
     def broken(*_: object, **__: object) -> None:
         raise np.linalg.LinAlgError("Singular matrix")
 
@@ -169,9 +165,7 @@ def test_numbers_that_break_down_are_exit_1(
     assert not (here / "gap.json").exists()
 
 
-def test_a_figure_needs_matplotlib_and_says_so(
-    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_figure_needs_matplotlib_and_says_so(here, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert run("diagnose", "ur10", "gap.csv", "--figure", "gap.png") == 2
     out, err = capsys.readouterr()
@@ -180,7 +174,7 @@ def test_a_figure_needs_matplotlib_and_says_so(
     assert not (here / "gap.png").exists()
 
 
-def test_effects_reach_the_fit(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_effects_reach_the_fit(here, capsys):
     options = ("--effects", "joint_compliance:J2,backlash:J3", "--effects", "joint_compliance:J3")
     assert run("calibrate", "ur10", "gap.csv", "--objective", "sum", *options, "--json") == 0
     content = json.loads(capsys.readouterr().out)
@@ -192,7 +186,7 @@ def test_effects_reach_the_fit(here: Path, capsys: pytest.CaptureFixture[str]) -
     assert content["accuracy"]["holdout"]["rms_mm"] < plain
 
 
-def test_the_library_is_listed(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_library_is_listed(here, capsys):
     assert run("effects") == 0
     out = capsys.readouterr().out
     assert all(name in out for name in EFFECTS)
@@ -204,7 +198,7 @@ def test_the_library_is_listed(here: Path, capsys: pytest.CaptureFixture[str]) -
     assert listed["backlash"]["law"] == EFFECTS["backlash"].law
 
 
-def test_places_that_data_can_test(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_places_that_data_can_test(here, capsys):
     assert run("effects", "ur10", "gap.csv", "--json") == 0
     with_order = {e["effect"]: e for e in json.loads(capsys.readouterr().out)["effects"]}
     assert "J2" in with_order["joint_compliance"]["places"]
@@ -219,7 +213,7 @@ def test_places_that_data_can_test(here: Path, capsys: pytest.CaptureFixture[str
     assert any("a second target" in row for row in rows)
 
 
-def test_tables_of_where_show_dashes_for_what_cannot_be_told() -> None:
+def test_tables_of_where_show_dashes_for_what_cannot_be_told():
     part = {"rms_mm": 0.5, "share": 1.0, "p": None}
     where = {
         "by_target": [
@@ -243,7 +237,7 @@ def test_tables_of_where_show_dashes_for_what_cannot_be_told() -> None:
     assert trend.cells() == [["visit order", "0.50", "-"]]
 
 
-def test_what_cannot_be_tested_and_what_to_measure_next(folder: Path) -> None:
+def test_what_cannot_be_tested_and_what_to_measure_next(folder):
     from dataclasses import replace
 
     from minimax_cal.diagnosing.result import Alternative

@@ -4,7 +4,6 @@ What a fit leaves of computed points is rounding, another on each processor.  He
 """
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,7 +48,7 @@ def exact() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("off", [(), (7,)], ids=["none", "one"])
-def test_commands_take_exact_points(off: Any, tmp_path: Path, robot: mc.Robot) -> None:
+def test_commands_take_exact_points(off, tmp_path, robot):
     """Of the poses none or one is off."""
     data, rng = simulate(robot, 40, 3, seed=3, truth=EXACT).data, np.random.default_rng(0)
     y = data.y.copy()
@@ -77,7 +76,7 @@ def test_commands_take_exact_points(off: Any, tmp_path: Path, robot: mc.Robot) -
 
 
 @pytest.mark.parametrize("kind", ["wires_3", "closures"])
-def test_instruments_take_exact_rows(kind: str, tmp_path: Path) -> None:
+def test_instruments_take_exact_rows(kind, tmp_path):
     from experiments import relative
 
     arm = relative.Arm.of("irb2600", 3, 0.0)

@@ -27,7 +27,7 @@ def rtde(path: Path, seed: int) -> Path:
     return path
 
 
-def test_logs_become_the_houses_columns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_logs_become_the_houses_columns(tmp_path, capsys):
     files = [rtde(tmp_path / "a.csv", 1), rtde(tmp_path / "b.csv", 2)]
     assert run("import", *files, "-o", tmp_path / "out.csv") == 0
     said = capsys.readouterr()
@@ -42,7 +42,7 @@ def test_logs_become_the_houses_columns(tmp_path: Path, capsys: pytest.CaptureFi
         assert_allclose(again.q, one.q, atol=1e-8)
 
 
-def test_logs_in_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_logs_in_json(tmp_path, capsys):
     path = rtde(tmp_path / "a.csv", 1)
     assert run("import", path, "--json") == 0
     told = json.loads(capsys.readouterr().out)
@@ -52,7 +52,7 @@ def test_logs_in_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert told["runs"][0]["columns"][-1] == "actual_current_5"
 
 
-def test_what_is_wrong_ends_with_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_wrong_ends_with_2(tmp_path, capsys):
     path = rtde(tmp_path / "a.csv", 1)
     assert run("import", path, "--leave-out", "3") == 2
     assert "--leave-out is about measured points" in capsys.readouterr().err

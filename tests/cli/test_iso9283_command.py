@@ -4,11 +4,9 @@ import json
 import re
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from conftest import ROOT
+from conftest import ROOT, invoked
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
@@ -16,7 +14,6 @@ from minimax_cal.cli.iso9283 import iso9283_command
 from minimax_cal.cli.map import map_command
 from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting.uncertainty import Uncertainty
-from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.judging.saved import open_saved
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.modelling.simulate import Simulation
@@ -43,18 +40,8 @@ def fit(folder: Path, poses: Path) -> Path:
     return path
 
 
-def run(command: click.Command, *arguments: object) -> tuple[int, str, str]:
-    """Exit code, stdout, stderr of a command as `main` would run it."""
-    result = CliRunner().invoke(command, [str(a) for a in arguments], standalone_mode=False)
-    if isinstance(result.exception, (CalibrationError, click.ClickException)):
-        return 2, result.stdout, str(result.exception)
-    if result.exception:
-        raise result.exception
-    return int(result.return_value), result.stdout, result.stderr
-
-
 def values(*arguments: object) -> dict:  # type: ignore[type-arg]
-    code, out, _ = run(iso9283_command, *arguments, "--json")
+    code, out, _ = invoked(iso9283_command, *arguments, "--json")
     assert code == 0
     return dict(json.loads(out))
 
@@ -67,18 +54,18 @@ def without(fit: Path, folder: Path, *keys: str, **put: object) -> Path:
     return path
 
 
-def test_tables_on_stdout(fit: Path) -> None:
-    code, out, notes = run(iso9283_command, fit)
+def test_tables_on_stdout(fit):
+    code, out, notes = invoked(iso9283_command, fit)
     assert code == 0
     assert not notes
     for words in ("by the formulas of ISO 9283", "held out", "training", "before", "after",
                   "AO' mean", "|AD| mean mm", "no test by ISO 9283", "30 cycles"):  # fmt: skip
         assert words in out
     assert "every pose" not in out
-    assert "every pose" in run(iso9283_command, fit, "--poses")[1]
+    assert "every pose" in invoked(iso9283_command, fit, "--poses")[1]
 
 
-def test_held_out_stays_apart_as_in_the_fit(fit: Path) -> None:
+def test_held_out_stays_apart_as_in_the_fit(fit):
     told = json.loads(fit.read_text())["accuracy"]
     found = values(fit)["parts"]
     for part, keys in (("holdout", ("nominal", "holdout")), ("train", ("nominal_train", "train"))):
@@ -90,7 +77,7 @@ def test_held_out_stays_apart_as_in_the_fit(fit: Path) -> None:
             assert mean == pytest.approx(told[key]["mean_mm"])
 
 
-def test_the_file_of_the_fit_says_the_same(fit: Path, poses: Path, tmp_path: Path) -> None:
+def test_the_file_of_the_fit_says_the_same(fit, poses, tmp_path):
     own, named = values(fit), values(fit, poses)
     for part in ("holdout", "train"):
         assert len(own["parts"][part]["poses"]) == len(named["parts"][part]["poses"])
@@ -105,7 +92,7 @@ def test_the_file_of_the_fit_says_the_same(fit: Path, poses: Path, tmp_path: Pat
     assert any("is not the file of the fit; 48 of its 60 rows" in n for n in again["notices"])
 
 
-def test_a_nominal_arm_is_placed_where_the_fit_placed_it(fit: Path) -> None:
+def test_a_nominal_arm_is_placed_where_the_fit_placed_it(fit):
     """A robot that is named is placed as the fit placed its own."""
     told = values(fit)["parts"]["holdout"]["cells"]["before"]["AP_mm"]
     found = values(fit, "--nominal", "irb2600")
@@ -113,26 +100,24 @@ def test_a_nominal_arm_is_placed_where_the_fit_placed_it(fit: Path) -> None:
     assert found["parts"]["holdout"]["cells"]["before"]["AP_mm"] == pytest.approx(told)
 
 
-def test_new_poses_are_all_held_out(
-    fit: Path, poses: Path, tmp_path: Path, noisy: Simulation, rng: np.random.Generator
-) -> None:
+def test_new_poses_are_all_held_out(fit, poses, tmp_path, noisy, rng):
     q = np.tile(noisy.data.q[:5] + 0.02, (6, 1))
     y = noisy.cell.predict(q) + 2e-5 * rng.normal(size=(30, 3, 3))
     labels = np.tile([f"P{i}" for i in range(1, 6)], 6)
     path = tmp_path / "again.csv"
     mc.write_measurements(path, mc.measurements(q, y, pose=labels, order=np.arange(30)))
     out = tmp_path / "iso.json"
-    code, text, notes = run(iso9283_command, fit, path, "-o", out)
+    code, text, notes = invoked(iso9283_command, fit, path, "-o", out)
     assert code == 0
     assert "0 of its 30 rows" in notes
     content = json.loads(out.read_text())
     assert list(content["parts"]) == ["holdout"]
     assert [p["visits"] for p in content["parts"]["holdout"]["poses"]] == [6] * 5
     assert f"{content['parts']['holdout']['poses'][0]['RP_all_mm']:.4f}" in text
-    assert run(iso9283_command, fit, path, "-q")[2] == ""
+    assert invoked(iso9283_command, fit, path, "-q")[2] == ""
 
 
-def test_tcp_by_name_and_by_place(fit: Path) -> None:
+def test_tcp_by_name_and_by_place(fit):
     spot = json.loads(fit.read_text())["targets_mm"]["smr2"]
     named = values(fit, "--tcp", "smr2")["parts"]["holdout"]["cells"]["after"]["AP_mm"]
     there = values(fit, "--tcp", ",".join(map(str, spot)))["parts"]["holdout"]["cells"]["after"]
@@ -150,21 +135,21 @@ def test_tcp_by_name_and_by_place(fit: Path) -> None:
         (("-o", "/nowhere/iso.json"), "no such folder"),
     ],
 )
-def test_mistakes_are_one_line(fit: Path, arguments: tuple[str, ...], words: str) -> None:
-    code, out, message = run(iso9283_command, fit, *arguments)
+def test_mistakes_are_one_line(fit, arguments, words):
+    code, out, message = invoked(iso9283_command, fit, *arguments)
     assert code == 2
     assert not out
     assert words in message
     assert "\n" not in message
 
 
-def test_files_that_are_no_fit(fit: Path, folder: Path, poses: Path) -> None:
+def test_files_that_are_no_fit(fit, folder, poses):
     for path, words in (
         (poses, "is not JSON"),
         (folder / "none.json", "cannot be read"),
         (without(fit, folder, "poses"), "name the file of measurements too"),
     ):
-        code, _, message = run(iso9283_command, path)
+        code, _, message = invoked(iso9283_command, path)
         assert code == 2
         assert words in message
     bare = without(fit, folder, "poses")
@@ -172,27 +157,25 @@ def test_files_that_are_no_fit(fit: Path, folder: Path, poses: Path) -> None:
     assert list(found["parts"]) == ["train"]
     assert any("all count as training poses" in n for n in found["notices"])
     gone = without(fit, folder, "nominal_robot")
-    assert "nominal_robot" in run(iso9283_command, gone)[2]
+    assert "nominal_robot" in invoked(iso9283_command, gone)[2]
 
 
-def test_poses_that_cannot_give_back_their_errors_are_refused(fit: Path, folder: Path) -> None:
+def test_poses_that_cannot_give_back_their_errors_are_refused(fit, folder):
     stored = json.loads(fit.read_text())["poses"]
     stored["errors_mm"]["final"][3][0][0] += 0.01
-    code, _, message = run(iso9283_command, without(fit, folder, poses=stored))
+    code, _, message = invoked(iso9283_command, without(fit, folder, poses=stored))
     assert code == 2
     assert "its effects need columns of the measurements" in message
 
 
-def test_data_of_another_frame_are_doubted(fit: Path, noisy: Simulation, tmp_path: Path) -> None:
+def test_data_of_another_frame_are_doubted(fit, noisy, tmp_path):
     path = tmp_path / "moved.csv"
     mc.write_measurements(path, noisy.data.with_y(noisy.data.y + 0.5))
-    _, _, notes = run(iso9283_command, fit, path)
+    _, _, notes = invoked(iso9283_command, fit, path)
     assert "check that data and fit belong to the same robot, measurement frame" in notes
 
 
-def test_targets_that_the_fit_left_out_are_left_out(
-    fit: Path, folder: Path, poses: Path, noisy: Simulation
-) -> None:
+def test_targets_that_the_fit_left_out_are_left_out(fit, folder, poses, noisy):
     two = mc.read_measurements(poses).keep(np.array([True, True, False]))
     path = folder / "two.json"
     mc.calibrate("irb2600", two).save(path)
@@ -201,7 +184,7 @@ def test_targets_that_the_fit_left_out_are_left_out(
     assert any("smr3 left out" in n for n in found["notices"])
 
 
-def test_effects_are_part_of_what_is_commanded(folder: Path, poses: Path, robot: mc.Robot) -> None:
+def test_effects_are_part_of_what_is_commanded(folder, poses, robot):
     fitted = mc.calibrate(robot, poses, "sum", effects=["joint_compliance:all"])
     path = folder / "effects.json"
     fitted.save(path)
@@ -214,16 +197,14 @@ def test_effects_are_part_of_what_is_commanded(folder: Path, poses: Path, robot:
     assert rms == pytest.approx(fitted.accuracy["holdout"].rms_mm, rel=1e-6)
 
 
-def test_the_page_quotes_what_its_commands_print(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_page_quotes_what_its_commands_print(tmp_path, monkeypatch):
     page = (ROOT / "docs" / "iso9283.md").read_text().partition("## An example")[2]
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.S)
     exec(compile(code, "iso9283.md", "exec"), {})
     mc.calibrate("irb2600", "poses.csv").save("fit.json")
     assert "minimax-cal iso9283 fit.json revisits.csv" in page
-    _, out, _ = run(iso9283_command, "fit.json", "revisits.csv")
+    _, out, _ = invoked(iso9283_command, "fit.json", "revisits.csv")
     printed = out.split()
     quoted = [part for text in re.findall(r"```text\n(.*?)```", page, flags=re.S)
               for part in re.split(r"\n\n(?=\w)", text)]  # fmt: skip
@@ -241,14 +222,14 @@ def test_the_page_quotes_what_its_commands_print(
 # ---- map -----------------------------------------------------------------------------------------
 
 
-def test_map_draws_and_tells(fit: Path, tmp_path: Path) -> None:
+def test_map_draws_and_tells(fit, tmp_path):
     path = tmp_path / "map.png"
-    code, out, _ = run(map_command, fit, "-o", path, *FAST)
+    code, out, _ = invoked(map_command, fit, "-o", path, *FAST)
     assert code == 0
     assert path.read_bytes().startswith(b"\x89PNG")
     for words in ("beyond", "observed before, held-out poses", "95 % mm"):
         assert words in out
-    code, out, _ = run(map_command, fit, *FAST, "--json", "--height", 1000, "--slab", 300)
+    code, out, _ = invoked(map_command, fit, *FAST, "--json", "--height", 1000, "--slab", 300)
     assert code == 0
     content = json.loads(out)
     assert content["height_mm"] == 1000.0
@@ -256,9 +237,7 @@ def test_map_draws_and_tells(fit: Path, tmp_path: Path) -> None:
     assert sum(content["observed"]["held_out"]) == 12
 
 
-def test_map_predicts_by_the_covariance_in_the_file(
-    fit: Path, folder: Path, robot: mc.Robot, poses: Path
-) -> None:
+def test_map_predicts_by_the_covariance_in_the_file(fit, folder, robot, poses):
     found = mc.calibrate(robot, poses)
     names = Names(6, found.cell.target_names)
     units = tuple("m" if length else "rad" for length in names.linear)
@@ -267,7 +246,7 @@ def test_map_predicts_by_the_covariance_in_the_file(
     file = without(fit, folder, covariance=known.to_dict())
     maps = []
     for frame in ("measurement", "base"):
-        code, out, notes = run(map_command, file, *FAST, "--json", "--frame", frame)
+        code, out, notes = invoked(map_command, file, *FAST, "--json", "--frame", frame)
         assert code == 0
         assert "the predicted radius, made wider" in notes  # joints give way: not in the covariance
         maps.append(json.loads(out))
@@ -279,7 +258,7 @@ def test_map_predicts_by_the_covariance_in_the_file(
         without(fit, folder, "covariance"),
         without(fit, folder, covariance={"names": ["a9"]}),
     ):
-        code, _, notes = run(map_command, broken, *FAST)
+        code, _, notes = invoked(map_command, broken, *FAST)
         assert code == 2
         assert "covariance" in notes
 
@@ -295,9 +274,7 @@ def test_map_predicts_by_the_covariance_in_the_file(
         (("--seed", -1), "seed -1"),
     ],
 )
-def test_map_refuses_what_makes_no_sense(
-    fit: Path, arguments: tuple[object, ...], words: str
-) -> None:
-    code, _, message = run(map_command, fit, *arguments)
+def test_map_refuses_what_makes_no_sense(fit, arguments, words):
+    code, _, message = invoked(map_command, fit, *arguments)
     assert code == 2
     assert words in message

@@ -21,7 +21,7 @@ def csv(tmp_path: Path, noisy: Simulation) -> Path:
     return path
 
 
-def test_summary_on_stdout(csv: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_summary_on_stdout(csv, capsys):
     assert run("calibrate", "irb2600", csv, "--details") == 0
     out, err = capsys.readouterr()
     for words in (
@@ -34,9 +34,7 @@ def test_summary_on_stdout(csv: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert "\x1b" not in out + err  # no colour codes into a pipe
 
 
-def test_the_first_screen_is_short_and_narrow(
-    csv: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_first_screen_is_short_and_narrow(csv, capsys):
     assert run("calibrate", "irb2600", csv, "-o", csv.with_name("fit.json")) == 0
     out = capsys.readouterr().out
     lines = [line.rstrip() for line in out.splitlines()]
@@ -58,7 +56,7 @@ def test_the_first_screen_is_short_and_narrow(
     assert "--details" in out
 
 
-def test_json_alone_on_stdout(csv: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_alone_on_stdout(csv, capsys):
     assert run("calibrate", "irb2600", csv, "--objective", "sum", "--json") == 0
     content = json.loads(capsys.readouterr().out)
     assert content["schema"] == 1
@@ -68,9 +66,7 @@ def test_json_alone_on_stdout(csv: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert robot_from_dict(content["robot"]).joints == 6
 
 
-def test_output_file_figure_and_evaluate(
-    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_output_file_figure_and_evaluate(csv, tmp_path, capsys):
     fit, picture = tmp_path / "fit.json", tmp_path / "errors.svg"
     assert run("calibrate", "irb2600", csv, "-o", fit, "--figure", picture, "-q") == 0
     assert "<svg" in picture.read_text()
@@ -95,7 +91,7 @@ def test_output_file_figure_and_evaluate(
     assert "training poses" not in said.err
 
 
-def test_every_option_reaches_the_fit(csv: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_option_reaches_the_fit(csv, capsys):
     arguments = (
         "--fix",
         "a2,beta*",
@@ -132,9 +128,7 @@ def test_every_option_reaches_the_fit(csv: Path, capsys: pytest.CaptureFixture[s
     assert found["d1"]["identifiable"]
 
 
-def test_the_same_seed_gives_the_same_numbers(
-    csv: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_same_seed_gives_the_same_numbers(csv, capsys):
     results = []
     for _ in range(2):
         assert run("calibrate", "irb2600", csv, "--json") == 0
@@ -176,14 +170,7 @@ def test_the_same_seed_gives_the_same_numbers(
         (("simulate", "irb2600", "--poses", "0", "-o", "x.csv"), "at least one pose"),
     ],
 )
-def test_wrong_input_is_one_line_and_exit_2(
-    arguments: tuple[str, ...],
-    say: str,
-    csv: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_wrong_input_is_one_line_and_exit_2(arguments, say, csv, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     before = set(tmp_path.iterdir())
     code = run(*(csv if a == "CSV" else a for a in arguments))
@@ -200,9 +187,7 @@ def test_wrong_input_is_one_line_and_exit_2(
     assert set(tmp_path.iterdir()) == before  # nothing half written
 
 
-def test_numbers_that_do_not_work_out_are_exit_1(
-    csv: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_numbers_that_do_not_work_out_are_exit_1(csv, capsys, monkeypatch):
     from minimax_cal.fitting import solve
     from minimax_cal.solvers.minimax import Sqp
 
@@ -211,9 +196,7 @@ def test_numbers_that_do_not_work_out_are_exit_1(
     assert "iteration limit" in capsys.readouterr().err
 
 
-def test_simulate_backends_robots_and_help(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_simulate_backends_robots_and_help(tmp_path, capsys):
     data, truth = tmp_path / "d.csv", tmp_path / "t.json"
     assert run("simulate", "ur5e", "--poses", 30, "-o", data, "--truth", truth) == 0
     assert mc.read_measurements(data).poses == 30
@@ -228,7 +211,7 @@ def test_simulate_backends_robots_and_help(
     assert run("--version") == 0
 
 
-def test_console_script_runs(csv: Path) -> None:
+def test_console_script_runs(csv):
     command = [sys.executable, "-m", "minimax_cal.cli", "calibrate", "nothing", str(csv)]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 2
@@ -236,9 +219,7 @@ def test_console_script_runs(csv: Path) -> None:
     assert len(ended.stderr.splitlines()) == 1
 
 
-def test_evaluate_doubts_data_that_do_not_belong(
-    csv: Path, tmp_path: Path, noisy: Simulation, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_evaluate_doubts_data_that_do_not_belong(csv, tmp_path, noisy, capsys):
     fit, wrong = tmp_path / "fit.json", tmp_path / "wrong.csv"
     assert run("calibrate", "irb2600", csv, "-o", fit) == 0
     mc.write_measurements(wrong, noisy.data.with_y(noisy.data.y * 1e-3))
@@ -250,9 +231,7 @@ def test_evaluate_doubts_data_that_do_not_belong(
     assert "holds no arm" in capsys.readouterr().err
 
 
-def test_a_bootstrap_is_shown_and_saved(
-    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bootstrap_is_shown_and_saved(csv, tmp_path, capsys):
     out = tmp_path / "fit.json"
     arguments = ("calibrate", "irb2600", csv, "--objective", "sum", "--bootstrap")
     assert run(*arguments, "40", "-o", out) == 0
@@ -264,7 +243,7 @@ def test_a_bootstrap_is_shown_and_saved(
     assert "1 replicates" in capsys.readouterr().err
 
 
-def test_inputs_are_never_overwritten(csv: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_inputs_are_never_overwritten(csv, capsys):
     before = csv.read_bytes()
     for arguments in (
         ("calibrate", "irb2600", csv, "-o", csv),
@@ -279,7 +258,7 @@ def test_inputs_are_never_overwritten(csv: Path, capsys: pytest.CaptureFixture[s
     assert not Path("-").exists()
 
 
-def test_a_closed_stdout_is_told_before_the_work(csv: Path) -> None:
+def test_a_closed_stdout_is_told_before_the_work(csv):
     """What is opened next would take its place, and hold the result."""
     closed = '"$@" >&-'
     command = ["sh", "-c", closed, "sh", sys.executable, "-m", "minimax_cal.cli"]
@@ -291,9 +270,7 @@ def test_a_closed_stdout_is_told_before_the_work(csv: Path) -> None:
     assert len(ended.stderr.splitlines()) == 1
 
 
-def test_ctrl_c_during_imports_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ctrl_c_during_imports_is_one_line(monkeypatch, capsys):
     class Interrupted(ModuleType):
         def __getattr__(self, name: str) -> None:
             raise KeyboardInterrupt
@@ -304,9 +281,7 @@ def test_ctrl_c_during_imports_is_one_line(
     assert capsys.readouterr().err == "error: interrupted\n"
 
 
-def test_too_little_memory_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_too_little_memory_is_one_line(monkeypatch, capsys):
     from minimax_cal.cli import robots
 
     def greedy(**_: object) -> None:
@@ -317,9 +292,7 @@ def test_too_little_memory_is_one_line(
     assert "not enough memory" in capsys.readouterr().err
 
 
-def test_cells_that_a_spreadsheet_would_run(
-    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_cells_that_a_spreadsheet_would_run(csv, tmp_path, capsys):
     """They pass through `import` and `compensate`, which say so; --safe-cells makes them text."""
     header, *rows = csv.read_text().splitlines()
     formula = "=cmd|' /C calc'!A0"
@@ -339,9 +312,7 @@ def test_cells_that_a_spreadsheet_would_run(
         assert not any(cell.startswith("'") for row in table for cell in row[:at])  # -1.5 stays
 
 
-def test_what_a_file_holds_moves_no_cursor(
-    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_file_holds_moves_no_cursor(csv, tmp_path, capsys):
     """Terminal codes in a header, and a cell of 200,000 digits."""
     header, first, *rest = csv.read_text().splitlines()
     odd = tmp_path / "odd.csv"
@@ -357,9 +328,7 @@ def test_what_a_file_holds_moves_no_cursor(
     assert len(capsys.readouterr().err) < 1100
 
 
-def test_results_are_written_before_pictures(
-    csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_results_are_written_before_pictures(csv, tmp_path, monkeypatch):
     from minimax_cal.cli import calibrate
 
     def broken(*_: object) -> None:
@@ -371,7 +340,7 @@ def test_results_are_written_before_pictures(
     assert mc.load_fit(out).status == "converged"
 
 
-def test_calibrate_starts_without_what_it_does_not_use() -> None:
+def test_calibrate_starts_without_what_it_does_not_use():
     """And what is put off is there when it is asked for."""
     unused = (
         "numba", "numpy.f2py.crackfortran", "unittest", "yaml", "minimax_cal.evidence.selection",
@@ -389,16 +358,14 @@ def test_calibrate_starts_without_what_it_does_not_use() -> None:
     assert ended.stdout == "[]\n"
 
 
-def test_the_package_itself_is_the_command() -> None:
+def test_the_package_itself_is_the_command():
     command = [sys.executable, "-m", "minimax_cal", "--version"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.split()[0]) == (0, "minimax-cal,")
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
-def test_u95_in_another_unit_is_reported_by_both(
-    factor: float, tmp_path: Path, noisy: Simulation, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_u95_in_another_unit_is_reported_by_both(factor, tmp_path, noisy, capsys):
     """Micrometres or metres under the name of millimetres."""
     csv = tmp_path / "poses.csv"
     mc.write_measurements(csv, noisy.data)
@@ -412,9 +379,7 @@ def test_u95_in_another_unit_is_reported_by_both(
         assert "is it in mm?" in err
 
 
-def test_a_result_without_parameters_is_refused(
-    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_result_without_parameters_is_refused(csv, tmp_path, capsys):
     """`compare` would find no difference where nothing is there to differ."""
     fit, empty = tmp_path / "fit.json", tmp_path / "empty.json"
     assert run("calibrate", "irb2600", csv, "--objective", "sum", "-o", fit) == 0

@@ -31,7 +31,7 @@ def given(options: Any, *arguments: object) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kind", [Options, RelativeOptions, PlanOptions, Truth, Grid])
-def test_defaults_are_those_of_the_fields(kind: Any) -> None:
+def test_defaults_are_those_of_the_fields(kind):
     defaults = vars(kind())
     found = given(options_from(kind))
     assert found
@@ -44,7 +44,7 @@ def test_defaults_are_those_of_the_fields(kind: Any) -> None:
             )
 
 
-def test_units_arrive_in_si() -> None:
+def test_units_arrive_in_si():
     found = given(
         options_from(PlanOptions),
         *("--acceptance", 90, "--noise", 20, "--body", 80, "--range", "1:20"),
@@ -59,7 +59,7 @@ def test_units_arrive_in_si() -> None:
     assert found["spots"] == (pytest.approx((0.001, 0.002, 0.003)),)
 
 
-def test_some_fields_and_arguments_of_a_function() -> None:
+def test_some_fields_and_arguments_of_a_function():
     assert set(given(options_from(Options, "seed", "qp"))) == {"seed", "qp"}
     told = options_of(compensate, most_change=Option(unit="deg", flag="--max-change"))
     assert given(told) == {"most_change": pytest.approx(np.pi / 36.0)}

@@ -32,9 +32,7 @@ def here(robot: mc.Robot, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("result", ["fit.json", "diagnosis.json"])
 @pytest.mark.parametrize("spelling", ["outside", "beyond"])
-def test_a_requirement_outside_is_not_judged(
-    result: str, spelling: str, here: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_requirement_outside_is_not_judged(result, spelling, here, tmp_path, capsys):
     page = tmp_path / "report.html"
     told = ("report", here / result, "--tolerance", "rms 50", "-o", page, "-q")
     assert run(*told, "--tolerance-for", spelling) == 0
@@ -48,7 +46,7 @@ def test_a_requirement_outside_is_not_judged(
         assert capsys.readouterr().out.startswith("passed")
 
 
-def test_old_spellings_are_not_offered(capsys: pytest.CaptureFixture[str]) -> None:
+def test_old_spellings_are_not_offered(capsys):
     assert run("report", "--help") == 0
     told = capsys.readouterr().out
     assert "inside or outside" in " ".join(told.split())
@@ -56,9 +54,7 @@ def test_old_spellings_are_not_offered(capsys: pytest.CaptureFixture[str]) -> No
 
 
 @pytest.mark.parametrize("result", ["fit.json", "bare.json", "diagnosis.json"])
-def test_evaluate_says_which_poses_are_outside(
-    result: str, here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_evaluate_says_which_poses_are_outside(result, here, capsys):
     assert run("evaluate", here / result, here / "fresh.csv", "--json") == 0
     out, err = capsys.readouterr()
     assert json.loads(out)["outside_spans"] == {"poses": 60, "joints": FROZEN}
@@ -70,7 +66,7 @@ def test_evaluate_says_which_poses_are_outside(
     assert "outside what" not in err
 
 
-def test_a_map_predicts_nothing_outside(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_map_predicts_nothing_outside(here, capsys):
     assert run("map", here / "fit.json", "--samples", 500, "--bins", 6, "--json") == 0
     out, err = capsys.readouterr()
     found = json.loads(out)

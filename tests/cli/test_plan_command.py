@@ -3,19 +3,17 @@
 import csv
 import json
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from conftest import invoked
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.cli.compensate import read_targets
-from minimax_cal.cli.options import in_flags
 from minimax_cal.cli.plan import plan_command
-from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.planning import outlook, task
 from minimax_cal.planning import plan as module
@@ -25,14 +23,7 @@ FEW = ("--candidates", 80, "-q")
 WIDE = ("--acceptance", 180)
 
 
-def run(*arguments: object) -> tuple[int, str, str]:
-    """Exit code, stdout, stderr of the command as `main` would run it."""
-    result = CliRunner().invoke(plan_command, [str(a) for a in arguments], standalone_mode=False)
-    if isinstance(result.exception, (CalibrationError, click.ClickException)):
-        return 2, result.stdout, in_flags(str(result.exception), plan_command)
-    if result.exception:
-        raise result.exception
-    return int(result.return_value), result.stdout, result.stderr
+run = partial(invoked, plan_command)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -86,7 +77,7 @@ def rows_of(path: Path) -> tuple[list[str], list[list[str]]]:
     return header, rows
 
 
-def test_the_file_says_its_units(planned: Path) -> None:
+def test_the_file_says_its_units(planned):
     header, rows = rows_of(planned)
     assert header[:3] == ["order", "pose", "q1_deg"]
     assert header[14] == "via"
@@ -98,14 +89,14 @@ def test_the_file_says_its_units(planned: Path) -> None:
     assert all(cell == "" for row in via for cell in row[15:])  # nothing is measured there
 
 
-def test_compensate_reads_the_stops(planned: Path) -> None:
+def test_compensate_reads_the_stops(planned):
     _, rows = rows_of(planned)
     given = read_targets(planned)
     assert_allclose(np.degrees(given.data.q), np.array([row[2:8] for row in rows], dtype=float))
     assert given.data.columns["approach3"].tolist() == [float(row[10]) for row in rows]
 
 
-def test_calibrate_reads_the_stops_once_they_are_measured(planned: Path, folder: Path) -> None:
+def test_calibrate_reads_the_stops_once_they_are_measured(planned, folder):
     """What the plan expects is where the nominal arm is: measured so, nothing is left to fit."""
     header, rows = rows_of(planned)
     expected = [i for i, name in enumerate(header) if name.startswith("expected_")]
@@ -134,7 +125,7 @@ def base_of(data: mc.Measurements) -> np.ndarray:
     return base
 
 
-def test_radians_and_slides(folder: Path) -> None:
+def test_radians_and_slides(folder):
     path = folder / "scara.csv"
     code, _, _ = run("scara_600", "--poses", 8, "--unit", "rad", "--targets", 1, "-o", path, *FEW,
                      *WIDE)  # fmt: skip
@@ -149,7 +140,7 @@ def test_radians_and_slides(folder: Path) -> None:
     assert set(ANGLES) == {"deg", "rad"}
 
 
-def test_json_alone_on_stdout() -> None:
+def test_json_alone_on_stdout():
     code, out, _ = run("irb2600", "--poses", 10, "--json", "--targets", 1, "--tracker",
                        "2500,-500,800", "--criterion", "D", "--joint", "J2=-20:40", *FEW,
                        *WIDE)  # fmt: skip
@@ -168,7 +159,7 @@ def test_json_alone_on_stdout() -> None:
                           *WIDE)[1])["q"] == content["q"]  # fmt: skip
 
 
-def test_a_fit_and_its_poses(fit: Path, poses: Path) -> None:
+def test_a_fit_and_its_poses(fit, poses):
     """The file of a calibration holds its poses: they count, as they do with --data."""
     found = []
     for more in (("--fit", fit), ("--fit", fit, "--data", poses), ("--data", poses)):
@@ -183,7 +174,7 @@ def test_a_fit_and_its_poses(fit: Path, poses: Path) -> None:
     assert_allclose(noise[0], noise[1], rtol=1e-6)
 
 
-def test_separate(poses: Path) -> None:
+def test_separate(poses):
     code, out, _ = run("irb2600", "--poses", 5, "--data", poses, "--separate", "encoder_gain:J3",
                        "gear_error:J3:turns=1", "--details", *FEW, *WIDE)  # fmt: skip
     assert code == 0
@@ -222,7 +213,7 @@ def test_separate(poses: Path) -> None:
         ((), "poses"),
     ],
 )
-def test_mistakes_are_told_in_one_line(arguments: tuple[object, ...], message: str) -> None:
+def test_mistakes_are_told_in_one_line(arguments, message):
     code, out, err = run("irb2600", *arguments, *FEW)
     assert code == 2
     assert out == ""

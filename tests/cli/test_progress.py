@@ -1,9 +1,7 @@
 """Stages with count and time left; a line now and then without a terminal; files by ending."""
 
 import json
-from pathlib import Path
 
-import pytest
 from conftest import run
 
 import minimax_cal as mc
@@ -22,7 +20,7 @@ class Hands:
         return self.at
 
 
-def test_time_left_is_that_of_the_steps_so_far() -> None:
+def test_time_left_is_that_of_the_steps_so_far():
     now = Hands()
     told = Stages(now)
 
@@ -41,9 +39,7 @@ def test_time_left_is_that_of_the_steps_so_far() -> None:
     assert clock(125.4) == "2 min 5 s"
 
 
-def test_a_line_every_ten_seconds_from_the_first_second(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_line_every_ten_seconds_from_the_first_second(monkeypatch, capsys):
     now, waits = Hands(), list[float]()
     ticker = Ticker(Stages(now))
 
@@ -72,7 +68,7 @@ def test_a_line_every_ten_seconds_from_the_first_second(
     assert capsys.readouterr().err == ""
 
 
-def test_files_by_their_ending(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_by_their_ending(tmp_path, capsys):
     mc.write_measurements(tmp_path / "poses.csv", mc.simulate("irb120", 30, 2, seed=1).data)
     command = ("calibrate", "irb120", tmp_path / "poses.csv", "--objective", "sum")
     assert run(*command, "-o", tmp_path / "errors.svg") == 0
@@ -100,7 +96,7 @@ def test_files_by_their_ending(tmp_path: Path, capsys: pytest.CaptureFixture[str
         assert (tmp_path / name).read_text().startswith(start)
 
 
-def test_help_lists_options_in_parts(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_lists_options_in_parts(capsys):
     assert run("calibrate", "--help") == 0
     out = capsys.readouterr().out
     titles = ("What is fitted:", "How it is solved:", "What is held out:",
@@ -110,7 +106,7 @@ def test_help_lists_options_in_parts(capsys: pytest.CaptureFixture[str]) -> None
     assert out.index("--cv") > out.index("What is held out:")
 
 
-def test_events_are_lines_of_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_events_are_lines_of_json(tmp_path, capsys):
     """Every line of stderr is one, in whatever order options stand; the next command is silent."""
     mc.write_measurements(tmp_path / "poses.csv", mc.simulate("irb120", 30, 2, seed=1).data)
     command = ("calibrate", "irb120", tmp_path / "poses.csv", "--objective", "sum", "-o",

@@ -5,20 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import run
 
 import minimax_cal as mc
 from experiments.relative import SIMULATORS, Arm
-from minimax_cal.cli import main
 from minimax_cal.instruments import write_relative
 from minimax_cal.robots.robot import robot_from_dict
 from minimax_cal.robots.sampling import random_poses
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(a) for a in arguments])
-    code = ended.value.code
-    return code if isinstance(code, int) else 0
 
 
 @pytest.fixture(scope="module")
@@ -51,13 +44,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         ("poses", ["position of the flange", "tool_rz", "RMS mrad", "30 of 42"], "a radian counts"),
     ],
 )
-def test_tables_on_stdout_and_notices_on_stderr(
-    kind: str,
-    words: list[str],
-    said: str,
-    files: dict[str, Path],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_tables_on_stdout_and_notices_on_stderr(kind, words, said, files, capsys):
     assert run("relative", "irb2600", files[kind], "--details") == 0
     out, err = capsys.readouterr()
     text = " ".join(out.split())
@@ -70,9 +57,7 @@ def test_tables_on_stdout_and_notices_on_stderr(
 
 
 @pytest.mark.parametrize("kind", ["wires_3", "closures_known", "poses"])
-def test_json_alone_on_stdout_and_the_same_in_the_file(
-    kind: str, files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_alone_on_stdout_and_the_same_in_the_file(kind, files, tmp_path, capsys):
     path = tmp_path / "fit.json"
     assert run("relative", "irb2600", files[kind], "--json", "-o", path) == 0
     text = capsys.readouterr().out
@@ -95,7 +80,7 @@ def test_json_alone_on_stdout_and_the_same_in_the_file(
     assert run("export", path, "--to", "dh-csv") == 0
 
 
-def test_options_reach_the_fit(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_reach_the_fit(files, capsys):
     more = ("--holdout", 0.3, "--seed", 7, "--fix", "a2,beta*", "--free", "d1", "--json", "-q")
     assert run("relative", "irb2600", files["wires_3"], "--offset", *more) == 0
     content = json.loads(capsys.readouterr().out)
@@ -145,12 +130,7 @@ def test_options_reach_the_fit(files: dict[str, Path], capsys: pytest.CaptureFix
         (("irb2600", "wires_3", "-o", "no/such/folder/fit.json"), "there is no such folder"),
     ],
 )
-def test_a_mistake_is_one_line_and_exit_code_2(
-    arguments: tuple[str, ...],
-    say: str,
-    files: dict[str, Path],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_mistake_is_one_line_and_exit_code_2(arguments, say, files, capsys):
     assert run("relative", *(files.get(a, a) for a in arguments)) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -171,15 +151,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(
         ("poses", "flange_ry_rad", "", ":4: some of the flange's columns are empty"),
     ],
 )
-def test_a_bad_cell_is_named_by_line_and_column(
-    kind: str,
-    column: str,
-    cell: str,
-    say: str,
-    files: dict[str, Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_bad_cell_is_named_by_line_and_column(kind, column, cell, say, files, tmp_path, capsys):
     lines = files[kind].read_text().splitlines()
     cells = lines[3].split(",")
     cells[lines[0].split(",").index(column)] = cell
@@ -189,9 +161,7 @@ def test_a_bad_cell_is_named_by_line_and_column(
     assert capsys.readouterr().err.startswith(f"error: {path}{say}")
 
 
-def test_numbers_that_do_not_work_out_are_exit_code_1(
-    files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_numbers_that_do_not_work_out_are_exit_code_1(files, tmp_path, capsys):
     # lengths under the joint values of other poses: no geometry explains them
     header, *lines = files["wires_3"].read_text().splitlines()[:41]
     cells = [line.split(",") for line in lines]
@@ -207,9 +177,7 @@ def test_numbers_that_do_not_work_out_are_exit_code_1(
     assert not (tmp_path / "fit.json").exists()
 
 
-def test_a_diagnosis_of_two_files_is_reported(
-    files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_diagnosis_of_two_files_is_reported(files, tmp_path, capsys):
     result, page = tmp_path / "relative.json", tmp_path / "relative.html"
     given = ("relative", "irb2600", files["wires_3"], files["tracker"], "--diagnose")
     assert run(*given, "-o", result, "--quiet") == 0
@@ -224,6 +192,6 @@ def test_a_diagnosis_of_two_files_is_reported(
     assert run("export", result, "--to", "dh-csv", "-o", tmp_path / "arm.csv", "--quiet") == 0
 
 
-def test_without_needs_diagnose(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_needs_diagnose(files, capsys):
     assert run("relative", "irb2600", files["wires_3"], "--without", "backlash") == 2
     assert "--without is of --diagnose" in capsys.readouterr().err

@@ -42,9 +42,7 @@ RESULTS = ("fit.json", "diagnosis.json", "relative.json")
 
 
 @pytest.mark.parametrize("result", RESULTS)
-def test_every_command_takes_every_result(
-    result: str, here: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_command_takes_every_result(result, here, tmp_path, capsys):
     source, data = here / result, here / "gap.csv"
     for command in (
         ("evaluate", source, data, "--json"),
@@ -61,9 +59,7 @@ def test_every_command_takes_every_result(
     assert (tmp_path / "report.html").read_text().count("<table") > 3
 
 
-def test_rungs_are_those_of_the_ladder(
-    here: Path, found: mc.Diagnosis, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rungs_are_those_of_the_ladder(here, found, capsys):
     held = found.data.take(found.held)
     assert len(found.ladder) == len(found.rungs()) >= 3
     for number, step in enumerate(found.ladder):
@@ -81,7 +77,7 @@ def test_rungs_are_those_of_the_ladder(
     assert "has no step 9; it has 0 (nominal), 1 (geometric)" in capsys.readouterr().err
 
 
-def test_a_relative_calibration_is_placed_by_the_data(here: Path) -> None:
+def test_a_relative_calibration_is_placed_by_the_data(here):
     data = mc.read_measurements(here / "gap.csv")
     known = open_result(here / "relative.json")
     cell, before, said = known.placed_by(data)
@@ -94,7 +90,7 @@ def test_a_relative_calibration_is_placed_by_the_data(here: Path) -> None:
     )
 
 
-def test_a_diagnosis_tells_a_fit_its_effects(here: Path, found: mc.Diagnosis) -> None:
+def test_a_diagnosis_tells_a_fit_its_effects(here, found):
     path, data = here / "diagnosis.json", here / "gap.csv"
     told = (path, str(path), found)
     fits = [mc.calibrate("ur10", data, "sum", effects=source) for source in told]

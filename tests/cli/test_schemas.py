@@ -29,20 +29,20 @@ def faults(kind: str, content: Any) -> list[str]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_each_is_a_schema(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_is_a_schema(kind, capsys):
     assert run("robots", "--schema", kind) == 0
     printed = json.loads(capsys.readouterr().out)
     jsonschema.Draft202012Validator.check_schema(printed)
     assert printed == schema_of(kind)
 
 
-def test_a_robot_file_is_meant_unless_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_robot_file_is_meant_unless_told(capsys):
     assert run("robots", "--schema") == 0
     assert json.loads(capsys.readouterr().out) == schema_of("robot")
 
 
 @pytest.mark.parametrize("name", mc.builtin_robots())
-def test_robots_as_they_are_written(name: str) -> None:
+def test_robots_as_they_are_written(name):
     file = resources.files("minimax_cal.robots") / "builtin" / f"{name}.json"
     for content in (json.loads(file.read_text("utf-8")), mc.load_robot(name).to_dict()):
         assert not faults("robot", content)
@@ -59,7 +59,7 @@ def places(content: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]
 
 
 @pytest.mark.parametrize("path", list(places(WHOLE)), ids=lambda path: ".".join(map(str, path)))
-def test_every_key_misspelt_is_refused(path: tuple[Any, ...]) -> None:
+def test_every_key_misspelt_is_refused(path):
     """With the nearest known one; today's spelling is ignored tomorrow otherwise."""
     *inner, key = path
     rng = np.random.default_rng(0)
@@ -76,7 +76,7 @@ def test_every_key_misspelt_is_refused(path: tuple[Any, ...]) -> None:
         assert f"unknown key {slip!r}" in str(error.value)
 
 
-def test_notes_are_free_and_nothing_else() -> None:
+def test_notes_are_free_and_nothing_else():
     notes = {"x_cell": 7, "source": "data sheet", "source_of_nominal": "drawing", "notes": ["a"]}
     assert not faults("robot", WHOLE | notes)
     assert robot_from_dict(WHOLE | notes).name == "arm"

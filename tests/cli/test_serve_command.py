@@ -2,19 +2,13 @@
 
 import socket
 import sys
-from pathlib import Path
 
 import pytest
 from conftest import run
 
 
 @pytest.mark.parametrize("missing", ["uvicorn", "starlette", "plotly.offline"])
-def test_a_missing_extra_is_named(
-    missing: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_missing_extra_is_named(missing, tmp_path, monkeypatch, capsys):
     pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[app]")
     monkeypatch.setitem(sys.modules, missing, None)
     assert run("serve", "--no-browser", "--folder", tmp_path / "sessions") == 2
@@ -24,7 +18,7 @@ def test_a_missing_extra_is_named(
     assert not (tmp_path / "sessions").exists()
 
 
-def test_a_port_that_is_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_port_that_is_taken(tmp_path, capsys):
     pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[app]")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -33,7 +27,7 @@ def test_a_port_that_is_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert line.startswith(f"error: --port {port}: cannot be had")
 
 
-def test_a_folder_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_that_cannot_be(tmp_path, capsys):
     pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[app]")
     (tmp_path / "file").write_text("x")
     assert run("serve", "--no-browser", "--folder", tmp_path / "file" / "sessions") == 2

@@ -2,12 +2,12 @@ import csv
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from conftest import invoked
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -64,7 +64,7 @@ def cell_of(robot: mc.Robot, effects: Fitted = NOTHING) -> mc.Cell:
     return mc.Cell(robot, np.eye(4), ("smr1", "smr2", "smr3"), spots, effects)
 
 
-def test_joints_that_count_the_other_way(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_joints_that_count_the_other_way(robot, rng):
     """The same arm with other joint signs: the same corrections, with these signs."""
     sign = np.array([1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
     wrong = off(robot, rng)
@@ -95,7 +95,7 @@ def apart(one: Array, other: Array) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_true_robot_comes_to_the_nominal_targets(robot: mc.Robot, seed: int) -> None:
+def test_the_true_robot_comes_to_the_nominal_targets(robot, seed):
     sim = simulate(robot, 100, 3, seed=seed)
     fit = mc.calibrate(robot, sim.data, effects=["joint_compliance:all"])
     q = regular(robot, random_poses(robot, 400, np.random.default_rng(seed + 10)))
@@ -110,9 +110,7 @@ def test_the_true_robot_comes_to_the_nominal_targets(robot: mc.Robot, seed: int)
 
 
 @pytest.mark.parametrize("frame", ["flange", "own"])
-def test_frames_lay_the_flange_where_they_say(
-    robot: mc.Robot, sim: Simulation, fit: mc.Fit, frame: str
-) -> None:
+def test_frames_lay_the_flange_where_they_say(robot, sim, fit, frame):
     q = regular(robot, random_poses(robot, 100, np.random.default_rng(3)))
     found = compensate(fit, q, frame=frame)
     assert not found.failed.any()
@@ -122,7 +120,7 @@ def test_frames_lay_the_flange_where_they_say(
     assert 1e3 * after.max() < 3.0 * fit.accuracy["holdout"].rms_mm
 
 
-def test_an_arm_as_drawn_is_left_alone(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_an_arm_as_drawn_is_left_alone(robot, rng):
     q = random_poses(robot, 50, rng)
     for frame in FRAMES:
         found = compensate(cell_of(robot), q, robot, frame=frame)
@@ -130,7 +128,7 @@ def test_an_arm_as_drawn_is_left_alone(robot: mc.Robot, rng: np.random.Generator
         assert set(found.outcome) == {Outcome.REACHED}
 
 
-def test_position_and_orientation_are_met(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_position_and_orientation_are_met(robot, rng):
     real = off(robot, rng)
     q = regular(robot, random_poses(robot, 100, rng))
     found = compensate(cell_of(real), q, robot, frame="own")
@@ -141,7 +139,7 @@ def test_position_and_orientation_are_met(robot: mc.Robot, rng: np.random.Genera
 
 
 @pytest.mark.parametrize("name", ["irb2600", "scara_600"])
-def test_slope_is_the_derivative_of_what_is_missing(name: str, rng: np.random.Generator) -> None:
+def test_slope_is_the_derivative_of_what_is_missing(name, rng):
     robot = mc.load_robot(name)
     q = random_poses(robot, 5, rng)
     data = path_of(q, robot, 0.0)
@@ -154,7 +152,7 @@ def test_slope_is_the_derivative_of_what_is_missing(name: str, rng: np.random.Ge
         assert_allclose((behind - ahead) / 2e-6, jacobian[:, :, j], rtol=0, atol=1e-8)
 
 
-def test_limits_hold_and_are_reported(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_limits_hold_and_are_reported(robot, rng):
     real = robot.with_mdh(robot.mdh + np.array([0, 0, -0.01, 0, 0]) * np.eye(6)[:, [2]])
     q = np.array([[0.3, 0.2, 1.3085, 0.4, 0.8, 0.1], [0.3, 0.2, 0.5, 0.4, 0.8, 0.1]])
     found = compensate(cell_of(real), q, robot, frame="own")
@@ -174,7 +172,7 @@ def test_limits_hold_and_are_reported(robot: mc.Robot, rng: np.random.Generator)
     assert "limit at line 1" in found.complaint()
 
 
-def test_a_stretched_arm_that_is_too_short_gets_as_near_as_it_can(robot: mc.Robot) -> None:
+def test_a_stretched_arm_that_is_too_short_gets_as_near_as_it_can(robot):
     real = robot.with_mdh(robot.mdh - np.array([0, 2e-3, 0, 0, 0]) * np.eye(6)[:, [3]])
     elbow = -np.arctan2(938.0, 150.0)  # forearm in line with the upper arm
     found = compensate(cell_of(real), [[0.2, 0.3, elbow, 0.0, 0.7, 0.0]], robot, frame="own")
@@ -187,7 +185,7 @@ def test_a_stretched_arm_that_is_too_short_gets_as_near_as_it_can(robot: mc.Robo
     assert_allclose(both.q[0], found.q[0], rtol=0, atol=1e-9)
 
 
-def test_a_straight_wrist_is_not_swung_about(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_a_straight_wrist_is_not_swung_about(robot, rng):
     q = random_poses(robot, 30, rng)
     q[:, 4] = 0.0
     found = compensate(cell_of(off(robot, rng)), q, robot, frame="own")
@@ -200,7 +198,7 @@ def test_a_straight_wrist_is_not_swung_about(robot: mc.Robot, rng: np.random.Gen
     assert np.all(np.hypot(found.distance, 0.1 * found.angle) < 1.1 * before)
 
 
-def test_scara_corrects_what_four_joints_can(rng: np.random.Generator) -> None:
+def test_scara_corrects_what_four_joints_can(rng):
     robot = mc.load_robot("scara_600")
     real = off(robot, rng)
     q = rng.uniform([-1.5, 0.6, 0.03, -2.0], [1.5, 2.0, 0.17, 2.0], (40, 4))
@@ -216,7 +214,7 @@ def test_scara_corrects_what_four_joints_can(rng: np.random.Generator) -> None:
     assert compensate(cell_of(raised), edge, robot, frame="own").outcome == (Outcome.LIMIT,)
 
 
-def test_a_redundant_arm_changes_least(rng: np.random.Generator) -> None:
+def test_a_redundant_arm_changes_least(rng):
     bend = np.pi / 2 * np.array([-1, 1, -1, 1, -1, 1, 0])
     mdh = np.stack([np.zeros(7), [0.34, 0, 0.4, 0, 0.4, 0, 0.126], np.zeros(7), bend,
                     np.zeros(7)], axis=1)  # fmt: skip
@@ -250,9 +248,7 @@ def effect(name: str, place: str, value: list[float], **choice: float) -> Fitted
     ],
     ids=lambda e: e.terms[0].label,
 )
-def test_every_kind_of_effect_is_corrected(
-    robot: mc.Robot, rng: np.random.Generator, effects: Fitted
-) -> None:
+def test_every_kind_of_effect_is_corrected(robot, rng, effects):
     q = regular(robot, random_poses(robot, 60, rng))
     columns = {"temperature": np.full(len(q), 32.0), "payload": np.full(len(q), 12.0)}
     data = replace(path_of(q, robot, 0.0), columns=columns).in_visit_order()
@@ -267,7 +263,7 @@ def test_every_kind_of_effect_is_corrected(
     assert np.abs(cell.follow(replace(data, q=plain.q)) - goal).max() > 1e-5
 
 
-def test_what_moves_only_reflectors_is_left_out(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_what_moves_only_reflectors_is_left_out(robot, rng):
     q = regular(robot, random_poses(robot, 20, rng))
     cell = cell_of(robot, effect("target_offset", "all", [1e-3]))
     found = compensate(cell, q, robot)
@@ -275,7 +271,7 @@ def test_what_moves_only_reflectors_is_left_out(robot: mc.Robot, rng: np.random.
     assert any("target offset" in notice for notice in found.notices)
 
 
-def test_play_that_pulls_both_ways_is_told(robot: mc.Robot) -> None:
+def test_play_that_pulls_both_ways_is_told(robot):
     """A joint is to turn back by less than its play: no side is the one it comes from."""
     q = np.repeat([[0.3, 0.2, -0.4, 0.4, 0.8, 0.1]], 3, axis=0)
     q[:, 0] += [0.0, 0.1, 0.2]
@@ -292,13 +288,13 @@ def test_play_that_pulls_both_ways_is_told(robot: mc.Robot) -> None:
     assert_allclose(again.q[:, 4] - q[:, 4], -5e-4, rtol=0, atol=1e-9)
 
 
-def test_two_thousand_targets(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_two_thousand_targets(robot, rng):
     q = random_poses(robot, 2000, rng)
     found = compensate(cell_of(off(robot, rng)), q, robot, frame="own")
     assert found.failed.mean() < 0.05
 
 
-def test_motion_is_rigid_and_the_least(rng: np.random.Generator) -> None:
+def test_motion_is_rigid_and_the_least(rng):
     spots = rng.normal(size=(4, 3))
     turn, shift = Rotation.from_rotvec([0.3, -0.2, 0.4]).as_matrix(), np.array([1.0, 2.0, 3.0])
     found = motion(spots, spots @ turn.T + shift)
@@ -308,7 +304,7 @@ def test_motion_is_rigid_and_the_least(rng: np.random.Generator) -> None:
     assert_allclose(alone, np.block([[np.eye(3), shift[:, None]], [np.zeros(3), 1.0]]), atol=1e-15)
 
 
-def test_the_saved_fit_gives_the_same(robot: mc.Robot, fit: mc.Fit, saved: Path) -> None:
+def test_the_saved_fit_gives_the_same(robot, fit, saved):
     q = regular(robot, random_poses(robot, 50, np.random.default_rng(8)))
     for frame in FRAMES:
         here, there = compensate(fit, q, frame=frame), compensate(saved, q, frame=frame)
@@ -321,7 +317,7 @@ def test_the_saved_fit_gives_the_same(robot: mc.Robot, fit: mc.Fit, saved: Path)
     assert np.abs(bare.q - given.q).max() < 5e-3
 
 
-def test_wrong_input_is_told(robot: mc.Robot, fit: mc.Fit) -> None:
+def test_wrong_input_is_told(robot, fit):
     q = np.zeros((1, 6))
     for wrong in (
         lambda: compensate(fit, q, frame="moon"),
@@ -340,7 +336,7 @@ def test_wrong_input_is_told(robot: mc.Robot, fit: mc.Fit) -> None:
             wrong()
 
 
-def test_tables_hold_what_a_hand_reckons() -> None:
+def test_tables_hold_what_a_hand_reckons():
     """Two targets of two joints, a turn and a slide; of nine missed ones eight are named."""
     found = Compensation(
         q=np.array([[0.101, 0.2], [0.3, 0.398]]),
@@ -391,7 +387,7 @@ def test_tables_hold_what_a_hand_reckons() -> None:
         assert says in many.complaint()
 
 
-def test_the_arm_is_seen_by_four_points_about_its_targets(robot: mc.Robot) -> None:
+def test_the_arm_is_seen_by_four_points_about_its_targets(robot):
     cell = cell_of(robot)
     arm = arm_of(cell)
     assert len(arm.target_names) == len(arm.target_positions) == 4
@@ -402,9 +398,7 @@ def test_the_arm_is_seen_by_four_points_about_its_targets(robot: mc.Robot) -> No
     assert_allclose(apart[~np.eye(4, dtype=bool)], 0.2 * np.sqrt(2.0), rtol=1e-14)
 
 
-def test_the_start_of_the_session_and_20_degrees_are_taken(
-    robot: mc.Robot, rng: np.random.Generator
-) -> None:
+def test_the_start_of_the_session_and_20_degrees_are_taken(robot, rng):
     q = regular(robot, random_poses(robot, 20, rng))[:2]
     warming = cell_of(robot, effect("thermal_growth", "all", [3e-4], constant=0.5, apart=0.0))
     first = compensate(warming, q, robot, frame="own")
@@ -421,9 +415,7 @@ def test_the_start_of_the_session_and_20_degrees_are_taken(
 
 
 @pytest.mark.parametrize(("part", "told"), [(6, False), (7, True), (3, True), (4, False)])
-def test_a_compliance_of_measured_torques_asks_for_them(
-    part: int, told: bool, robot: mc.Robot, rng: np.random.Generator
-) -> None:
+def test_a_compliance_of_measured_torques_asks_for_them(part, told, robot, rng):
     cell = cell_of(robot, effect("joint_compliance", "J2", [2e-6], parts=2.0**part))
     found = compensate(cell, regular(robot, random_poses(robot, 20, rng))[:1], robot, frame="own")
     assert any("fitted to measured torques" in notice for notice in found.notices) == told
@@ -434,22 +426,11 @@ def write(path: Path, header: str, *rows: str) -> Path:
     return path
 
 
-def run(*arguments: object) -> tuple[int, str, str]:
-    """Exit code, stdout, stderr of the command as `main` would run it."""
-    result = CliRunner().invoke(
-        compensate_command, [str(a) for a in arguments], standalone_mode=False
-    )
-    if isinstance(result.exception, (mc.CalibrationError, click.ClickException)):
-        return 2, result.stdout, str(result.exception)
-    if result.exception:
-        raise result.exception
-    return int(result.return_value), result.stdout, result.stderr
-
-
+run = partial(invoked, compensate_command)
 DEGREES = "name,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,payload_kg,speed"
 
 
-def test_command_keeps_the_file_and_corrects_the_joints(saved: Path, tmp_path: Path) -> None:
+def test_command_keeps_the_file_and_corrects_the_joints(saved, tmp_path):
     rows = ["pick,10,20,-15,30,40,50,0,v100", "place,-40,5,10,-60,55,0,5,v50"]
     targets = write(tmp_path / "targets.csv", DEGREES, *rows)
     out = tmp_path / "out.csv"
@@ -479,7 +460,7 @@ def test_command_keeps_the_file_and_corrects_the_joints(saved: Path, tmp_path: P
     assert run(saved, out)[0] == 2  # corrected already
 
 
-def test_targets_in_german_come_back_under_their_names(saved: Path, tmp_path: Path) -> None:
+def test_targets_in_german_come_back_under_their_names(saved, tmp_path):
     head = "Name;" + ";".join(f"Achse {i} [°]" for i in range(1, 7)) + ";Werkzeug"
     german, out = tmp_path / "Ziele.csv", tmp_path / "out.csv"
     german.write_bytes(f"{head}\r\nGreifpunkt ä;10;20,5;-15;30;40;50;A\r\n".encode("cp1252"))
@@ -490,7 +471,7 @@ def test_targets_in_german_come_back_under_their_names(saved: Path, tmp_path: Pa
         assert next(csv.reader(stream)) == [*head.split(";"), *ADDED]
 
 
-def test_command_says_which_targets_are_missed(saved: Path, tmp_path: Path) -> None:
+def test_command_says_which_targets_are_missed(saved, tmp_path):
     header = ",".join(f"q{i}_rad" for i in range(1, 7))
     far = write(tmp_path / "far.csv", header, "0.1,0.2,0.3,0.4,0.8,0", "0.1,0.2,0.3,0.4,0,0")
     out = tmp_path / "out.csv"
@@ -518,13 +499,13 @@ def test_command_says_which_targets_are_missed(saved: Path, tmp_path: Path) -> N
         ("Achse 1,Achse 2", "0,0", "Achse 1 has no unit: write Achse 1 [deg], or [rad]"),
     ],
 )
-def test_command_tells_slips(saved: Path, tmp_path: Path, header: str, row: str, word: str) -> None:
+def test_command_tells_slips(saved, tmp_path, header, row, word):
     code, _, said = run(saved, write(tmp_path / "t.csv", header, row))
     assert code == 2
     assert word in said
 
 
-def test_command_tells_wrong_files(saved: Path, tmp_path: Path) -> None:
+def test_command_tells_wrong_files(saved, tmp_path):
     targets = write(tmp_path / "t.csv", DEGREES, "a,1,2,3,4,50,6,0,v")
     assert run(saved, tmp_path / "none.csv")[0] == 2
     assert run(targets, targets)[0] == 2
@@ -536,11 +517,11 @@ def test_command_tells_wrong_files(saved: Path, tmp_path: Path) -> None:
     alone.write_text(json.dumps(mc.load_fit(saved).cell.whole()))
     code, _, said = run(alone, targets)
     assert code == 2
-    assert f"{alone}: does not tell its nominal robot; give nominal=" in said
+    assert f"{alone}: does not tell its nominal robot; give --robot" in said
     assert run(alone, targets, "--robot", "irb2600", "-q")[0] == 0
 
 
-def test_command_through_main_where_it_is_registered(saved: Path, tmp_path: Path) -> None:
+def test_command_through_main_where_it_is_registered(saved, tmp_path):
     from minimax_cal.cli.running import cli
 
     if "compensate" not in cli.commands:

@@ -75,11 +75,11 @@ def check_files(split: Split, folder: Path) -> None:
     assert rms < 0.97 * alone  # what the geometry of the joint fit would have done
 
 
-def test_files_of_simulated_arms(simulated: Split, tmp_path: Path) -> None:
+def test_files_of_simulated_arms(simulated, tmp_path):
     check_files(simulated, tmp_path)
 
 
-def test_files_of_real_arms(real: Split, tmp_path: Path) -> None:
+def test_files_of_real_arms(real, tmp_path):
     check_files(real, tmp_path)
 
 
@@ -111,7 +111,7 @@ CARRIED = {
 
 
 @pytest.mark.parametrize("to", DELIVERABLES)
-def test_each_says_what_it_carries(to: str, soft: mc.Fit) -> None:
+def test_each_says_what_it_carries(to, soft):
     """Drift and growth by the session's clock belong to none."""
     found = mc.deliver(soft, to)
     every = {term.label for term in soft.cell.effects.terms}
@@ -124,7 +124,7 @@ def test_each_says_what_it_carries(to: str, soft: mc.Fit) -> None:
     }  # fmt: skip
 
 
-def test_it_is_the_fit_of_exactly_that(soft: mc.Fit) -> None:
+def test_it_is_the_fit_of_exactly_that(soft):
     """The same poses, split and options: what `calibrate` finds with those effects."""
     for to, options in (
         ("json", {}),
@@ -141,7 +141,7 @@ def test_it_is_the_fit_of_exactly_that(soft: mc.Fit) -> None:
         assert found.whole.rms == soft.within.after.rms_mm
 
 
-def test_priors_fixed_names_and_the_objective_stay() -> None:
+def test_priors_fixed_names_and_the_objective_stay():
     made = simulate("ur10", 60, 3, seed=6, truth=Truth(compliance=2e-6))
     asked: dict[str, Any] = {"objective": "minimax", "fix": "beta*", "priors": {"a*": "0.1mm"}}
     plain = mc.calibrate("ur10", made.data, **asked)
@@ -151,7 +151,7 @@ def test_priors_fixed_names_and_the_objective_stay() -> None:
     assert mc.deliver(joint, "urdf").figures.rms == pytest.approx(plain.within.after.rms_mm)
 
 
-def test_what_carries_all_is_written_as_it_is() -> None:
+def test_what_carries_all_is_written_as_it_is():
     robot = weighed("irb120")
     data = simulate(robot, 60, 3, seed=2, truth=Truth(compliance=2e-6)).data
     joint = mc.calibrate(robot, data, "sum", effects=EFFECTS)
@@ -168,7 +168,7 @@ def test_what_carries_all_is_written_as_it_is() -> None:
     assert content == plain.to_dict()["robot"]
 
 
-def test_a_file_delivers_what_the_fit_does(soft: mc.Fit, tmp_path: Path) -> None:
+def test_a_file_delivers_what_the_fit_does(soft, tmp_path):
     """The digits of geometry alone are those of `robot` in the file of the result."""
     soft.save(tmp_path / "fit.json")
     for to in ("json", "compensate", "ros2-control"):
@@ -180,7 +180,7 @@ def test_a_file_delivers_what_the_fit_does(soft: mc.Fit, tmp_path: Path) -> None
     assert written == json.loads((tmp_path / "fit.json").read_text())["robot"]
 
 
-def test_a_result_without_measurements_goes_out_as_it_is(soft: mc.Fit, tmp_path: Path) -> None:
+def test_a_result_without_measurements_goes_out_as_it_is(soft, tmp_path):
     soft.save(tmp_path / "fit.json", poses=False)
     found = exported(tmp_path / "fit.json", "urdf")
     assert found.delivered
@@ -194,7 +194,7 @@ def test_a_result_without_measurements_goes_out_as_it_is(soft: mc.Fit, tmp_path:
     assert exported("irb120", "json").to_dict()["delivered"]["holdout_rms_mm"] is None
 
 
-def test_a_fit_after_a_check_is_not_made_again(soft: mc.Fit) -> None:
+def test_a_fit_after_a_check_is_not_made_again(soft):
     """Its few poses tell what moved, and not the links: what moved goes into both geometries."""
     rng = np.random.default_rng(0)
     moved = soft.cell.robot.mdh.copy()
@@ -218,7 +218,7 @@ def gap() -> mc.Diagnosis:
     return mc.diagnose("irb120", made.data, quick=True, seed=3)
 
 
-def test_a_diagnosis_delivers_its_confirmed_effects(gap: mc.Diagnosis, tmp_path: Path) -> None:
+def test_a_diagnosis_delivers_its_confirmed_effects(gap, tmp_path):
     firm = {f.term.label for f in gap.effects if f.established}
     assert firm
     gap.save(tmp_path / "gap.json")
@@ -237,7 +237,7 @@ def test_a_diagnosis_delivers_its_confirmed_effects(gap: mc.Diagnosis, tmp_path:
 # ---- corrected targets -------------------------------------------------------------------------
 
 
-def test_corrected_targets_say_what_to_expect_on_the_arm(soft: mc.Fit) -> None:
+def test_corrected_targets_say_what_to_expect_on_the_arm(soft):
     """The figures of what joints can correct, fitted for exactly that; never the model's own 0."""
     own, q = mc.deliver(soft, "compensate"), soft.data.q[:3]
     found = mc.compensate(soft, q)
@@ -257,7 +257,7 @@ def test_corrected_targets_say_what_to_expect_on_the_arm(soft: mc.Fit) -> None:
 # ---- by command --------------------------------------------------------------------------------
 
 
-def test_the_command_tells_figures_and_json(soft: mc.Fit, tmp_path: Path) -> None:
+def test_the_command_tells_figures_and_json(soft, tmp_path):
     soft.save(tmp_path / "fit.json")
 
     def told(*more: object) -> Any:
@@ -278,16 +278,14 @@ def test_the_command_tells_figures_and_json(soft: mc.Fit, tmp_path: Path) -> Non
     assert "delivered" not in told("--to", "json").stdout
 
 
-def test_an_unknown_format_is_one_line(soft: mc.Fit) -> None:
+def test_an_unknown_format_is_one_line(soft):
     with pytest.raises(mc.OptionError, match="no such format; choose one of urdf"):
         mc.deliver(soft, "step")
     assert set(EXPORTERS) < set(DELIVERABLES)
     assert isinstance(mc.deliver(soft, "json"), Delivered)
 
 
-def test_a_refit_that_is_no_better_than_the_drawing_is_not_delivered_unasked(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_refit_that_is_no_better_than_the_drawing_is_not_delivered_unasked(monkeypatch):
     """The joint fit helps; what the file can hold of it does not."""
     made = simulate(mc.load_robot("ur10"), 40, 3, seed=3, truth=Truth(compliance=3e-6))
     joint = mc.calibrate("ur10", made.data, "sum", effects=EFFECTS)
@@ -321,7 +319,7 @@ def with_torques(robot: mc.Robot, own: str) -> Measurements:
 
 
 @pytest.mark.parametrize("own", ["bias", "friction", "noise"])
-def test_what_was_fitted_to_measured_torques_is_fitted_to_those_of_gravity(own: str) -> None:
+def test_what_was_fitted_to_measured_torques_is_fitted_to_those_of_gravity(own):
     """No torque is measured where a file is used: its figure is what it reaches without."""
     robot = mc.load_robot("irb2600")
     data = with_torques(robot, own)

@@ -109,7 +109,7 @@ ROBOTS = ("irb120", "fanuc_r2000ic_165f", "ur10", "scara_600", "meca500")
 
 @pytest.mark.dev
 @pytest.mark.parametrize("name", ROBOTS)
-def test_new_urdf(name: str) -> None:
+def test_new_urdf(name):
     pinocchio = pytest.importorskip("pinocchio")
     robot = bent(mc.load_robot(name), last=True)
     mass, com = np.arange(robot.joints) + 1.0, np.ones((robot.joints, 3)) * [0.1, 0.2, 0.3]
@@ -161,7 +161,7 @@ def theirs_at(text: str, q: np.ndarray, frame: str) -> np.ndarray:
 
 @pytest.mark.dev
 @pytest.mark.parametrize("last", [False, True])
-def test_original_urdf_with_corrected_origins(original: Path, last: bool) -> None:
+def test_original_urdf_with_corrected_origins(original, last):
     nominal = mc.load_robot(original)
     model = to_robot(parse_urdf(original.read_bytes()))
     robot = bent(nominal, last=last)
@@ -180,7 +180,7 @@ def test_original_urdf_with_corrected_origins(original: Path, last: bool) -> Non
 
 
 @pytest.mark.dev
-def test_fit_of_the_builtin_robot_on_a_urdf_with_other_frames(original: Path) -> None:
+def test_fit_of_the_builtin_robot_on_a_urdf_with_other_frames(original):
     nominal = mc.load_robot("ur10")
     robot = bent(nominal)
     urdf = parse_urdf(original.read_bytes(), "ur10.urdf")
@@ -192,7 +192,7 @@ def test_fit_of_the_builtin_robot_on_a_urdf_with_other_frames(original: Path) ->
 
 
 @pytest.mark.dev
-def test_urdf_that_is_rounded_still_gives_the_calibrated_poses(original: Path) -> None:
+def test_urdf_that_is_rounded_still_gives_the_calibrated_poses(original):
     nominal = mc.load_robot("ur10")
     robot, rounded = bent(nominal), original.read_bytes().replace(HALF.encode(), b"1.5708")
     urdf = parse_urdf(rounded, "rounded.urdf")
@@ -216,7 +216,7 @@ def base_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.dev
-def test_urdf_without_a_fixed_joint_after_the_last(original: Path) -> None:
+def test_urdf_without_a_fixed_joint_after_the_last(original):
     urdf = parse_urdf(original.read_bytes(), "ur10.urdf")
     nominal = robot_from_dict(to_robot(urdf, "wrist_3_link").content)
     change = np.zeros((6, 5))
@@ -232,7 +232,7 @@ def test_urdf_without_a_fixed_joint_after_the_last(original: Path) -> None:
         export(job, "urdf")
 
 
-def test_another_robot_is_refused(original: Path) -> None:
+def test_another_robot_is_refused(original):
     urdf = parse_urdf(original.read_bytes(), "ur10.urdf")
     irb = mc.load_robot("irb120")
     with pytest.raises(OptionError, match="moves otherwise than the nominal robot"):
@@ -247,7 +247,7 @@ def test_another_robot_is_refused(original: Path) -> None:
         export(replace(job_of(ur10), originals=(urdf,)), "json")
 
 
-def test_ur_yaml() -> None:
+def test_ur_yaml():
     robot = bent(mc.load_robot("ur10"))
     made = export(job_of(robot), "ur-yaml")
     table = yaml.safe_load(made.content)["kinematics"]
@@ -268,7 +268,7 @@ def test_ur_yaml() -> None:
     assert yaml.safe_load(other)["kinematics"]["hash"] != number
 
 
-def test_ur_yaml_turns_a_joint_over_and_refuses_what_it_cannot_hold() -> None:
+def test_ur_yaml_turns_a_joint_over_and_refuses_what_it_cannot_hold():
     ur10 = mc.load_robot("ur10")
     robot = replace(bent(ur10), sign=np.array([1.0, -1, -1, 1, -1, 1]))
     table = yaml.safe_load(export(job_of(robot), "ur-yaml").content)["kinematics"]
@@ -285,7 +285,7 @@ def test_ur_yaml_turns_a_joint_over_and_refuses_what_it_cannot_hold() -> None:
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_ros_yaml(name: str) -> None:
+def test_ros_yaml(name):
     robot = bent(mc.load_robot(name), last=True)
     joints = yaml.safe_load(export(job_of(robot), "ros-yaml").content)["joints"]
     q, poses = poses_of(robot)
@@ -302,7 +302,7 @@ def test_ros_yaml(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["irb2600", "scara_600"])
-def test_ros2_control_holds_the_offsets(name: str) -> None:
+def test_ros2_control_holds_the_offsets(name):
     """The drawing's arm at joint = actuator + offset stands where the calibrated one does."""
     data = simulate(name, 40, 3, seed=4).data
     fit = mc.calibrate(name, data, "sum", only="offsets")
@@ -331,7 +331,7 @@ def test_ros2_control_holds_the_offsets(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_dh_csv_and_json(name: str, tmp_path: Path) -> None:
+def test_dh_csv_and_json(name, tmp_path):
     robot = bent(mc.load_robot(name), last=True)
     made = export(job_of(robot), "dh-csv")
     rows = list(csv.DictReader(io.StringIO(made.content.decode())))
@@ -360,7 +360,7 @@ def moc_values(text: str) -> dict[str, dict[str, dict[str, float]]]:
     return out
 
 
-def test_moc_holds_the_corrections_of_a_fit() -> None:
+def test_moc_holds_the_corrections_of_a_fit():
     nominal = mc.load_robot("irb120")
     robot = bent(nominal, last=True)
     job = replace(job_of(robot, nominal), experimental=True)
@@ -395,9 +395,7 @@ def fit(tmp_path_factory: pytest.TempPathFactory, original: Path) -> tuple[Path,
 
 
 @pytest.mark.dev
-def test_a_calibrated_ur10_by_command_in_an_independent_reader(
-    fit: tuple[Path, Simulation], original: Path, tmp_path: Path
-) -> None:
+def test_a_calibrated_ur10_by_command_in_an_independent_reader(fit, original, tmp_path):
     path, _ = fit
     result = run(path, "--to", "urdf", "--urdf", original, "-o", tmp_path / "out.urdf")
     assert result.exception is None, result.output
@@ -411,7 +409,7 @@ def test_a_calibrated_ur10_by_command_in_an_independent_reader(
 
 
 @pytest.mark.parametrize("to", FORMATS)
-def test_every_format_by_command(to: str, fit: tuple[Path, Simulation]) -> None:
+def test_every_format_by_command(to, fit):
     result = run(fit[0], "--to", to)
     assert result.exception is None
     quiet = run(fit[0], "--to", to, "-q")
@@ -429,7 +427,7 @@ def test_every_format_by_command(to: str, fit: tuple[Path, Simulation]) -> None:
             assert other == result.stdout
 
 
-def test_command_on_a_robot_and_its_errors(original: Path, tmp_path: Path) -> None:
+def test_command_on_a_robot_and_its_errors(original, tmp_path):
     assert json.loads(run("irb120", "--to", "json").stdout)["name"] == "ABB IRB 120"
     result = run(original, "--to", "dh-csv")
     assert result.exception is None
@@ -452,7 +450,7 @@ def test_command_on_a_robot_and_its_errors(original: Path, tmp_path: Path) -> No
     assert "cannot be parsed" in str(run(tmp_path / "broken.json", "--to", "json").exception)
 
 
-def test_an_arm_without_its_nominal_robot(fit: tuple[Path, Simulation], tmp_path: Path) -> None:
+def test_an_arm_without_its_nominal_robot(fit, tmp_path):
     content = mc.load_fit(fit[0]).cell.whole()
     (tmp_path / "cell.json").write_text(json.dumps(content))
     found = exported(tmp_path / "cell.json", "json")
@@ -463,7 +461,7 @@ def test_an_arm_without_its_nominal_robot(fit: tuple[Path, Simulation], tmp_path
     assert "holds no measurements" in found.notices[-1]
 
 
-def test_ur_yaml_of_another_make_is_told() -> None:
+def test_ur_yaml_of_another_make_is_told():
     ur10 = export(job_of(bent(mc.load_robot("ur10"))), "ur-yaml").notices
     assert not any("has not the axes" in notice for notice in ur10)
     abb = mc.load_robot("irb2600")

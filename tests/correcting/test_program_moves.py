@@ -15,17 +15,11 @@ from minimax_cal.correcting.compensate import compensate
 from minimax_cal.correcting.programs import krl, rapid
 from minimax_cal.correcting.programs.points import MARK
 from minimax_cal.correcting.programs.program import Program, read_program
-from minimax_cal.modelling.simulate import Simulation
 
 Q = np.array([0.3, 0.2, 0.1, 0.5, 0.8, 0.4])
 TOOL = "PERS tooldata tGrip:=[TRUE,[[20,0,150],[1,0,0,0]],[1,[0,0,1],[1,0,0,0],0,0,0]];"
 NOWHERE = "0,0,0,1,0,0,0"
 JOINTS = "{A1 10,A2 20,A3 -10,A4 30,A5 40,A6 50}"
-
-
-@pytest.fixture(scope="module")
-def fit(noisy: Simulation) -> mc.Fit:
-    return mc.calibrate("irb2600", noisy.data, "sum")
 
 
 @pytest.fixture
@@ -79,7 +73,7 @@ def weld(target: str, *moves: str) -> str:
         "pick RelTool(p1,0,0,9),tGrip\\fast;",
     ],
 )
-def test_no_motion_hides_its_tool(move: str, target: str, tmp_path: Path) -> None:
+def test_no_motion_hides_its_tool(move, target, tmp_path):
     """Refused as the plain move is, and taken where the tool is named."""
     text = weld(target, "! of tools", move)
     with pytest.raises(mc.CalibrationError, match=r"a\.mod:6: moves with tGrip, not with tool0"):
@@ -98,9 +92,7 @@ def test_no_motion_hides_its_tool(move: str, target: str, tmp_path: Path) -> Non
         (("MoveL p1,v1,z1,tool0;", "ArcL p1,v1,s1,w1,z1,tGrip;"), r"a\.mod:6: moves with tGrip"),
     ],
 )
-def test_other_tools_and_work_objects_are_refused(
-    moves: tuple[str, ...], said: str, target: str, tmp_path: Path
-) -> None:
+def test_other_tools_and_work_objects_are_refused(moves, said, target, tmp_path):
     with pytest.raises(mc.CalibrationError, match=said):
         opened(tmp_path / "a.mod", weld(target, *moves))
 
@@ -108,7 +100,7 @@ def test_other_tools_and_work_objects_are_refused(
 @pytest.mark.parametrize(
     "displaced", ["PDispSet frame1;", "  PDispOn\\Rot, p1, tool0;", "pdispon p1,tool0;"]
 )
-def test_displaced_points_are_refused(displaced: str, target: str, tmp_path: Path) -> None:
+def test_displaced_points_are_refused(displaced, target, tmp_path):
     """Unless the words are in a comment, or end a displacement."""
     move = "MoveL p1,v1,fine,tool0;"
     name = displaced.strip().partition(",")[0].split()[0].split("\\")[0]
@@ -117,7 +109,7 @@ def test_displaced_points_are_refused(displaced: str, target: str, tmp_path: Pat
     assert opened(tmp_path / "a.mod", weld(target, "! " + displaced, "PDispOff;", move)).points
 
 
-def test_numbers_are_no_two_tools(target: str, tmp_path: Path) -> None:
+def test_numbers_are_no_two_tools(target, tmp_path):
     text = weld(target, "MoveL p1,v1,z1,tA;", "MoveAbsJ home,v1,z1,tool0;", "SpotL p1,v1,g,s,tB;")
     with pytest.raises(mc.CalibrationError, match=r"a\.mod:7: moves with tB, at line 5 with tA"):
         opened(tmp_path / "a.mod", text, NOWHERE)
@@ -137,15 +129,13 @@ def test_numbers_are_no_two_tools(target: str, tmp_path: Path) -> None:
          [" does not tell the tool and work object of"]),
     ],
 )  # fmt: skip
-def test_a_tool_that_is_not_told_is_said(
-    moves: tuple[str, ...], said: list[str], target: str, tmp_path: Path
-) -> None:
+def test_a_tool_that_is_not_told_is_said(moves, said, target, tmp_path):
     notices = opened(tmp_path / "a.mod", weld(target, *moves)).data.notices
     assert len(notices) == len(said)
     assert all(word in notice for word, notice in zip(said, notices, strict=True))
 
 
-def test_points_are_found_wherever_they_stand(target: str) -> None:
+def test_points_are_found_wherever_they_stand(target):
     """In a motion of an option, in a call of a routine, and where a variable is set."""
     lines = [f"ArcL {target},v1,s1,w1,z1,tool0;", f"pick {target},tool0;", "VAR robtarget p2;",
              f"p2:={target};", "p3:=[[1,2,3],[1,0,0,0],[0,0,0,0],[0,0,0,0,0,0]];"]  # fmt: skip
@@ -172,9 +162,7 @@ def axes_and(place: str, *lines: str) -> str:
         ("BAS(#BASE,2)", "BASE_DATA[2]", "wobj"),
     ],
 )
-def test_krl_moves_with_the_tool_and_the_base_it_tells(
-    line: str, told: str, option: str, place: str, tmp_path: Path
-) -> None:
+def test_krl_moves_with_the_tool_and_the_base_it_tells(line, told, option, place, tmp_path):
     """Refused as a module of RAPID is, and taken where numbers say what they are."""
     text = axes_and(place, line)
     said = rf"a\.src:4: moves with {re.escape(told)}.*not with \$NULLFRAME; give {option}=x,y,z"
@@ -183,7 +171,7 @@ def test_krl_moves_with_the_tool_and_the_base_it_tells(
     assert opened(tmp_path / "a.src", text, NOWHERE, NOWHERE).data.poses == 2
 
 
-def test_krl_of_the_flange_and_of_joints_asks_for_no_tool(place: str, tmp_path: Path) -> None:
+def test_krl_of_the_flange_and_of_joints_asks_for_no_tool(place, tmp_path):
     lines = ("$TOOL=$NULLFRAME", "BAS(#BASE,0)", "$BASE={X 0,Y 0.0,Z 0,A 0,B 0,C 0}",
              "IF $TOOL == grip THEN")  # fmt: skip
     assert not opened(tmp_path / "a.src", axes_and(place, *lines)).data.notices
@@ -193,7 +181,7 @@ def test_krl_of_the_flange_and_of_joints_asks_for_no_tool(place: str, tmp_path: 
     assert opened(tmp_path / "a.src", axes_and(place, *lines), NOWHERE).data.poses == 3
 
 
-def test_krl_of_several_tools_is_refused_and_of_none_is_said(place: str, tmp_path: Path) -> None:
+def test_krl_of_several_tools_is_refused_and_of_none_is_said(place, tmp_path):
     lines = ("DECL FDAT FP1={TOOL_NO 3,BASE_NO 2}", "DECL FDAT FP2={TOOL_NO 4,BASE_NO 2}")
     with pytest.raises(mc.CalibrationError, match=r"line 4 with TOOL_DATA\[3\].*split the file"):
         opened(tmp_path / "a.src", axes_and(place, *lines), NOWHERE, NOWHERE)
@@ -203,7 +191,7 @@ def test_krl_of_several_tools_is_refused_and_of_none_is_said(place: str, tmp_pat
     assert not opened(tmp_path / "a.src", axes_and(place), NOWHERE, NOWHERE).data.notices
 
 
-def test_relative_motions_and_offsets_stay(fit: mc.Fit, place: str, tmp_path: Path) -> None:
+def test_relative_motions_and_offsets_stay(fit, place, tmp_path):
     """Byte for byte, each line said; points beside them are corrected."""
     kept = [
         f"PTP_REL {JOINTS}", "LIN_REL {E6POS: X 10,Y 0,Z 0,A 0,B 0,C 0}", "slin_rel {Z 5}",
@@ -226,7 +214,7 @@ def test_relative_motions_and_offsets_stay(fit: mc.Fit, place: str, tmp_path: Pa
     assert made[1] == f"; {MARK}"
 
 
-def test_a_program_of_offsets_alone_is_refused(tmp_path: Path) -> None:
+def test_a_program_of_offsets_alone_is_refused(tmp_path):
     with pytest.raises(mc.CalibrationError, match="no points with numbers, only relative motions"):
         opened(tmp_path / "a.src", "LIN_REL {Z 5}\nLIN XP:{X 0,Y 0,Z 5,A 0,B 0,C 0}\n")
 
@@ -240,10 +228,7 @@ def test_a_program_of_offsets_alone_is_refused(tmp_path: Path) -> None:
         ("a.dat", "&ACCESS RVP\nDEFDAT m PUBLIC ; of m\n{}", 3),
     ],
 )
-def test_a_program_is_corrected_once(
-    name: str, text: str, line: int, fit: mc.Fit, target: str, place: str, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+def test_a_program_is_corrected_once(name, text, line, fit, target, place, tmp_path, capsys):
     """A comment tells that it was, and nothing else changes but the numbers."""
     body = f"CONST robtarget p1:={target};" if name == "a.mod" else f"E6POS X={{{place},S 2,T 0}}"
     fit.save(tmp_path / "fit.json")
@@ -267,9 +252,7 @@ def test_a_program_is_corrected_once(
 
 @pytest.mark.parametrize(("given", "out"), [("a.mod", "b.csv"), ("a.csv", "b.mod"),
                                             ("a.mod", "b.src"), ("a.txt", "b.dat")])  # fmt: skip
-def test_a_program_goes_into_no_table_nor_a_table_into_a_program(
-    given: str, out: str, fit: mc.Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_program_goes_into_no_table_nor_a_table_into_a_program(given, out, fit, tmp_path, capsys):
     fit.save(tmp_path / "fit.json")
     (tmp_path / given).write_text("")
     assert run("compensate", tmp_path / "fit.json", tmp_path / given, "-o", tmp_path / out) == 2
@@ -279,9 +262,7 @@ def test_a_program_goes_into_no_table_nor_a_table_into_a_program(
     assert len(err.splitlines()) == 1
 
 
-def test_an_arm_without_its_nominal_robot_asks_for_it(
-    fit: mc.Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_arm_without_its_nominal_robot_asks_for_it(fit, tmp_path, capsys):
     (tmp_path / "cell.json").write_text(json.dumps(fit.cell.whole()))
     (tmp_path / "a.csv").write_text("q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n1,2,3,4,50,6\n")
     (tmp_path / "a.src").write_text(f"PTP {JOINTS}")

@@ -1,7 +1,6 @@
 """Whole programs: their points corrected, everything else byte for byte."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from minimax_cal.correcting.programs import krl, rapid
 from minimax_cal.correcting.programs.points import MARK
 from minimax_cal.correcting.programs.program import read_program
 from minimax_cal.ground.errors import DataError
-from minimax_cal.modelling.simulate import Simulation
 
 JOINTS = np.array(
     [
@@ -95,15 +93,8 @@ def unmarked(made: bytes) -> bytes:
     return b"".join(rest)
 
 
-@pytest.fixture(scope="module")
-def fit(noisy: Simulation) -> mc.Fit:
-    return mc.calibrate("irb2600", noisy.data, "sum")
-
-
 @pytest.mark.parametrize("language", ["rapid", "krl"])
-def test_the_calibrated_arm_reaches_the_points(
-    language: str, fit: mc.Fit, robot: mc.Robot, tmp_path: Path
-) -> None:
+def test_the_calibrated_arm_reaches_the_points(language, fit, robot, tmp_path):
     """What the controller makes of the new numbers brings the calibrated flange to the old ones."""
     name, text = ("a.mod", module(robot)) if language == "rapid" else ("a.dat", data_list(robot))
     frames = ("tGrip", "wTable") if language == "rapid" else ()
@@ -124,9 +115,7 @@ def test_the_calibrated_arm_reaches_the_points(
 
 
 @pytest.mark.parametrize("language", ["rapid", "krl"])
-def test_all_else_stays_byte_for_byte(
-    language: str, fit: mc.Fit, robot: mc.Robot, tmp_path: Path
-) -> None:
+def test_all_else_stays_byte_for_byte(language, fit, robot, tmp_path):
     name, text = ("a.mod", module(robot)) if language == "rapid" else ("a.src", data_list(robot))
     frames = ("tGrip", "wTable") if language == "rapid" else ()
     (tmp_path / name).write_bytes(text.encode("latin-1"))
@@ -148,7 +137,7 @@ def test_all_else_stays_byte_for_byte(
     assert len(lines) == 4
 
 
-def test_angles_and_quaternions_stay_near_what_was_there(rng: np.random.Generator) -> None:
+def test_angles_and_quaternions_stay_near_what_was_there(rng):
     """Through the singular B = 90 degrees, and with the other sign of a quaternion."""
     for b in (90.0, 89.9999, -90.0, 12.0):
         text = f"PTP {{X 1,Y 2,Z 3,A 100,B {b},C -170,S 2,T 2}}"
@@ -171,7 +160,7 @@ def test_angles_and_quaternions_stay_near_what_was_there(rng: np.random.Generato
     ]
 
 
-def test_a_quarter_turn_that_changed_is_told() -> None:
+def test_a_quarter_turn_that_changed_is_told():
     text = "robtarget p:=[[1,2,3],[1,0,0,0],[0,-1,0,1],[0,0,0,0,0,0]];"
     (point,) = rapid.points(rapid.read(text, "a.mod"))
     before, after = np.array([1e-4, 0, 0, -0.1, 0, 0.3]), np.array([-1e-4, 0, 0, -0.1, 0, 0.3])
@@ -201,10 +190,7 @@ def test_a_quarter_turn_that_changed_is_told() -> None:
         ("a.csv", "q1_deg\n1\n", ["--tool", "t"], "go with a program"),
     ],
 )  # fmt: skip
-def test_a_wrong_program_is_one_line(
-    name: str, text: str, options: list[str], said: str, fit: mc.Fit, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+def test_a_wrong_program_is_one_line(name, text, options, said, fit, tmp_path, capsys):  # fmt: skip
     fit.save(tmp_path / "fit.json")
     (tmp_path / name).write_text(text)
     assert run("compensate", tmp_path / "fit.json", tmp_path / name, *options) == 2
@@ -218,9 +204,7 @@ def test_a_wrong_program_is_one_line(
     ["tGrip.tframe.trans.z:=tGrip.tframe.trans.z+5;", "IF di1=1 wTable.oframe:=PoseVect(x);",
      "tGrip := tOther;", "wTable.uframe.trans:=[1,2,3];"],
 )  # fmt: skip
-def test_frames_that_the_run_writes_are_refused(
-    change: str, robot: mc.Robot, tmp_path: Path
-) -> None:
+def test_frames_that_the_run_writes_are_refused(change, robot, tmp_path):
     """Nobody knows where the points are then; a correction would be wrong in silence."""
     text = module(robot).replace("  PROC main()", f"  PROC main()\r\n    {change}")
     (tmp_path / "a.mod").write_bytes(text.encode("latin-1"))
@@ -231,7 +215,7 @@ def test_frames_that_the_run_writes_are_refused(
     assert read_program(tmp_path / "a.mod", robot, "tGrip", "wTable").points
 
 
-def test_coordinates_that_the_run_writes_are_said(robot: mc.Robot, tmp_path: Path) -> None:
+def test_coordinates_that_the_run_writes_are_said(robot, tmp_path):
     before = "    MoveL p10,"
     text = module(robot).replace(before, f"    IF a=1 p10.trans.z:=p10.trans.z+5;\r\n{before}")
     (tmp_path / "a.mod").write_bytes(text.encode("latin-1"))
@@ -243,7 +227,7 @@ def test_coordinates_that_the_run_writes_are_said(robot: mc.Robot, tmp_path: Pat
     assert "XP0.Z" in " ".join(read_program(tmp_path / "a.src", robot).data.notices)
 
 
-def test_external_axes_are_said(robot: mc.Robot, tmp_path: Path) -> None:
+def test_external_axes_are_said(robot, tmp_path):
     """A track carries the arm to where no correction knows it."""
     none, path = "9E+09,9E+09,9E+09,9E+09,9E+09,9E+09", tmp_path / "a.mod"
     for values, said in (
@@ -264,7 +248,7 @@ def test_external_axes_are_said(robot: mc.Robot, tmp_path: Path) -> None:
     )
 
 
-def test_the_command_writes_a_program(fit: mc.Fit, robot: mc.Robot, tmp_path: Path) -> None:
+def test_the_command_writes_a_program(fit, robot, tmp_path):
     fit.save(tmp_path / "fit.json")
     (tmp_path / "a.mod").write_bytes(module(robot).encode("latin-1"))
     words = ["compensate", tmp_path / "fit.json", tmp_path / "a.mod", "--tool", "tGrip"]

@@ -5,7 +5,7 @@ import numpy as np
 from minimax_cal.evidence.components import fit_components
 
 
-def test_variances_of_groups_and_noise_are_found() -> None:
+def test_variances_of_groups_and_noise_are_found():
     rng = np.random.default_rng(0)
     group = np.repeat([0, 1, 2], 60)
     sigma = np.array([3.0, 0.0, 0.5])

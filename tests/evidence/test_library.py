@@ -32,7 +32,7 @@ def shifted(robot: Robot) -> Study:
     return studied(robot, data, fit_cell(robot, data, SUM, silent))
 
 
-def test_motions_that_differ_at_one_pose_are_two(shifted: Study) -> None:
+def test_motions_that_differ_at_one_pose_are_two(shifted):
     clock = np.sort(shifted.scene.column("clock"))
     terms = [
         (Term("target_shift", target, {"since": float(clock[row])}), 1.0)
@@ -44,7 +44,7 @@ def test_motions_that_differ_at_one_pose_are_two(shifted: Study) -> None:
     assert len(np.unique(every)) == len(every) == 3 * len(terms)
 
 
-def test_equal_motions_are_one(shifted: Study) -> None:
+def test_equal_motions_are_one(shifted):
     stack, term = (
         Stack(ArmLaws(shifted.scene, shifted.rows)),
         Term("frame_drift", "frame", {"constant": 0.5}),
@@ -56,7 +56,7 @@ def test_equal_motions_are_one(shifted: Study) -> None:
     assert stack.columns.shape == (shifted.rows.error.size, len(np.unique(one.main)))
 
 
-def test_a_nest_moved_at_the_pose_at_which_it_did(shifted: Study) -> None:
+def test_a_nest_moved_at_the_pose_at_which_it_did(shifted):
     found = select(arm_library(shifted.scene, shifted.rows, ("gear_ripple",))).chosen
     clock = np.sort(shifted.scene.column("clock"))
     assert [c.term.label for c in found] == ["target_shift:smr1"]
@@ -64,7 +64,7 @@ def test_a_nest_moved_at_the_pose_at_which_it_did(shifted: Study) -> None:
 
 
 @pytest.mark.parametrize("off", [-30, 1, 17, 30])
-def test_a_moment_is_found_from_one_nearby(shifted: Study, off: int) -> None:
+def test_a_moment_is_found_from_one_nearby(shifted, off):
     clock = np.sort(shifted.scene.column("clock"))
     term = Term("target_shift", "smr1", {"since": float(clock[MOVED + off])})
     lib = Library.empty(ArmLaws(shifted.scene, shifted.rows))
@@ -73,7 +73,7 @@ def test_a_moment_is_found_from_one_nearby(shifted: Study, off: int) -> None:
     assert tuned(table, table.added(near[0])).candidate.term.choice["since"] == clock[MOVED]
 
 
-def test_fewer_moments_are_tried_the_farther_off(shifted: Study) -> None:
+def test_fewer_moments_are_tried_the_farther_off(shifted):
     clock = np.sort(shifted.scene.column("clock"))
     finer = EFFECTS["target_shift"].finer(shifted.scene, {"since": float(clock[200])})
     rows = np.searchsorted(clock, [choice["since"] for choice in finer])

@@ -6,7 +6,7 @@ from tests.thresholds import LIMITS, thresholds
 MOST = 45
 
 
-def test_numbers_that_decide_are_few_and_in_one_module() -> None:
+def test_numbers_that_decide_are_few_and_in_one_module():
     found = thresholds()
     assert [name for name in found if not name.startswith(LIMITS)] == []
     assert len(found) <= MOST

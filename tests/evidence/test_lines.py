@@ -46,7 +46,7 @@ def line(rng: np.random.Generator, curve: Array, q: Array) -> Line:
     return Line(q, curve + rng.normal(size=len(q)), np.ones(len(q)))
 
 
-def test_a_wave_stays_when_its_sweep_is_cut_and_a_curve_does_not() -> None:
+def test_a_wave_stays_when_its_sweep_is_cut_and_a_curve_does_not():
     stay, move = [], []
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -59,14 +59,14 @@ def test_a_wave_stays_when_its_sweep_is_cut_and_a_curve_does_not() -> None:
     assert np.mean(move) <= 0.25  # a curve may hold a wave by chance
 
 
-def test_a_joint_that_mostly_stands_at_one_end_shows_no_line(rng: np.random.Generator) -> None:
+def test_a_joint_that_mostly_stands_at_one_end_shows_no_line(rng):
     """Its sweep has no two halves: more than half of the poses have the least angle."""
     q = np.concatenate([np.full(12, -1.0), np.linspace(0.0, 2.0, 8)])
     wave = line(rng, 5.0 * np.cos(20.0 * q), q)
     assert not wave.stays(20.0)
 
 
-def test_the_strongest_wave_is_the_one_that_is_there() -> None:
+def test_the_strongest_wave_is_the_one_that_is_there():
     rng = np.random.default_rng(0)
     q = rng.uniform(-2.5, 2.5, 400)
     turns, tries = line(rng, 3.0 * np.cos(33.3 * q), q).strongest(8.0, 260.0)
@@ -74,7 +74,7 @@ def test_the_strongest_wave_is_the_one_that_is_there() -> None:
     assert_allclose(tries, 2.0 * 252.0 * 5.0 / (2.0 * np.pi), rtol=0.02)
 
 
-def test_lines_near_a_ratio_are_few() -> None:
+def test_lines_near_a_ratio_are_few():
     assert bands(np.nan) == []
     assert bands(120.0) == [(119.0, 121.0), (238.0, 242.0)]
     made = opened("irb120")
@@ -87,7 +87,7 @@ def test_lines_near_a_ratio_are_few() -> None:
     assert [term.place for term in near] == ["J1", "J1", "J2", "J2", "J3", "J3"]  # of these told
 
 
-def test_once_a_gear_has_a_line_each_other_is_asked_for_by_itself() -> None:
+def test_once_a_gear_has_a_line_each_other_is_asked_for_by_itself():
     made = opened("irb120")
     none = np.zeros((len(made.rows.error), 0))
     noise = restricted(made.rows, none)
@@ -118,16 +118,14 @@ def test_once_a_gear_has_a_line_each_other_is_asked_for_by_itself() -> None:
         ("J1", 150.0, [("J2", 100.4), ("J3", 75.0)], True),
     ],
 )
-def test_a_line_is_expected_where_another_gear_has_the_like(
-    place: str, turns: float, heard: list[tuple[str, float]], expected: bool
-) -> None:
+def test_a_line_is_expected_where_another_gear_has_the_like(place, turns, heard, expected):
     made = opened("irb120", told=False)
     lines = [Term("gear_ripple", at, {"turns": t}) for at, t in heard]
     line = Term("gear_ripple", place, {"turns": turns})
     assert is_expected(made.scene, line, lines) == expected
 
 
-def test_the_level_is_shared_once() -> None:
+def test_the_level_is_shared_once():
     """Chances of all that is looked at, each at its own gate, add up to the level."""
     choice = chosen(opened("irb120"), ())
     table = bench(choice.library, ())
@@ -137,7 +135,7 @@ def test_the_level_is_shared_once() -> None:
     assert_allclose([c.tries / table.looked_at(c) for c in lines.values()], LINES)
 
 
-def test_an_expected_line_has_the_level_to_itself() -> None:
+def test_an_expected_line_has_the_level_to_itself():
     loud = Cause("gear_ripple", "J2", 2000.0, 1)
     choice = chosen(opened("irb120", loud, seed=5, told=False), ())
     (line,) = choice.chosen
@@ -155,7 +153,7 @@ def test_an_expected_line_has_the_level_to_itself() -> None:
 
 
 @pytest.mark.parametrize(("told", "named"), [(True, True), (False, False)])
-def test_a_faint_line_is_found_where_its_gear_is_known(told: bool, named: bool) -> None:
+def test_a_faint_line_is_found_where_its_gear_is_known(told, named):
     made = opened("irb120", Cause("gear_ripple", "J1", 20.0, 1), seed=5, told=told)
     choice = chosen(made, ())
     assert (("gear_ripple", "J1") in {c.key for c in choice.chosen}) == named
@@ -169,13 +167,13 @@ def test_a_faint_line_is_found_where_its_gear_is_known(told: bool, named: bool) 
         ("gear_error/orders", "J6", ("gear_error", "J6")),
     ],
 )
-def test_one_law_of_another_course_is_one_name(law: str, place: str, key: tuple[str, str]) -> None:
+def test_one_law_of_another_course_is_one_name(law, place, key):
     """Motors and casting that warm up apart, a lag that ends, two orders of one gear."""
     choice = chosen(opened("rail", Cause(law, place, 3000.0), seed=4, poses=100), ())
     assert {c.key for c in choice.chosen} == {key}
 
 
-def test_what_other_weights_chose_is_dropped_where_it_is_not_needed() -> None:
+def test_what_other_weights_chose_is_dropped_where_it_is_not_needed():
     made = opened("irb120", Cause("backlash", "J2", 500.0))
     choice = chosen(made, ())
     lib = choice.library
@@ -185,7 +183,7 @@ def test_what_other_weights_chose_is_dropped_where_it_is_not_needed() -> None:
     assert [c.key for c in again.chosen] == [("backlash", "J2")]
 
 
-def test_the_only_one_that_other_weights_chose_is_compared_anew() -> None:
+def test_the_only_one_that_other_weights_chose_is_compared_anew():
     made = opened("irb120", Cause("backlash", "J2", 500.0))
     lib = chosen(made, ()).library
     alike = bench(lib, ()).added(next(c for c in lib.candidates if c.key == ("settling", "J2")))
@@ -193,7 +191,7 @@ def test_the_only_one_that_other_weights_chose_is_compared_anew() -> None:
     assert [c.key for c in again.chosen] == [("backlash", "J2")]
 
 
-def test_a_moment_that_is_sought_costs_as_a_parameter_does() -> None:
+def test_a_moment_that_is_sought_costs_as_a_parameter_does():
     lib = chosen(opened("irb120", Cause("backlash", "J2", 500.0)), ()).library
     seats = [c for c in lib.candidates if c.term.effect == "target_reseat"]
     assert {c.shapes for c in seats} == {1}
@@ -208,9 +206,7 @@ def test_a_moment_that_is_sought_costs_as_a_parameter_does() -> None:
         ([9.0], [(8.0, 10.0), (16.0, 20.0)]),  # of half as many no gear has teeth
     ],
 )
-def test_gears_of_a_kind_are_sought_at_their_ratio(
-    heard: list[float], expected: list[tuple[float, float]]
-) -> None:
+def test_gears_of_a_kind_are_sought_at_their_ratio(heard, expected):
     assert_allclose(np.array(alike(heard)).reshape(-1, 2), np.array(expected).reshape(-1, 2))
 
 
@@ -228,15 +224,13 @@ def test_gears_of_a_kind_are_sought_at_their_ratio(
         (np.nan, [33.3], [36.5], 0.25, True),  # whose sweep resolves no such difference
     ],
 )
-def test_a_line_has_a_ratio_or_another_line_for_company(
-    ratio: float, own: list[float], others: list[float], turned: float, kept: bool
-) -> None:
+def test_a_line_has_a_ratio_or_another_line_for_company(ratio, own, others, turned, kept):
     q = np.linspace(0.0, 2.0 * np.pi * turned, 50)
     assert in_company(ratio, q, own, others) == kept
 
 
 @pytest.mark.parametrize("strong", [20.0, 2000.0])
-def test_a_faint_line_is_found_where_another_joint_has_the_like(strong: float) -> None:
+def test_a_faint_line_is_found_where_another_joint_has_the_like(strong):
     faint, loud = Cause("gear_ripple", "J1", 24.0, 1), Cause("gear_ripple", "J2", strong, 1)
     choice = chosen(opened("irb120", faint, loud, seed=5, told=False), ())
     found = {c.key for c in choice.chosen}
@@ -244,7 +238,7 @@ def test_a_faint_line_is_found_where_another_joint_has_the_like(strong: float) -
 
 
 @pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 64), marks=pytest.mark.slow)])
-def test_lines_that_are_not_there_are_rarely_found_beside_one(seeds: range) -> None:
+def test_lines_that_are_not_there_are_rarely_found_beside_one(seeds):
     """Half a percent of the joints, two of a hundred arms: five of 60 by an accident of 0.7 %."""
     loud = Cause("gear_ripple", "J2", 1000.0, 1)
     strange = 0

@@ -5,7 +5,6 @@ import pytest
 from numpy.testing import assert_allclose
 from problems_fit import study
 
-import minimax_cal as mc
 from experiments.gap_cases import Case, make
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence.noise import Noise, Problem, inflation, restricted
@@ -20,14 +19,14 @@ def quiet() -> Study:
     return study(6e-6, 1.0, 0)
 
 
-def test_rotated_rows_keep_every_square(quiet: Study, rng: np.random.Generator) -> None:
+def test_rotated_rows_keep_every_square(quiet, rng):
     fields = rng.normal(size=(4, *quiet.scene.points.shape))
     rows = quiet.rows.of(fields)
     assert_allclose(rows.T @ rows, fields.reshape(4, -1) @ fields.reshape(4, -1).T, rtol=1e-12)
     assert_allclose(quiet.rows.back(rows[:, 2]), fields[2], rtol=0, atol=1e-12)
 
 
-def test_the_variance_of_a_row_is_that_of_its_direction(quiet: Study) -> None:
+def test_the_variance_of_a_row_is_that_of_its_direction(quiet):
     """Each rotated row has variance s^2 + t^2 |S'u|^2, and rows of a pose are uncorrelated."""
     rows, jacobian = quiet.rows, quiet.scene.jacobian
     arms = rows.of(jacobian)  # (N, n)
@@ -38,14 +37,14 @@ def test_the_variance_of_a_row_is_that_of_its_direction(quiet: Study) -> None:
     assert_allclose(own @ own.T, expected, rtol=0, atol=1e-9 * expected.max())
 
 
-def test_what_is_left_is_square_to_the_geometry(quiet: Study) -> None:
+def test_what_is_left_is_square_to_the_geometry(quiet):
     """The fit is a least-squares one, so its rows have no part in the geometry's span."""
     rows = quiet.rows
     assert_allclose(rows.basis.T @ rows.error, 0.0, atol=1e-6 * np.linalg.norm(rows.error))
 
 
 @pytest.mark.parametrize(("jitter", "noise"), [(0.0, 1.0), (6e-6, 1.0), (20e-6, 1.0), (6e-6, 2.0)])
-def test_noise_and_jitter_are_found(jitter: float, noise: float) -> None:
+def test_noise_and_jitter_are_found(jitter, noise):
     """Means over eight arms, within 15 % (a fifth of the mean instrument noise for no jitter)."""
     found = []
     for seed in range(8):
@@ -59,7 +58,7 @@ def test_noise_and_jitter_are_found(jitter: float, noise: float) -> None:
     assert abs(mean_jitter - jitter) < max(0.15 * jitter, 2e-6)
 
 
-def test_weights_are_the_inverse_variances(quiet: Study) -> None:
+def test_weights_are_the_inverse_variances(quiet):
     noise = Noise(2.0, 1e-10, 0.0)
     variance_ratio = quiet.rows.variance_ratio
     assert_allclose(
@@ -67,7 +66,7 @@ def test_weights_are_the_inverse_variances(quiet: Study) -> None:
     )
 
 
-def test_the_variance_counts_what_the_fit_took(rng: np.random.Generator) -> None:
+def test_the_variance_counts_what_the_fit_took(rng):
     """Half of the rows' freedom is in the fit: dividing by their number would say 0.5."""
     n, p = 300, 150
     found = []
@@ -81,7 +80,7 @@ def test_the_variance_counts_what_the_fit_took(rng: np.random.Generator) -> None
     assert abs(np.mean(total) - 1.0) < 4.0 * np.sqrt(2.0 / (n - p) / len(found))
 
 
-def test_a_problem_without_freedom_has_a_noise(quiet: Study) -> None:
+def test_a_problem_without_freedom_has_a_noise(quiet):
     rows = quiet.rows
     few = Problem(
         rows.error[:9], np.eye(9), rows.variance_ratio[:9], rows.size, rows.group[:9],
@@ -90,7 +89,7 @@ def test_a_problem_without_freedom_has_a_noise(quiet: Study) -> None:
     assert restricted(few, np.zeros((9, 0))).variance > 0.0
 
 
-def test_missing_targets_count_for_nothing(robot: mc.Robot) -> None:
+def test_missing_targets_count_for_nothing(robot):
     made = make(Case("irb2600", "none", seed=3))
     data = with_history(made.data)
     y = data.y.copy()
@@ -102,7 +101,7 @@ def test_missing_targets_count_for_nothing(robot: mc.Robot) -> None:
     assert 12e-6 < np.sqrt(found.variance) < 25e-6
 
 
-def test_a_field_is_as_noisy_as_its_groups_tell() -> None:
+def test_a_field_is_as_noisy_as_its_groups_tell():
     """White rows: 1; an error that all rows of a group share: as many times as there are rows."""
     rng, n, count = np.random.default_rng(5), 3000, 6
     group = np.arange(n) // count
@@ -114,7 +113,7 @@ def test_a_field_is_as_noisy_as_its_groups_tell() -> None:
     assert abs(alike - (1.0 + 0.5 * (count - 1))) < 0.6  # variance of a sum of `count` rows
 
 
-def test_one_wrong_group_makes_a_field_no_surer() -> None:
+def test_one_wrong_group_makes_a_field_no_surer():
     rng, n = np.random.default_rng(6), 900
     group, law = np.arange(n) // 9, rng.normal(size=n)
     rest = rng.normal(size=n)

@@ -7,34 +7,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from problems_fit import study
+from problems_fit import ROUNDING, check_products, rough_study, study
 
-from experiments.gap_cases import Case, Cause, make
-from minimax_cal.diagnosing.study import Study, studied
+from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.bench import bench
 from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.products import LEAST
 from minimax_cal.evidence.ratios import NODES, interpolation, nodes
-from minimax_cal.fitting.options import Options, silent
-from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.dictionary import ArmLaws, arm_library
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.periodogram import sums
 
 RATIOS = np.array([0.0, 0.013, 0.4, 3.7, 1.0e4])
-ROUNDING = 1e-9  # of products, relative to the largest of their columns
 
 
 @pytest.fixture(scope="module")
 def rough() -> Study:
-    """100 poses with play in a joint, a gear's line, and joints that do not come back."""
-    causes = (Cause("backlash", "J2", 400.0), Cause("gear_ripple", "J4", 400.0))
-    sealed = make(Case("irb2600", "pair", causes, seed=4))
-    data = with_history(sealed.data)
-    fit = fit_cell(sealed.robot, data, Options(objective="sum"), silent)
-    return studied(sealed.robot, data, fit)
+    return rough_study()
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +33,7 @@ def lib(rough: Study) -> Library:
 
 
 @pytest.mark.parametrize("decade", [-3, 0, 4])
-def test_polynomials_of_a_decade_give_every_weight(decade: int) -> None:
+def test_polynomials_of_a_decade_give_every_weight(decade):
     ratios = 10.0 ** np.linspace(decade, decade + 1, 101)
     variance = np.concatenate([[0.0], np.logspace(-9, 6, 301)])
 
@@ -55,38 +45,20 @@ def test_polynomials_of_a_decade_give_every_weight(decade: int) -> None:
     assert_allclose(found, weights(ratios), rtol=1e-9)
 
 
-def test_products_are_the_sums_over_rows(rough: Study) -> None:
+def test_products_are_the_sums_over_rows(rough):
     """Of what weighted least squares on the geometry leave of the columns."""
     products = arm_library(rough.scene, rough.rows).products
     index, sets = np.array([3, 17, 18]), np.array([[0, 5], [7, 30]])
     clear, raw = products.columns.clear, products.columns.raw
     p = products.columns.fixed - 1
     found = products.at(RATIOS, index)
-    within = found.among(sets)
     for i, ratio in enumerate(RATIOS):
         weight = 1.0 / (1.0 + ratio * rough.rows.variance_ratio)
-        geometry, root = products.geometry * np.sqrt(weight), np.sqrt(weight)
-        basis = np.linalg.qr(geometry.T)[0]
-        every = clear[p:] * root
-        rest = every - (every @ basis) @ basis.T
-        size = np.linalg.norm(clear[p:], axis=1)
-        gram, atol = rest @ rest.T, ROUNDING * np.outer(size, size)
-        assert np.all(np.abs(found.lines[i] - gram[1 + index, 1:]) <= atol[1 + index, 1:])
-        assert np.all(np.abs(found.error[i] - gram[0]) <= atol[0])
-        assert np.all(np.abs(found.pull[i] - gram[1 + index, 0]) <= atol[1 + index, 0])
-        for c, pair in enumerate(1 + sets):
-            off = np.abs(within[i, c] - gram[np.ix_(pair, pair)])
-            assert np.all(off <= atol[np.ix_(pair, pair)])
-        assert_allclose(found.whole[i], weight @ raw**2, rtol=ROUNDING)
-        assert_allclose(found.square[i], every[0] @ every[0], rtol=ROUNDING)
-        assert_allclose(found.logs[i], np.linalg.slogdet(geometry @ geometry.T)[1], atol=1e-8)
-        lower = found.factor[i]
-        assert_allclose(lower @ lower.T, geometry @ geometry.T, rtol=ROUNDING, atol=1e-9)
-        shared = geometry @ every[np.concatenate([[0], 1 + index])].T
-        assert_allclose(lower @ found.part[i], shared, rtol=ROUNDING, atol=ROUNDING * size.max())
+        geometry = products.geometry * np.sqrt(weight)
+        check_products(found, i, index, sets, clear[p:], geometry, weight, raw)
 
 
-def test_columns_are_stored_without_what_geometry_imitates(lib: Library, rough: Study) -> None:
+def test_columns_are_stored_without_what_geometry_imitates(lib, rough):
     clear = lib.products.clear(np.arange(lib.products.columns.count))
     size = np.linalg.norm(lib.columns, axis=0)
     assert np.all(ROUNDING * size >= np.abs(clear @ rough.rows.basis).T)
@@ -94,7 +66,7 @@ def test_columns_are_stored_without_what_geometry_imitates(lib: Library, rough: 
                     rtol=0, atol=ROUNDING * np.abs(lib.columns).max())  # fmt: skip
 
 
-def test_what_is_left_of_a_column_is_that_of_the_column_and_geometry(rough: Study) -> None:
+def test_what_is_left_of_a_column_is_that_of_the_column_and_geometry(rough):
     """A thousand times as much geometry in it changes no product; geometry alone leaves least."""
     products = arm_library(rough.scene, rough.rows).products
     columns, basis = products.columns, rough.rows.basis
@@ -109,7 +81,7 @@ def test_what_is_left_of_a_column_is_that_of_the_column_and_geometry(rough: Stud
     assert gram[0, 0, 0] == pytest.approx(LEAST * more @ more, rel=ROUNDING)
 
 
-def test_candidates_stored_nowhere_compare_as_stored_ones(lib: Library) -> None:
+def test_candidates_stored_nowhere_compare_as_stored_ones(lib):
     chosen = [next(c for c in lib.candidates if c.key == ("joint_compliance", "all"))]
     term = Term("gear_ripple", "J4", {"turns": 33.3})
     table = bench(lib, chosen)
@@ -121,13 +93,13 @@ def test_candidates_stored_nowhere_compare_as_stored_ones(lib: Library) -> None:
     assert_allclose([loose.gain, loose.evidence], [held.gain, held.evidence], rtol=1e-8)
 
 
-def test_where_no_line_is_sought_none_is_compared(lib: Library) -> None:
+def test_where_no_line_is_sought_none_is_compared(lib):
     """No joint moves enough for a line: nothing aside, with and without effects chosen."""
     for chosen in ([], list(lib.candidates[:1])):
         assert bench(lib, chosen).beside(lib.aside(())).ranked(()) == []
 
 
-def test_waves_on_a_grid_are_sums_over_poses(rng: np.random.Generator) -> None:
+def test_waves_on_a_grid_are_sums_over_poses(rng):
     q, score, size = rng.uniform(-3, 3, 40), rng.normal(size=40), rng.uniform(size=40)
     turns = np.arange(8.0, 260.0, 0.31)
     pull, square, whole = sums(turns, q, score, size)
@@ -137,7 +109,7 @@ def test_waves_on_a_grid_are_sums_over_poses(rng: np.random.Generator) -> None:
     assert whole == pytest.approx(size.sum())
 
 
-def test_products_know_no_order_of_columns(rng: np.random.Generator) -> None:
+def test_products_know_no_order_of_columns(rng):
     """Columns that come later have the same products as those that were there before."""
     quiet = study(6e-6, 1.0, 0)
     early = arm_library(quiet.scene, quiet.rows)
@@ -155,7 +127,7 @@ def test_products_know_no_order_of_columns(rng: np.random.Generator) -> None:
     assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12 * np.abs(theirs).max())
 
 
-def test_laws_leave_no_scene_behind(rough: Study) -> None:
+def test_laws_leave_no_scene_behind(rough):
     """A scene keeps its laws, and its laws not the scene: it goes with the last name for it."""
     scene = replace(rough.scene)
     Term("link_bending", "L2").columns(scene).doubts(scene)

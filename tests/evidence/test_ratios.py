@@ -21,24 +21,24 @@ from minimax_cal.ground.arrays import Array
 
 
 @pytest.mark.parametrize("count", [2, FEW, NODES])
-def test_points_are_the_zeros_of_a_chebyshev_polynomial(count: int) -> None:
+def test_points_are_the_zeros_of_a_chebyshev_polynomial(count):
     at = points(count)
     assert_allclose(chebyshev.chebval(2.0 * at - 1.0, np.eye(count + 1)[count]), 0.0, atol=1e-13)
     assert np.all(np.diff(at) > 0.0)
     assert np.all((at > 0.0) & (at < 1.0))
 
 
-def test_ratios_are_tried_in_decades() -> None:
+def test_ratios_are_tried_in_decades():
     assert_allclose(RATIOS, [0.0, *(10.0**power for power in range(-3, 6))], rtol=1e-12)
 
 
 @pytest.mark.parametrize("decade", [-3, 0, 4])
-def test_nodes_lie_so_in_a_decade(decade: int) -> None:
+def test_nodes_lie_so_in_a_decade(decade):
     assert_allclose(np.log10(nodes(decade)), decade + points(NODES), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("count", [FEW, NODES])
-def test_polynomials_are_met_exactly(count: int, rng: np.random.Generator) -> None:
+def test_polynomials_are_met_exactly(count, rng):
     coefficients, at = rng.normal(size=count), points(count)
     x = np.array([0.0, 0.1, at[3], 0.77, 1.0])
 
@@ -63,21 +63,21 @@ def bowl(least: float, bent: float = 0.0) -> Array:
 
 
 @pytest.mark.parametrize("least", [-2.9, -2.02, -0.3, 0.0, 1.7183, 4.4, 4.95])
-def test_the_likeliest_ratio_is_found_between_those_that_are_tried(least: float) -> None:
+def test_the_likeliest_ratio_is_found_between_those_that_are_tried(least):
     assert_allclose(bowl(least), least, rtol=0, atol=1e-9)
     assert_allclose(bowl(least, bent=1.0), least, rtol=0, atol=1e-6)
 
 
-def test_beyond_the_ends_it_is_the_end() -> None:
+def test_beyond_the_ends_it_is_the_end():
     assert_allclose([bowl(-4.5), bowl(7.0)], np.log10(RATIOS[[1, -1]]), atol=1e-12)
 
 
-def test_it_is_none_where_none_is_better() -> None:
+def test_it_is_none_where_none_is_better():
     assert find_ratio(lambda ratios: np.where(ratios > 0.0, 1.0, 0.0)) == 0.0
     assert find_ratio(lambda ratios: 0.0 * ratios) == 0.0
 
 
-def test_a_vertex_is_that_of_the_parabola() -> None:
+def test_a_vertex_is_that_of_the_parabola():
     x = np.arange(5.0)
     for least in (1.6, 2.0, 2.4):
         assert_allclose(2.0 + vertex(3.0 * (x - least) ** 2 - 7.0, 2), least, rtol=1e-12)

@@ -47,7 +47,7 @@ def rest(rng: np.random.Generator, error: Array) -> Rest:
     return rest_of(problem(rng, error), PLAIN, none, STRAIGHT)
 
 
-def test_what_fades_is_the_root_of_its_covariance() -> None:
+def test_what_fades_is_the_root_of_its_covariance():
     rng = np.random.default_rng(4)
     order, felt = rng.permutation(30), rng.normal(size=(2, 30, 5))
     lag = np.arange(30)[:, None] - np.arange(30)
@@ -56,7 +56,7 @@ def test_what_fades_is_the_root_of_its_covariance() -> None:
     assert np.allclose(Fading(order, 0.6).score(felt), expected, rtol=1e-12)
 
 
-def test_noise_is_called_remains_as_often_as_the_level_says() -> None:
+def test_noise_is_called_remains_as_often_as_the_level_says():
     rng = np.random.default_rng(5)
     chances = []
     for _ in range(60):
@@ -66,7 +66,7 @@ def test_noise_is_called_remains_as_often_as_the_level_says() -> None:
     assert rare < 0.14  # 0.05 + 3 sigma
 
 
-def test_a_motion_that_scatters_by_itself_is_no_remainder() -> None:
+def test_a_motion_that_scatters_by_itself_is_no_remainder():
     rng = np.random.default_rng(6)
     chances = []
     for _ in range(25):
@@ -79,7 +79,7 @@ def test_a_motion_that_scatters_by_itself_is_no_remainder() -> None:
 
 
 @pytest.mark.parametrize("size", [0.35, 1.0])
-def test_what_is_there_is_found_with_its_place_driver_and_size(size: float) -> None:
+def test_what_is_there_is_found_with_its_place_driver_and_size(size):
     rng = np.random.default_rng(7)
     what = asked(rng)
     true = what[4]
@@ -92,7 +92,7 @@ def test_what_is_there_is_found_with_its_place_driver_and_size(size: float) -> N
     assert found.share == pytest.approx(size**2 / (1.0 + size**2), rel=0.5)
 
 
-def test_what_was_fitted_does_not_remain() -> None:
+def test_what_was_fitted_does_not_remain():
     rng = np.random.default_rng(8)
     what = asked(rng)
     field = what[4].motion[:, 0] * np.repeat(what[4].feature[0, 0], WIDTH)
@@ -104,7 +104,7 @@ def test_what_was_fitted_does_not_remain() -> None:
     assert remains(beside, fixed) == ()
 
 
-def test_the_axes_of_a_visits_rows_do_not_matter() -> None:
+def test_the_axes_of_a_visits_rows_do_not_matter():
     """Rows that are alike have any axes: those of `eigh` differ between processors."""
     rng = np.random.default_rng(9)
     what, rows = asked(rng), problem(rng, rng.normal(size=VISITS * WIDTH))

@@ -56,7 +56,7 @@ def study_of(robot: mc.Robot, data: mc.Measurements) -> Study:
         ("target_offset", "smr1"),
     ],
 )
-def test_a_plain_effect_is_named_and_sized(law: str, place: str) -> None:
+def test_a_plain_effect_is_named_and_sized(law, place):
     """lambda = 1000: effect and place exactly, and the noise is found beside it."""
     choice = chosen(opened(Cause(law, place, 1000.0), seed=11), ())
     assert [c.key for c in choice.chosen] == [(law, place)]
@@ -64,7 +64,7 @@ def test_a_plain_effect_is_named_and_sized(law: str, place: str) -> None:
 
 
 @pytest.mark.parametrize("seed", [11, 12])
-def test_a_joint_that_stiffens_is_told_as_its_compliance(seed: int) -> None:
+def test_a_joint_that_stiffens_is_told_as_its_compliance(seed):
     """By a machine whose law is not ours: tau / (1 + 2 |tau| / most)."""
     choice = chosen(opened(Cause("joint_compliance/hardening", "J3", 5000.0), seed=seed), ())
     (one,) = choice.chosen
@@ -74,7 +74,7 @@ def test_a_joint_that_stiffens_is_told_as_its_compliance(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_masses_in_doubt_excuse_what_little_they_explain(seed: int) -> None:
+def test_masses_in_doubt_excuse_what_little_they_explain(seed):
     """And not a law that is missing, for which they would have to be many sigma off."""
     robot = mc.load_robot("ur10")
     mass, com = masses_of(robot)
@@ -90,25 +90,25 @@ def test_masses_in_doubt_excuse_what_little_they_explain(seed: int) -> None:
         assert choice.doubted.shape[1] == len(main) + excused * len(loose)
 
 
-def test_no_name_without_an_effect() -> None:
+def test_no_name_without_an_effect():
     for seed in range(8):
         choice = chosen(opened(seed=100 + seed), ())
         assert choice.chosen == ()
 
 
-def test_two_effects_are_both_named() -> None:
+def test_two_effects_are_both_named():
     made = opened(Cause("backlash", "J1", 300.0), Cause("gear_error", "J3", 300.0), seed=4)
     choice = chosen(made, ())
     assert {c.key for c in choice.chosen} == {("backlash", "J1"), ("gear_error", "J3")}
 
 
-def test_a_deleted_effect_is_not_named() -> None:
+def test_a_deleted_effect_is_not_named():
     made = opened(Cause("gear_ripple", "J2", 1000.0), seed=2)
     choice = chosen(made, ("gear_ripple",))
     assert "gear_ripple" not in {c.term.effect for c in choice.chosen}
 
 
-def test_rivals_hold_the_truth_where_it_cannot_be_told() -> None:
+def test_rivals_hold_the_truth_where_it_cannot_be_told():
     """A tilting base looks like a yielding second joint: whatever is named, both are in the set."""
     for seed in (1, 2, 3):
         choice = chosen(opened(Cause("base_flex", "frame", 60.0), seed=seed), ())
@@ -121,7 +121,7 @@ def test_rivals_hold_the_truth_where_it_cannot_be_told() -> None:
             assert power >= 0.0
 
 
-def test_two_effects_that_are_both_there_are_no_rivals() -> None:
+def test_two_effects_that_are_both_there_are_no_rivals():
     """Fits as good as one another, of which each is needed beside the other."""
     names = (("encoder_gain", "J2"), ("backlash", "J2"))
     made = opened(*(Cause(*name, 300.0) for name in names), seed=4)
@@ -137,7 +137,7 @@ def test_two_effects_that_are_both_there_are_no_rivals() -> None:
         assert_allclose(np.log(found), np.log(expected), rtol=0.1)
 
 
-def test_a_cause_and_what_resembles_it_stay_rivals() -> None:
+def test_a_cause_and_what_resembles_it_stay_rivals():
     """The one that is not there is of no use beside the truth, ten times of ten."""
     for seed in range(10):
         made = opened(Cause("joint_compliance", "J2", 400.0), seed=seed)
@@ -149,7 +149,7 @@ def test_a_cause_and_what_resembles_it_stay_rivals() -> None:
         assert table.p_beside(table.added(truth), truth) == 1.0
 
 
-def test_lambda_is_the_one_that_was_asked_for() -> None:
+def test_lambda_is_the_one_that_was_asked_for():
     """The generator's detectability and the diagnosis' agree to 35 %, masses being 15 % off."""
     made = opened(Cause("joint_compliance", "J3", 400.0), seed=6)
     choice = chosen(made, ())
@@ -159,7 +159,7 @@ def test_lambda_is_the_one_that_was_asked_for() -> None:
     assert rho2 > 1.0 - 1e-6
 
 
-def test_values_are_those_of_least_squares() -> None:
+def test_values_are_those_of_least_squares():
     """Without jitter the fit beside the geometry is plain least squares on both."""
     made = opened(Cause("encoder_gain", "J2", 500.0), seed=8)
     lib = arm_library(made.scene, made.rows)
@@ -194,7 +194,7 @@ def yielding(study: Study, tool: Array, stiff: Array) -> Study:
 SOFT = np.array([0.0, 1e-6, 1.5e-6, 1e-5, 1.5e-5, 4e-5])
 
 
-def test_the_weight_of_an_untold_tool_is_found_beside_the_axis() -> None:
+def test_the_weight_of_an_untold_tool_is_found_beside_the_axis():
     made = yielding(opened(seed=3, poses=200), np.array([0.06, -0.08, 0.1]), SOFT)
     choice = chosen(made, ())
     (one,) = choice.chosen
@@ -208,14 +208,14 @@ def test_the_weight_of_an_untold_tool_is_found_beside_the_axis() -> None:
         assert abs(value[i] - SOFT[j - 1] * 4.0 * lever / 0.1) < 4.0 * sigma[i]
 
 
-def test_a_tool_on_the_axis_needs_no_levers() -> None:
+def test_a_tool_on_the_axis_needs_no_levers():
     made = yielding(opened(seed=3, poses=200), np.array([0.0, 0.0, 0.1]), SOFT)
     choice = chosen(made, ())
     assert [c.key for c in choice.chosen] == [("joint_compliance", "all")]
     assert "tool" not in choice.chosen[0].term.choice
 
 
-def test_what_signs_cost_is_the_rise_of_the_bounded_square() -> None:
+def test_what_signs_cost_is_the_rise_of_the_bounded_square():
     """Against least squares with bounds on all rows: no compliance below 0."""
     made = yielding(opened(seed=5), np.array([0.0, 0.0, 0.1]), -SOFT)
     lib = arm_library(made.scene, made.rows)
@@ -247,7 +247,7 @@ def test_what_signs_cost_is_the_rise_of_the_bounded_square() -> None:
         assert (value >= -1e-9 * sigma)[c.upward].all()
 
 
-def test_a_line_is_found_by_its_frequency() -> None:
+def test_a_line_is_found_by_its_frequency():
     made = opened(Cause("gear_ripple", "J4", 300.0), seed=3)
     noise = restricted(made.rows, np.zeros((len(made.rows.error), 0)))
     found = {
@@ -258,7 +258,7 @@ def test_a_line_is_found_by_its_frequency() -> None:
     assert min(abs(found["J4"].choice["turns"] - turns) for turns in ARMS["irb2600"].ripple) < 0.1
 
 
-def test_the_open_variant_is_chosen_by_evidence() -> None:
+def test_the_open_variant_is_chosen_by_evidence():
     """A text leaves the moment of the shift open: the fit then uses the right one."""
     import minimax_cal as mc
 
@@ -268,14 +268,14 @@ def test_the_open_variant_is_chosen_by_evidence() -> None:
     assert fit.accuracy["holdout"].rms_mm < 1.1 * truth
 
 
-def test_resemblance_knows_the_law() -> None:
+def test_resemblance_knows_the_law():
     sealed = make(Case("irb2600", "single", (Cause("gear_error", "J3", 300.0),), seed=1))
     alike = resemblance(sealed.robot, sealed.data, sealed.displacement)
     assert alike["gear_error", "J3"] > 0.99
     assert alike["target_offset", "smr1"] < 0.2
 
 
-def test_terms_of_one_place_are_not_chosen_twice() -> None:
+def test_terms_of_one_place_are_not_chosen_twice():
     made = opened(Cause("backlash", "J3", 2000.0), seed=5)
     choice = chosen(made, ())
     keys = [c.key for c in choice.chosen if c.term.effect != "gear_ripple"]

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pytest
 
 from minimax_cal.evidence import stability
 from minimax_cal.evidence.dictionary import Spec
@@ -25,7 +24,7 @@ def repeats(*names: set[tuple[str, str]], asked: int | None = None) -> Repeats:
     return Repeats(tuple(map(frozenset, names)), asked or len(names))
 
 
-def test_a_frequency_is_the_share_of_subsamples_that_find_one_of_the_names() -> None:
+def test_a_frequency_is_the_share_of_subsamples_that_find_one_of_the_names():
     found = repeats({A}, {A, B}, {B}, {C})
     assert found.frequency({A}) == 0.5
     assert found.frequency({A, B}) == 0.75
@@ -34,13 +33,13 @@ def test_a_frequency_is_the_share_of_subsamples_that_find_one_of_the_names() -> 
     assert repeats({A}, {A}, asked=4).frequency({A}) == 1.0
 
 
-def test_a_name_takes_the_place_of_another_where_it_is_found_without_it() -> None:
+def test_a_name_takes_the_place_of_another_where_it_is_found_without_it():
     assert repeats({A}, {A}, {B}, {B}).instead_of({A}) == [B]
     assert repeats({A}, {A}, {A}, {A}, {A}, {B}).instead_of({A}) == []  # once in six
     assert repeats({A, C}, {A, C}, {B, C}, {B, C}).instead_of({A}) == [B]  # C is there anyhow
 
 
-def test_every_group_is_left_out_as_often_and_stays_together() -> None:
+def test_every_group_is_left_out_as_often_and_stays_together():
     group = np.repeat(np.arange(30), 4)
     masks = np.array(subsamples(group))
     assert len(masks) == PARTS * ROUNDS
@@ -104,9 +103,7 @@ def straight(rng: np.random.Generator, sizes: dict[int, float], rows: int = 240)
     return Library.of(Straight(problem, regressors), [Law(i) for i in range(30)], ())
 
 
-def test_a_law_of_any_domain_is_found_again_and_a_faint_one_less_often(
-    rng: np.random.Generator,
-) -> None:
+def test_a_law_of_any_domain_is_found_again_and_a_faint_one_less_often(rng):
     whole = select(straight(rng, {3: 1.0, 7: 0.25}))
     names = [c.key for c in whole.chosen]
     assert ("law 3", "x") in names
@@ -117,16 +114,14 @@ def test_a_law_of_any_domain_is_found_again_and_a_faint_one_less_often(
     assert found.frequency({("law 1", "x")}) < 0.5
 
 
-def test_rows_too_few_for_their_geometry_are_not_asked(rng: np.random.Generator) -> None:
+def test_rows_too_few_for_their_geometry_are_not_asked(rng):
     whole = select(straight(rng, {3: 5.0}, rows=27))
     found = repeated(whole, subsamples(whole.library.rows.group))
     assert found.names == ()
     assert np.isnan(found.frequency({("law 3", "x")}))
 
 
-def test_subsamples_do_not_depend_on_what_was_drawn_before(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_subsamples_do_not_depend_on_what_was_drawn_before(rng, monkeypatch):
     group = np.arange(9)
     first = subsamples(group)
     rng.normal(size=3)

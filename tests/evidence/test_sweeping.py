@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from problems_fit import study, study_of
+from problems_fit import ROUNDING, check_products, rough_study, study, study_of
 
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.study import Study
@@ -23,15 +23,12 @@ from minimax_cal.evidence.sweeping import COUNT, Swept, ratios_about
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.dictionary import arm_library
 
-ROUNDING = 1e-9  # of products, relative to the largest of their columns
 NEAR = 0.5  # relative difference of a ratio among few from the likeliest of all
 
 
 @pytest.fixture(scope="module")
 def rough() -> Study:
-    """100 poses with play in a joint, a gear's line, and joints that do not come back."""
-    causes = (Cause("backlash", "J2", 400.0), Cause("gear_ripple", "J4", 400.0))
-    return study_of(make(Case("irb2600", "pair", causes, seed=4)))
+    return rough_study()
 
 
 @pytest.fixture(scope="module")
@@ -55,43 +52,22 @@ def some_rows(rows: Problem, kept: Array) -> Problem:
                    rows.size, rows.group[kept], rows.measured[kept], rows.exact)  # fmt: skip
 
 
-def test_products_of_a_part_are_sums_over_its_rows(swept: Swept, rough: Study, kept: Array) -> None:
+def test_products_of_a_part_are_sums_over_its_rows(swept, rough, kept):
     """Of what weighted least squares on the geometry leave of the columns."""
     index, sets = np.array([3, 17, 18]), np.array([[0, 5], [7, 30]])
     columns = swept.columns
     p = columns.fixed - 1
     ratios = swept.ratios[[0, 3, 1]]
     found = swept.at(ratios, index)
-    within = found.among(sets)
     for i, ratio in enumerate(ratios):
         weight = kept / (1.0 + ratio * rough.rows.variance_ratio)
-        root = np.sqrt(weight)
-        geometry = swept.geometry * root
-        basis = np.linalg.qr(geometry.T)[0]
-        every = columns.clear[p:] * root
-        rest = every - (every @ basis) @ basis.T
-        size = np.linalg.norm(columns.clear[p:], axis=1)
-        gram, atol = rest @ rest.T, ROUNDING * np.outer(size, size)
-        assert np.all(np.abs(found.lines[i] - gram[1 + index, 1:]) <= atol[1 + index, 1:])
-        assert np.all(np.abs(found.error[i] - gram[0]) <= atol[0])
-        assert np.all(np.abs(found.pull[i] - gram[1 + index, 0]) <= atol[1 + index, 0])
-        for c, pair in enumerate(1 + sets):
-            off = np.abs(within[i, c] - gram[np.ix_(pair, pair)])
-            assert np.all(off <= atol[np.ix_(pair, pair)])
-        assert_allclose(found.whole[i], weight @ columns.raw**2, rtol=ROUNDING)
-        assert_allclose(found.square[i], every[0] @ every[0], rtol=ROUNDING)
-        assert_allclose(found.logs[i], np.linalg.slogdet(geometry @ geometry.T)[1], atol=1e-8)
-        lower = found.factor[i]
-        assert_allclose(lower @ lower.T, geometry @ geometry.T, rtol=ROUNDING, atol=1e-9)
-        shared = geometry @ every[np.concatenate([[0], 1 + index])].T
-        assert_allclose(lower @ found.part[i], shared, rtol=ROUNDING, atol=ROUNDING * size.max())
+        geometry = swept.geometry * np.sqrt(weight)
+        check_products(found, i, index, sets, columns.clear[p:], geometry, weight, columns.raw)
     span, basis = swept.swept.span, rough.rows.basis[kept]
     assert_allclose(span.T @ basis.T @ basis @ span, np.eye(span.shape[1]), rtol=0, atol=ROUNDING)
 
 
-def test_the_noise_of_a_part_is_that_of_its_rows_alone(
-    swept: Swept, rough: Study, kept: Array
-) -> None:
+def test_the_noise_of_a_part_is_that_of_its_rows_alone(swept, rough, kept):
     alone = some_rows(rough.rows, kept)
     index = np.array([4, 9])
     expected = restricted(alone, swept.columns.raw[kept][:, index])
@@ -102,7 +78,7 @@ def test_the_noise_of_a_part_is_that_of_its_rows_alone(
     assert swept.dof(index) == alone.count - alone.basis.shape[1] - 2
 
 
-def test_ratios_lie_about_those_of_the_whole() -> None:
+def test_ratios_lie_about_those_of_the_whole():
     found = ratios_about([Noise(2.0, 1.0, 1.0), Noise(0.01, 1.0, 1.0)])
     assert found[0] == 0.0
     assert len(found) == COUNT + 1
@@ -110,7 +86,7 @@ def test_ratios_lie_about_those_of_the_whole() -> None:
     assert np.all(np.diff(ratios_about([Noise(0.0, 1.0, 0.0)])) > 0.0)
 
 
-def test_few_rows_have_the_noise_of_their_mean_square(whole: Choice, rough: Study) -> None:
+def test_few_rows_have_the_noise_of_their_mean_square(whole, rough):
     """Fewer than `LEAST_NOISE_DOF` degrees of freedom tell no two noises apart."""
     number = np.arange(rough.scene.poses)
     parts = [Swept(whole.grams, rough.rows.at(number < count)) for count in (1, 2, 3)]
@@ -120,9 +96,7 @@ def test_few_rows_have_the_noise_of_their_mean_square(whole: Choice, rough: Stud
     assert_allclose(noise.variance, float(error @ error) / few.kept.sum(), rtol=1e-6)
 
 
-def test_a_candidate_beside_others_is_least_squares_on_the_rows_that_count(
-    whole: Choice, rough: Study, kept: Array
-) -> None:
+def test_a_candidate_beside_others_is_least_squares_on_the_rows_that_count(whole, rough, kept):
     some = whole.part(kept)
     first, second = (next(c for c in some.candidates if c.key == key and not len(c.doubt))
                      for key in (("backlash", "J2"), ("gear_error", "J3")))  # fmt: skip
@@ -171,7 +145,7 @@ class Some:
         ((Cause("backlash", "J1", 300.0), Cause("thermal_growth", "all", 1000.0)), 60),
     ],
 )
-def test_a_part_names_what_its_rows_alone_name(causes: tuple[Cause, ...], poses: int) -> None:
+def test_a_part_names_what_its_rows_alone_name(causes, poses):
     """From the same candidates, at the likeliest ratio of all and not of few."""
     made = study_of(make(Case("irb2600", "single", causes, seed=5, poses=poses)))
     choice = select(arm_library(made.scene, made.rows))
@@ -192,9 +166,7 @@ def left_by(choice: Choice) -> Array:
     return remaining(rows, weight, choice.known)
 
 
-def test_a_part_is_searched_whatever_the_other_rows_hold(
-    whole: Choice, rough: Study, kept: Array, rng: np.random.Generator
-) -> None:
+def test_a_part_is_searched_whatever_the_other_rows_hold(whole, rough, kept, rng):
     choice = select(whole.part(kept))
     names = {("backlash", "J2"), ("gear_ripple", "J4")}
     assert {c.key for c in choice.chosen} == names
@@ -209,7 +181,7 @@ def test_a_part_is_searched_whatever_the_other_rows_hold(
     assert outside < 0.9 * np.sqrt(np.mean(rough.rows.error[~kept] ** 2))
 
 
-def test_a_part_tunes_again_what_it_ends_with() -> None:
+def test_a_part_tunes_again_what_it_ends_with():
     """By its own rows: a nest that moved late is dated by those poses alone."""
     sealed = study_of(make(Case("irb2600", "single", (Cause("target_shift", "smr2", 1000.0),))))
     choice = select(arm_library(sealed.scene, sealed.rows))
@@ -226,7 +198,7 @@ def test_a_part_tunes_again_what_it_ends_with() -> None:
     assert len(part.library.columns.T) == before
 
 
-def test_a_part_that_shows_hardly_anything_of_a_cause_does_not_test_it() -> None:
+def test_a_part_that_shows_hardly_anything_of_a_cause_does_not_test_it():
     """A nest that moved late, and poses from before: rounding is left of its columns."""
     made = study(jitter=0.0, noise=1.0, seed=3)
     choice = select(arm_library(made.scene, made.rows))
@@ -237,7 +209,7 @@ def test_a_part_that_shows_hardly_anything_of_a_cause_does_not_test_it() -> None
     select(part)  # and no warning
 
 
-def test_parts_leave_no_memory_behind(whole: Choice, kept: Array) -> None:
+def test_parts_leave_no_memory_behind(whole, kept):
     """Products are large: they go with the last name for them, not when a collector comes."""
     part = whole.part(kept)
     choice = select(part)

@@ -16,28 +16,28 @@ def course() -> algorithm_1.Course:
     return course_of(Job("irb2600", 0, 10), ("subgradient:raw",))
 
 
-def test_the_printed_algorithm_comes_near_the_optimum(course: algorithm_1.Course) -> None:
+def test_the_printed_algorithm_comes_near_the_optimum(course):
     """A thousandth of what the start is off by, within ten outer steps, full steps or searched."""
     for values in course.ways.values():
         assert values[10] <= min(GOOD, 1e-3 * values[0])
         assert min(values) > -1e-9  # nothing is below the optimum
 
 
-def test_a_line_search_never_rises(course: algorithm_1.Course) -> None:
+def test_a_line_search_never_rises(course):
     assert (np.diff(course.ways["with a line search"]) <= 1e-9).all()
 
 
-def test_our_backend_of_the_method_comes_as_near(course: algorithm_1.Course) -> None:
+def test_our_backend_of_the_method_comes_as_near(course):
     assert course.ours["subgradient:raw"] <= 1e-3
 
 
 @pytest.mark.slow  # loops that are not compiled; `test_the_inner_loop_...` holds the iterates
-def test_the_eliminated_form_comes_nearer() -> None:
+def test_the_eliminated_form_comes_nearer():
     ours = course_of(Job("irb2600", 0, 0), ("subgradient:eliminated",)).ours
     assert ours["subgradient:eliminated"] <= 1e-5
 
 
-def test_the_inner_loop_is_that_of_our_backend() -> None:
+def test_the_inner_loop_is_that_of_our_backend():
     """Written twice, from the paper: the same iterates."""
     problem, start = problem_of(Job("irb2600", 0, 1), "squared")
     at = problem.linearise(start)
@@ -51,7 +51,7 @@ def test_the_inner_loop_is_that_of_our_backend() -> None:
     assert_allclose(lam, ours.y, atol=np.abs(ours.y - near.y).max() + 1e-12)
 
 
-def test_rows_are_those_of_the_paper() -> None:
+def test_rows_are_those_of_the_paper():
     """The active function's own row is zero; a distance that is met exactly leaves C = -1."""
     problem, start = problem_of(Job("irb2600", 0, 1), "squared")
     at = problem.linearise(start)

@@ -6,7 +6,7 @@ import pytest
 from experiments.boosting import BINS, boost, grow
 
 
-def test_trees_foretell_what_features_hold_and_no_noise() -> None:
+def test_trees_foretell_what_features_hold_and_no_noise():
     rng = np.random.default_rng(0)
     seen, new = rng.uniform(-1.0, 1.0, size=(2, 2000, 6))
 
@@ -20,7 +20,7 @@ def test_trees_foretell_what_features_hold_and_no_noise() -> None:
     assert np.std(noise) < 0.35
 
 
-def test_a_tree_splits_where_a_step_is() -> None:
+def test_a_tree_splits_where_a_step_is():
     bins = np.tile(np.arange(BINS), 40)[:, None]
     tree = grow(bins, np.where(bins[:, 0] > 9, 1.0, -1.0))
     assert (tree.feature[0, 0], tree.above[0, 0]) == (0, 9)

@@ -56,7 +56,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         log.close()
 
 
-def test_a_cluster_gives_the_same_results(cluster: str, tmp_path: Path) -> None:
+def test_a_cluster_gives_the_same_results(cluster, tmp_path):
     expected = [work(job) for job in JOBS]
     found = sweep(work, JOBS, name="dask", cluster=cluster, folder=tmp_path)
     assert same(found, expected)
@@ -68,7 +68,7 @@ def test_a_cluster_gives_the_same_results(cluster: str, tmp_path: Path) -> None:
     assert {each.process for each in again} == processes
 
 
-def test_calibrate_many_is_what_one_process_finds(cluster: str) -> None:
+def test_calibrate_many_is_what_one_process_finds(cluster):
     sheets = [mc.simulate("irb120", 30, 1, seed).data for seed in range(2)]
     broken = sheets[0].take(np.arange(2))
     found = mc.calibrate_many("irb120", [sheets[0], broken, sheets[1]], cluster=cluster)
@@ -79,7 +79,7 @@ def test_calibrate_many_is_what_one_process_finds(cluster: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_diagnosis_is_what_one_process_finds(cluster: str) -> None:
+def test_a_diagnosis_is_what_one_process_finds(cluster):
     data = mc.simulate("irb120", 60, 1, 1, truth=mc.Truth(compliance=3e-6)).data
     alone, found = mc.diagnose("irb120", data), mc.diagnose("irb120", data, cluster=cluster)
     assert found.verdict == alone.verdict
@@ -87,9 +87,7 @@ def test_a_diagnosis_is_what_one_process_finds(cluster: str) -> None:
     assert_allclose(found.beyond.typical_mm, alone.beyond.typical_mm, rtol=1e-12)
 
 
-def test_a_fleet_is_what_one_process_finds(
-    cluster: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_fleet_is_what_one_process_finds(cluster, tmp_path, capsys):
     cells = tmp_path / "cells.toml"
     lines = ['[defaults]\nrobot = "irb120"\nobjective = "sum"\ntolerance = "rms 0.5"']
     for name in ("0", "1"):
@@ -104,17 +102,13 @@ def test_a_fleet_is_what_one_process_finds(
     assert told == mc.fleet(cells, processes=1).to_dict()
 
 
-def test_a_cluster_with_other_code_is_refused(
-    cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cluster_with_other_code_is_refused(cluster, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "fingerprint", lambda function: "other")
     with pytest.raises(OptionError, match="other code"):
         sweep(work, JOBS, name="other", cluster=cluster, folder=tmp_path)
 
 
-def test_a_cluster_without_the_study_is_refused(
-    cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cluster_without_the_study_is_refused(cluster, tmp_path, monkeypatch):
     (tmp_path / "only_here.py").write_text("def work(job):\n    return job\n")
     monkeypatch.syspath_prepend(tmp_path)
     import only_here
@@ -123,12 +117,12 @@ def test_a_cluster_without_the_study_is_refused(
         sweep(only_here.work, [1, 2], name="lost", cluster=cluster, folder=tmp_path)
 
 
-def test_errors_of_a_job_come_back_from_a_cluster(cluster: str, tmp_path: Path) -> None:
+def test_errors_of_a_job_come_back_from_a_cluster(cluster, tmp_path):
     with pytest.raises(ModuleNotFoundError, match="no extra for"):
         sweep(missing, [1, 2], name="error", cluster=cluster, folder=tmp_path)
 
 
-def test_a_job_that_kills_its_worker_ends_the_sweep(cluster: str, tmp_path: Path) -> None:
+def test_a_job_that_kills_its_worker_ends_the_sweep(cluster, tmp_path):
     with pytest.raises(click.ClickException, match="worker"):  # joblib's backend waits for ever
         sweep(kill_worker, [0, 1], name="killed", cluster=cluster, folder=tmp_path)
 
@@ -157,12 +151,7 @@ def deserted(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]
 
 
 @pytest.mark.parametrize("dead", ["worker", "scheduler"])
-def test_a_deserted_cluster_is_not_waited_for(
-    dead: str,
-    deserted: tuple[str, list[subprocess.Popen[bytes]]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_deserted_cluster_is_not_waited_for(dead, deserted, tmp_path, monkeypatch):
     monkeypatch.setattr(parallel, "PATIENCE", 60.0)
     monkeypatch.setattr(parallel, "DESERTED", 1.0)
     monkeypatch.setattr(parallel, "WATCH", 0.2)

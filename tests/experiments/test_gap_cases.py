@@ -13,6 +13,7 @@ import minimax_cal as mc
 from experiments import blind_gap, gap_cases
 from experiments.gap_cases import ARMS, FAULTS, LAWS, Case, Cause, Sealed, Truth, World
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import plain
 
 ROBOTS = tuple(ARMS)
 
@@ -36,7 +37,7 @@ def seen(place: World, robot: mc.Robot, q: Array, spots: Array) -> Array:
 
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("law", LAWS)
-def test_lambda_is_what_was_asked_for(law: str, robot: str) -> None:
+def test_lambda_is_what_was_asked_for(law, robot):
     for place in gap_cases.places(law, robot)[-1:]:
         power = 1.0 if law in FAULTS else 70.0
         sealed = gap_cases.make(Case(robot, "test", (Cause(law, place, power, 1),), poses=60))
@@ -48,7 +49,7 @@ def test_lambda_is_what_was_asked_for(law: str, robot: str) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_no_power_moves_nothing(law: str) -> None:
+def test_no_power_moves_nothing(law):
     place = gap_cases.places(law, "irb2600")[0]
     sealed = gap_cases.make(Case("irb2600", "test", (Cause(law, place, 0.0),), poses=60))
     assert np.all(sealed.displacement == 0.0)
@@ -56,14 +57,14 @@ def test_no_power_moves_nothing(law: str) -> None:
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_forward_kinematics_is_the_packages(robot: str) -> None:
+def test_forward_kinematics_is_the_packages(robot):
     place = world(robot)
     expected = seen(place, place.robot, place.q + place.jitter, place.spots)
     assert_allclose(gap_cases.measure(place, gap_cases.rigid(place)), expected, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_torque_is_the_slope_of_potential_energy(robot: str) -> None:
+def test_torque_is_the_slope_of_potential_energy(robot):
     place = world(robot)
     q = place.q[:20]
 
@@ -78,7 +79,7 @@ def test_torque_is_the_slope_of_potential_energy(robot: str) -> None:
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_jacobians_are_the_derivatives_of_the_points(robot: str) -> None:
+def test_jacobians_are_the_derivatives_of_the_points(robot):
     place = dataclasses.replace(world(robot, jitter=0.0), base=np.eye(4))
     geometry, joints = gap_cases.jacobians(place)
     assert geometry.shape[-1] == 5 * 6 + 6 + 9
@@ -101,7 +102,7 @@ def test_jacobians_are_the_derivatives_of_the_points(robot: str) -> None:
         assert_allclose(joints[..., joint], (ends[0] - ends[1]) / (2 * step), rtol=0, atol=1e-8)
 
 
-def test_geometry_alone_has_no_power() -> None:
+def test_geometry_alone_has_no_power():
     place = world()
     geometry, _ = gap_cases.jacobians(place)
     ruler = gap_cases.judge(place, np.full(geometry.shape[:2], 1e-5), 6e-6)
@@ -111,7 +112,7 @@ def test_geometry_alone_has_no_power() -> None:
         assert np.linalg.norm(motion) > 1e-3
 
 
-def test_power_without_jitter_is_the_squared_ratio_to_noise() -> None:
+def test_power_without_jitter_is_the_squared_ratio_to_noise():
     place = world()
     ruler = gap_cases.judge(place, np.full((len(place.q), 3), 2e-5), 0.0)
     bare = dataclasses.replace(ruler, geometry=ruler.geometry[:, :0])
@@ -120,7 +121,7 @@ def test_power_without_jitter_is_the_squared_ratio_to_noise() -> None:
     assert_allclose(bare.power(motion), 0.25 * place.train.sum(), rtol=1e-12)
 
 
-def test_encoder_gain_is_a_difference_of_forward_kinematics() -> None:
+def test_encoder_gain_is_a_difference_of_forward_kinematics():
     place = world(jitter=0.0)
     gain = np.array([1.0, 1.0, 1.003, 1.0, 1.0, 1.0])
     expected = seen(place, place.robot, place.q * gain, place.spots)
@@ -129,7 +130,7 @@ def test_encoder_gain_is_a_difference_of_forward_kinematics() -> None:
     assert_allclose(found, expected, rtol=0, atol=1e-13)
 
 
-def test_coupling_backlash_and_settling_by_hand() -> None:
+def test_coupling_backlash_and_settling_by_hand():
     place = world(jitter=0.0)
     last = np.concatenate([place.q[:1], place.q[:-1]])
     for cause, joint, dq in (
@@ -145,7 +146,7 @@ def test_coupling_backlash_and_settling_by_hand() -> None:
         assert_allclose(moved(place, cause, 2e-4), expected, rtol=0, atol=1e-13)
 
 
-def test_growth_is_another_geometry_at_every_row() -> None:
+def test_growth_is_another_geometry_at_every_row():
     place = world(jitter=0.0)
     found = moved(place, Cause("thermal_growth", "all", 1.0), 1e-4)
     assert_allclose(found[0], 0.0, atol=1e-15)  # time 0
@@ -159,7 +160,7 @@ def test_growth_is_another_geometry_at_every_row() -> None:
     assert_allclose(found, share[:, None, None] * whole, rtol=0, atol=1e-9)
 
 
-def test_target_laws_move_what_they_say() -> None:
+def test_target_laws_move_what_they_say():
     place = world(jitter=0.0)
     still = gap_cases.measure(place, gap_cases.rigid(place))
     offset = moved(place, Cause("target_offset", "smr2", 1.0), 1e-4)
@@ -174,7 +175,7 @@ def test_target_laws_move_what_they_say() -> None:
     assert_allclose(size[after, 2], 3e-4, rtol=1e-9)
 
 
-def test_a_beam_under_a_weight_at_its_end_sags_as_the_textbook_says() -> None:
+def test_a_beam_under_a_weight_at_its_end_sags_as_the_textbook_says():
     """One heavy point at the end of a level beam: slope F L^2 / 2EI, sag F L^3 / 3EI."""
     place = world()
     mdh = np.zeros((6, 5))
@@ -189,7 +190,7 @@ def test_a_beam_under_a_weight_at_its_end_sags_as_the_textbook_says() -> None:
     assert_allclose(unit.links[:, 1, [0, 2, 3, 4]], 0.0, atol=1e-9)
 
 
-def test_base_flex_tips_the_arm_towards_its_load() -> None:
+def test_base_flex_tips_the_arm_towards_its_load():
     place = world()
     unit = LAWS["base_flex"](place, Cause("base_flex", "frame", 1.0), np.random.default_rng(0))
     centres = gap_cases.centres(place.robot, gap_cases.frames(place.robot, place.q))
@@ -199,7 +200,7 @@ def test_base_flex_tips_the_arm_towards_its_load() -> None:
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_the_session_is_as_described(robot: str) -> None:
+def test_the_session_is_as_described(robot):
     sealed = gap_cases.make(Case(robot, "test", (Cause("backlash", "J1", 50.0),), poses=60))
     data = sealed.data
     train = data.columns["split"] == "train"
@@ -218,7 +219,7 @@ def test_the_session_is_as_described(robot: str) -> None:
     assert 0.3 < away.min() < away.max() < 7.0
 
 
-def test_the_robot_told_is_not_the_true_one() -> None:
+def test_the_robot_told_is_not_the_true_one():
     sealed = gap_cases.make(Case("irb2600", "test"))
     told, true = sealed.robot, sealed.true
     assert_allclose(told.mdh, mc.load_robot("irb2600").mdh)
@@ -229,7 +230,7 @@ def test_the_robot_told_is_not_the_true_one() -> None:
     assert_allclose(off, gap_cases.WRONG, rtol=1e-9)
 
 
-def test_noise_and_floor() -> None:
+def test_noise_and_floor():
     """Without effect, the true robot leaves the noise and jitter that the floor says."""
     sums = []
     for seed in range(5):
@@ -242,7 +243,7 @@ def test_noise_and_floor() -> None:
     assert_allclose(np.mean(sums), 1.0, atol=0.1)
 
 
-def test_files_read_back_and_keep_the_secret_apart(tmp_path: Path) -> None:
+def test_files_read_back_and_keep_the_secret_apart(tmp_path):
     causes = (Cause("joint_compliance", "J2", 100.0), Cause("gear_error", "J3", 60.0, 1))
     sealed = gap_cases.make(Case("irb2600", "pair", causes, background=10.0, seed=9))
     gap_cases.write(sealed, tmp_path)
@@ -262,7 +263,7 @@ def test_files_read_back_and_keep_the_secret_apart(tmp_path: Path) -> None:
     assert_allclose(truth.powers, [100.0, 60.0], rtol=1e-6)
 
 
-def test_the_same_case_is_the_same_file() -> None:
+def test_the_same_case_is_the_same_file():
     case = Case("ur10e", "single", (Cause("tool_flex", "all", 50.0),), seed=3)
     assert pickle.loads(pickle.dumps(case)) == case
     first, second = gap_cases.make(case), gap_cases.make(case)
@@ -311,11 +312,11 @@ GAIN = ("encoder_gain", "J2")
         (("outliers", "smr1"), ("outliers", "all"), "exact"),
     ],
 )
-def test_match(said: tuple[str, str], truth: tuple[str, str], expected: str) -> None:
+def test_match(said, truth, expected):
     assert blind_gap.match(said, truth) == expected
 
 
-def test_score_of_single_answers() -> None:
+def test_score_of_single_answers():
     case = Case("irb2600", "single", (Cause("gear_error", "J2", 100.0),))
     row = blind_gap.score(case, truth_of(J2), answer("named", J2))
     assert (row["match"], row["in_set"], row["set_size"], row["sure"]) == ("exact", True, 1, True)
@@ -326,10 +327,10 @@ def test_score_of_single_answers() -> None:
     assert (row["all_right"], row["all_in_sets"], row["strange"]) == (False, True, 1)
     row = blind_gap.score(case, truth_of(J2), answer("unknown"))
     assert (row["match"], row["in_set"], row["set_size"]) == ("", False, 0)
-    json.dumps(blind_gap.clean(row), allow_nan=False)
+    json.dumps(plain(row), allow_nan=False)
 
 
-def test_score_of_several_effects() -> None:
+def test_score_of_several_effects():
     causes = (Cause("gear_error", "J2", 100.0), Cause("encoder_gain", "J2", 100.0))
     case = Case("irb2600", "pair", causes)
     truth = truth_of(J2, GAIN)
@@ -344,13 +345,13 @@ def test_score_of_several_effects() -> None:
     assert blind_gap.score(case, small, answer("named", J2, GAIN, J3))["strange"] == 1
 
 
-def test_nearest_rival_is_not_the_truth_itself() -> None:
+def test_nearest_rival_is_not_the_truth_itself():
     alike = {J2: 1.0, ALL: 0.99, J3: 0.2, GAIN: 0.8, ("backlash", "J1"): float("nan")}
     assert blind_gap.nearest(J2, alike) == (GAIN, 0.8)
     assert blind_gap.nearest(J2, {J2: 1.0}) == (("", ""), 0.0)
 
 
-def test_criteria_and_tables_of_made_up_rows() -> None:
+def test_criteria_and_tables_of_made_up_rows():
     def row(condition: str, said: dict, *names: tuple[str, str], **more: object) -> dict:
         causes = tuple(Cause(effect, place, 100.0) for effect, place in names)
         made = blind_gap.score(Case("irb2600", condition, causes), truth_of(*names), said)
@@ -404,15 +405,13 @@ def test_criteria_and_tables_of_made_up_rows() -> None:
         (1, float("nan"), True, ("", "")),
     ],
 )
-def test_a_limit_is_shown_as_it_is_asked(
-    hits: int, limit: float, good: bool, shown: tuple[str, str]
-) -> None:
+def test_a_limit_is_shown_as_it_is_asked(hits, limit, good, shown):
     rows = [{"hit": i < hits} for i in range(200)]
     line = blind_gap.Criterion("", "", rows, lambda row: row["hit"], limit, good).line()
     assert line[5:] == shown
 
 
-def test_a_run_shows_the_diagnosis_files_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_shows_the_diagnosis_files_only(monkeypatch):
     """Robot and data by path, in a folder that says nothing; then the seal is opened."""
     given = []
 
@@ -442,13 +441,13 @@ def test_a_run_shows_the_diagnosis_files_only(monkeypatch: pytest.MonkeyPatch) -
     assert_allclose(row["known_mm"], row["floor_mm"], rtol=0.2)
 
 
-def test_intervals_are_clopper_and_pearsons() -> None:
+def test_intervals_are_clopper_and_pearsons():
     assert_allclose(blind_gap.interval(0, 100), [0.0, 1 - 0.025 ** (1 / 100)], atol=1e-12)
     assert_allclose(blind_gap.interval(100, 100), [0.025 ** (1 / 100), 1.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("size", [blind_gap.Size(), blind_gap.QUICK])
-def test_plan_covers_every_condition(size: blind_gap.Size) -> None:
+def test_plan_covers_every_condition(size):
     cases = blind_gap.plan(1, size)
     assert len({case.seed for case in cases}) == len(cases)
     conditions = {case.condition for case in cases}
@@ -461,6 +460,6 @@ def test_plan_covers_every_condition(size: blind_gap.Size) -> None:
             assert cause.place in gap_cases.places(cause.law, case.robot)
 
 
-def test_sealed_fields_are_what_is_written() -> None:
+def test_sealed_fields_are_what_is_written():
     names = {field.name for field in dataclasses.fields(Sealed)}
     assert {field.name for field in dataclasses.fields(Truth)} <= names

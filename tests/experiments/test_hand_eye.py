@@ -8,7 +8,6 @@ import minimax_cal as mc
 from experiments.hand_eye import Placed, closed_form, linearise, mdh_pose, place, twists
 from experiments.poses import exp, inverse, pose_residual
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.sampling import random_poses
 
@@ -26,7 +25,7 @@ def cell(robot: mc.Robot, count: int, seed: int) -> tuple[Array, Array, Array, A
 
 @pytest.mark.parametrize("name", ["irb2600", "ur10", "meca500"])
 @pytest.mark.parametrize("seed", range(20))
-def test_closed_form_recovers_both_frames(name: str, seed: int) -> None:
+def test_closed_form_recovers_both_frames(name, seed):
     robot = mc.load_robot(name)
     _, A, B, X, Z = cell(robot, 20, seed)
     found_x, found_z = closed_form(A, B)
@@ -34,7 +33,7 @@ def test_closed_form_recovers_both_frames(name: str, seed: int) -> None:
     assert_allclose(found_z, Z, rtol=0, atol=1e-9)
 
 
-def test_closed_form_with_half_turns() -> None:
+def test_closed_form_with_half_turns():
     # from the first pose all others turn by almost 180 degrees: the signs are in doubt
     rng = np.random.default_rng(4)
     axes = rng.normal(size=(12, 3))
@@ -47,7 +46,7 @@ def test_closed_form_with_half_turns() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_refinement_finds_what_rotations_about_one_axis_leave_open(seed: int) -> None:
+def test_refinement_finds_what_rotations_about_one_axis_leave_open(seed):
     robot = mc.load_robot("scara_600")
     q, _, B, _, _ = cell(robot, 20, seed)
     found = place(robot.mdh, q * robot.sign, robot.prismatic, B, LENGTH)
@@ -56,7 +55,7 @@ def test_refinement_finds_what_rotations_about_one_axis_leave_open(seed: int) ->
     assert_allclose(poses, B, rtol=0, atol=1e-9)
 
 
-def test_refinement_of_noisy_poses(robot: mc.Robot) -> None:
+def test_refinement_of_noisy_poses(robot):
     q, A, B, X, Z = cell(robot, 60, 1)
     noise = 1e-4 * np.random.default_rng(2).normal(size=(60, 6))
     B = B @ exp(noise)
@@ -73,7 +72,7 @@ def test_refinement_of_noisy_poses(robot: mc.Robot) -> None:
     assert_allclose(inverse(found.x.base), Z, rtol=0, atol=1e-4)
 
 
-def test_twists_are_the_derivative_of_the_step(rng: np.random.Generator) -> None:
+def test_twists_are_the_derivative_of_the_step(rng):
     robot = mc.load_robot("scara_600")  # turning joints and a slide
     q = random_poses(robot, 5, rng) * robot.sign
     mdh = robot.mdh + 0.1 * rng.normal(size=robot.mdh.shape)
@@ -87,7 +86,7 @@ def test_twists_are_the_derivative_of_the_step(rng: np.random.Generator) -> None
         assert_allclose(turn, slopes[:, 3:, i], rtol=0, atol=1e-12)
 
 
-def test_mdh_pose_fit_finds_the_true_robot(robot: mc.Robot, clean: Simulation) -> None:
+def test_mdh_pose_fit_finds_the_true_robot(robot, clean):
     found = mdh_pose(robot, clean.data)
     assert found.status == "converged"
     assert found.identified == 30

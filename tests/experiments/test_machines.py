@@ -12,7 +12,7 @@ from experiments.machines import LAWS, MAKES, Asked
 
 
 @pytest.mark.parametrize("robot", MAKES)
-def test_an_arm_moves_as_the_package_says_slides_too(robot: str) -> None:
+def test_an_arm_moves_as_the_package_says_slides_too(robot):
     place = machines.world_of(Asked(robot, "test", poses=40), np.random.default_rng(4))
     pose = place.base @ place.robot.pose(place.q + place.jitter)
     expected = np.einsum("mij,kj->mki", pose[:, :3, :3], place.spots) + pose[:, None, :3, 3]
@@ -20,7 +20,7 @@ def test_an_arm_moves_as_the_package_says_slides_too(robot: str) -> None:
 
 
 @pytest.mark.parametrize("robot", ["scara_600", "rail"])
-def test_a_slide_is_a_column_of_the_jacobian(robot: str) -> None:
+def test_a_slide_is_a_column_of_the_jacobian(robot):
     asked = Asked(robot, "test", poses=40, jitter=0.0)
     place = replace(machines.world_of(asked, np.random.default_rng(4)), base=np.eye(4))
     joint, step = int(np.argmax(place.robot.prismatic)), 1e-6
@@ -34,7 +34,7 @@ def test_a_slide_is_a_column_of_the_jacobian(robot: str) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_lambda_is_what_was_asked_for(law: str) -> None:
+def test_lambda_is_what_was_asked_for(law):
     able = [robot for robot in MAKES if machines.places(law, robot, 3)]
     for robot in (able[0], able[-1]):
         place = machines.places(law, robot, 3)[-1]
@@ -43,7 +43,7 @@ def test_lambda_is_what_was_asked_for(law: str) -> None:
         assert made.displacement.shape == (1, 3, made.data.poses, 3)
 
 
-def test_a_separable_cause_is_told_from_one_that_is_not() -> None:
+def test_a_separable_cause_is_told_from_one_that_is_not():
     row = {"verdict": "named", "all_right": True, "lambda": 60.0, "telling": 30.0}
     assert machine_gap.separable(row)
     assert machine_gap.right(row)
@@ -52,7 +52,7 @@ def test_a_separable_cause_is_told_from_one_that_is_not() -> None:
     assert not machine_gap.right(row | {"all_right": False})
 
 
-def test_every_case_can_be_made_and_has_a_seed_of_its_own() -> None:
+def test_every_case_can_be_made_and_has_a_seed_of_its_own():
     cases = machine_gap.plan(5, machine_gap.QUICK)
     assert len({case.seed for case in cases}) == len(cases)
     for case in cases:

@@ -2,7 +2,6 @@
 
 import pickle
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,14 +50,14 @@ def moved_triangle(rng: np.random.Generator) -> tuple[Array, Array, Array]:
     return shape, poses, points(poses, shape)
 
 
-def test_poses_of_a_triangle_are_recovered(rng: np.random.Generator) -> None:
+def test_poses_of_a_triangle_are_recovered(rng):
     shape, poses, y = moved_triangle(rng)
     assert_allclose(triangle(y), shape, atol=1e-13)
     assert_allclose(shape.mean(axis=0), 0.0, atol=1e-15)
     assert_allclose(poses_of(shape, y), poses, atol=1e-13)
 
 
-def test_errors_of_known_poses(rng: np.random.Generator) -> None:
+def test_errors_of_known_poses(rng):
     measured = exp(rng.normal(size=(30, 6)))
     turn = rng.normal(size=(30, 3))
     other = measured @ pose(Rotation.from_rotvec(turn).as_matrix(), np.tile([0.3, 0, 0.4], (30, 1)))
@@ -66,7 +65,7 @@ def test_errors_of_known_poses(rng: np.random.Generator) -> None:
     assert_allclose(position_error(measured, other), 0.5, atol=1e-14)
 
 
-def test_euler_angles_exaggerate_near_gimbal_lock() -> None:
+def test_euler_angles_exaggerate_near_gimbal_lock():
     def turned(a: float, b: float, c: float) -> Array:
         turn = Rotation.from_euler("xyz", [a, b, c], degrees=True).as_matrix()
         return pose(turn, np.zeros(3))[None]
@@ -78,13 +77,13 @@ def test_euler_angles_exaggerate_near_gimbal_lock() -> None:
     assert_allclose(euler_deviation(*near), np.radians([[40, 0, 40]]), atol=1e-9)
 
 
-def test_lever_weighs_an_angle_like_the_three_points(rng: np.random.Generator) -> None:
+def test_lever_weighs_an_angle_like_the_three_points(rng):
     shape = triangle(rng.normal(size=(1, 3, 3)))
     spread = sum(np.trace(hat(s).T @ hat(s)) for s in shape) / 3.0  # mean over axes of the turn
     assert 3.0 * lever(shape) ** 2 == pytest.approx(spread, rel=1e-12)
 
 
-def test_sum_and_minimax_are_the_best_at_what_they_minimise(alone: Studies) -> None:
+def test_sum_and_minimax_are_the_best_at_what_they_minimise(alone):
     # all methods but the nominal one fit the same family of arms
     _, results = alone[0]
     best = figure_of(results["sum"], "AP RMSE", "training")
@@ -95,7 +94,7 @@ def test_sum_and_minimax_are_the_best_at_what_they_minimise(alone: Studies) -> N
         assert figure_of(outcomes, "worst SMR", "training") >= worst * (1 - 1e-3), name
 
 
-def test_poe_and_mdh_fit_one_smr_alike(alone: Studies) -> None:
+def test_poe_and_mdh_fit_one_smr_alike(alone):
     _, results = alone[0]
     for i, name in enumerate(SINGLE, start=1):
         mdh, poe = results[name][0], results[f"POE SMR {i}"][0]
@@ -103,27 +102,27 @@ def test_poe_and_mdh_fit_one_smr_alike(alone: Studies) -> None:
             assert_allclose(mdh.errors[part].distance, poe.errors[part].distance, rtol=0, atol=1e-8)
 
 
-def test_every_method_beats_the_nominal_one_held_out(alone: Studies) -> None:
+def test_every_method_beats_the_nominal_one_held_out(alone):
     _, results = alone[0]
     for key in FIGURES:
         values = {name: figure_of(each, key, "held out") for name, each in results.items()}
         assert max(values, key=lambda name: values[name]) == "nominal"
 
 
-def test_absent_data_are_said_to_be_absent(alone: Studies) -> None:
+def test_absent_data_are_said_to_be_absent(alone):
     text = "\n".join(table.text(200) for table in methods.tables(alone, []))
     assert text.count("data absent") == 2 * 2  # title and row, for each real robot
     assert list(methods.figures(alone)) == ["methods_1"]
 
 
-def test_training_never_stands_without_held_out(alone: Studies) -> None:
+def test_training_never_stands_without_held_out(alone):
     for table in methods.tables(alone, []):
         for name in table.header:
             if name.endswith("training"):
                 assert name.replace("training", "held out") in table.header
 
 
-def test_splits_part_the_poses() -> None:
+def test_splits_part_the_poses():
     shared("fanuc_r2000")
     for case in methods.cases(quick=False):
         joints = [methods.divided(case, split, 3, SHARED)[1:] for split in range(case.splits)]
@@ -136,7 +135,7 @@ def test_splits_part_the_poses() -> None:
             assert len(np.unique(every, axis=0)) == len(every) == train.poses + held.poses
 
 
-def test_real_robots_improve_held_out() -> None:
+def test_real_robots_improve_held_out():
     shared("irb120")
     case = methods.cases(quick=True)[1]
     outcomes = {
@@ -150,7 +149,7 @@ def test_real_robots_improve_held_out() -> None:
     assert len(pickle.dumps(outcomes)) > 0  # so that a sweep may keep them
 
 
-def test_weights_are_swept_for_each_case(alone: Studies, tmp_path: Path) -> None:
+def test_weights_are_swept_for_each_case(alone, tmp_path):
     case, results = alone[0]
     asked: list[float] = []
 
@@ -163,7 +162,7 @@ def test_weights_are_swept_for_each_case(alone: Studies, tmp_path: Path) -> None
     assert [(each.label, len(outcomes)) for each, _, outcomes in found] == [(case.label, 1)] * 7
 
 
-def test_a_heavier_weight_favours_orientation(alone: Studies, tmp_path: Path) -> None:
+def test_a_heavier_weight_favours_orientation(alone, tmp_path):
     case, results = alone[0]
     heavy = [methods.outcome_of(Job(case, 0, POSE, 1, tmp_path, length=3.0))]
     for key, sense in (("AO' RMSE", -1.0), ("AP RMSE", 1.0)):
@@ -171,7 +170,7 @@ def test_a_heavier_weight_favours_orientation(alone: Studies, tmp_path: Path) ->
         assert sense * change > 0.0
 
 
-def test_command(alone: Studies, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_command(alone, tmp_path, monkeypatch):
     case, results = alone[0]
     monkeypatch.setattr(methods, "run", lambda *_: alone)
     monkeypatch.setattr(methods, "run_weights", lambda *_: [(case, np.nan, results[POSE])])

@@ -12,7 +12,6 @@ from experiments.motion_blind import (
     SINGLE,
     SOUND,
     Told,
-    interval,
     oracle,
     place_of,
     plan,
@@ -37,7 +36,7 @@ from experiments.motion_cases import (
 from minimax_cal.dynamics.laws import LAWS
 
 
-def test_two_generators_agree_where_friction_is_no_matter_of_taste() -> None:
+def test_two_generators_agree_where_friction_is_no_matter_of_taste():
     """MuJoCo's friction is soft about a reversal; rotor, body and the rest are the same."""
     pytest.importorskip("mujoco")
     from experiments.motion_cases import by_mujoco
@@ -52,7 +51,7 @@ def test_two_generators_agree_where_friction_is_no_matter_of_taste() -> None:
 
 
 @pytest.mark.parametrize("name", CAUSES)
-def test_every_cause_adds_torque_to_a_sound_arm(name: str) -> None:
+def test_every_cause_adds_torque_to_a_sound_arm(name):
     made = make(Case(SINGLE, OWN, ((name, 1),), 7))
     size = np.sqrt(np.mean(np.concatenate(made.signal) ** 2, axis=0))
     noise = np.sqrt(np.mean(np.concatenate(made.noise) ** 2, axis=0))
@@ -61,7 +60,7 @@ def test_every_cause_adds_torque_to_a_sound_arm(name: str) -> None:
         assert np.all(size[np.arange(len(size)) != 1] < 1e-6)
 
 
-def test_a_sound_arm_has_nothing_to_be_seen() -> None:
+def test_a_sound_arm_has_nothing_to_be_seen():
     made = make(Case(SOUND, OWN, (), 7))
     again = make(Case(SOUND, OWN, (), 7))
     assert all(np.abs(part).max() < 1e-9 for part in made.signal)
@@ -69,7 +68,7 @@ def test_a_sound_arm_has_nothing_to_be_seen() -> None:
     assert not np.array_equal(made.runs[0].torque, make(Case(SOUND, OWN, (), 8)).runs[0].torque)
 
 
-def test_a_flexible_joint_moves_its_link_otherwise_than_its_motor() -> None:
+def test_a_flexible_joint_moves_its_link_otherwise_than_its_motor():
     rng = np.random.default_rng(1)
     robot = some_arm(rng)
     plant = replace(sound(rng, robot), compliance=np.full(robot.joints, 1e-3))
@@ -79,7 +78,7 @@ def test_a_flexible_joint_moves_its_link_otherwise_than_its_motor() -> None:
     assert_allclose(motor.q - motion.q, 1e-3 * rigid, atol=1e-12)
 
 
-def test_a_hysteretic_cable_remembers_where_it_turned() -> None:
+def test_a_hysteretic_cable_remembers_where_it_turned():
     there = np.linspace(0.0, 1.0, 101)
     way = hysteresis(np.concatenate([there, there[::-1]]), 0.2)
     assert way[100] == pytest.approx(1.0)
@@ -87,7 +86,7 @@ def test_a_hysteretic_cable_remembers_where_it_turned() -> None:
     assert way[20] == pytest.approx(1.0)  # 0.2 rad from where it began
 
 
-def test_the_oracle_tells_a_rotor_from_other_laws_and_sees_no_payload_in_a_torque() -> None:
+def test_the_oracle_tells_a_rotor_from_other_laws_and_sees_no_payload_in_a_torque():
     case = Case(SINGLE, OWN, (("armature", 2),), 11)
     made = make(case)
     visible, separable = oracle(made, (("armature", "J3"),))
@@ -120,7 +119,7 @@ def told(condition: str, truth: str, verdict: str, *main: str, **more: object) -
                 tuple(map(pair, main)), **given)  # type: ignore[arg-type]  # fmt: skip
 
 
-def test_answers_are_judged_by_the_truth() -> None:
+def test_answers_are_judged_by_the_truth():
     right = told(SINGLE, "stribeck J2", "named", "stribeck J2")
     kin = told(SINGLE, "stribeck J2", "named", "degressive J2")
     wrong = told(SINGLE, "stribeck J2", "named", "stribeck J3")
@@ -146,7 +145,7 @@ def test_answers_are_judged_by_the_truth() -> None:
     assert counts["outside: sure and wrong"] == (2, 1)
 
 
-def test_a_payload_is_judged_by_its_mass_and_interval() -> None:
+def test_a_payload_is_judged_by_its_mass_and_interval():
     near = told(SINGLE, "payload L3", "named", "payload L3", mass=(1.02, 0.005, 1.0))
     far = told(SINGLE, "payload L3", "named", "payload L3", mass=(1.05, 0.05, 1.0))
     counts = {row[0]: row[1:3] for row in questions_table([near, far]).rows}
@@ -154,7 +153,7 @@ def test_a_payload_is_judged_by_its_mass_and_interval() -> None:
     assert counts["payload: the true mass within its 95 % interval"] == (2, 1)
 
 
-def test_a_payload_that_nobody_told_is_named_with_its_mass() -> None:
+def test_a_payload_that_nobody_told_is_named_with_its_mass():
     answer = run(Case(SINGLE, OWN, (("payload", 0),), 3))
     value, sigma, true = answer.mass
     assert answer.right
@@ -162,7 +161,7 @@ def test_a_payload_that_nobody_told_is_named_with_its_mass() -> None:
     assert abs(value - true) < 3.0 * sigma
 
 
-def test_the_plan_holds_every_cause_by_both_generators() -> None:
+def test_the_plan_holds_every_cause_by_both_generators():
     cases = plan(3, 6, 2 * len(LIBRARY))
     assert len({case.seed for case in cases}) == len(cases)
     single = {(c.causes[0][0], c.generator) for c in cases if c.condition == SINGLE}
@@ -176,12 +175,7 @@ def test_the_plan_holds_every_cause_by_both_generators() -> None:
     assert place_of("cable", 5, 4) == ("cable", "J2")
 
 
-def test_an_interval_of_none_of_sixty() -> None:
-    assert interval(0, 60) == pytest.approx((0.0, 5.96), abs=0.01)
-    assert interval(60, 60) == pytest.approx((94.04, 100.0), abs=0.01)
-
-
-def test_a_rotor_that_nobody_told_is_named() -> None:
+def test_a_rotor_that_nobody_told_is_named():
     answer = run(Case(SINGLE, OWN, (("armature", 2),), 11))
     assert answer.truth == (("armature", "J3"),)
     assert answer.right

@@ -9,7 +9,7 @@ from experiments.driven_arms import drawn_arm
 from experiments.motion_gap import Case, Closed, Judged, closed_table, real_table
 
 
-def test_an_arm_lacks_what_is_asked_for_and_repeats_by_its_seed() -> None:
+def test_an_arm_lacks_what_is_asked_for_and_repeats_by_its_seed():
     arm, again = (drawn_arm("scara_600", 2, ("friction", "payload")) for _ in range(2))
     assert arm.withheld.payload == again.withheld.payload > 0.0
     assert (arm.withheld.friction > 0.0).all()
@@ -19,7 +19,7 @@ def test_an_arm_lacks_what_is_asked_for_and_repeats_by_its_seed() -> None:
     assert real.body_mass[-1] == pytest.approx(arm.known.body_mass[-1] + arm.withheld.payload)
 
 
-def test_tables_count_what_remains() -> None:
+def test_tables_count_what_remains():
     one = Closed(10.0, 1.0, 0.1, np.array([0.1, 0.2]), np.array([0.01, 0.02]))
     case = Case("ur10", ("friction",), 1)
     *_, last = closed_table([case, case], [one, one]).rows

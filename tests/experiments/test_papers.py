@@ -44,11 +44,11 @@ LIST = ROOT / "docs" / "errata.md"
 
 
 @pytest.mark.parametrize("one", errata.ERRATA, ids=lambda one: one.where)
-def test_an_erratum_is_shown_by_its_counter_example(one: errata.Erratum) -> None:
+def test_an_erratum_is_shown_by_its_counter_example(one):
     assert errata.stands(one)
 
 
-def test_what_was_withdrawn_is_shown_too() -> None:
+def test_what_was_withdrawn_is_shown_too():
     """The printed iteration ends at the optimum, x = 1, from multipliers above and below."""
     ends = errata.WITHDRAWN[0].numbers()
     assert_allclose(ends, 1.0, atol=1e-4)
@@ -56,7 +56,7 @@ def test_what_was_withdrawn_is_shown_too() -> None:
     assert not {one.where for one in errata.ERRATA} & {one.where for one in errata.WITHDRAWN}
 
 
-def test_no_entries_of_table_3_give_the_percentages_of_the_text() -> None:
+def test_no_entries_of_table_3_give_the_percentages_of_the_text():
     columns = np.array(list(PAPER.values())).T
     pairs = np.array([(a, b) for column in columns for a, b in permutations(column, 2)])
     given = 100.0 * (1.0 - np.concatenate([pairs[:, 1] / pairs[:, 0],
@@ -65,23 +65,23 @@ def test_no_entries_of_table_3_give_the_percentages_of_the_text() -> None:
         assert np.abs(given - printed).min() > 0.02, printed  # two decimals are told
 
 
-def test_the_list_on_the_page_is_what_the_command_writes() -> None:
+def test_the_list_on_the_page_is_what_the_command_writes():
     assert errata.page() in LIST.read_text(encoding="utf-8")
 
 
 # ---- verdicts ----------------------------------------------------------------------------------
 
 
-def test_verdicts_follow_from_their_parts() -> None:
+def test_verdicts_follow_from_their_parts():
     assert [told(True, True), told(True, False), told(False)] == [YES, PARTLY, NO]
 
 
-def test_a_quick_run_says_nothing_on_few_cases() -> None:
+def test_a_quick_run_says_nothing_on_few_cases():
     made = {n: Verdict("x", "splits", "1", "1", YES, cases=n) for n in (0, 2, 19, 20)}
     assert [of_quick(v).verdict for v in made.values()] == [YES, TOO_FEW, TOO_FEW, YES]
 
 
-def test_rules_are_two_sided_and_printed() -> None:
+def test_rules_are_two_sided_and_printed():
     assert [near(x, 67.34) for x in (-15.7, 50.0, 51.0, 84.0, 85.0)] == [
         False, False, True, True, False,
     ]  # fmt: skip
@@ -96,7 +96,7 @@ def errors(*sums: float) -> Errors:
     return Errors(sums, np.ones(12), np.ones(4), np.ones(4))
 
 
-def test_a_condition_is_judged_by_what_it_makes_small() -> None:
+def test_a_condition_is_judged_by_what_it_makes_small():
     made = {name: errors(3.0, 3.0, 4.0) for name in FIVE}
     made |= {"nominal": errors(9, 9, 9), "smr:1": errors(1, 5, 5), "smr:2": errors(5, 1, 5)}
     made |= {"smr:3": errors(5, 5, 1), "sum": errors(2, 2, 3.5), "minimax": errors(3, 3, 3)}
@@ -105,12 +105,12 @@ def test_a_condition_is_judged_by_what_it_makes_small() -> None:
     assert [best_of(name, worse) for name in ("minimax", "smr:1", "sum", "nominal")] == [False] * 4
 
 
-def test_rises_are_counted() -> None:
+def test_rises_are_counted():
     course = Course(np.array([4.0, 2.0, 3.0, 3.0, 1.0, 1.5]), 6, True, 1.0)
     assert rises(course) == 2
 
 
-def test_starts_moved_by_rounding_stand_beside_the_same_starts() -> None:
+def test_starts_moved_by_rounding_stand_beside_the_same_starts():
     def row(every: int, lost: int) -> Row:
         theta, alpha = grid(every)
         least = theta + alpha > 0.0
@@ -127,7 +127,7 @@ def test_starts_moved_by_rounding_stand_beside_the_same_starts() -> None:
     assert m.minimum[0] == m.minimum[1]
 
 
-def test_regions_of_the_joint_space_are_its_clusters() -> None:
+def test_regions_of_the_joint_space_are_its_clusters():
     rng = np.random.default_rng(0)
     centres = 10.0 * rng.normal(size=(splits.REGIONS, 6))
     q = np.repeat(centres, 8, axis=0) + 0.1 * rng.normal(size=(8 * splits.REGIONS, 6))
@@ -136,7 +136,7 @@ def test_regions_of_the_joint_space_are_its_clusters() -> None:
     assert len(set(label[:, 0])) == splits.REGIONS
 
 
-def test_splits_hold_every_region_out_once_and_tell_their_spread() -> None:
+def test_splits_hold_every_region_out_once_and_tell_their_spread():
     data = splits.ROBOTS["irb2600"][1](0)
     jobs = [splits.Job("irb2600", "by groups", region, 100, 0) for region in range(splits.REGIONS)]
     held = np.array([splits.held_rows(data[1], job) for job in jobs])
@@ -166,7 +166,7 @@ def rows_of_page() -> list[tuple[str, ...]]:
     return list(grid.rows)
 
 
-def test_the_page_has_no_item_that_is_not_covered_but_for_hardware() -> None:
+def test_the_page_has_no_item_that_is_not_covered_but_for_hardware():
     rows = rows_of_page()
     assert len({row[0] for row in rows}) == len(rows) >= 50
     for item, command, paper, ours, verdict, remark in rows:
@@ -190,7 +190,7 @@ def rows_of_command(out: Path, *options: str) -> list[list[str]]:
 
 
 @pytest.mark.slow
-def test_no_quick_verdict_contradicts_the_page(tmp_path: Path) -> None:
+def test_no_quick_verdict_contradicts_the_page(tmp_path):
     verdict = {row[0]: row[4] for row in rows_of_page()}
     quick = {row[0]: row[4] for row in rows_of_command(tmp_path, "--quick")}
     assert quick.keys() <= verdict.keys()
@@ -199,7 +199,7 @@ def test_no_quick_verdict_contradicts_the_page(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_page_says_what_the_command_prints(tmp_path: Path) -> None:
+def test_the_page_says_what_the_command_prints(tmp_path):
     for arm in ("irb120", "fanuc_r2000", "ur10_b", "meca500_r"):
         shared(arm)  # skips where its measurements are not there
     fresh = rows_of_command(tmp_path)
@@ -228,7 +228,7 @@ def meet(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
     return low <= max(TIMES * most, most + COUNT) and least <= max(TIMES * high, high + COUNT)
 
 
-def test_pages_are_compared_as_far_as_machines_agree() -> None:
+def test_pages_are_compared_as_far_as_machines_agree():
     assert same_numbers("S Fig. 5: x", "150 to 360 / 7", "400 / 7")
     assert not same_numbers("S Fig. 5: x", "150 to 360 / 7", "1200 / 7")
     assert not same_numbers("S Fig. 6: x", "0 / 9 of 9", "7 / 9 of 9")

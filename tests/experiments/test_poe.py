@@ -28,7 +28,7 @@ ROUNDING = 1e-12
 
 
 @pytest.mark.parametrize("name", mc.builtin_robots())
-def test_same_forward_kinematics_as_the_links(name: str, rng: np.random.Generator) -> None:
+def test_same_forward_kinematics_as_the_links(name, rng):
     robot = mc.load_robot(name)
     q, tool = random_poses(robot, 40, rng), exp(rng.normal(size=6))
     found = screws_of(robot, tool).poses(q * robot.sign)
@@ -36,7 +36,7 @@ def test_same_forward_kinematics_as_the_links(name: str, rng: np.random.Generato
 
 
 @pytest.mark.parametrize("name", ["irb2600", "ur10", "scara_600"])
-def test_twists_are_the_derivative_of_the_step(name: str, rng: np.random.Generator) -> None:
+def test_twists_are_the_derivative_of_the_step(name, rng):
     robot = mc.load_robot(name)
     q = random_poses(robot, 5, rng) * robot.sign
     arm = screws_of(robot, exp(rng.normal(size=6)))
@@ -48,7 +48,7 @@ def test_twists_are_the_derivative_of_the_step(name: str, rng: np.random.Generat
         assert_allclose(turn, twists[:, 3:, i], rtol=0, atol=ROUNDING)
 
 
-def test_pose_slope_is_the_derivative_of_the_residual(rng: np.random.Generator) -> None:
+def test_pose_slope_is_the_derivative_of_the_residual(rng):
     computed, length, h = exp(rng.normal(size=(7, 6))), 0.3, 1e-5
     measured = computed @ exp(rng.normal(size=(7, 6)))  # large errors: Jl^-1 matters
     slope = pose_slope(measured, computed, np.broadcast_to(np.eye(6), (7, 6, 6)), length)
@@ -57,7 +57,7 @@ def test_pose_slope_is_the_derivative_of_the_residual(rng: np.random.Generator) 
         assert_allclose((ends[0] - ends[1]) / (2 * h), slope[..., i], rtol=0, atol=1e-8)
 
 
-def test_a_step_keeps_screws_pure(rng: np.random.Generator) -> None:
+def test_a_step_keeps_screws_pure(rng):
     robot = mc.load_robot("scara_600")
     arm = screws_of(robot, np.eye(4)).step(rng.normal(size=30))
     v, w = arm.twists[:, :3], arm.twists[:, 3:]
@@ -81,7 +81,7 @@ def measured_arm(name: str, truth: Truth) -> tuple[mc.Robot, Array, Array, float
 @pytest.mark.parametrize(
     ("name", "independent"), [("irb2600", 30), ("ur10", 30), ("scara_600", 20)]
 )
-def test_exact_poses_are_met(name: str, independent: int) -> None:
+def test_exact_poses_are_met(name, independent):
     _, q, poses, length, nominal = measured_arm(name, EXACT)
     found = fit_poses(nominal, q, poses, length)
     assert found.status == "converged"
@@ -95,7 +95,7 @@ def test_exact_poses_are_met(name: str, independent: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["irb2600", "ur10", "scara_600"])
-def test_poe_and_mdh_describe_the_same_arms(name: str) -> None:
+def test_poe_and_mdh_describe_the_same_arms(name):
     robot, q, poses, length, nominal = measured_arm(name, Truth())
     screws = fit_poses(nominal, q, poses, length)
     links = place(robot.mdh, q, robot.prismatic, poses, length, links=True)
@@ -103,7 +103,7 @@ def test_poe_and_mdh_describe_the_same_arms(name: str) -> None:
     assert screws.cost == pytest.approx(links.cost, rel=1e-8)
 
 
-def test_redundant_parameters_share_the_step() -> None:
+def test_redundant_parameters_share_the_step():
     def linearise(x: Array) -> tuple[Array, Array]:
         return np.array([x[0] + x[1] - 2.0, x[2] - 1.0]), np.array([[1.0, 1, 0], [0, 0, 1]])
 
@@ -112,7 +112,7 @@ def test_redundant_parameters_share_the_step() -> None:
     assert (found.identified, found.parameters) == (2, 3)
 
 
-def test_exp_of_a_small_twist_agrees_with_its_series(rng: np.random.Generator) -> None:
+def test_exp_of_a_small_twist_agrees_with_its_series(rng):
     for size in (1e-9, 1e-4, 1e-3, 0.1):
         twist = size * rng.normal(size=6)
         hat = np.zeros((4, 4))

@@ -16,7 +16,6 @@ from experiments.convergence import Setting
 from experiments.errata import some_arm
 from experiments.pseudo_inverse import arm, joint_rows, least_step, separable_rows
 from minimax_cal.robots.kinematics import forward
-from minimax_cal.robots.robot import Robot
 
 STEP = 1e-6  # of central differences: their error is about 1e-9 of the largest lever
 NEAR = 2e-8
@@ -37,7 +36,7 @@ def euler(phi: float, theta: float, psi: float) -> np.ndarray:
     return np.asarray(z @ y @ x)
 
 
-def test_the_arm_is_the_librarys(robot: Robot) -> None:
+def test_the_arm_is_the_librarys(robot):
     rng = np.random.default_rng(0)
     at = rng.normal(size=39)
     q = rng.normal(size=(7, 6))
@@ -46,7 +45,7 @@ def test_the_arm_is_the_librarys(robot: Robot) -> None:
     assert_allclose(arm(at, q)[0].T, tip @ euler(*at[33:36]).T + at[30:33], rtol=0, atol=1e-13)
 
 
-def test_rows_are_derivatives() -> None:
+def test_rows_are_derivatives():
     at, q, y = some_arm()
     rows, error = joint_rows(at, q, y)
     assert_allclose(error, y - arm(at, q)[0].ravel(), rtol=0, atol=0)
@@ -59,7 +58,7 @@ def test_rows_are_derivatives() -> None:
     assert np.linalg.norm(joint_rows(at, q, y)[0][lengths] @ c) > 0.0
 
 
-def test_the_least_step_is_that_of_the_pseudo_inverse() -> None:
+def test_the_least_step_is_that_of_the_pseudo_inverse():
     rng = np.random.default_rng(1)
     J = rng.normal(size=(30, 7)) @ rng.normal(size=(7, 12))
     H, g = J.T @ J, J.T @ rng.normal(size=30)
@@ -77,7 +76,7 @@ print(np.abs(joint_rows(*arm)[0] - joint_rows.py_func(*arm)[0]).max())
 
 
 @pytest.mark.slow
-def test_compiled_and_plain_are_the_same() -> None:
+def test_compiled_and_plain_are_the_same():
     pytest.importorskip("numba", reason="needs numba: pip install 'minimax-cal[fast]'")
     here = Path(__file__).parent
     code = COMPARED.format(root=str(here.parent.parent), here=str(here))
@@ -87,7 +86,7 @@ def test_compiled_and_plain_are_the_same() -> None:
     assert float(made.stdout) < 1e-13
 
 
-def test_the_unit_of_length_decides_about_nllm() -> None:
+def test_the_unit_of_length_decides_about_nllm():
     """(J'J + mu I) adds the same mu to square radians and to square lengths."""
     robot, model = convergence.problem_of(Setting(seed=1))
     begin = convergence.flat(robot, 1.0, -1.0)
@@ -100,7 +99,7 @@ def test_the_unit_of_length_decides_about_nllm() -> None:
     assert same["all, mm"] == same["all, m"]  # with lengths eliminated the unit drops out
 
 
-def test_rounding_decides_which_way_nllm_takes_in_millimetres() -> None:
+def test_rounding_decides_which_way_nllm_takes_in_millimetres():
     """A unit of rounding at the start is a large share of the error soon after."""
     robot, model = convergence.problem_of(Setting(seed=1))
     begin = convergence.flat(robot, 1.0, -1.0)
@@ -111,7 +110,7 @@ def test_rounding_decides_which_way_nllm_takes_in_millimetres() -> None:
     assert np.nanmax(np.abs(moved / plain - 1.0)) > 1e-3
 
 
-def test_damping_never_raises_the_cost_and_the_course_is_whole() -> None:
+def test_damping_never_raises_the_cost_and_the_course_is_whole():
     robot, model = convergence.problem_of(Setting(seed=1))
     begin = convergence.flat(robot, 0.5, 0.5)
     count, cost, _, costs = convergence.letter("nllm", "all, m", model, begin, 200, 201)
@@ -120,7 +119,7 @@ def test_damping_never_raises_the_cost_and_the_course_is_whole() -> None:
     assert np.isnan(costs[count:]).all()
 
 
-def test_without_converging_the_limit_is_said() -> None:
+def test_without_converging_the_limit_is_said():
     robot, model = convergence.problem_of(replace(Setting(), seed=1))
     count, _, ended, _ = convergence.letter("nllm", "all, mm", model, convergence.flat(robot, 3), 5)
     assert (count, ended) == (5, pseudo_inverse.LIMIT)

@@ -30,7 +30,7 @@ def told() -> dict[str, float]:
     return {name: float(value) for name, value in rows}
 
 
-def test_the_peers_derivatives_are_those_of_their_squares(raw: speed_peers.Raw) -> None:
+def test_the_peers_derivatives_are_those_of_their_squares(raw):
     u, step = 1e-3 * np.random.default_rng(0).normal(size=len(raw.free)), 1e-6
     around = [
         (raw.squares(u + step * v)[0] - raw.squares(u - step * v)[0]) / (2.0 * step)
@@ -40,7 +40,7 @@ def test_the_peers_derivatives_are_those_of_their_squares(raw: speed_peers.Raw) 
     assert_allclose(np.stack(around, axis=-1), slope, rtol=0, atol=1e-6 * np.abs(slope).max())
 
 
-def test_peers_and_we_reach_the_same_optimum(case: speed.Case, raw: speed_peers.Raw) -> None:
+def test_peers_and_we_reach_the_same_optimum(case, raw):
     ours = case.model.cost(speed.squares(case)).sum()
     theirs = (raw.rows(speed_peers.gauss_newton(raw))[0] ** 2).sum()
     assert_allclose(theirs, ours, rtol=1e-9)
@@ -48,7 +48,7 @@ def test_peers_and_we_reach_the_same_optimum(case: speed.Case, raw: speed_peers.
     assert_allclose(worst, speed.worst_target(case), rtol=speed.SAME)
 
 
-def test_the_page_tells_the_order_of_magnitude(case: speed.Case, raw: speed_peers.Raw) -> None:
+def test_the_page_tells_the_order_of_magnitude(case, raw):
     pytest.importorskip("numba", reason="the page's ratios are those with numba")
     times = speed.race(
         {

@@ -12,7 +12,7 @@ from experiments.pseudo_inverse import CONVERGED
 from qp_backends import Problem
 
 
-def test_the_grid_is_the_papers() -> None:
+def test_the_grid_is_the_papers():
     theta, alpha = convergence.grid(1)
     assert len(theta) == 63 * 63
     assert_allclose([theta.min(), theta.max(), alpha.min(), alpha.max()], [-3.1, 3.1, -3.1, 3.1])
@@ -24,7 +24,7 @@ def test_the_grid_is_the_papers() -> None:
 
 @pytest.mark.parametrize("method", convergence.PAPER)
 @pytest.mark.parametrize("unit", convergence.UNITS)
-def test_the_letter_and_the_library_reach_the_same_minimum(method: str, unit: str) -> None:
+def test_the_letter_and_the_library_reach_the_same_minimum(method, unit):
     setting = Setting(seed=1)
     least = convergence.least_cost(setting)
     robot, model = convergence.problem_of(setting)
@@ -37,7 +37,7 @@ def test_the_letter_and_the_library_reach_the_same_minimum(method: str, unit: st
     assert_allclose(ours.cost[0], least, rtol=1e-6)
 
 
-def test_separable_methods_come_back_from_radians_away() -> None:
+def test_separable_methods_come_back_from_radians_away():
     setting = Setting(seed=1)
     least = convergence.least_cost(setting)
     corners = (-3.1, -3.1, 3.1, 3.1, 1.5), (-3.1, 3.1, -3.1, 3.1, -2.0)
@@ -46,12 +46,12 @@ def test_separable_methods_come_back_from_radians_away() -> None:
         assert_allclose(found.cost, least, rtol=1e-6)
 
 
-def test_any_base_is_found() -> None:
+def test_any_base_is_found():
     for trial in any_base.trials(3, 3, float(np.pi)):
         assert any_base.run(trial).ours
 
 
-def test_minimax_has_the_least_rmse_phi_in_training() -> None:
+def test_minimax_has_the_least_rmse_phi_in_training():
     phi = {
         c: conditions.run(conditions.Job("irb2600", c, 60, 4)).train.phi
         for c in ("smr:1", "smr:2", "sum", "pose", "minimax")
@@ -61,7 +61,7 @@ def test_minimax_has_the_least_rmse_phi_in_training() -> None:
     assert phi["sum"] > phi["minimax"]
 
 
-def test_a_solver_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_solver_that_takes_too_long_is_ended(monkeypatch):
     one = np.eye(1)
     problem = Problem(one, -np.ones(1), one, np.array([-1.0]), np.array([0.5]))
     pools: list[Pool] = []

@@ -83,17 +83,13 @@ def expected() -> list[Found]:
 
 
 @pytest.mark.parametrize("processes", [1, 2])
-def test_results_in_the_order_of_the_jobs(
-    processes: int, expected: list[Found], tmp_path: Path
-) -> None:
+def test_results_in_the_order_of_the_jobs(processes, expected, tmp_path):
     found = sweep(work, JOBS, name="order", jobs_in_parallel=processes, folder=tmp_path)
     assert same(found, expected)
     assert (os.getpid() in {each.process for each in found}) == (processes == 1)
 
 
-def test_kept_results_are_used_unless_fresh(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_kept_results_are_used_unless_fresh(tmp_path, capsys):
     log = tmp_path / "log"
     jobs = [Job(seed, str(log)) for seed in range(4)]
     one = dict(name="kept", jobs_in_parallel=1, folder=tmp_path)
@@ -106,7 +102,7 @@ def test_kept_results_are_used_unless_fresh(
     assert len(log.read_text().split()) == 8
 
 
-def test_damaged_parts_are_computed_again(expected: list[Found], tmp_path: Path) -> None:
+def test_damaged_parts_are_computed_again(expected, tmp_path):
     one = dict(name="damage", jobs_in_parallel=1, folder=tmp_path)
     sweep(work, JOBS, **one)
     paths = sorted((tmp_path / "damage").iterdir())
@@ -135,7 +131,7 @@ class Trap:
         return Path.touch, (self.path,)
 
 
-def test_a_part_holds_data_and_runs_nothing(tmp_path: Path) -> None:
+def test_a_part_holds_data_and_runs_nothing(tmp_path):
     """Whoever writes into the cache can still make no code run."""
     part, sprung = tmp_path / "x.part", tmp_path / "sprung"
     for content in (pickle.dumps(Trap(sprung)), pickle.dumps([os.system, "true"])):
@@ -151,12 +147,12 @@ def test_a_part_holds_data_and_runs_nothing(tmp_path: Path) -> None:
     assert found["b"] == good["b"]
 
 
-def test_a_process_that_dies_ends_the_sweep_in_a_word(tmp_path: Path) -> None:
+def test_a_process_that_dies_ends_the_sweep_in_a_word(tmp_path):
     with pytest.raises(click.ClickException, match="a process died"):
         sweep(kill_worker, [0, 1, 2], name="dead", jobs_in_parallel=2, folder=tmp_path)
 
 
-def test_a_key_names_all_that_a_result_depends_on() -> None:
+def test_a_key_names_all_that_a_result_depends_on():
     keys = {
         module.key(name, function, job, code)
         for name in ("a", "b")
@@ -168,7 +164,7 @@ def test_a_key_names_all_that_a_result_depends_on() -> None:
     assert module.key("a", work, Job(0), "x") == module.key("a", work, Job(0), "x")
 
 
-def test_code_of_a_study_is_its_file_and_what_it_imports(tmp_path: Path) -> None:
+def test_code_of_a_study_is_its_file_and_what_it_imports(tmp_path):
     for name, text in {
         "study": "from pkg.helper import f\nimport numpy.linalg",
         "helper": "def f():\n    from pkg import deeper",
@@ -202,7 +198,7 @@ sweep(work, jobs, name="interrupted", jobs_in_parallel=2, folder=folder)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is sent as a signal")
-def test_an_interrupted_sweep_resumes(tmp_path: Path) -> None:
+def test_an_interrupted_sweep_resumes(tmp_path):
     child = subprocess.Popen(
         [sys.executable, "-c", SCRIPT, str(tmp_path)],
         env=ENVIRONMENT,
@@ -224,7 +220,7 @@ def test_an_interrupted_sweep_resumes(tmp_path: Path) -> None:
     assert same(found, [work(Job(seed)) for seed in range(20)])
 
 
-def test_functions_and_options_that_cannot_work(tmp_path: Path) -> None:
+def test_functions_and_options_that_cannot_work(tmp_path):
     with pytest.raises(TypeError, match="top of a module"):
         sweep(lambda job: job, [1], name="lambda", folder=tmp_path)
     with pytest.raises(OptionError, match="--jobs 0"):
@@ -235,7 +231,6 @@ def test_functions_and_options_that_cannot_work(tmp_path: Path) -> None:
 # ---- options of a study ----------------------------------------------------------------------
 
 
-@click.command()
 @study_options("toy")
 @click.option("--more", default=1)
 def toy(study: Study, more: int) -> None:
@@ -247,7 +242,7 @@ def run_toy(*arguments: str) -> Result:
     return CliRunner().invoke(toy, arguments)
 
 
-def test_nobody_at_the_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nobody_at_the_address(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(parallel, "PATIENCE", 1.0)
@@ -266,13 +261,7 @@ def test_nobody_at_the_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     ("package", "extra", "options"),
     [("distributed", "distributed", ["--cluster", "tcp://h:1"]), ("joblib", "experiments", [])],
 )
-def test_a_missing_package_is_named(
-    package: str,
-    extra: str,
-    options: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_missing_package_is_named(package, extra, options, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, package, None)
     result = run_toy(*options)
@@ -283,7 +272,7 @@ def test_a_missing_package_is_named(
 # ---- all studies -----------------------------------------------------------------------------
 
 
-def test_options_of_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_of_a_study(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = run_toy("--quick", "--seed", "3", "--jobs", "1", "--json", "x.json", "--more", "2")
     assert result.exit_code == 0, result.stderr
@@ -299,7 +288,7 @@ HOSTILE = "<script>alert('x')</script> & \"quoted\" | bar"
 def fake(name: str, monkeypatch: pytest.MonkeyPatch, body: Any) -> None:
     """A module with a command `main` that does body(study)."""
     made = ModuleType(name)
-    made.main = click.command()(study_options(name)(body))
+    made.main = study_options(name)(body)
     monkeypatch.setitem(sys.modules, name, made)
 
 
@@ -319,9 +308,7 @@ def bad(study: Study) -> None:
     raise ValueError(HOSTILE)
 
 
-def test_all_studies_make_one_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_all_studies_make_one_page(tmp_path, monkeypatch, capsys):
     fake("fake_bad", monkeypatch, bad)
     fake("fake_good", monkeypatch, good)
     table = {
@@ -357,7 +344,7 @@ def test_all_studies_make_one_page(
     assert (out / "index.html").read_text() == page
 
 
-def test_tables_survive_markdown() -> None:
+def test_tables_survive_markdown():
     table = Table("t | t", ("a|b", "n"), (("x | y", 1.0), ("", 2.0)), ("", ".1f"))
     (found,) = tables_of(table.markdown())
     assert (found.title, found.header, found.right) == ("t | t", table.header, (False, True))
@@ -365,9 +352,7 @@ def test_tables_survive_markdown() -> None:
     assert tables_of("no table\n| lonely |\n") == []
 
 
-def test_studies_are_listed_and_run_by_name(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_studies_are_listed_and_run_by_name(monkeypatch, capsys, tmp_path):
     studies.main([])
     listed = capsys.readouterr().out
     assert all(name in listed for name in studies.STUDIES)
@@ -383,7 +368,7 @@ def test_studies_are_listed_and_run_by_name(
     assert (tmp_path / "fake_good.md").exists()
 
 
-def test_a_study_starts_under_its_own_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_study_starts_under_its_own_name(monkeypatch):
     made = ModuleType("experiments.fake_study")
     seen: list[str] = []
     made.main = lambda prog_name: seen.append(prog_name)

@@ -1,7 +1,6 @@
 """What moved between the sessions of one fit: a joint's zero, a nest, the tool, or nothing."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,7 +48,7 @@ def knocked() -> mc.Fit:
     return mc.calibrate(ROBOT, measured(joint=3), "sum")
 
 
-def test_the_joint_that_moved_is_named_with_size_and_interval(knocked: mc.Fit) -> None:
+def test_the_joint_that_moved_is_named_with_size_and_interval(knocked):
     (joint, frame) = knocked.moved
     assert (joint.effect, joint.place, joint.session) == ("encoder_zero", "J3", "june")
     (amount,) = joint.amounts
@@ -62,7 +61,7 @@ def test_the_joint_that_moved_is_named_with_size_and_interval(knocked: mc.Fit) -
     assert joint.text in said
 
 
-def test_nothing_is_named_where_nothing_moved() -> None:
+def test_nothing_is_named_where_nothing_moved():
     fit = mc.calibrate(ROBOT, measured(), "sum")
     assert of_arm(fit) == []
     still = mc.calibrate(ROBOT, measured(away=False), "sum")
@@ -70,7 +69,7 @@ def test_nothing_is_named_where_nothing_moved() -> None:
     assert any("instrument and base stand as at first" in text for text in still.notices)
 
 
-def test_a_nest_that_moved_is_named() -> None:
+def test_a_nest_that_moved_is_named():
     fit = mc.calibrate(ROBOT, measured(nest=1), "sum")
     assert of_arm(fit) == ["target_shift:smr2:session=2.0"]
     sizes = [amount.value for amount in fit.moved[0].amounts]
@@ -78,19 +77,19 @@ def test_a_nest_that_moved_is_named() -> None:
     assert np.all(np.abs(np.array(sizes) - [3e-4, 0.0, -2e-4]) < FIVE * np.array(sigmas))
 
 
-def test_a_change_of_one_session_alone_is_told_as_such() -> None:
+def test_a_change_of_one_session_alone_is_told_as_such():
     fit = mc.calibrate(ROBOT, measured(joint=4, third=True), "sum")
     assert of_arm(fit) == ["encoder_zero:J4:session=2.0:alone=1.0"]
     assert fit.moved[0].only
     assert "in session june alone" in fit.moved[0].sentence
 
 
-def test_the_change_is_written_and_read(knocked: mc.Fit, tmp_path: Path) -> None:
+def test_the_change_is_written_and_read(knocked, tmp_path):
     knocked.save(tmp_path / "fit.json")
     assert mc.load_fit(tmp_path / "fit.json").moved == knocked.moved
 
 
-def test_a_fit_of_the_change_meets_the_noise_and_the_next_campaign(knocked: mc.Fit) -> None:
+def test_a_fit_of_the_change_meets_the_noise_and_the_next_campaign(knocked):
     """The arm is that of the last session, for a campaign that is measured later as well."""
     freed = mc.calibrate(ROBOT, measured(joint=3), "sum", effects=[knocked.moved[0].text])
     assert of_arm(freed) == []
@@ -112,7 +111,7 @@ def test_a_fit_of_the_change_meets_the_noise_and_the_next_campaign(knocked: mc.F
     assert_allclose(at_rest.predict(later), freed.cell.predict(later), rtol=0, atol=1e-12)
 
 
-def test_campaigns_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_campaigns_on_the_command_line(tmp_path, capsys):
     data = measured(joint=3)
     paths = []
     for name in ("march", "june"):

@@ -26,9 +26,7 @@ from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 
 
 @pytest.mark.parametrize("objective", ["sum", "smr:2"])
-def test_a_part_is_judged_by_a_fit_without_it(
-    robot: mc.Robot, noisy: Simulation, objective: str
-) -> None:
+def test_a_part_is_judged_by_a_fit_without_it(robot, noisy, objective):
     fit = mc.calibrate(robot, noisy.data, objective, holdout=0.0)
     fold = fit.beyond.folds[0]
     part = next(p for p in parts(fit.data) if p.name == fold.where)
@@ -40,7 +38,7 @@ def test_a_part_is_judged_by_a_fit_without_it(
     assert fold.poses == part.rows.sum()
 
 
-def test_effects_stand_beside_geometry_alone(robot: mc.Robot) -> None:
+def test_effects_stand_beside_geometry_alone(robot):
     soft = simulate(robot, 80, truth=Truth(compliance=2e-6)).data
     fit = mc.calibrate(robot, soft, "sum", effects=("joint_compliance:all",))
     plain = mc.calibrate(robot, soft, "sum")
@@ -51,7 +49,7 @@ def test_effects_stand_beside_geometry_alone(robot: mc.Robot) -> None:
         assert_allclose(fold.geometric_mm, shared[fold.where], rtol=5e-3)
 
 
-def test_typical_is_pooled_and_worst_is_named(robot: mc.Robot, noisy: Simulation) -> None:
+def test_typical_is_pooled_and_worst_is_named(robot, noisy):
     found = mc.calibrate(robot, noisy.data, "sum").beyond
     assert found.worst is not None
     assert found.worst_mm == max(fold.rms_mm for fold in found.folds)
@@ -60,7 +58,7 @@ def test_typical_is_pooled_and_worst_is_named(robot: mc.Robot, noisy: Simulation
     assert_allclose(found.typical_mm**2, (poses * square).sum() / poses.sum(), rtol=1e-12)
 
 
-def test_no_part_can_be_spared_of_few_poses(robot: mc.Robot) -> None:
+def test_no_part_can_be_spared_of_few_poses(robot):
     few = simulate(robot, 12).data
     found = mc.calibrate(robot, few, "sum", holdout=0.0, fix="beta*").beyond
     content = plain(found)
@@ -69,7 +67,7 @@ def test_no_part_can_be_spared_of_few_poses(robot: mc.Robot) -> None:
         assert content["reason"]
 
 
-def test_a_fit_that_extrapolates_badly_says_so(robot: mc.Robot) -> None:
+def test_a_fit_that_extrapolates_badly_says_so(robot):
     """An arm whose second joint has a gear error: regions miss by more than poses between."""
     rng = np.random.default_rng(3)
     ideal = simulate(robot, 300, seed=5)
@@ -91,9 +89,7 @@ def one_end(robot: mc.Robot, poses: int = 40, half: float = 0.6) -> Measurements
     return replace(ideal.data, q=q).with_y(ideal.cell.predict(q) + noise)
 
 
-def test_parts_that_effects_alone_need_are_judged_as_a_calibration_of_the_rest_would(
-    robot: mc.Robot,
-) -> None:
+def test_parts_that_effects_alone_need_are_judged_as_a_calibration_of_the_rest_would(robot):
     """Without one end of joint 6 its gear's harmonics are not told: the rest gives them up."""
     data, gear = one_end(robot), ("gear_error:J6:orders=3",)
     fit = mc.calibrate(robot, data, "sum", effects=gear)
@@ -114,7 +110,7 @@ def test_parts_that_effects_alone_need_are_judged_as_a_calibration_of_the_rest_w
     assert "40 poses, each judged" in fit.headline()
 
 
-def test_the_search_goes_on_where_one_step_does_not_arrive(robot: mc.Robot) -> None:
+def test_the_search_goes_on_where_one_step_does_not_arrive(robot):
     data = one_end(robot, 36, half=0.5)
     effects = ("gear_error:J5:orders=3", "gear_error:J6:orders=3")
     fit = mc.calibrate(robot, data, "sum", effects=effects)
@@ -138,7 +134,7 @@ def test_the_search_goes_on_where_one_step_does_not_arrive(robot: mc.Robot) -> N
     assert far
 
 
-def test_parts_that_none_can_judge_are_counted_and_named(robot: mc.Robot) -> None:
+def test_parts_that_none_can_judge_are_counted_and_named(robot):
     """Joint 6 stands still but at a few poses, which geometry cannot do without."""
     ideal = simulate(robot, 60, seed=5)
     q = ideal.data.q.copy()
@@ -177,7 +173,7 @@ class Rows:
     ("apart", "lost"),
     [([1.0, 1.0, 1.0, 1.0], False), ([0.0, 0.0, 0.0, 0.0], False), ([1.0, 0.0, 0.0, 0.0], True)],
 )
-def test_what_no_pose_tells_costs_no_part(apart: list[float], lost: bool, weight: float) -> None:
+def test_what_no_pose_tells_costs_no_part(apart, lost, weight):
     """Of two parameters with nearly the same columns: told by all poses, by none, by the first."""
     rows: Any = np.stack([np.ones(4), 1.0 + np.array(apart) * [1e-2, -1e-2, 1e-2, -1e-2]], axis=1)
     poses = Rows(rows, weight)
@@ -185,9 +181,7 @@ def test_what_no_pose_tells_costs_no_part(apart: list[float], lost: bool, weight
 
 
 @pytest.mark.parametrize("seed", [2, 5])
-def test_no_part_left_out_makes_a_joint_yield_upwards(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_part_left_out_makes_a_joint_yield_upwards(seed, monkeypatch):
     """Compliances near 0: one step from the whole fit would go below in some parts."""
     found, steps, plain = [], [], beyond.fit_of_rest
 
@@ -232,9 +226,7 @@ def rms_mm(arm: mc.Fit, made: Simulation, q: Array) -> float:
         (range(6), 2.6, ["J1", "J2", "J3", "J4", "J5", "J6"]),
     ],
 )
-def test_nothing_is_claimed_outside_what_joints_spanned(
-    robot: mc.Robot, joints: Sequence[int], degrees: float, narrow: list[str]
-) -> None:
+def test_nothing_is_claimed_outside_what_joints_spanned(robot, joints, degrees, narrow):
     made = with_spans(robot, joints, degrees)
     fit = mc.calibrate(robot, made.data, "sum")
     content = fit.to_dict()["accuracy"]["beyond"]
@@ -254,7 +246,7 @@ def test_nothing_is_claimed_outside_what_joints_spanned(
     assert rms_mm(fit, made, made.data.q) < inside
 
 
-def test_what_joints_spanned_survives_the_file(robot: mc.Robot) -> None:
+def test_what_joints_spanned_survives_the_file(robot):
     fit = mc.calibrate(robot, with_spans(robot, (0,), 3.0).data, "sum")
     again = mc.Fit.from_dict(fit.to_dict())
     assert again.beyond == fit.beyond
@@ -263,7 +255,7 @@ def test_what_joints_spanned_survives_the_file(robot: mc.Robot) -> None:
     assert bare.spans == fit.spans
 
 
-def test_joints_that_moved_are_not_named(robot: mc.Robot, noisy: Simulation) -> None:
+def test_joints_that_moved_are_not_named(robot, noisy):
     found = mc.calibrate(robot, noisy.data, "sum").beyond
     assert found.worst is not None
     assert not found.narrow
@@ -271,7 +263,7 @@ def test_joints_that_moved_are_not_named(robot: mc.Robot, noisy: Simulation) -> 
     assert plain(found)["plan"] is None
 
 
-def test_a_diagnosis_claims_nothing_outside_either(robot: mc.Robot) -> None:
+def test_a_diagnosis_claims_nothing_outside_either(robot):
     found = mc.diagnose(robot, with_spans(robot, (0, 1, 2), 0.0).data)
     gap = found.to_dict()["gap"]["beyond"]
     assert gap["worst_mm"] is None
@@ -281,7 +273,7 @@ def test_a_diagnosis_claims_nothing_outside_either(robot: mc.Robot) -> None:
 
 
 @pytest.mark.slow
-def test_the_plan_that_is_offered_mends_it(robot: mc.Robot) -> None:
+def test_the_plan_that_is_offered_mends_it(robot):
     made = with_spans(robot, (0, 1, 2), 0.0)
     fit = mc.calibrate(robot, made.data, "sum")
     words = fit.beyond.plan.split()
@@ -295,7 +287,7 @@ def test_the_plan_that_is_offered_mends_it(robot: mc.Robot) -> None:
     assert rms_mm(mended, made, anywhere) < mended.beyond.worst_mm
 
 
-def test_sums_by_part_are_those_of_each_part(robot: mc.Robot, noisy: Simulation) -> None:
+def test_sums_by_part_are_those_of_each_part(robot, noisy):
     fit = mc.calibrate(robot, noisy.data, "sum")
     poses = Poses.of(fit.estimator, fit.cell.state)
     masks = [np.arange(poses.seen.shape[1]) % 4 == number for number in range(4)]

@@ -42,7 +42,7 @@ def of(fit: mc.Fit, effect: str) -> list[Parameter]:
 
 @pytest.mark.parametrize("loss", ["square", "huber"])
 @pytest.mark.parametrize("objective", OBJECTIVES)
-def test_a_compliance_that_would_be_negative_rests_at_0(objective: str, loss: str) -> None:
+def test_a_compliance_that_would_be_negative_rests_at_0(objective, loss):
     data = measured(-1e-6)
     fit = mc.calibrate(ARM, data, objective, effects=EFFECTS, loss=loss)
     (rests,) = of(fit, RISES)
@@ -63,14 +63,14 @@ def test_a_compliance_that_would_be_negative_rests_at_0(objective: str, loss: st
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
-def test_what_is_positive_is_found_as_without_bounds(objective: str) -> None:
+def test_what_is_positive_is_found_as_without_bounds(objective):
     fit = mc.calibrate(ARM, measured(2e-6), objective, effects=EFFECTS)
     (found,) = of(fit, RISES)
     assert abs(found.value - 2e-6) < 5.0 * found.sigma
     assert not of(fit, RISES)[0].reason
 
 
-def test_a_fit_at_its_bounds_is_the_best_between_them() -> None:
+def test_a_fit_at_its_bounds_is_the_best_between_them():
     """Its slope pulls no parameter that is free, and those at a bound beyond it."""
     data = measured(-1e-6)
     fit = mc.calibrate(ARM, data, "sum", effects=EFFECTS)
@@ -85,7 +85,7 @@ def test_a_fit_at_its_bounds_is_the_best_between_them() -> None:
     assert np.abs(slope[~here]).max() < 1e-7
 
 
-def test_steps_and_values_keep_to_their_bounds() -> None:
+def test_steps_and_values_keep_to_their_bounds():
     gram = np.array([[2.0, 1.0], [1.0, 2.0]])
     step = bounded(gram, np.array([-1.0, 1.0]), np.array([0.0, -np.inf]), np.full(2, np.inf))
     assert_allclose(step, [0.0, 0.5], rtol=0, atol=1e-12)

@@ -1,6 +1,5 @@
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,10 +7,10 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.fitting.solve import fit_cell
-from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+from minimax_cal.modelling.simulate import Truth, simulate
 
 
-def test_true_robot_is_found_without_noise(robot: mc.Robot, clean: Simulation) -> None:
+def test_true_robot_is_found_without_noise(robot, clean):
     fit = mc.calibrate(robot, clean.data, "sum")
     assert fit.status == "converged"
     assert fit.accuracy["holdout"].max_mm < 1e-8
@@ -20,7 +19,7 @@ def test_true_robot_is_found_without_noise(robot: mc.Robot, clean: Simulation) -
     assert_allclose(fit.predict(new), clean.cell.predict(new), rtol=0, atol=1e-10)
 
 
-def test_each_accuracy_is_of_its_own_rows(robot: mc.Robot, noisy: Simulation) -> None:
+def test_each_accuracy_is_of_its_own_rows(robot, noisy):
     """Nominal and calibrated, trained and held out: none stands in the place of another."""
     fit = mc.calibrate(robot, noisy.data, "sum", holdout=0.3)
     for name, cell, rows in (
@@ -37,7 +36,7 @@ def test_each_accuracy_is_of_its_own_rows(robot: mc.Robot, noisy: Simulation) ->
     assert len({fit.accuracy[name].rms_mm for name in fit.accuracy}) == 4
 
 
-def test_minimax_lowers_the_largest_sum(robot: mc.Robot, noisy: Simulation) -> None:
+def test_minimax_lowers_the_largest_sum(robot, noisy):
     total = mc.calibrate(robot, noisy.data, "sum")
     worst = mc.calibrate(robot, noisy.data, "minimax")
     assert max(worst.accuracy["train"].sse_mm2) < max(total.accuracy["train"].sse_mm2)
@@ -49,7 +48,7 @@ def test_minimax_lowers_the_largest_sum(robot: mc.Robot, noisy: Simulation) -> N
     assert_allclose(worst.minimax.size, worst.accuracy["train"].sse_mm2)
 
 
-def test_pose_objective_trades_position_for_orientation(robot: mc.Robot, noisy: Simulation) -> None:
+def test_pose_objective_trades_position_for_orientation(robot, noisy):
     from experiments.poses import orientation_error, poses_of, triangle
 
     def turn(fit: mc.Fit) -> float:
@@ -67,13 +66,13 @@ def test_pose_objective_trades_position_for_orientation(robot: mc.Robot, noisy: 
     assert own.accuracy["train"].rms_mm < 1.02 * total.accuracy["train"].rms_mm
 
 
-def test_pose_needs_a_triangle(robot: mc.Robot, noisy: Simulation) -> None:
+def test_pose_needs_a_triangle(robot, noisy):
     two = noisy.data.keep(np.array([True, True, False]))
     with pytest.raises(mc.OptionError, match="three targets"):
         mc.calibrate(robot, two, "pose")
 
 
-def test_worst_point_is_lowered(robot: mc.Robot, noisy: Simulation) -> None:
+def test_worst_point_is_lowered(robot, noisy):
     total = mc.calibrate(robot, noisy.data, "sum")
     point = mc.calibrate(robot, noisy.data, "point")
     assert point.status == "converged"
@@ -86,7 +85,7 @@ def test_worst_point_is_lowered(robot: mc.Robot, noisy: Simulation) -> None:
     assert point.minimax.multiplier.sum() == pytest.approx(1.0)
 
 
-def test_single_target_objective_fits_that_target_alone(robot: mc.Robot, noisy: Simulation) -> None:
+def test_single_target_objective_fits_that_target_alone(robot, noisy):
     fit = mc.calibrate(robot, noisy.data, "smr:2", holdout=0.0)
     alone = mc.calibrate(robot, noisy.data.only(1), "sum", holdout=0.0)
     assert_allclose(fit.accuracy["train"].sse_mm2[1], alone.accuracy["train"].sse_mm2[0], rtol=1e-6)
@@ -95,7 +94,7 @@ def test_single_target_objective_fits_that_target_alone(robot: mc.Robot, noisy: 
     assert fit.accuracy["train"].sse_mm2[0] > total.accuracy["train"].sse_mm2[0]
 
 
-def test_targets_measured_at_different_poses(robot: mc.Robot) -> None:
+def test_targets_measured_at_different_poses(robot):
     """One reflector a pose: F_i / m_i is compared, and no distance row exists."""
     made = simulate(robot, 120, 3, seed=11)
     y = np.full_like(made.data.y, np.nan)
@@ -111,7 +110,7 @@ def test_targets_measured_at_different_poses(robot: mc.Robot) -> None:
     assert fit.accuracy["holdout"].rms_mm < 0.6 * fit.accuracy["nominal"].rms_mm
 
 
-def test_sigma_is_the_scatter_over_repeated_measurements(robot: mc.Robot) -> None:
+def test_sigma_is_the_scatter_over_repeated_measurements(robot):
     """Pooled z-scores over 30 x 33 parameters: their mean square is one within 5 sigma."""
     truth = Truth(compliance=0)
     scores = []
@@ -128,7 +127,7 @@ def test_sigma_is_the_scatter_over_repeated_measurements(robot: mc.Robot) -> Non
     assert abs(square - 1.0) < 5 * np.sqrt(2 / len(scores)) * 2  # parameters correlate: twice
 
 
-def test_fixed_parameters_stay_and_freed_ones_are_kept(robot: mc.Robot, noisy: Simulation) -> None:
+def test_fixed_parameters_stay_and_freed_ones_are_kept(robot, noisy):
     fit = mc.calibrate(robot, noisy.data, "sum", fix="a*, beta2", free=["d1"])
     by_name = {p.name: p for p in fit.parameters}
     assert by_name["alpha2"].identifiable  # a* is every a, not every name with an a in front
@@ -142,13 +141,13 @@ def test_fixed_parameters_stay_and_freed_ones_are_kept(robot: mc.Robot, noisy: S
     assert_allclose(free.accuracy["holdout"].rms_mm, plain.accuracy["holdout"].rms_mm, rtol=1e-9)
 
 
-def test_fixing_every_link_leaves_base_and_targets(robot: mc.Robot, noisy: Simulation) -> None:
+def test_fixing_every_link_leaves_base_and_targets(robot, noisy):
     fit = mc.calibrate(robot, noisy.data, "sum", fix=["*"])
     assert sum(p.identifiable for p in fit.parameters) == 15
     assert_allclose(fit.accuracy["train"].rms_mm, fit.accuracy["nominal_train"].rms_mm, rtol=1e-9)
 
 
-def test_parameters_that_are_not_identified_keep_their_value() -> None:
+def test_parameters_that_are_not_identified_keep_their_value():
     for name in ("scara_600", "irb2600"):
         robot = mc.load_robot(name)
         fit = mc.calibrate(robot, simulate(robot, 60, 3, seed=4).data, free=["d1"])
@@ -156,7 +155,7 @@ def test_parameters_that_are_not_identified_keep_their_value() -> None:
             assert p.identifiable or p.value == p.nominal
 
 
-def test_priors_help_when_poses_are_few(robot: mc.Robot) -> None:
+def test_priors_help_when_poses_are_few(robot):
     made = simulate(robot, 60, 1, seed=12, truth=Truth(compliance=0, noise=2e-4))
     few = made.data.take(np.arange(11))
     rest = made.data.take(np.arange(11, 60))
@@ -171,7 +170,7 @@ def test_priors_help_when_poses_are_few(robot: mc.Robot) -> None:
     assert mc.calibrate(robot, too_few, "sum", holdout=0.0, priors=priors).status == "converged"
 
 
-def test_targets_that_follow_weigh_no_prior(robot: mc.Robot, noisy: Simulation) -> None:
+def test_targets_that_follow_weigh_no_prior(robot, noisy):
     """smr:K is the calibration of that target alone, with priors too."""
     priors = {"a*": 1e-4, "d*": 1e-4, "theta*": 1e-4, "alpha*": 1e-4, "beta*": 1e-4}
     one = mc.calibrate(robot, noisy.data, "smr:1", priors=priors)
@@ -181,7 +180,7 @@ def test_targets_that_follow_weigh_no_prior(robot: mc.Robot, noisy: Simulation) 
     assert_allclose(one.robot.mdh, alone.robot.mdh, rtol=0, atol=1e-6)
 
 
-def test_a_tight_prior_pins_and_a_wide_one_does_nothing(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_tight_prior_pins_and_a_wide_one_does_nothing(robot, noisy):
     plain = mc.calibrate(robot, noisy.data, "sum", holdout=0.0)
     wide = mc.calibrate(robot, noisy.data, "sum", holdout=0.0, priors={"a2": 1e3})
     tight = mc.calibrate(robot, noisy.data, "sum", holdout=0.0, priors={"a2": 1e-9})
@@ -194,13 +193,13 @@ def test_a_tight_prior_pins_and_a_wide_one_does_nothing(robot: mc.Robot, noisy: 
     assert value["tight"].sigma < 1e-3 * value["plain"].sigma
 
 
-def test_minimax_takes_priors_too(robot: mc.Robot, noisy: Simulation) -> None:
+def test_minimax_takes_priors_too(robot, noisy):
     fit = mc.calibrate(robot, noisy.data, "minimax", priors={"a2": 1e-9})
     assert fit.status == "converged"
     assert_allclose(next(p.value for p in fit.parameters if p.name == "a2"), 0.9, atol=1e-8)
 
 
-def test_u95_weights_the_fit(robot: mc.Robot) -> None:
+def test_u95_weights_the_fit(robot):
     made = simulate(robot, 80, 3, seed=13, truth=Truth(compliance=0))
     rng = np.random.default_rng(0)
     bad = np.arange(80) % 4 == 0
@@ -217,7 +216,7 @@ def test_u95_weights_the_fit(robot: mc.Robot) -> None:
     assert miss[1] < 0.2 * miss[0]
 
 
-def test_saved_fit_comes_back(robot: mc.Robot, noisy: Simulation, tmp_path: Path) -> None:
+def test_saved_fit_comes_back(robot, noisy, tmp_path):
     fit = mc.calibrate(robot, noisy.data)
     fit.save(tmp_path / "fit.json")
     cell = mc.load_cell(tmp_path / "fit.json")
@@ -244,21 +243,21 @@ def test_saved_fit_comes_back(robot: mc.Robot, noisy: Simulation, tmp_path: Path
     }
 
 
-def test_no_holdout_is_said(robot: mc.Robot, noisy: Simulation) -> None:
+def test_no_holdout_is_said(robot, noisy):
     fit = mc.calibrate(robot, noisy.data, holdout=0.0)
     assert any("no pose is held out" in note for note in fit.notices)
     assert fit.to_dict()["accuracy"]["holdout"]["rms_mm"] is None
     assert "none was held out" in fit.headline()
 
 
-def test_one_target_says_that_minimax_is_the_sum(robot: mc.Robot) -> None:
+def test_one_target_says_that_minimax_is_the_sum(robot):
     data = simulate(robot, 60, 1, seed=2).data
     fit = mc.calibrate(robot, data, "minimax")
     assert any("minimax and sum are the same" in note for note in fit.notices)
     assert fit.accuracy == mc.calibrate(robot, data, "sum").accuracy
 
 
-def test_collinear_targets_are_a_notice(robot: mc.Robot) -> None:
+def test_collinear_targets_are_a_notice(robot):
     made = simulate(robot, 60, 3, seed=2)
     spots = np.outer([0.0, 0.1, 0.25], [1.0, 0.0, 0.2])
     cell = replace(made.cell, target_positions=spots)
@@ -286,15 +285,13 @@ def test_collinear_targets_are_a_notice(robot: mc.Robot) -> None:
         ({"distance": "cubed"}, "no distance form 'cubed'"),
     ],
 )
-def test_wrong_choices_are_refused(
-    options: dict, say: str, robot: mc.Robot, noisy: Simulation
-) -> None:  # type: ignore[type-arg]
+def test_wrong_choices_are_refused(options, say, robot, noisy):  # type: ignore[type-arg]
     with pytest.raises(mc.CalibrationError) as caught:
         mc.calibrate(robot, noisy.data, **options)
     assert say in str(caught.value)
 
 
-def test_pose_after_a_search_over_base_rotations(robot: mc.Robot, noisy: Simulation) -> None:
+def test_pose_after_a_search_over_base_rotations(robot, noisy):
     """A joint's zero off by a right angle: the search ends with several members at once."""
     off = robot.mdh.copy()
     off[3, 2] += np.pi / 2
@@ -302,19 +299,19 @@ def test_pose_after_a_search_over_base_rotations(robot: mc.Robot, noisy: Simulat
     assert fit.accuracy["holdout"].rms_mm < fit.accuracy["nominal"].rms_mm
 
 
-def test_a_holdout_that_leaves_nothing_is_refused(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_holdout_that_leaves_nothing_is_refused(robot, noisy):
     with pytest.raises(mc.OptionError, match=r"\b60\b"):
         mc.calibrate(robot, noisy.data, holdout=0.995)
 
 
 @pytest.mark.parametrize("objective", ["sum", "minimax", "point", "pose"])
-def test_exact_data_are_a_success(objective: str, robot: mc.Robot, clean: Simulation) -> None:
+def test_exact_data_are_a_success(objective, robot, clean):
     fit = mc.calibrate(robot, clean.data, objective)
     assert fit.status == "converged"
     assert fit.accuracy["holdout"].max_mm < 1e-6
 
 
-def test_only_offsets_leave_the_rest_as_drawn(noisy: Simulation, robot: mc.Robot) -> None:
+def test_only_offsets_leave_the_rest_as_drawn(noisy, robot):
     fit = mc.calibrate(robot, noisy.data, "sum", only="offsets")
     change = fit.robot.mdh - robot.mdh
     assert np.flatnonzero(np.abs(change).max(axis=0)).tolist() == [2]  # theta
@@ -329,8 +326,6 @@ def test_only_offsets_leave_the_rest_as_drawn(noisy: Simulation, robot: mc.Robot
 
 
 @pytest.mark.parametrize("sigma", ["1e-300mm", "1e300mm"])
-def test_a_prior_that_says_nothing_is_refused(
-    robot: mc.Robot, noisy: Simulation, sigma: str
-) -> None:
+def test_a_prior_that_says_nothing_is_refused(robot, noisy, sigma):
     with pytest.raises(mc.OptionError, match=r"\ba2\b.*sigma"):
         mc.calibrate(robot, noisy.data, priors={"a2": sigma})

@@ -122,7 +122,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_derivatives(name: str, robot: mc.Robot, noisy: Simulation) -> None:
+def test_derivatives(name, robot, noisy):
     here = CASES[name](robot, noisy)
     problem, rng = PointCones.of(here.worst), np.random.default_rng(0)
     at = problem.step(here.start, rng.normal(size=len(problem.white)))
@@ -138,7 +138,7 @@ def test_derivatives(name: str, robot: mc.Robot, noisy: Simulation) -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_norms_are_the_sqps_functions(name: str, robot: mc.Robot, noisy: Simulation) -> None:
+def test_norms_are_the_sqps_functions(name, robot, noisy):
     here = CASES[name](robot, noisy)
     rows = PointCones.of(here.worst).linearise(here.start)
     f, c = here.worst.evaluate(here.start)
@@ -150,15 +150,13 @@ def test_norms_are_the_sqps_functions(name: str, robot: mc.Robot, noisy: Simulat
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_cone_programs_end_at_the_same_value(name: str, robot: mc.Robot, noisy: Simulation) -> None:
+def test_cone_programs_end_at_the_same_value(name, robot, noisy):
     here = CASES[name](robot, noisy)
     assert_allclose(here.value(), by_cones(here), rtol=1e-8)
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_certificate_closes_at_an_optimum(
-    name: str, robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_the_certificate_closes_at_an_optimum(name, robot, noisy):
     here = CASES[name](robot, noisy)
     best = here.sqp()
     proof = certify(here.worst, best, here.data.line)
@@ -179,7 +177,7 @@ def test_the_certificate_closes_at_an_optimum(
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_certificate_is_open_elsewhere(name: str, robot: mc.Robot, noisy: Simulation) -> None:
+def test_the_certificate_is_open_elsewhere(name, robot, noisy):
     here = CASES[name](robot, noisy)
     early = here.sqp(iterations=1)
     proof = certify(here.worst, early, here.data.line)
@@ -188,7 +186,7 @@ def test_the_certificate_is_open_elsewhere(name: str, robot: mc.Robot, noisy: Si
     assert proof.bound < certify(here.worst, here.sqp(), here.data.line).value
 
 
-def test_the_points_that_decide_are_named(robot: mc.Robot, noisy: Simulation) -> None:
+def test_the_points_that_decide_are_named(robot, noisy):
     here = missing(robot, noisy)
     data = replace(here.data, line=here.data.line + 100)
     best = here.sqp()
@@ -209,9 +207,7 @@ def test_the_points_that_decide_are_named(robot: mc.Robot, noisy: Simulation) ->
     assert_allclose(content["value_mm"], 1e3 * proof.value)
 
 
-def test_weights_count_in_the_value_and_not_in_the_distances(
-    robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_weights_count_in_the_value_and_not_in_the_distances(robot, noisy):
     here = weighted(robot, noisy)
     best = here.sqp()
     proof = certify(here.worst, best, here.data.line)
@@ -224,7 +220,7 @@ def test_weights_count_in_the_value_and_not_in_the_distances(
     assert_allclose(np.sqrt(weight) * distance, proof.value, rtol=1e-6)
 
 
-def test_a_certificate_does_not_depend_on_the_scaling(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_certificate_does_not_depend_on_the_scaling(robot, noisy):
     """The problem may be scaled at the answer instead of the start: the multipliers follow."""
     here = bound_by_distances(robot, noisy)
     best = here.sqp()
@@ -238,14 +234,14 @@ def test_a_certificate_does_not_depend_on_the_scaling(robot: mc.Robot, noisy: Si
         assert_allclose(other.multiplier, same.multiplier, rtol=1e-6)
 
 
-def test_the_sqp_finds_its_way_from_the_nominal_arm(robot: mc.Robot, noisy: Simulation) -> None:
+def test_the_sqp_finds_its_way_from_the_nominal_arm(robot, noisy):
     """Errors of millimetres, not of the fit."""
     model, begin = identified(robot, noisy.data)
     here = Setup(noisy.data, model, begin, measured_distances(noisy.data))
     assert_allclose(here.value(), by_cones(plain(robot, noisy)), rtol=1e-8)
 
 
-def test_thousands_of_points(robot: mc.Robot) -> None:
+def test_thousands_of_points(robot):
     """3000 points take the SQP no more programs than 300 do, and its answer is certified."""
     few, many = (setup(robot, simulate(robot, poses, 3, seed=1).data) for poses in (100, 1000))
     assert many.sqp().iterations <= few.sqp().iterations + 3

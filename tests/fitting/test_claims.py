@@ -1,6 +1,5 @@
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.ground.files import plain
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.simulate import Simulation, simulate
+from minimax_cal.modelling.simulate import simulate
 
 
 def mirrored(data: Measurements) -> Measurements:
@@ -28,9 +27,7 @@ def stuck(robot: mc.Robot, data: Measurements) -> tuple[Measurements, np.ndarray
     return replace(data, q=q), rows[1:]
 
 
-def test_a_fit_that_contradicts_its_data_has_failed_and_writes_no_robot(
-    robot: mc.Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_fit_that_contradicts_its_data_has_failed_and_writes_no_robot(robot, tmp_path, capsys):
     data, out = tmp_path / "d.csv", tmp_path / "fit.json"
     mc.write_measurements(data, mirrored(simulate(robot, 110, 2, seed=5).data))
     assert run("calibrate", "irb2600", data, "--objective", "sum", "--json", "-o", out) == 1
@@ -42,7 +39,7 @@ def test_a_fit_that_contradicts_its_data_has_failed_and_writes_no_robot(
         mc.export(fit, "json")
 
 
-def test_bad_rows_that_are_held_out_are_told(robot: mc.Robot, noisy: Simulation) -> None:
+def test_bad_rows_that_are_held_out_are_told(robot, noisy):
     data, wrong = stuck(robot, noisy.data)
     fit = mc.calibrate(robot, data, "sum")
     assert fit.status == "converged"
@@ -58,7 +55,7 @@ def test_bad_rows_that_are_held_out_are_told(robot: mc.Robot, noisy: Simulation)
     assert "without outliers worst part" in fit.headline()
 
 
-def test_sound_held_out_rows_are_no_suspects(robot: mc.Robot) -> None:
+def test_sound_held_out_rows_are_no_suspects(robot):
     named = [
         one
         for seed in range(6)
@@ -68,7 +65,7 @@ def test_sound_held_out_rows_are_no_suspects(robot: mc.Robot) -> None:
     assert not named  # errors of the model are larger at new poses, and no fault of the rows
 
 
-def test_suspects_of_a_file_come_back(robot: mc.Robot, noisy: Simulation, tmp_path: Path) -> None:
+def test_suspects_of_a_file_come_back(robot, noisy, tmp_path):
     data, _ = stuck(robot, noisy.data)
     fit = mc.calibrate(robot, data, "sum")
     fit.save(tmp_path / "fit.json")
@@ -79,7 +76,7 @@ def test_suspects_of_a_file_come_back(robot: mc.Robot, noisy: Simulation, tmp_pa
     assert again.trusted.rms_mm == pytest.approx(fit.trusted.rms_mm, rel=1e-9)
 
 
-def test_a_wrong_point_of_the_fit_is_set_aside_where_its_part_judges(robot: mc.Robot) -> None:
+def test_a_wrong_point_of_the_fit_is_set_aside_where_its_part_judges(robot):
     """As beyond as measured without it: the loss gives it no weight, its part would tell it."""
     data = mc.simulate(robot, 100, 3, seed=4).data
     clean = mc.calibrate(robot, data, "sum", loss="tukey")

@@ -7,12 +7,12 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.fitting.crossed import MIN_HELD_POSES
 from minimax_cal.measuring.accuracy import accuracy
-from minimax_cal.modelling.simulate import Simulation, simulate
+from minimax_cal.modelling.simulate import simulate
 
 ONE_STEP = 0.02  # of an error's size: a fit without a fold is one Gauss-Newton step away
 
 
-def test_every_pose_is_judged_by_a_fit_without_it(robot: mc.Robot, noisy: Simulation) -> None:
+def test_every_pose_is_judged_by_a_fit_without_it(robot, noisy):
     """One held-out pose each, so that a fold's own fit can be had by `split`."""
     fit = mc.calibrate(robot, noisy.data, "sum", cv=True, seed=3)
     held = fit.error_crossed[:, fit.held]
@@ -36,7 +36,7 @@ def _by_group(fit: mc.Fit, folds: np.ndarray) -> np.ndarray:
     return folds[np.searchsorted(np.unique(group[~fit.held]), group[~fit.held])]
 
 
-def test_few_held_out_poses_are_cross_validated(robot: mc.Robot) -> None:
+def test_few_held_out_poses_are_cross_validated(robot):
     few, many = (simulate(robot, count, 3, seed=5).data for count in (60, 100))
     told = mc.calibrate(robot, few, "sum")
     assert told.accuracy["holdout"].poses < MIN_HELD_POSES
@@ -53,7 +53,7 @@ def test_few_held_out_poses_are_cross_validated(robot: mc.Robot) -> None:
     assert told.to_dict()["accuracy"]["holdout"]["poses"] == 12
 
 
-def test_too_few_poses_are_a_loud_warning(robot: mc.Robot) -> None:
+def test_too_few_poses_are_a_loud_warning(robot):
     """8 training poses of 3 targets tell 48 numbers, for 33 parameters."""
     data = simulate(robot, 10, 3, seed=5).data
     with pytest.warns(mc.CalibrationWarning, match="too few poses: 8 training poses tell 48"):

@@ -13,13 +13,12 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.fitting import solve
 from minimax_cal.modelling.near import jointly, separated
-from minimax_cal.modelling.simulate import Simulation
 from qp_backends import Solution
 
 
 def test_the_default_is_separable_squares_then_warm_started_qps_through_qpsolvers(
-    robot: mc.Robot, noisy: Simulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    robot, noisy, monkeypatch
+):
     seen: list[np.ndarray | None] = []
     found: list[np.ndarray] = []
     plain = qpsolvers.solve_problem
@@ -44,7 +43,7 @@ def test_the_default_is_separable_squares_then_warm_started_qps_through_qpsolver
         np.testing.assert_array_equal(start, last)
 
 
-def test_the_fast_choices_end_at_the_same_optimum(robot: mc.Robot, noisy: Simulation) -> None:
+def test_the_fast_choices_end_at_the_same_optimum(robot, noisy):
     usual = mc.calibrate(robot, noisy.data)
     fast = mc.calibrate(robot, noisy.data, method="joint", qp="daqp:direct")
     assert fast.work.least_squares == "nlgn"
@@ -54,9 +53,7 @@ def test_the_fast_choices_end_at_the_same_optimum(robot: mc.Robot, noisy: Simula
     assert_allclose(fast.minimax.size.max(), usual.minimax.size.max(), rtol=1e-9)
 
 
-def test_result_file_and_headline_say_who_answered(
-    robot: mc.Robot, noisy: Simulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_result_file_and_headline_say_who_answered(robot, noisy, monkeypatch):
     fit = mc.calibrate(robot, noisy.data)
     content = fit.to_dict()
     assert content["answered"] == dict(fit.answered)
@@ -69,7 +66,7 @@ def test_result_file_and_headline_say_who_answered(
     assert "QPs" not in mc.calibrate(robot, noisy.data, "sum").headline()
 
 
-def test_a_function_of_the_user_is_named(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_function_of_the_user_is_named(robot, noisy):
     from qp_backends import Problem
     from qp_backends import solve as solve_qp
 
@@ -81,9 +78,7 @@ def test_a_function_of_the_user_is_named(robot: mc.Robot, noisy: Simulation) -> 
     assert fit.work.warm_starts == 0
 
 
-def test_steps_of_variable_projection_start_from_the_best_lengths(
-    robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_steps_of_variable_projection_start_from_the_best_lengths(robot, noisy):
     """Same minimum as all parameters at once; the first cost is what the best lengths leave."""
     task = solve.prepared(robot, noisy.data, mc.Options())
     model = task.base.only(task.identified(task.base, task.frame.state).active)
@@ -101,7 +96,7 @@ def test_steps_of_variable_projection_start_from_the_best_lengths(
 
 @pytest.mark.parametrize(("method", "least"), [("eliminated", 1e-5), ("raw", 1e-3)])
 @pytest.mark.parametrize("arm", ["irb2600", "irb120", "ur5e"])
-def test_the_papers_subgradient_answers_by_itself(arm: str, method: str, least: float) -> None:
+def test_the_papers_subgradient_answers_by_itself(arm, method, least):
     """RMSE(phi) over the optimum; it is no success unless it is one, and says how far it came."""
     drawn = mc.load_robot(arm)
     data = mc.simulate(drawn, 60, 3, seed=0).data

@@ -51,7 +51,7 @@ def assert_same(read: Any, made: Any) -> None:
     assert_allclose(read, made, rtol=1e-11, atol=1e-14)
 
 
-def test_what_was_saved_comes_back(fit: mc.Fit, saved: mc.Fit, rng: np.random.Generator) -> None:
+def test_what_was_saved_comes_back(fit, saved, rng):
     q = rng.uniform(-2.0, 2.0, (20, 6))
     assert_same(saved.predict(q), fit.predict(q))
     assert_same(saved.covariance, fit.covariance)
@@ -69,9 +69,7 @@ def test_what_was_saved_comes_back(fit: mc.Fit, saved: mc.Fit, rng: np.random.Ge
     assert saved.options.settings() == fit.options.settings()
 
 
-def test_the_robot_is_of_geometry_alone(
-    fit: mc.Fit, saved: mc.Fit, robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_the_robot_is_of_geometry_alone(fit, saved, robot, noisy):
     """`robot` is what a fit without effects finds; `cell` keeps the joint fit; each stands once."""
     content = fit.to_dict()
     joint = bool(fit.cell.effects.causes)
@@ -89,7 +87,7 @@ def test_the_robot_is_of_geometry_alone(
         assert fit.robot is fit.cell.robot
 
 
-def test_the_report_is_the_same(fit: mc.Fit, saved: mc.Fit) -> None:
+def test_the_report_is_the_same(fit, saved):
     one, other = (
         render(compose(read_sources([each]), Wording("2026-01-31"))) for each in (fit, saved)
     )
@@ -97,7 +95,7 @@ def test_the_report_is_the_same(fit: mc.Fit, saved: mc.Fit) -> None:
     assert strip(one) == strip(other)
 
 
-def test_every_fact_is_in_the_file_and_shown_everywhere(fit: mc.Fit, tmp_path: Path) -> None:
+def test_every_fact_is_in_the_file_and_shown_everywhere(fit, tmp_path):
     """What `Fit` declares, by its key; in words in the summary, the report and the page."""
     content = fit.to_dict()
     facts = {**stored_facts(mc.Fit), **derived_facts(mc.Fit)}
@@ -112,7 +110,7 @@ def test_every_fact_is_in_the_file_and_shown_everywhere(fit: mc.Fit, tmp_path: P
     assert said in fit_words(*mark(tmp_path / "fit.json"))
 
 
-def test_work_goes_on_from_a_saved_fit(fit: mc.Fit, saved: mc.Fit) -> None:
+def test_work_goes_on_from_a_saved_fit(fit, saved):
     assert_same(saved.estimator.model.weight, fit.estimator.model.weight)
     assert_same(saved.estimator.model.prior.weight, fit.estimator.model.prior.weight)
     assert_array_equal(saved.estimator.share, fit.estimator.share)
@@ -122,7 +120,7 @@ def test_work_goes_on_from_a_saved_fit(fit: mc.Fit, saved: mc.Fit) -> None:
         assert_same(one.change, other.change)
 
 
-def test_the_estimator_gives_the_sigma_of_the_fit(fit: mc.Fit) -> None:
+def test_the_estimator_gives_the_sigma_of_the_fit(fit):
     """Rebuilt where the fit ended; with effects the columns were linear a pass before: 1 %."""
     from minimax_cal.fitting.uncertainty import uncertainty_of
 
@@ -134,7 +132,7 @@ def test_the_estimator_gives_the_sigma_of_the_fit(fit: mc.Fit) -> None:
     assert_allclose(ratio, 1.0, rtol=0, atol=rtol)
 
 
-def test_a_file_without_poses(fit: mc.Fit, tmp_path: Path) -> None:
+def test_a_file_without_poses(fit, tmp_path):
     """What is told pose by pose is not in it; all else comes back."""
     path = tmp_path / "fit.json"
     fit.save(path, poses=False)
@@ -150,7 +148,7 @@ def test_a_file_without_poses(fit: mc.Fit, tmp_path: Path) -> None:
     assert_same(back.predict(fit.data.q[:3]), fit.predict(fit.data.q[:3]))
 
 
-def test_a_number_changed_by_hand_counts(fit: mc.Fit) -> None:
+def test_a_number_changed_by_hand_counts(fit):
     content = fit.to_dict()
     joint = content["cell"] if fit.cell.effects.causes else content
     first = next(iter(joint["targets_mm"].values()))
@@ -182,9 +180,7 @@ def test_a_number_changed_by_hand_counts(fit: mc.Fit) -> None:
         ),
     ],
 )
-def test_a_broken_file_is_one_line(
-    change: Any, says: str, robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_a_broken_file_is_one_line(change, says, robot, noisy):
     content = json.loads(mc.calibrate(robot, noisy.data, "sum").json())
     change(content)
     with pytest.raises(mc.CalibrationError, match=says) as told:
@@ -193,7 +189,7 @@ def test_a_broken_file_is_one_line(
     assert "\n" not in str(told.value)
 
 
-def test_results_show_themselves(robot: mc.Robot, noisy: Simulation) -> None:
+def test_results_show_themselves(robot, noisy):
     fit = mc.calibrate(robot, noisy.data, "sum")
     assert len(repr(fit)) < 400
     assert repr(fit.parameters) == "<45 parameters, 33 identified>"
@@ -207,7 +203,7 @@ def test_results_show_themselves(robot: mc.Robot, noisy: Simulation) -> None:
 
 
 @pytest.mark.dev
-def test_a_frame_of_parameters(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_frame_of_parameters(robot, noisy):
     pytest.importorskip("pandas", reason="pandas is not installed: no frame to look at")
     frame = mc.calibrate(robot, noisy.data, "sum").parameters.frame()
     assert list(frame["name"][:2]) == ["a1", "d1"]
@@ -218,7 +214,7 @@ def test_a_frame_of_parameters(robot: mc.Robot, noisy: Simulation) -> None:
     ("qp", "says"),
     [(lambda problem: problem.q, "returned ndarray"), (7, "give the name of a backend")],
 )
-def test_a_wrong_qp_is_an_error_in_words(qp: Any, says: str) -> None:
+def test_a_wrong_qp_is_an_error_in_words(qp, says):
     data = mc.simulate("irb2600", 40, 2, seed=1).data
     with pytest.raises(mc.OptionError, match=says):
         mc.calibrate("irb2600", data, objective="minimax", qp=qp)

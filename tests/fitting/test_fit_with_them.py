@@ -1,7 +1,5 @@
 """What was set aside for a fit is listed, and counted beside what the fit claims."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -33,7 +31,7 @@ def unticked(data: Measurements, lines: Array) -> Measurements:
     return left_out(data, [f"{','.join(map(str, lines))}=looks odd"])
 
 
-def test_points_weigh_as_much_as_they_would_among_all(rng: np.random.Generator) -> None:
+def test_points_weigh_as_much_as_they_would_among_all(rng):
     """Where a fifth is held out, a point set aside counts a fifth of a held-out one."""
     held, aside = rng.normal(size=(2, 40, 3)), 3.0 * rng.normal(size=(2, 10, 3))
     found = with_them(held, np.arange(40), aside, 0.2)
@@ -48,7 +46,7 @@ def test_points_weigh_as_much_as_they_would_among_all(rng: np.random.Generator) 
     assert_allclose(alone.rms_mm, 1e3 * np.sqrt((held**2).sum(-1).mean()), rtol=1e-12)
 
 
-def test_unticked_poses_are_listed_and_counted(tmp_path: Path) -> None:
+def test_unticked_poses_are_listed_and_counted(tmp_path):
     """2 % of the poses: the claim without them is smaller, that with them is as before."""
     data, lines = spoilt()
     before = mc.calibrate("irb120", data, "sum").accuracy["holdout"].rms_mm
@@ -78,7 +76,7 @@ def test_unticked_poses_are_listed_and_counted(tmp_path: Path) -> None:
     assert again.with_them.rms_ci95_mm == fit.with_them.rms_ci95_mm
 
 
-def test_few_poses_are_cross_validated_and_all_count() -> None:
+def test_few_poses_are_cross_validated_and_all_count():
     data, lines = spoilt(60)
     fit = mc.calibrate("irb120", unticked(data, lines), "sum", holdout=0.2)
     assert fit.error_crossed.size
@@ -87,7 +85,7 @@ def test_few_poses_are_cross_validated_and_all_count() -> None:
     assert counted.rms_mm > 3.0 * fit.within.after.rms_mm
 
 
-def test_without_any_nothing_is_said() -> None:
+def test_without_any_nothing_is_said():
     fit = mc.calibrate("irb120", simulate("irb120", 60, 2, seed=1, truth=TRUTH).data, "sum")
     assert fit.set_aside == ()
     assert fit.to_dict()["set_aside"] == []
@@ -96,7 +94,7 @@ def test_without_any_nothing_is_said() -> None:
 
 
 @pytest.mark.parametrize("options", [{"trim": 0.05}, {"loss": "tukey"}])
-def test_what_a_robust_fit_gives_no_weight_is_listed(options: dict[str, object]) -> None:
+def test_what_a_robust_fit_gives_no_weight_is_listed(options):
     data, lines = spoilt()
     fit = mc.calibrate("irb120", data, "sum", **options)  # type: ignore[arg-type]
     train = set(fit.train.line)
@@ -105,7 +103,7 @@ def test_what_a_robust_fit_gives_no_weight_is_listed(options: dict[str, object])
     assert next(iter(options)) in fit.set_aside[0].why
 
 
-def test_a_target_that_hardly_any_pose_shows_is_listed() -> None:
+def test_a_target_that_hardly_any_pose_shows_is_listed():
     data = simulate("irb120", 60, 3, seed=1, truth=TRUTH).data
     y = data.y.copy()
     y[2:, 2] = np.nan
@@ -117,7 +115,7 @@ def test_a_target_that_hardly_any_pose_shows_is_listed() -> None:
     )
 
 
-def test_effects_and_sessions_reach_points_set_aside() -> None:
+def test_effects_and_sessions_reach_points_set_aside():
     """Their errors need the moves and the clock of the visits, which they were among."""
     data, lines = spoilt(120)
     marked = np.isin(data.line, lines)[:, None] & np.ones(3, dtype=bool)

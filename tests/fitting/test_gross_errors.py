@@ -76,11 +76,11 @@ def at_noise(fit: mc.Fit) -> bool:
     # of the last two a threshold on what shows alone would leave 0.14 and 0.15 mm
     [*((k, s) for k in KINDS for s in (0, 3)), (KINDS[3], 54), (KINDS[3], 60)],
 )
-def test_a_random_arm_reaches_the_noise(kind: str, seed: int) -> None:
+def test_a_random_arm_reaches_the_noise(kind, seed):
     assert at_noise(calibrated(kind, seed))
 
 
-def test_identification_is_asked_again_at_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_identification_is_asked_again_at_the_answer(monkeypatch):
     """Axes drawn coaxial that are not: without the second look the fit stops above the noise."""
     after = calibrated("coaxial neighbours", 0)
     monkeypatch.setattr(solve, "MAX_GROWTHS", 0)
@@ -90,14 +90,14 @@ def test_identification_is_asked_again_at_the_answer(monkeypatch: pytest.MonkeyP
     assert many > few
 
 
-def test_what_was_identified_stays_so_and_the_rest_stays_as_drawn() -> None:
+def test_what_was_identified_stays_so_and_the_rest_stays_as_drawn():
     fit = calibrated("coaxial neighbours", 1)
     rest = [p for p in fit.parameters if not p.identifiable]
     assert rest
     assert all(p.value == p.nominal for p in rest)
 
 
-def test_whole_arms_gain_nothing(robot: mc.Robot) -> None:
+def test_whole_arms_gain_nothing(robot):
     """A drawing that is right but for tolerances: the second look finds no more."""
     data = mc.simulate(robot, 60, 3, seed=4).data
     task = solve.prepared(robot, data, mc.Options(objective="sum"))

@@ -39,7 +39,7 @@ def misses(cell: Cell, true: Cell, q: Array) -> float:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_joint_that_nearly_stands_still(seed: int) -> None:
+def test_a_joint_that_nearly_stands_still(seed):
     data, true = measured(seed, 1.0)
     fit = mc.calibrate("ur10", data, "sum")
     assert fit.status in ("converged", "no_better")
@@ -54,14 +54,14 @@ def test_a_joint_that_nearly_stands_still(seed: int) -> None:
     assert np.array_equal(freely.cell.robot.mdh, fit.cell.robot.mdh)
 
 
-def test_poses_that_determine_all_need_no_drawing() -> None:
+def test_poses_that_determine_all_need_no_drawing():
     data, _ = measured(0, 0.0)
     fit = mc.calibrate("ur10", data, "sum")
     assert not fit.prior.any()
     assert not any("drawing holds" in text for text in fit.notices)
 
 
-def test_a_diagnosis_holds_them_as_well() -> None:
+def test_a_diagnosis_holds_them_as_well():
     """Its geometry is that of the calibration, to the rounds that weigh the prior."""
     data, _ = measured(2, 1.0)
     fit = mc.calibrate("ur10", data, "sum", holdout=0.2)

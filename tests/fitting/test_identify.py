@@ -7,7 +7,7 @@ from minimax_cal.fitting import identify
 from minimax_cal.fitting.identify import Because
 from minimax_cal.modelling import start
 from minimax_cal.modelling.model import SumOfSquares, model_of
-from minimax_cal.modelling.simulate import Simulation, simulate
+from minimax_cal.modelling.simulate import simulate
 from minimax_cal.solvers import least_squares
 
 TWELVE = "d1 theta1 d2 beta1 beta3 beta4 beta5 a6 d6 theta6 alpha6 beta6"
@@ -27,7 +27,7 @@ def find(robot: mc.Robot, data: mc.Measurements, order: np.ndarray | None = None
     )  # fmt: skip
 
 
-def test_the_twelve_redundant_parameters(robot: mc.Robot, noisy: Simulation) -> None:
+def test_the_twelve_redundant_parameters(robot, noisy):
     _, _, found = find(robot, noisy.data)
     assert set(found.reasons) == set(TWELVE.split())
     assert found.active.sum() == 33
@@ -37,14 +37,14 @@ def test_the_twelve_redundant_parameters(robot: mc.Robot, noisy: Simulation) -> 
     assert found.reasons["theta6"].text == "same motion as all targets moved together"
 
 
-def test_one_target_leaves_27_of_39(robot: mc.Robot) -> None:
+def test_one_target_leaves_27_of_39(robot):
     _, _, found = find(robot, simulate(robot, 60, 1, seed=1).data)
     assert len(found.active) == 39
     assert found.active.sum() == 27
 
 
 @pytest.mark.parametrize(("name", "dropped"), [("ur10", "d2 d3"), ("irb120", "d2")])
-def test_beta_instead_of_d_on_parallel_axes(name: str, dropped: str) -> None:
+def test_beta_instead_of_d_on_parallel_axes(name, dropped):
     robot = mc.load_robot(name)
     _, _, found = find(robot, simulate(robot, 80, 3, seed=2).data)
     for d in dropped.split():
@@ -52,9 +52,7 @@ def test_beta_instead_of_d_on_parallel_axes(name: str, dropped: str) -> None:
         assert d.replace("d", "beta") not in found.reasons
 
 
-def test_singular_values_are_those_of_the_scaled_jacobian(
-    robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_singular_values_are_those_of_the_scaled_jacobian(robot, noisy):
     model, state, found = find(robot, noisy.data)
     jacobian = model.jacobian(state).reshape(-1, model.names.count)[:, found.active]
     norms = np.sqrt((jacobian**2).sum(axis=0) / model.counts.sum())
@@ -62,7 +60,7 @@ def test_singular_values_are_those_of_the_scaled_jacobian(
     assert_allclose(found.singular, expected, rtol=1e-9)
 
 
-def test_a_prismatic_joint_has_its_own_redundancy() -> None:
+def test_a_prismatic_joint_has_its_own_redundancy():
     robot = mc.load_robot("scara_600")
     made = simulate(robot, 80, 3, seed=3)
     model, state, found = find(robot, made.data)
@@ -77,9 +75,7 @@ def test_a_prismatic_joint_has_its_own_redundancy() -> None:
     assert fit.accuracy["holdout"].rms_mm < 0.3 * fit.accuracy["nominal"].rms_mm
 
 
-def test_predictions_do_not_depend_on_the_copy_that_is_dropped(
-    robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_predictions_do_not_depend_on_the_copy_that_is_dropped(robot, noisy):
     rng = np.random.default_rng(6)
     points = float(noisy.data.seen.sum())
     errors = []
@@ -100,7 +96,7 @@ def test_predictions_do_not_depend_on_the_copy_that_is_dropped(
         assert_allclose(error, errors[0], rtol=0, atol=1e-9)  # 1e-6 mm
 
 
-def test_what_the_poses_do_not_show_is_told_from_what_no_pose_can(robot: mc.Robot) -> None:
+def test_what_the_poses_do_not_show_is_told_from_what_no_pose_can(robot):
     """Joint 4 never moves: its offset is then told from nothing, and the reason says so."""
     rng = np.random.default_rng(7)
     made = simulate(robot, 80, 3, seed=7)
@@ -114,7 +110,7 @@ def test_what_the_poses_do_not_show_is_told_from_what_no_pose_can(robot: mc.Robo
     assert all(why.kind is Because.NOT_TOLD for why in extra.values())
 
 
-def test_a_target_on_the_last_axis_does_not_measure_the_wrist(robot: mc.Robot) -> None:
+def test_a_target_on_the_last_axis_does_not_measure_the_wrist(robot):
     """A tenth of a millimetre of lever (as on a real UR10) must not yield angles of ten degrees."""
     from minimax_cal.modelling.simulate import Truth
 

@@ -1,7 +1,5 @@
 """Files of lengths, closures and poses: read as meant, or one line says why not."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -42,7 +40,7 @@ def examples(rng: np.random.Generator) -> dict[str, Instrument]:
 
 
 @pytest.mark.parametrize("kind", ["distances", "closures", "poses"])
-def test_what_is_written_is_read_back(kind: str, tmp_path: Path, rng: np.random.Generator) -> None:
+def test_what_is_written_is_read_back(kind, tmp_path, rng):
     data, path = examples(rng)[kind], tmp_path / "data.csv"
     write_relative(path, data)
     found = read_relative(path)
@@ -66,7 +64,7 @@ def test_what_is_written_is_read_back(kind: str, tmp_path: Path, rng: np.random.
             assert_allclose(found.at.columns[name], column, rtol=0, atol=1e-9)
 
 
-def test_slides_and_degrees_and_metres(tmp_path: Path) -> None:
+def test_slides_and_degrees_and_metres(tmp_path):
     path = tmp_path / "data.csv"
     rows = [f"{10 * i},{100 + i},{1.5 + 0.01 * i}" for i in range(6)]
     path.write_text("\n".join(["q1_deg,q2_mm,wire3_m", *rows]))
@@ -77,9 +75,7 @@ def test_slides_and_degrees_and_metres(tmp_path: Path) -> None:
     assert_allclose(found.length[:, 0], 1.5 + 0.01 * np.arange(6), rtol=1e-14)
 
 
-def test_quaternions_and_rotation_vectors_are_the_same_poses(
-    tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_quaternions_and_rotation_vectors_are_the_same_poses(tmp_path, rng):
     turn = Rotation.random(5, rng=rng)
     place = rng.normal(size=(5, 3))
     sign = np.array([1, -1, 1, -1, 1])  # q and -q are the same turn
@@ -99,7 +95,7 @@ def test_quaternions_and_rotation_vectors_are_the_same_poses(
         assert_allclose(found.pose[:, :3, 3], place, rtol=0, atol=1e-15)
 
 
-def test_rows_without_a_measurement_are_left_out_and_said(tmp_path: Path) -> None:
+def test_rows_without_a_measurement_are_left_out_and_said(tmp_path):
     path = tmp_path / "data.csv"
     rows = [f"{i / 10},0,0,{500 + i}" for i in range(6)] + ["0.7,0,0,"]
     path.write_text("\n".join([f"{JOINTS},wire1_mm", *rows]))
@@ -108,7 +104,7 @@ def test_rows_without_a_measurement_are_left_out_and_said(tmp_path: Path) -> Non
     assert found.at.notices == (f"{path}: 1 rows hold nothing measured and are left out",)
 
 
-def test_columns_that_nothing_uses_are_named(tmp_path: Path) -> None:
+def test_columns_that_nothing_uses_are_named(tmp_path):
     path = tmp_path / "data.csv"
     rows = [f"{i / 10},0,0,{500 + i},7,0.02" for i in range(6)]
     path.write_text("\n".join([f"{JOINTS},wire1_mm,operator,u95_mm", *rows]))
@@ -130,6 +126,7 @@ GOOD = {
     ],
 }
 WIRE, SOCKET, VECTOR, QUATERNION = GOOD
+TOUCH = "surface,kind"
 
 
 def changed(header: str, row: int, text: str) -> list[str]:
@@ -163,11 +160,19 @@ def changed(header: str, row: int, text: str) -> list[str]:
         ("flange_x_mm,flange_y_mm,flange_z_mm", ["1,2,3"] * 6, ":1:", "give the flange's orien"),
         ("flange_rx_rad,flange_ry_rad,flange_rz_rad", ["1,2,3"] * 6, ":1:", "flange_x_mm is miss"),
         ("flange_x_cm", ["1"] * 6, ":1:", "column flange_x_cm is not understood"),
+        ("surface", ["A"] * 5, ":1:", "column kind is missing"),
+        (TOUCH, ["A,cone"] * 5, ":", "kind: 'cone' of surface 'A'; write plane or sphere"),
+        (TOUCH, ["A,plane"] * 3, ":", "column surface: 'A' is touched at 3 different poses"),
+        (TOUCH, ["A,sphere"] * 4, ":", "touch a sphere at 5 or more"),
+        (TOUCH, ["A,plane"] * 5 + ["A,sphere"], ":7:", "surface 'A' has another kind, size"),
+        (f"{TOUCH},radius_mm", ["A,sphere,-3"] * 6, ":", "a radius must be positive"),
+        (f"{TOUCH},ball_radius_mm", ["A,plane,3"] * 5 + ["A,plane,4"], ":", "2 values; a probe"),
+        (f"{TOUCH},normal_x", ["A,plane,1"] * 6, ":1:", "a face has normal_x, normal_y and nor"),
+        (f"{TOUCH},socket", ["A,plane,1"] * 6, ":", "columns socket and surface are of different"),
+        (TOUCH, [","] * 6, ":", "nothing was measured at any pose"),
     ],
 )  # fmt: skip
-def test_bad_columns_are_one_line_with_place_and_mend(
-    header: str, cells: list[str], place: str, words: str, tmp_path: Path
-) -> None:
+def test_bad_columns_are_one_line_with_place_and_mend(header, cells, place, words, tmp_path):
     path = tmp_path / "bad.csv"
     rows = [f"0.{i},0.2,-0.{i},{cell}" for i, cell in enumerate(cells)]
     path.write_text("\n".join([f"{JOINTS},{header}", *rows]))
@@ -180,7 +185,7 @@ def test_bad_columns_are_one_line_with_place_and_mend(
 
 
 @pytest.mark.parametrize("header", list(GOOD))
-def test_the_good_columns_are_good(header: str, tmp_path: Path) -> None:
+def test_the_good_columns_are_good(header, tmp_path):
     path = tmp_path / "good.csv"
     rows = [f"0.{i},0.2,-0.{i},{cell}" for i, cell in enumerate(GOOD[header])]
     path.write_text("\n".join([f"{JOINTS},{header}", *rows]))
@@ -201,7 +206,7 @@ def test_the_good_columns_are_good(header: str, tmp_path: Path) -> None:
         (f"{JOINTS},socket\n0,0,0,A\n0,0,0,A\n1,0,0,B\n2,0,0,B\n", "the same joint values only"),
     ],
 )
-def test_bad_files_are_one_line(text: str, words: str, tmp_path: Path) -> None:
+def test_bad_files_are_one_line(text, words, tmp_path):
     path = tmp_path / "bad.csv"
     path.write_text(text)
     with pytest.raises(mc.DataError) as caught:
@@ -211,7 +216,7 @@ def test_bad_files_are_one_line(text: str, words: str, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_bad_arrays() -> None:
+def test_bad_arrays():
     q = np.arange(18.0).reshape(6, 3)
     with pytest.raises(mc.DataError, match="holds no poses"):
         distances(np.zeros((0, 3)), np.zeros((0, 1)))
@@ -230,7 +235,7 @@ def test_bad_arrays() -> None:
         distances(q[0], np.ones(6))
 
 
-def test_points_beside_wires_are_said_not_to_be_used(tmp_path: Path) -> None:
+def test_points_beside_wires_are_said_not_to_be_used(tmp_path):
     rows = "\n".join(f"{0.1 * i},{0.2 * i},{1000 + i},{i},2,3" for i in range(8))
     path = tmp_path / "wires.csv"
     path.write_text(f"q1_rad,q2_rad,wire1_mm,smr1_x_mm,smr1_y_mm,smr1_z_mm\n{rows}\n")

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -74,7 +73,7 @@ def fitted(kinds: tuple[str, ...], effects: tuple[str, ...] = ()) -> tuple[Arm, 
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "contacts"])
-def test_the_rows_of_an_arm_that_gives_way_have_its_derivative(kind: str) -> None:
+def test_the_rows_of_an_arm_that_gives_way_have_its_derivative(kind):
     """By central differences, of links, of the instrument's own and of the laws.
 
     But for a turn of the base of points: their rows are along its axes, and turn with it.
@@ -105,7 +104,7 @@ def test_the_rows_of_an_arm_that_gives_way_have_its_derivative(kind: str) -> Non
         )
 
 
-def test_an_arm_at_other_poses_gives_way_by_the_same_laws() -> None:
+def test_an_arm_at_other_poses_gives_way_by_the_same_laws():
     """At the training poses `at_rows_of` predicts what the rows do."""
     for kind in KINDS:
         arm, fit = fitted((kind,), ASKED)
@@ -121,7 +120,7 @@ PULLED = (("wires_3",), ("closures_known",), ("poses",), ("tracker", "closures_k
 
 
 @pytest.mark.parametrize("kinds", PULLED)
-def test_the_compliance_is_found_to_its_sigma(kinds: tuple[str, ...]) -> None:
+def test_the_compliance_is_found_to_its_sigma(kinds):
     pulls = []
     for seed in range(8):
         arm, data, known = measured(seed, kinds)
@@ -134,7 +133,7 @@ def test_the_compliance_is_found_to_its_sigma(kinds: tuple[str, ...]) -> None:
     assert np.abs(pulls).max() < 3.5
 
 
-def test_with_its_effects_an_arm_is_met_as_no_stiff_one_is() -> None:
+def test_with_its_effects_an_arm_is_met_as_no_stiff_one_is():
     for kinds in PULLED:
         arm, data, known = measured(1, kinds)
         plain = relative(arm.robot, list(data), known_distances=known)
@@ -147,7 +146,7 @@ def test_with_its_effects_an_arm_is_met_as_no_stiff_one_is() -> None:
         assert plain.cell is None
 
 
-def test_a_joint_that_does_not_give_way_rests_at_its_bound() -> None:
+def test_a_joint_that_does_not_give_way_rests_at_its_bound():
     arm, rng = Arm(TOLD, arm_of(2).real, -2e-7), np.random.default_rng(8)
     data = SIMULATORS["wires_3"](arm, rng, 100, NOISE).data
     fit = relative(arm.robot, data, effects="joint_compliance:J2")
@@ -159,7 +158,7 @@ def test_a_joint_that_does_not_give_way_rests_at_its_bound() -> None:
 
 
 @pytest.mark.parametrize("kinds", [*((kind,) for kind in KINDS), KINDS])
-def test_the_rows_of_evidence_estimate_what_the_fit_does(kinds: tuple[str, ...]) -> None:
+def test_the_rows_of_evidence_estimate_what_the_fit_does(kinds):
     """One Gauss-Newton step from geometry alone, weighed alike, geometry projected out."""
     arm, fit = fitted(kinds)
     scene = scene_of_all(arm.robot, fit)
@@ -178,9 +177,7 @@ def test_the_rows_of_evidence_estimate_what_the_fit_does(kinds: tuple[str, ...])
 
 
 @pytest.mark.parametrize("kinds", [*((kind,) for kind in KINDS), KINDS])
-def test_the_rows_of_a_stiff_arm_have_the_noise_of_their_instruments(
-    kinds: tuple[str, ...],
-) -> None:
+def test_the_rows_of_a_stiff_arm_have_the_noise_of_their_instruments(kinds):
     arm, fit = fitted(kinds, ASKED)
     scene = scene_of_all(arm.robot, fit)
     rows = rows_of_all(scene, fit)
@@ -198,7 +195,7 @@ def test_the_rows_of_a_stiff_arm_have_the_noise_of_their_instruments(
 # ---- the file ----------------------------------------------------------------------------------
 
 
-def test_a_file_predicts_with_its_effects(tmp_path: Path) -> None:
+def test_a_file_predicts_with_its_effects(tmp_path):
     arm, data, _ = measured(3, ("wires_3", "closures"))
     fit = relative(arm.robot, list(data), effects=ASKED)
     path = tmp_path / "fit.json"
@@ -217,7 +214,7 @@ def test_a_file_predicts_with_its_effects(tmp_path: Path) -> None:
     assert met < 2.0 * NOISE < 0.5 * missed
 
 
-def test_what_carries_no_effect_holds_the_geometry_fitted_alone(tmp_path: Path) -> None:
+def test_what_carries_no_effect_holds_the_geometry_fitted_alone(tmp_path):
     arm, data, _ = measured(3, ("wires_3", "closures"))
     fit = relative(arm.robot, list(data), effects=ASKED)
     made = mc.deliver(fit, "urdf")
@@ -228,7 +225,7 @@ def test_what_carries_no_effect_holds_the_geometry_fitted_alone(tmp_path: Path) 
     assert_allclose(held.cell.robot.mdh, fit.cell.robot.mdh, rtol=0, atol=1e-12)
 
 
-def test_effects_that_are_no_arms_or_lack_something_are_refused(tmp_path: Path) -> None:
+def test_effects_that_are_no_arms_or_lack_something_are_refused(tmp_path):
     arm, data, _ = measured(3, ("wires_3", "closures"))
     for effect, words in (
         ("target_offset", "belongs to one instrument, not to the arm that all share"),

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Mapping
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -82,7 +81,7 @@ def off(seed: int, robot: mc.Robot, ball: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_weak_prior_brings_a_panda_home_from_a_plate_of_sockets(seed: int) -> None:
+def test_a_weak_prior_brings_a_panda_home_from_a_plate_of_sockets(seed):
     with_prior, plain = fitted(seed, PRIOR), fitted(seed, None)
     assert str(with_prior.status) == "converged"
     balls = [1e-3 * np.array(fit.instrument["target_mm"]) for fit in (with_prior, plain)]
@@ -94,7 +93,7 @@ def test_a_weak_prior_brings_a_panda_home_from_a_plate_of_sockets(seed: int) -> 
     assert all(0.0 < p.sigma <= 5e-3 for p in links)
 
 
-def test_a_firm_prior_keeps_the_drawing() -> None:
+def test_a_firm_prior_keeps_the_drawing():
     firm = fitted(0, {"a*": 1e-9, "d*": 1e-9})
     for p in firm.parameters:
         if p.name[0] in "ad" and not p.name.startswith("alpha") and p.identifiable:
@@ -111,7 +110,7 @@ def wires() -> tuple[mc.Simulation, Instrument]:
     return made, distances(made.data.q, length)
 
 
-def test_a_loose_prior_says_nothing() -> None:
+def test_a_loose_prior_says_nothing():
     _, data = wires()
     loose, plain = (mc.relative("irb2600", data, priors=p) for p in ({"theta*": 1e3}, None))
     for one, other in zip(loose.parameters, plain.parameters, strict=True):
@@ -119,7 +118,7 @@ def test_a_loose_prior_says_nothing() -> None:
         assert_allclose(one.sigma, other.sigma, rtol=1e-3)
 
 
-def test_wires_and_poses_take_priors_too() -> None:
+def test_wires_and_poses_take_priors_too():
     made, lengths = wires()
     q = made.data.q
     pose = made.cell.base @ made.cell.robot.pose(q)
@@ -130,21 +129,21 @@ def test_wires_and_poses_take_priors_too() -> None:
         assert all(abs(p.value - p.nominal) < 1e-7 for p in kept)
 
 
-def test_what_no_prior_can_be_is_refused() -> None:
+def test_what_no_prior_can_be_is_refused():
     with pytest.raises(mc.OptionError, match=r"target_x: .* have no nominal value to keep"):
         fitted(0, {"target_x": 1e-3})
     with pytest.raises(mc.OptionError, match="must be positive"):
         fitted(0, {"a2": -1.0})
 
 
-def test_a_distance_that_no_prior_allows_is_refused() -> None:
+def test_a_distance_that_no_prior_allows_is_refused():
     _, q, labels, known = plate(0)
     wrong = [(*known[0][:2], known[0][2] + 0.5), *known[1:]]
     with pytest.raises(mc.OptionError, match="check the labels and the length"):
         mc.relative(PANDA, closures(q, labels), known_distances=wrong, priors=PRIOR)
 
 
-def test_the_command_takes_priors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_takes_priors(tmp_path, capsys):
     _, q, labels, known = plate(2)
     head = ",".join([*(f"q{j + 1}_rad" for j in range(7)), "socket"])
     pairs = zip(q.tolist(), labels, strict=True)
@@ -163,7 +162,7 @@ def test_the_command_takes_priors(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("seen", ["tracker", "poses"])
-def test_of_links_that_move_alike_priors_tell_each(seen: str, seed: int) -> None:
+def test_of_links_that_move_alike_priors_tell_each(seen, seed):
     """d2 and d3 of parallel axes: their sum is measured, their difference is what priors say.
 
     With equal priors s each gets half of the sum, and the sigma s / sqrt(2).

@@ -3,7 +3,6 @@
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -111,9 +110,7 @@ MAKERS = [seen, wires, sockets, several]
 
 @pytest.mark.parametrize("name", ["irb2600", "scara_600"])
 @pytest.mark.parametrize("make", MAKERS)
-def test_slopes_are_the_derivative_of_the_rows(
-    name: str, make: object, rng: np.random.Generator
-) -> None:
+def test_slopes_are_the_derivative_of_the_rows(name, make, rng):
     robot = mc.load_robot(name)
     robot = robot.with_mdh(robot.mdh + 0.05 * rng.normal(size=robot.mdh.shape))
     stack, x = make(robot, rng)  # type: ignore[operator]
@@ -129,9 +126,7 @@ def test_slopes_are_the_derivative_of_the_rows(
 
 
 @pytest.mark.parametrize("make", MAKERS)
-def test_rows_of_a_batch_are_those_of_its_members(
-    robot: mc.Robot, make: object, rng: np.random.Generator
-) -> None:
+def test_rows_of_a_batch_are_those_of_its_members(robot, make, rng):
     stack, x = make(robot, rng)  # type: ignore[operator]
     some = stack.movable & (rng.uniform(size=stack.names.count) < 0.7)
     batch = x.repeat(3)
@@ -143,9 +138,7 @@ def test_rows_of_a_batch_are_those_of_its_members(
         assert_allclose(jacobians[i], jacobian, rtol=0, atol=1e-13)
 
 
-def test_the_barycentre_is_the_best_place_of_a_socket(
-    robot: mc.Robot, rng: np.random.Generator
-) -> None:
+def test_the_barycentre_is_the_best_place_of_a_socket(robot, rng):
     # the cost without the sockets is the least over all sockets' places, by explicit least squares
     q, socket = random_poses(robot, 20, rng), rng.permutation(np.arange(20) % 3)
     visits = Block.of(robot, closures(q, socket))
@@ -162,7 +155,7 @@ KINDS = [k for k in SIMULATORS if k != "closures"]
 
 @pytest.mark.parametrize("name", ["irb2600", "ur10"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_without_noise_the_true_arm_is_found(name: str, kind: str) -> None:
+def test_without_noise_the_true_arm_is_found(name, kind):
     arm, fit = fitted(name, kind)
     assert fit.status == "converged"
     assert fit.accuracy["holdout"].poses > 0
@@ -173,7 +166,7 @@ def test_without_noise_the_true_arm_is_found(name: str, kind: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["irb2600", "ur10"])
-def test_closures_find_the_arm_but_for_its_scale(name: str) -> None:
+def test_closures_find_the_arm_but_for_its_scale(name):
     arm, fit = fitted(name, "closures")
     assert fit.accuracy["holdout"].max_mm < 1e-6
     shape = position_errors(arm, fit.robot, spot_of(fit), checks(arm), scaled=True)
@@ -198,7 +191,7 @@ def test_closures_find_the_arm_but_for_its_scale(name: str) -> None:
     assert off.max() < 1e-8
 
 
-def test_one_socket_is_enough() -> None:
+def test_one_socket_is_enough():
     arm, seen = measured("irb2600", "closures")
     rng = np.random.default_rng(3)
     goal = np.repeat(arm.place(seen.data.at.q[:1]), 300, axis=0)
@@ -211,7 +204,7 @@ def test_one_socket_is_enough() -> None:
     assert shape.max() < 1e-8
 
 
-def test_scaling_all_lengths_changes_no_closure_but_a_known_distance(robot: mc.Robot) -> None:
+def test_scaling_all_lengths_changes_no_closure_but_a_known_distance(robot):
     q, socket = closing_poses(robot, SPOT, 4, 5, np.random.default_rng(0))
     _, socket = np.unique(socket, return_inverse=True)
     centres = [place(robot, q, SPOT)[socket == i].mean(axis=0) for i in (0, 1)]
@@ -230,13 +223,13 @@ def test_scaling_all_lengths_changes_no_closure_but_a_known_distance(robot: mc.R
 
 @pytest.mark.parametrize("name", ["irb2600", "ur10", "meca500"])
 @pytest.mark.parametrize("kind", list(SIMULATORS))
-def test_identified_is_the_rank_by_finite_differences(name: str, kind: str) -> None:
+def test_identified_is_the_rank_by_finite_differences(name, kind):
     arm, seen = measured(name, kind)
     _, fit = fitted(name, kind)
     assert fit.identified == rank_of(arm, seen)
 
 
-def test_counts_by_kind(robot: mc.Robot) -> None:
+def test_counts_by_kind(robot):
     # 21 of the arm itself; 3 more for each anchor; 6 of the base and 3 of the tool's turn
     expected = {"poses": 30, "wires_4": 33, "wires_3": 30, "wires_1": 24, "ball_bar": 30}
     expected |= {"closures": 20, "closures_known": 21, "plate_known": 21}
@@ -250,7 +243,7 @@ def slid(name: str, sizes: tuple[float, float]) -> tuple[Arm, np.random.Generato
     return Arm(robot, robot.with_mdh(robot.mdh + errors), 0.0), rng
 
 
-def test_an_arm_with_a_slide() -> None:
+def test_an_arm_with_a_slide():
     arm, rng = slid("scara_600", (5e-4, 1e-3))
     q = random_poses(arm.robot, 80, rng)
     anchors = rng.normal(size=(3, 3))
@@ -271,7 +264,7 @@ SEEDS = (0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 8)
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("anchors", "offset"), [(1, 0.0), (3, 0.1)])
-def test_no_guess_is_needed(seed: int, anchors: int, offset: float) -> None:
+def test_no_guess_is_needed(seed, anchors, offset):
     # 5 mm and 10 mrad off, a target half a metre off, anchors anywhere, offsets of 0.1 m
     rng = np.random.default_rng(seed)
     robot = mc.load_robot(["irb2600", "ur10"][seed % 2])
@@ -290,7 +283,7 @@ def test_no_guess_is_needed(seed: int, anchors: int, offset: float) -> None:
         assert any("offsets are weakly determined" in notice for notice in fit.notices)
 
 
-def test_an_offset_that_is_there_and_not_fitted_shows() -> None:
+def test_an_offset_that_is_there_and_not_fitted_shows():
     arm, seen = measured("irb2600", "wires_3", noise=NOISE)
     shifted = replace(seen.data, length=seen.data.length + np.array([0.002, 0.0, -0.003]))
     wrong, right = relative(arm.robot, shifted), relative(arm.robot, shifted, offset=True)
@@ -302,7 +295,7 @@ def test_an_offset_that_is_there_and_not_fitted_shows() -> None:
         assert told[name].sigma > NOISE / np.sqrt(80)  # weaker than the mean of the lengths
 
 
-def test_reach_closes_and_says_where_it_cannot(robot: mc.Robot) -> None:
+def test_reach_closes_and_says_where_it_cannot(robot):
     rng = np.random.default_rng(1)
     q = random_poses(robot, 20, rng)
     goal = place(robot, random_poses(robot, 20, rng), SPOT)
@@ -317,7 +310,7 @@ def test_reach_closes_and_says_where_it_cannot(robot: mc.Robot) -> None:
 
 
 @pytest.mark.parametrize(("kind", "arms"), [("wires_3", 8), ("closures_known", 4), ("poses", 6)])
-def test_sigmas_are_the_scatter_of_fits(kind: str, arms: int) -> None:
+def test_sigmas_are_the_scatter_of_fits(kind, arms):
     # each parameter's deviation from the fit without noise, which is the truth in the same gauge
     z, ratio = [], []
     for seed in range(arms):
@@ -337,7 +330,7 @@ def test_sigmas_are_the_scatter_of_fits(kind: str, arms: int) -> None:
     assert 0.7 < np.sqrt(np.mean(np.square(ratio))) < 1.3
 
 
-def test_misclosures_are_as_about_known_sockets() -> None:
+def test_misclosures_are_as_about_known_sockets():
     rng = np.random.default_rng(3)
     socket = np.array(["A"] * 4 + ["B"] * 2 + ["C"] * 3 + ["D"])
     held = np.array([False, False, False, True] + [False] * 2 + [True] * 3 + [True])
@@ -350,7 +343,7 @@ def test_misclosures_are_as_about_known_sockets() -> None:
     assert free_numbers(socket, held) == (3 * (5 - 2), 3 * (5 - 2))
 
 
-def test_whole_sockets_are_held_out_where_there_are_enough() -> None:
+def test_whole_sockets_are_held_out_where_there_are_enough():
     arm, seen = measured("irb2600", "closures_known", noise=NOISE)
     fit = relative(arm.robot, seen.data, known_distances=seen.known, holdout=0.3)
     assert len([n for n in fit.notices if "3 of 10 sockets" in n]) == 1
@@ -365,7 +358,7 @@ def test_whole_sockets_are_held_out_where_there_are_enough() -> None:
     assert fewer.numbers["holdout"] == 3 * 6
 
 
-def test_the_split_column_decides() -> None:
+def test_the_split_column_decides():
     arm, seen = measured("irb2600", "closures_known")
     out = [label for label in seen.data.sockets if label not in seen.known[0][:2]][:2]
     label = np.where(np.isin(seen.data.socket, out), "holdout", "train")
@@ -378,14 +371,14 @@ def test_the_split_column_decides() -> None:
         relative(arm.robot, data, known_distances=seen.known)
 
 
-def test_an_error_of_lengths_is_not_called_one_of_position() -> None:
+def test_an_error_of_lengths_is_not_called_one_of_position():
     _, fit = fitted("irb2600", "wires_3", noise=NOISE)
     assert "no error of position" in fit.headline()
     _, fit = fitted("irb2600", "closures", noise=NOISE)
     assert "no error of position" in fit.headline()
 
 
-def test_points_that_stand_out_are_named() -> None:
+def test_points_that_stand_out_are_named():
     arm, seen = measured("irb2600", "wires_3", noise=NOISE)
     length = seen.data.length.copy()
     length[17, 2] += 0.05
@@ -394,7 +387,7 @@ def test_points_that_stand_out_are_named() -> None:
 
 
 @pytest.mark.slow  # its fit goes to the limit of its steps
-def test_another_robot_is_doubted() -> None:
+def test_another_robot_is_doubted():
     seen = SIMULATORS["wires_3"](Arm.of("irb2600", 0, 0.0), np.random.default_rng(5), 45, 0.0)
     fit = relative("irb120", seen.data)
     assert any("the nominal robot misses by" in notice for notice in fit.notices)
@@ -405,7 +398,7 @@ def test_another_robot_is_doubted() -> None:
 
 
 @pytest.mark.parametrize(("factor", "name"), [(1e-3, "wire1_m"), (1e3, "wire1_mm")])
-def test_lengths_in_another_unit_are_refused(factor: float, name: str) -> None:
+def test_lengths_in_another_unit_are_refused(factor, name):
     arm, seen = measured("irb2600", "wires_3", noise=NOISE)
     wrong = replace(seen.data, length=factor * seen.data.length)
     with pytest.raises(mc.DataError, match=rf"\b{name}\b"):
@@ -413,7 +406,7 @@ def test_lengths_in_another_unit_are_refused(factor: float, name: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["wires_3", "closures"])
-def test_a_reversed_joint_is_named(kind: str) -> None:
+def test_a_reversed_joint_is_named(kind):
     arm, seen = measured("irb2600", kind, noise=NOISE)
     q = seen.data.at.q * [1, 1, -1, 1, 1, 1]
     wrong = replace(seen.data, at=replace(seen.data.at, q=q))
@@ -421,7 +414,7 @@ def test_a_reversed_joint_is_named(kind: str) -> None:
         relative(arm.robot, wrong)
 
 
-def test_a_large_offset_that_is_not_fitted_fails() -> None:
+def test_a_large_offset_that_is_not_fitted_fails():
     arm, seen = measured("irb2600", "wires_3", noise=NOISE)
     shifted = replace(seen.data, length=seen.data.length + np.array([0.1, 0.05, -0.03]))
     fit = relative(arm.robot, shifted)
@@ -430,14 +423,14 @@ def test_a_large_offset_that_is_not_fitted_fails() -> None:
     assert relative(arm.robot, shifted, offset=True).status is Status.CONVERGED
 
 
-def test_labels_of_sockets_at_random_are_no_closures(robot: mc.Robot) -> None:
+def test_labels_of_sockets_at_random_are_no_closures(robot):
     """All could close if the arm shrank to a point."""
     q = random_poses(robot, 60, np.random.default_rng(0))
     fit = relative(robot, closures(q, [f"S{i % 6}" for i in range(60)]))
     assert fit.status is Status.FAILED
 
 
-def test_a_known_distance_that_cannot_be_is_refused() -> None:
+def test_a_known_distance_that_cannot_be_is_refused():
     arm, seen = measured("irb2600", "closures", noise=NOISE)
     a, b = seen.data.sockets[:2]
     fit = relative(arm.robot, seen.data)
@@ -456,7 +449,7 @@ def test_a_known_distance_that_cannot_be_is_refused() -> None:
 # ---- options ---------------------------------------------------------------------------------
 
 
-def test_fix_and_free() -> None:
+def test_fix_and_free():
     arm, seen = measured("irb2600", "wires_3", noise=NOISE)
     fit = relative(arm.robot, seen.data, fix="a2,beta*", free=["d1"])
     told = {p.name: p for p in fit.parameters}
@@ -492,7 +485,7 @@ def test_fix_and_free() -> None:
         ("wires_3", {"fix": ["anchor1_x"]}, "no nominal value to keep"),
     ],
 )
-def test_bad_options_are_one_line(kind: str, options: dict[str, object], words: str) -> None:
+def test_bad_options_are_one_line(kind, options, words):
     arm, seen = measured("irb2600", kind)
     with pytest.raises(mc.OptionError) as caught:
         relative(arm.robot, seen.data, **options)  # type: ignore[arg-type]
@@ -500,7 +493,7 @@ def test_bad_options_are_one_line(kind: str, options: dict[str, object], words: 
     assert "\n" not in str(caught.value)
 
 
-def test_too_few_lengths_are_told_with_their_number() -> None:
+def test_too_few_lengths_are_told_with_their_number():
     arm, seen = measured("irb2600", "wires_1")
     few = seen.data.take(np.arange(25))
     with pytest.raises(mc.DataError, match=r"\b20\b.*\b24\b"):
@@ -512,12 +505,12 @@ def test_too_few_lengths_are_told_with_their_number() -> None:
 
 
 @pytest.mark.parametrize("text", ["A,B", "A,B,x", "A,B,5,6", ",B,5", "A,B,--5", "A,B,nan"])
-def test_a_known_distance_must_be_readable(text: str) -> None:
+def test_a_known_distance_must_be_readable(text):
     with pytest.raises(mc.OptionError, match="write two sockets and a length"):
         known_of(text)
 
 
-def test_a_known_distance_in_words() -> None:
+def test_a_known_distance_in_words():
     *labels, length = known_of(" S1 , plate 2, 500.02 mm")
     assert labels == ["S1", "plate 2"]
     assert_allclose(length, 0.50002, rtol=1e-14)
@@ -526,7 +519,7 @@ def test_a_known_distance_in_words() -> None:
 # ---- whole poses -----------------------------------------------------------------------------
 
 
-def test_four_reflectors_weigh_position_and_turn_by_the_lever(rng: np.random.Generator) -> None:
+def test_four_reflectors_weigh_position_and_turn_by_the_lever(rng):
     lever = 0.37
     shift, turn = 1e-6 * rng.normal(size=3), 1e-6 * rng.normal(size=3)
     for count in (3, 4):
@@ -539,7 +532,7 @@ def test_four_reflectors_weigh_position_and_turn_by_the_lever(rng: np.random.Gen
 
 
 @pytest.mark.parametrize("count", [3, 4])
-def test_virtual_reflectors_are_real_ones(count: int) -> None:
+def test_virtual_reflectors_are_real_ones(count):
     """Reflectors screwed on where the virtual ones are give the same calibration."""
     arm, seen = measured("ur10", "poses", noise=NOISE)
     lever = 0.2
@@ -555,7 +548,7 @@ def test_virtual_reflectors_are_real_ones(count: int) -> None:
         assert fit.identified == sum(p.identifiable for p in real.parameters) - 6  # their shape
 
 
-def test_poses_tell_the_turn_of_the_tool_and_more() -> None:
+def test_poses_tell_the_turn_of_the_tool_and_more():
     arm, seen = measured("irb2600", "poses", noise=NOISE)
     fit = relative(arm.robot, seen.data)
     assert fit.beyond == ("tool_rx", "tool_ry", "tool_rz")  # at a point off all wrist axes
@@ -568,7 +561,7 @@ def test_poses_tell_the_turn_of_the_tool_and_more() -> None:
 
 
 @pytest.mark.slow
-def test_the_tool_and_its_sigma_are_found() -> None:
+def test_the_tool_and_its_sigma_are_found():
     _, fit = fitted("irb2600", "poses", noise=NOISE)
     told = {p.name: p for p in fit.parameters}
     exact = fitted("irb2600", "poses")[1]
@@ -583,7 +576,7 @@ def test_the_tool_and_its_sigma_are_found() -> None:
     assert told["d6"].reason == "same motion as the tool"
 
 
-def test_the_lever_comes_from_the_columns() -> None:
+def test_the_lever_comes_from_the_columns():
     arm, seen = measured("irb2600", "poses", noise=NOISE)
     assert relative(arm.robot, seen.data).instrument["lever_mm"] == pytest.approx(100.0)
     columns = {"u95": np.full(100, 3e-5), "rotation_u95": np.full(100, 1e-4)}
@@ -592,7 +585,7 @@ def test_the_lever_comes_from_the_columns() -> None:
     assert relative(arm.robot, data, lever=0.05).instrument["lever_mm"] == pytest.approx(50.0)
 
 
-def test_errors_of_poses_name_the_users_columns() -> None:
+def test_errors_of_poses_name_the_users_columns():
     arm, seen = measured("irb2600", "poses")
     pose = seen.data.pose.copy()
     pose[:, :3, 3] *= 1e-3
@@ -600,7 +593,7 @@ def test_errors_of_poses_name_the_users_columns() -> None:
         relative(arm.robot, flange_poses(seen.data.at.q, pose), lever=1e-4)
 
 
-def test_a_real_arm_by_lengths_of_its_trackers_points() -> None:
+def test_a_real_arm_by_lengths_of_its_trackers_points():
     shared("irb120")  # skips where there are no data
     kinds = ("wires_3", "wires_1", "tracker")
     three, one, tracker = (run_real(RealJob("irb120", kind, 0)) for kind in kinds)
@@ -619,7 +612,7 @@ def test_a_real_arm_by_lengths_of_its_trackers_points() -> None:
 
 
 @pytest.mark.parametrize("kind", ["wires_3", "closures_known", "poses"])
-def test_the_saved_result_is_a_robot(kind: str, tmp_path: Path) -> None:
+def test_the_saved_result_is_a_robot(kind, tmp_path):
     arm, fit = fitted("irb2600", kind, noise=NOISE)
     path = tmp_path / "fit.json"
     fit.save(path)
@@ -631,14 +624,14 @@ def test_the_saved_result_is_a_robot(kind: str, tmp_path: Path) -> None:
         mc.load_cell(path)  # it has no place in a measurement frame, or no reflectors
 
 
-def test_the_same_data_give_the_same_numbers() -> None:
+def test_the_same_data_give_the_same_numbers():
     arm, seen = measured("ur10", "wires_3", noise=NOISE)
     one, other = (relative(arm.robot, seen.data).to_dict() for _ in range(2))
     one.pop("seconds"), other.pop("seconds")
     assert one == other
 
 
-def test_nothing_held_out_is_said() -> None:
+def test_nothing_held_out_is_said():
     arm, seen = measured("ur10", "closures", noise=NOISE)
     fit = relative(arm.robot, seen.data, holdout=0.0)
     assert any("no pose is held out" in notice for notice in fit.notices)
@@ -646,7 +639,7 @@ def test_nothing_held_out_is_said() -> None:
     assert fit.to_dict()["accuracy"]["holdout"]["rms_mm"] is None
 
 
-def test_sockets_by_arrays_and_labels_that_are_numbers() -> None:
+def test_sockets_by_arrays_and_labels_that_are_numbers():
     arm, seen = measured("ur10", "closures", noise=NOISE)
     number = np.unique(seen.data.socket, return_inverse=True)[1]
     fit = relative(arm.robot, closures(seen.data.at.q, number))
@@ -690,23 +683,21 @@ class Height(mc_instruments.Instrument):
         ("point", "by_point .* of row "),
     ],
 )
-def test_an_instrument_that_does_not_read_as_it_says_is_named(
-    robot: mc.Robot, wrong: str, said: str
-) -> None:
+def test_an_instrument_that_does_not_read_as_it_says_is_named(robot, wrong, said):
     q = random_poses(robot, 40, np.random.default_rng(0))
     made = Height(bare(q, {}), place(robot, q, SPOT)[:, 2], wrong)
     with pytest.raises(mc.DataError, match=f"height: {said}") if wrong else nullcontext():
         mc_instruments.check_instrument(made, robot)
 
 
-def test_a_kind_of_its_own_is_asked_for() -> None:
+def test_a_kind_of_its_own_is_asked_for():
     with pytest.raises(mc.OptionError, match="give it a kind of its own: 'distances' is built in"):
         mc.register_instrument(type("Mine", (Height,), {"kind": "distances"}))
     with pytest.raises(mc.OptionError, match="it has none"):
         mc.register_instrument(type("Mine", (mc_instruments.Instrument,), {}))
 
 
-def test_readings_that_are_no_numbers_are_named(robot: mc.Robot) -> None:
+def test_readings_that_are_no_numbers_are_named(robot):
     q = random_poses(robot, 40, np.random.default_rng(0))
     with pytest.raises(mc.DataError, match="height has 39 entries; there are 40 poses"):
         mc.relative(robot, Height(bare(q, {}), np.zeros(39)))
@@ -736,7 +727,7 @@ class Level(mc_instruments.Instrument):
         return ResidualRows(error, np.arange(m), nowhere, nowhere, across, np.ones((m, 1)))
 
 
-def test_an_instrument_may_read_the_flange_itself(robot: mc.Robot) -> None:
+def test_an_instrument_may_read_the_flange_itself(robot):
     """Beside a tracker it is fitted; what the evidence cannot know of it is refused in words."""
     arm, rng = Arm.of("irb2600", 1, 0.0), np.random.default_rng(0)
     mc.register_instrument(Level)

@@ -33,7 +33,7 @@ def both(error: Array, seed: int = 0) -> Array:
 
 @settings(max_examples=40)
 @given(st.integers(3, 40), st.integers(1, 4), st.floats(1e-7, 1e3), st.integers(0, 99))
-def test_intervals_scale_with_the_errors(m: int, k: int, size: float, seed: int) -> None:
+def test_intervals_scale_with_the_errors(m, k, size, seed):
     error = rng_of(seed).normal(size=(k, m, 3))
     low, high, least, most = both(error)
     rms = np.sqrt((error**2).sum(-1).mean())
@@ -42,18 +42,18 @@ def test_intervals_scale_with_the_errors(m: int, k: int, size: float, seed: int)
     assert_allclose(both(size * error), size * np.array([low, high, least, most]), rtol=1e-9)
 
 
-def test_the_same_seed_gives_the_same_ends(rng: np.random.Generator) -> None:
+def test_the_same_seed_gives_the_same_ends(rng):
     error = rng.normal(size=(2, 15, 3))
     assert np.array_equal(both(error, 4), both(error, 4))
     assert not np.array_equal(both(error, 4), both(error, 5))
 
 
-def test_targets_of_a_pose_are_no_further_poses(rng: np.random.Generator) -> None:
+def test_targets_of_a_pose_are_no_further_poses(rng):
     error = rng.normal(size=(1, 20, 3))
     assert_allclose(both(np.repeat(error, 3, axis=0)), both(error), rtol=1e-12)
 
 
-def test_what_was_not_measured_does_not_count(rng: np.random.Generator) -> None:
+def test_what_was_not_measured_does_not_count(rng):
     error = rng.normal(size=(3, 20, 3))
     error[1, ::2] = np.nan
     padded = np.concatenate([error, np.full((3, 7, 3), np.nan)], axis=1)
@@ -62,7 +62,7 @@ def test_what_was_not_measured_does_not_count(rng: np.random.Generator) -> None:
     assert_allclose(both(turned), both(error), rtol=1e-9)
 
 
-def test_too_few_poses_tell_nothing() -> None:
+def test_too_few_poses_tell_nothing():
     for m in range(3):
         assert np.isnan(both(np.ones((2, m, 3)))).all()
     assert rms_interval(np.zeros((1, 5, 3)), rng=rng_of()) == Interval(0.0, 0.0)
@@ -70,7 +70,7 @@ def test_too_few_poses_tell_nothing() -> None:
 
 
 @pytest.mark.parametrize(("m", "zero"), [(12, 6), (7, 6), (400, 399)])
-def test_exact_zeros_are_the_smallest_errors(m: int, zero: int) -> None:
+def test_exact_zeros_are_the_smallest_errors(m, zero):
     """Bootstrap samples may hold nothing but zeros: no warning, and the ends of tiny errors."""
     error = rng_of(5).normal(size=(1, m, 3))
     error[:, :zero] = 0.0
@@ -84,7 +84,7 @@ def test_exact_zeros_are_the_smallest_errors(m: int, zero: int) -> None:
     assert np.isnan(told(found, rms).high) == (m == zero + 1)  # one pose is all of the error
 
 
-def test_an_upper_end_of_the_law_alone_is_not_told() -> None:
+def test_an_upper_end_of_the_law_alone_is_not_told():
     """Seven poses of which one is nearly all of the error: no sample without it tells anything."""
     error = np.zeros((1, 7, 3))
     error[0, :, 0] = [2.09, 0.31, 0.35, 0.4, 0.29, 0.38, 0.33]
@@ -98,7 +98,7 @@ def test_an_upper_end_of_the_law_alone_is_not_told() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(3, 30), st.data())
-def test_exact_poses_count_as_nearly_exact_ones(m: int, data: st.DataObject) -> None:
+def test_exact_poses_count_as_nearly_exact_ones(m, data):
     """Bootstrap samples of exact poses alone have no logarithm; the limit of small errors does."""
     exact = data.draw(st.integers(1, m - 1))
     error = rng_of(m).normal(size=(2, m, 3))
@@ -110,7 +110,7 @@ def test_exact_poses_count_as_nearly_exact_ones(m: int, data: st.DataObject) -> 
     assert_allclose(both(error), found, rtol=1e-6)
 
 
-def test_many_normal_errors_give_the_chi_square_interval(rng: np.random.Generator) -> None:
+def test_many_normal_errors_give_the_chi_square_interval(rng):
     """3m normal coordinates of one variance: its exact interval, within 10 % of its width."""
     error = rng.normal(size=(1, 2000, 3))
     found = rms_interval(error, rng=rng_of())
@@ -119,7 +119,7 @@ def test_many_normal_errors_give_the_chi_square_interval(rng: np.random.Generato
     assert_allclose([found.low, found.high], exact, rtol=0, atol=0.1 * np.ptp(exact))
 
 
-def test_a_wider_level_is_wider(rng: np.random.Generator) -> None:
+def test_a_wider_level_is_wider(rng):
     error = rng.normal(size=(3, 12, 3))
     for interval in (rms_interval, max_interval):
         wide, narrow = (interval(error, level=v, rng=rng_of()) for v in (0.99, 0.8))
@@ -138,7 +138,7 @@ LAWS = {
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_the_rms_interval_covers(name: str) -> None:
+def test_the_rms_interval_covers(name):
     """95 % less the known shortfall, within 3.3 standard deviations of the number of runs."""
     law, mean, poses, loss = LAWS[name]
     rng, held = rng_of(1), 0
@@ -151,7 +151,7 @@ def test_the_rms_interval_covers(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "poses"), [("exact", 10), ("exact", 40), ("tracker", 20)])
-def test_the_largest_of_new_poses_is_covered(name: str, poses: int) -> None:
+def test_the_largest_of_new_poses_is_covered(name, poses):
     """Lognormal distances: 95 %.  Lighter tails, as of noise: up to 3 % more."""
     rng, held = rng_of(2), 0
     for _ in range(RUNS):
@@ -167,7 +167,7 @@ def test_the_largest_of_new_poses_is_covered(name: str, poses: int) -> None:
     assert 0.95 - CHANCE < held / RUNS < 0.95 + more + CHANCE
 
 
-def test_the_largest_of_normal_samples_follow_their_law() -> None:
+def test_the_largest_of_normal_samples_follow_their_law():
     """The largest of n has the distribution Phi^n; all of n sorted are a normal sample."""
     top = top_of_normal(12, 5, rng_of(3))
     assert np.all(np.diff(top, axis=1) < 0.0)
@@ -179,7 +179,7 @@ def test_the_largest_of_normal_samples_follow_their_law() -> None:
     assert abs(every.var() - 1.0) < 4.0 * np.sqrt(2.0 / len(every))
 
 
-def test_chance_of_a_larger_error_is_free_of_the_law(rng: np.random.Generator) -> None:
+def test_chance_of_a_larger_error_is_free_of_the_law(rng):
     """The next of n + 1 is the largest as often as any other; 4 standard deviations."""
     runs, n = 20000, 14
     for sample in (rng.standard_cauchy((runs, n + 1)), rng.uniform(size=(runs, n + 1))):

@@ -37,7 +37,7 @@ def calibrated(name: str, kind: str, seed: int, **options) -> tuple[RelativeCali
 
 @pytest.mark.parametrize("kind", ["poses", "wires_3", "wires_1", "ball_bar", "closures_known"])
 @pytest.mark.parametrize("name", SCALE)
-def test_where_nothing_is_open_the_sigma_holds_the_truth(name: str, kind: str) -> None:
+def test_where_nothing_is_open_the_sigma_holds_the_truth(name, kind):
     for seed in range(2):
         fit, ratio = calibrated(name, kind, seed)
         assert fit.positions_open == ()
@@ -46,7 +46,7 @@ def test_where_nothing_is_open_the_sigma_holds_the_truth(name: str, kind: str) -
 
 
 @pytest.mark.parametrize("name", SCALE)
-def test_closures_without_a_length_leave_one_length_open(name: str) -> None:
+def test_closures_without_a_length_leave_one_length_open(name):
     for seed in range(3):
         fit, _ = calibrated(name, "closures", seed)
         assert fit.positions_open == (SCALE[name],)
@@ -58,16 +58,14 @@ def test_closures_without_a_length_leave_one_length_open(name: str) -> None:
     assert RelativeCalibration.from_dict(content).headline() == fit.headline()
 
 
-def test_what_the_user_fixes_is_not_open() -> None:
+def test_what_the_user_fixes_is_not_open():
     fit, _ = calibrated("ur10", "closures", 1, fix="a2")
     assert fit.positions_open == ()
 
 
 @pytest.mark.parametrize("name", ["irb2600", "ur10"])
 @pytest.mark.parametrize("on_axis", [True, False])
-def test_one_reflector_on_the_last_axis_does_not_speak_for_the_tool(
-    name: str, on_axis: bool
-) -> None:
+def test_one_reflector_on_the_last_axis_does_not_speak_for_the_tool(name, on_axis):
     """True errors of another point of the tool, whose offset and base are fitted by scipy."""
     arm, rng = Arm.of(name, 1, 0.0), np.random.default_rng(1)
     spot = np.array([0.0, 0.0, 0.1]) if on_axis else SPOT

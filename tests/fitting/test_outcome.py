@@ -3,7 +3,6 @@
 import csv
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.simulate import Simulation, Truth, gravity, simulate
+from minimax_cal.modelling.simulate import Truth, gravity, simulate
 from minimax_cal.modelling.start import fit_base
 from minimax_cal.robots.robot import robot_from_dict
 from minimax_cal.robots.sampling import random_poses
@@ -41,7 +40,7 @@ def whole_degrees(data: Measurements) -> Measurements:
 # ---- another arm ---------------------------------------------------------------------------------
 
 
-def test_the_file_of_another_arm_has_failed_and_names_links(tmp_path: Path) -> None:
+def test_the_file_of_another_arm_has_failed_and_names_links(tmp_path):
     """Nobody sees it in the errors: enough free parameters make the one arm of the other."""
     data, out = tmp_path / "d.csv", tmp_path / "fit.json"
     mc.write_measurements(data, simulate("irb120", 105, 3, seed=1).data)
@@ -57,7 +56,7 @@ def test_the_file_of_another_arm_has_failed_and_names_links(tmp_path: Path) -> N
     assert mc.calibrate(rough, data, "sum").status == "converged"
 
 
-def test_another_arm_is_not_polished() -> None:
+def test_another_arm_is_not_polished():
     """Its minimax took a minute: links of a kilometre, and QPs that no backend answers."""
     other = simulate("ur10", 24, 3, 1, Truth(compliance=0.0)).data
     with pytest.warns(mc.CalibrationWarning, match="implausibly large changes"):
@@ -67,7 +66,7 @@ def test_another_arm_is_not_polished() -> None:
     assert fit.minimax.iterations <= 20
 
 
-def test_a_real_arm_under_the_name_of_another_has_failed() -> None:
+def test_a_real_arm_under_the_name_of_another_has_failed():
     if not (SHARED / "irb120").is_dir() or not (SHARED / "ur10_b").is_dir():
         pytest.skip("real measurements are not on this machine")
     data = mc.read_measurements(SHARED / "irb120" / "measurements.csv")
@@ -76,7 +75,7 @@ def test_a_real_arm_under_the_name_of_another_has_failed() -> None:
     assert "a3 by" in fit.reason
 
 
-def test_large_changes_are_those_of_identified_links(robot: mc.Robot) -> None:
+def test_large_changes_are_those_of_identified_links(robot):
     reach, n = robot.reach(), robot.joints
     known = np.ones(5 * n, dtype=bool)
 
@@ -99,7 +98,7 @@ def test_large_changes_are_those_of_identified_links(robot: mc.Robot) -> None:
     assert said(2, 3, 2.0 * np.pi + 0.1)
 
 
-def test_a_rough_drawing_says_so_in_its_file(robot: mc.Robot) -> None:
+def test_a_rough_drawing_says_so_in_its_file(robot):
     content = robot.to_dict()
     assert "nominal" not in content
     rough = replace(robot, rough=True).to_dict()
@@ -120,7 +119,7 @@ def exchanged(data: Measurements, one: int, other: int) -> Measurements:
     return replace(data, q=q)
 
 
-def test_exchanged_rows_are_named(robot: mc.Robot) -> None:
+def test_exchanged_rows_are_named(robot):
     data = simulate(robot, 100, 3, seed=5).data
     held = mc.calibrate(robot, data, "sum").held
     one, other = np.flatnonzero(~held)[[7, 40]]
@@ -135,7 +134,7 @@ def test_exchanged_rows_are_named(robot: mc.Robot) -> None:
     assert any("rows hold each other's points" in notice for notice in fit.notices)
 
 
-def test_slips_are_judged_on_the_rows_that_tried_them() -> None:
+def test_slips_are_judged_on_the_rows_that_tried_them():
     """Two exchanged rows made the sign of a joint look reversed; the rows tried held neither."""
     data = simulate("ur10", 200, 1, seed=2).data
     fit = mc.calibrate("ur10", exchanged(data, 66, 133), "sum")  # raised DataError
@@ -145,7 +144,7 @@ def test_slips_are_judged_on_the_rows_that_tried_them() -> None:
 # ---- computed points -----------------------------------------------------------------------------
 
 
-def test_points_of_the_controller_were_computed(robot: mc.Robot, noisy: Simulation) -> None:
+def test_points_of_the_controller_were_computed(robot, noisy):
     sound = mc.calibrate(robot, noisy.data, "sum")
     q = noisy.data.q
     for cell, arm in ((sound.nominal, "the drawn arm"), (sound.cell, "the calibrated arm")):
@@ -158,7 +157,7 @@ def test_points_of_the_controller_were_computed(robot: mc.Robot, noisy: Simulati
         assert again.status in ("converged", "no_better")
 
 
-def test_the_limit_is_a_twentieth_of_what_is_declared(robot: mc.Robot) -> None:
+def test_the_limit_is_a_twentieth_of_what_is_declared(robot):
     """Points as exact as 2 um are measured where nothing else is declared."""
     truth = replace(EXACT, noise=2e-6)
     data = as_measured(simulate(robot, 60, 3, seed=6, truth=truth).data)
@@ -172,7 +171,7 @@ def test_the_limit_is_a_twentieth_of_what_is_declared(robot: mc.Robot) -> None:
     assert mc.calibrate(robot, data, "sum", instrument="10um").status == "converged"
 
 
-def test_a_simulated_file_says_so_in_a_column(tmp_path: Path, clean: Simulation) -> None:
+def test_a_simulated_file_says_so_in_a_column(tmp_path, clean):
     path, plain, older = (tmp_path / name for name in ("d.csv", "plain.csv", "older.csv"))
     mc.write_measurements(path, clean.data)
     header, *rows = path.read_text().splitlines()
@@ -200,7 +199,7 @@ def test_a_simulated_file_says_so_in_a_column(tmp_path: Path, clean: Simulation)
 # ---- no better than the drawn arm ----------------------------------------------------------------
 
 
-def test_an_arm_that_is_no_better_keeps_the_drawn_one(robot: mc.Robot, tmp_path: Path) -> None:
+def test_an_arm_that_is_no_better_keeps_the_drawn_one(robot, tmp_path):
     data, out = tmp_path / "d.csv", tmp_path / "fit.json"
     made = simulate(robot, 40, 2, seed=3)
     mc.write_measurements(data, whole_degrees(made.data))
@@ -221,7 +220,7 @@ def test_an_arm_that_is_no_better_keeps_the_drawn_one(robot: mc.Robot, tmp_path:
     assert fit.headline().startswith("The calibrated arm is no better than the drawn one (")
 
 
-def test_before_and_after_are_of_the_same_poses_by_the_same_rule(robot: mc.Robot) -> None:
+def test_before_and_after_are_of_the_same_poses_by_the_same_rule(robot):
     """The drawn arm is placed without each pose, as the calibrated one is fitted without it."""
     data = simulate(robot, 40, 2, seed=3).data
     fit = mc.calibrate(robot, data, "sum")
@@ -246,7 +245,7 @@ def test_before_and_after_are_of_the_same_poses_by_the_same_rule(robot: mc.Robot
     assert_allclose(accuracy(drawn[:, [row]]).rms_mm, accuracy(own).rms_mm, rtol=0.02)
 
 
-def test_the_comparison_is_paired(rng: np.random.Generator) -> None:
+def test_the_comparison_is_paired(rng):
     drawn = rng.normal(size=(2, 50, 3))
     group = np.arange(50)
     same = compare_arms(drawn, drawn, group)
@@ -262,7 +261,7 @@ def test_the_comparison_is_paired(rng: np.random.Generator) -> None:
     assert compare_arms(drawn[:, :1], drawn[:, :1], group[:1]).is_better  # nobody can say
 
 
-def test_a_held_out_outlier_does_not_hide_a_better_arm(robot: mc.Robot) -> None:
+def test_a_held_out_outlier_does_not_hide_a_better_arm(robot):
     data = simulate(robot, 120, 2, seed=4).data
     sound = mc.calibrate(robot, data, "sum")
     row = int(np.flatnonzero(sound.held)[3])
@@ -282,7 +281,7 @@ def test_a_held_out_outlier_does_not_hide_a_better_arm(robot: mc.Robot) -> None:
     assert f"line {data.line[row]} smr1" in fit.reason or fit.status == "failed"
 
 
-def test_a_point_that_only_the_calibrated_arm_misses_counts(robot: mc.Robot) -> None:
+def test_a_point_that_only_the_calibrated_arm_misses_counts(robot):
     """Of an arm that extrapolates badly the bad pose is no outlier."""
     fit = mc.calibrate(robot, simulate(robot, 120, 2, seed=4).data, "sum")
     row = int(np.flatnonzero(fit.held)[0])
@@ -299,7 +298,7 @@ def test_a_point_that_only_the_calibrated_arm_misses_counts(robot: mc.Robot) -> 
 # ---- limits --------------------------------------------------------------------------------------
 
 
-def test_an_upper_limit_is_never_below_what_was_seen() -> None:
+def test_an_upper_limit_is_never_below_what_was_seen():
     assert told(Interval(0.1, 0.2899), 0.5165) == Interval(0.1, 0.5165)
     assert told(Interval(0.1, 0.9), 0.5165) == Interval(0.1, 0.9)
     assert np.isnan(told(Interval(0.1, 9.0), 0.5165).high)
@@ -308,9 +307,7 @@ def test_an_upper_limit_is_never_below_what_was_seen() -> None:
 # ---- what is made of it --------------------------------------------------------------------------
 
 
-def test_what_is_no_better_is_never_passed_nor_valid_nor_exported_unasked(
-    robot: mc.Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_no_better_is_never_passed_nor_valid_nor_exported_unasked(robot, tmp_path, capsys):
     data, out, arm = (tmp_path / name for name in ("d.csv", "fit.json", "arm.urdf"))
     made = simulate(robot, 40, 2, seed=3)
     mc.write_measurements(data, whole_degrees(made.data))
@@ -338,7 +335,7 @@ def test_what_is_no_better_is_never_passed_nor_valid_nor_exported_unasked(
     assert_allclose(robot_from_dict(kept).mdh, fit.cell.robot.mdh, atol=1e-12)
 
 
-def test_computed_points_keep_no_calibration_valid(robot: mc.Robot, noisy: Simulation) -> None:
+def test_computed_points_keep_no_calibration_valid(robot, noisy):
     fit = mc.calibrate(robot, noisy.data, "sum")
     q = simulate(robot, 15, 1, seed=9).data.q
     y = np.round(fit.cell.predict(q), 6)
@@ -374,7 +371,7 @@ def sound_arm(seed: int) -> tuple[str, float, str]:
 
 @pytest.mark.filterwarnings("ignore::minimax_cal.CalibrationWarning")
 @pytest.mark.parametrize("count", [pytest.param(25), pytest.param(500, marks=pytest.mark.slow)])
-def test_sound_arms_are_calibrated(count: int) -> None:
+def test_sound_arms_are_calibrated(count):
     """None has failed.  Those that are no better by what was seen are truly better in 2 of 500:
     of 21 and 34 poses, where what no geometry explains is most of the error.
     """  # fmt: skip

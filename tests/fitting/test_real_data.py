@@ -38,13 +38,13 @@ def medians(name: str, holdout: float) -> tuple[float, float]:
         ("meca500_r", 0.2, 0.09, 0.065),
     ],
 )
-def test_held_out_accuracy(name: str, holdout: float, nominal: float, most: float) -> None:
+def test_held_out_accuracy(name, holdout, nominal, most):
     before, after = medians(name, holdout)
     assert before == pytest.approx(nominal, rel=0.2)
     assert after <= most
 
 
-def test_fanuc_leave_one_pose_out() -> None:
+def test_fanuc_leave_one_pose_out():
     robot, data = (
         mc.load_robot(shared("fanuc_r2000")[0]),
         mc.read_measurements(shared("fanuc_r2000")[1]),
@@ -61,7 +61,7 @@ def test_fanuc_leave_one_pose_out() -> None:
 
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("seed", range(3))
-def test_minimax_never_exceeds_the_sum(seed: int, name: str) -> None:
+def test_minimax_never_exceeds_the_sum(seed, name):
     robot, data = arm_of(name)
     total, worst = (
         mc.calibrate(robot, data, objective, holdout=0.3, seed=seed)
@@ -73,7 +73,7 @@ def test_minimax_never_exceeds_the_sum(seed: int, name: str) -> None:
 
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("backend", ["quadprog", "clarabel", "osqp", "proxqp"])
-def test_backends_agree(backend: str, name: str) -> None:
+def test_backends_agree(backend, name):
     robot, data = arm_of(name)
     best = [
         max(mc.calibrate(robot, data, qp=qp, holdout=0.3).accuracy["train"].sse_mm2)
@@ -86,7 +86,7 @@ def test_backends_agree(backend: str, name: str) -> None:
     ("times", "name"),
     [(2, "simulated"), (3, "irb120"), pytest.param(200, "irb120", marks=pytest.mark.slow)],
 )
-def test_turning_and_moving_the_frame(times: int, name: str) -> None:
+def test_turning_and_moving_the_frame(times, name):
     nominal, data = arm_of(name)
     rng = np.random.default_rng(0)
     total = mc.calibrate(nominal, data, "sum")
@@ -106,9 +106,7 @@ def test_turning_and_moving_the_frame(times: int, name: str) -> None:
         )
 
 
-def test_a_part_of_few_poses_is_judged_by_a_fit_that_has_arrived(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_part_of_few_poses_is_judged_by_a_fit_that_has_arrived(monkeypatch):
     """One step from the whole fit says 258 mm at an end of joint 6; files without it say 0.14."""
     robot, path = shared("fanuc_r2000")
     effects = ("joint_compliance:all", "gear_error:J6:orders=3")

@@ -46,7 +46,7 @@ RHO = {  # rho(u) with rho'(u) = u weight(u), written down anew
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_weight_and_slope_are_derivatives_of_the_loss(name: str) -> None:
+def test_weight_and_slope_are_derivatives_of_the_loss(name):
     u, step = np.linspace(0.05, 2.5, 51), 1e-6  # no knot of a loss is on this grid
     weight = (RHO[name](u + step) - RHO[name](u - step)) / (2.0 * step) / u
     assert_allclose(LOSSES[name].weight(u), weight, atol=1e-8)
@@ -55,7 +55,7 @@ def test_weight_and_slope_are_derivatives_of_the_loss(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_losses_are_95_percent_efficient_in_three_dimensions(name: str) -> None:
+def test_losses_are_95_percent_efficient_in_three_dimensions(name):
     """(E psi')^2 / E psi^2, integrated over the chi distribution with three degrees of freedom."""
     loss = LOSSES[name]
 
@@ -77,7 +77,7 @@ def test_losses_are_95_percent_efficient_in_three_dimensions(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_moments_are_those_of_the_chi_distribution(robot: mc.Robot, name: str) -> None:
+def test_moments_are_those_of_the_chi_distribution(robot, name):
     """At the truth itself the distances are sigma chi_3; 15000 of them leave 2 % of chance."""
     case = shifted(robot, 0.0, 0.0, poses=5000, seed=3)
     state = case.without()
@@ -138,7 +138,7 @@ def slopes(case: Case, x: Array, unit: float) -> Array:
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_nothing_near_is_better(small: Case, name: str) -> None:
+def test_nothing_near_is_better(small, name):
     """BFGS on the sum of rho and the prior comes from beside the answer back to it."""
     found = small.robust(name)
     unit = found.loss_scale * LOSSES[name].tuning
@@ -166,7 +166,7 @@ def test_nothing_near_is_better(small: Case, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["huber", "cauchy"])
-def test_scipy_finds_the_same_optimum(small: Case, name: str) -> None:
+def test_scipy_finds_the_same_optimum(small, name):
     """scipy's loss of the distances themselves is this loss, up to its scale."""
     none = Prior(small.model.prior.mean, np.zeros(small.model.names.count))
     model, plain = FITTER(small.model.with_prior(none), state_of(small.found))
@@ -193,9 +193,7 @@ def test_scipy_finds_the_same_optimum(small: Case, name: str) -> None:
 
 @pytest.mark.parametrize(("loss", "trim"), [("tukey", 0.0), ("square", 0.25), ("cauchy", 0.25)])
 @pytest.mark.parametrize("size", [1e-3, 1.0])
-def test_a_fifth_of_wrong_points_does_no_harm(
-    robot: mc.Robot, loss: str, trim: float, size: float
-) -> None:
+def test_a_fifth_of_wrong_points_does_no_harm(robot, loss, trim, size):
     case = shifted(robot, 0.2, size)
     found = case.robust(loss, trim)
     assert found.fit.status[0] == "converged"
@@ -208,7 +206,7 @@ def test_a_fifth_of_wrong_points_does_no_harm(
 
 
 @pytest.mark.parametrize(("loss", "trim"), [("tukey", 0.0), ("square", 0.25)])
-def test_misread_joints_are_found(robot: mc.Robot, loss: str, trim: float) -> None:
+def test_misread_joints_are_found(robot, loss, trim):
     """All targets of a pose are off together, always in the same sense: a fifth of the poses."""
     case = misread(robot, 0.2, 2e-3)
     found = case.robust(loss, trim)
@@ -220,9 +218,7 @@ def test_misread_joints_are_found(robot: mc.Robot, loss: str, trim: float) -> No
 @pytest.mark.parametrize(("loss", "trim", "most"), [
     ("tukey", 0.0, 1e-9), ("square", 0.25, 1e-9), ("cauchy", 0.0, 1e-8), ("huber", 0.0, 1e-6),
 ])  # fmt: skip
-def test_without_noise_the_truth_is_found(
-    robot: mc.Robot, loss: str, trim: float, most: float
-) -> None:
+def test_without_noise_the_truth_is_found(robot, loss, trim, most):
     case = shifted(robot, 0.2, 1e-3, truth=EXACT)
     found = case.robust(loss, trim)
     assert case.miss(state_of(found.fit)) < most
@@ -230,7 +226,7 @@ def test_without_noise_the_truth_is_found(
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_clean_points_are_fitted_as_by_least_squares(robot: mc.Robot, loss: str) -> None:
+def test_clean_points_are_fitted_as_by_least_squares(robot, loss):
     case = shifted(robot, 0.0, 0.0, poses=80)
     found = case.robust(loss)
     off = np.linalg.norm(case.model.error(state_of(found.fit))
@@ -241,7 +237,7 @@ def test_clean_points_are_fitted_as_by_least_squares(robot: mc.Robot, loss: str)
     assert aside.weights.all() == (not aside.suspects)
 
 
-def test_one_target(robot: mc.Robot) -> None:
+def test_one_target(robot):
     case = shifted(robot, 0.1, 1e-3, poses=60, targets=1)
     for found in (case.robust("tukey"), case.robust(trim=0.15)):
         assert (case.listed(found) == case.bad).all()
@@ -249,7 +245,7 @@ def test_one_target(robot: mc.Robot) -> None:
         assert not any(one.together for one in found.suspects)
 
 
-def test_missing_points(robot: mc.Robot) -> None:
+def test_missing_points(robot):
     """A third of the points was not measured; of some poses one target is left."""
     full = shifted(robot, 0.1, 1e-3, poses=60)
     y = full.data.y.copy()
@@ -267,7 +263,7 @@ def test_missing_points(robot: mc.Robot) -> None:
     assert_allclose(aside.model.counts, (~gone.T & ~case.bad).sum(axis=1))
 
 
-def test_weights_of_the_instrument_stay(robot: mc.Robot) -> None:
+def test_weights_of_the_instrument_stay(robot):
     """Points of a tenth the accuracy are no suspects when u95 says so, and wrong good ones are."""
     made = simulate(robot, 60, 3, 0, EVEN)
     rng = np.random.default_rng(0)
@@ -304,7 +300,7 @@ def few_that_tell_the_wrist(
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_bad_pose_that_draws_the_fit_to_itself(robot: mc.Robot, seed: int) -> None:
+def test_a_bad_pose_that_draws_the_fit_to_itself(robot, seed):
     case = few_that_tell_the_wrist(robot, (-1.2,), 1, 2e-3, seed, 1)
     plain = distances(case.model, state_of(case.found))[0]
     assert (plain > plain[0]).sum() > 40  # least squares misses most other points by more
@@ -315,7 +311,7 @@ def test_a_bad_pose_that_draws_the_fit_to_itself(robot: mc.Robot, seed: int) -> 
     assert case.miss(state_of(found.fit)) < 0.3 * case.miss(state_of(case.found))
 
 
-def test_parameters_that_only_suspects_tell_are_named(robot: mc.Robot) -> None:
+def test_parameters_that_only_suspects_tell_are_named(robot):
     wrist = (-1.2, 1.4, -0.7)
     for wrong in (1, 3):
         case = few_that_tell_the_wrist(robot, wrist, wrong, 0.05, 0, 3)
@@ -329,7 +325,7 @@ def test_parameters_that_only_suspects_tell_are_named(robot: mc.Robot) -> None:
 # ---- points set aside ------------------------------------------------------------------------
 
 
-def test_at_most_the_share_is_set_aside(robot: mc.Robot) -> None:
+def test_at_most_the_share_is_set_aside(robot):
     case = shifted(robot, 0.1, 1e-3)
     for share in (0.02, 0.05, 0.1, 0.2, 0.4):
         found = case.robust(trim=share)
@@ -340,7 +336,7 @@ def test_at_most_the_share_is_set_aside(robot: mc.Robot) -> None:
         assert_allclose(found.kept.weight, case.model.weight * ~away)
 
 
-def test_what_is_set_aside_is_a_fixed_point(robot: mc.Robot) -> None:
+def test_what_is_set_aside_is_a_fixed_point(robot):
     """The final fit itself finds just these points to stand out, and comes out again the same."""
     case = shifted(robot, 0.1, 3e-4, seed=4)
     found = case.robust(trim=0.2)
@@ -353,7 +349,7 @@ def test_what_is_set_aside_is_a_fixed_point(robot: mc.Robot) -> None:
     assert_allclose(state_of(again.fit).mdh, state_of(found.fit).mdh, rtol=0)
 
 
-def test_points_that_stand_out_but_stay_in_are_told() -> None:
+def test_points_that_stand_out_but_stay_in_are_told():
     """A real arm with an effect that geometry lacks: heavy tails, or outliers?  It depends."""
     paths = shared("fanuc_r2000")
     robot, data = mc.load_robot(paths[0]), mc.read_measurements(paths[1])
@@ -368,7 +364,7 @@ def test_points_that_stand_out_but_stay_in_are_told() -> None:
 
 
 @pytest.mark.parametrize("per", ["target", "point"])
-def test_minimax_on_the_trimmed_model_is_that_without_the_points(robot: mc.Robot, per: str) -> None:
+def test_minimax_on_the_trimmed_model_is_that_without_the_points(robot, per):
     case = shifted(robot, 0.05, 1e-3, poses=40)
     found = case.robust(trim=0.1)
     y = np.where((found.weights > 0.0).T[..., None], case.data.y, np.nan)
@@ -389,7 +385,7 @@ def test_minimax_on_the_trimmed_model_is_that_without_the_points(robot: mc.Robot
 # ---- the rest of the model -------------------------------------------------------------------
 
 
-def test_effects_are_fitted_along(robot: mc.Robot) -> None:
+def test_effects_are_fitted_along(robot):
     """A made-up effect with one parameter, and wrong points that would spoil it."""
     case = shifted(robot, 0.1, 1e-3)
     field = np.random.default_rng(0).normal(size=(1, 3, 3, 50))
@@ -412,7 +408,7 @@ def test_effects_are_fitted_along(robot: mc.Robot) -> None:
     assert (case.listed(found) == case.bad).all()
 
 
-def test_targets_that_follow_are_not_judged(robot: mc.Robot) -> None:
+def test_targets_that_follow_are_not_judged(robot):
     """As with objective smr:2: the others have a weight that is nothing beside one."""
     case = shifted(robot, 0.1, 1e-3)
     model, plain = FITTER(case.model.emphasise(np.array([1e-9, 1.0, 1e-9])), state_of(case.found))
@@ -424,21 +420,19 @@ def test_targets_that_follow_are_not_judged(robot: mc.Robot) -> None:
     assert_allclose(found.scale, NOISE, rtol=0.2)
 
 
-def test_a_pose_has_the_least_weight_of_its_targets(robot: mc.Robot) -> None:
+def test_a_pose_has_the_least_weight_of_its_targets(robot):
     case = shifted(robot, 0.1, 1e-3)
     found = case.robust("tukey")
     assert_allclose(found.by_pose.weight, np.tile(found.weights.min(axis=0), (3, 1)))
 
 
-def test_rounds_that_do_not_settle_are_told(
-    robot: mc.Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rounds_that_do_not_settle_are_told(robot, monkeypatch):
     monkeypatch.setattr(robust, "MAX_ROUNDS", 1)
     found = shifted(robot, 0.1, 1e-3, poses=30).robust("huber")
     assert found.fit.status == ("iteration_limit",)
 
 
-def test_a_plain_fit_that_diverged_stays_what_it_is(robot: mc.Robot) -> None:
+def test_a_plain_fit_that_diverged_stays_what_it_is(robot):
     case = shifted(robot, 0.1, 1e-3, poses=20)
     state = state_of(case.found)
     lost = replace(
@@ -460,7 +454,7 @@ def test_a_plain_fit_that_diverged_stays_what_it_is(robot: mc.Robot) -> None:
         ("square", float("nan"), "trim nan"),
     ],
 )
-def test_wrong_choices_are_refused(robot: mc.Robot, loss: str, trim: float, say: str) -> None:
+def test_wrong_choices_are_refused(robot, loss, trim, say):
     case = shifted(robot, 0.0, 0.0, poses=20)
     with pytest.raises(mc.OptionError, match=say) as caught:
         case.robust(loss, trim)

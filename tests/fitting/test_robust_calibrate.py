@@ -37,7 +37,7 @@ def spoilt(made: Simulation, share: float = 0.05, size: float = 1e-3) -> mc.Meas
         {"objective": "smr:2", "loss": "tukey"},
     ],
 )
-def test_wrong_points_do_no_harm(robot: mc.Robot, options: dict) -> None:  # type: ignore[type-arg]
+def test_wrong_points_do_no_harm(robot, options):  # type: ignore[type-arg]
     made = simulate(robot, 80, 3, seed=14, truth=Truth(compliance=0))
     new = np.random.default_rng(1).uniform(-2, 2, (200, 6))
     truth = made.cell.predict(new)
@@ -52,7 +52,7 @@ def test_wrong_points_do_no_harm(robot: mc.Robot, options: dict) -> None:  # typ
     assert miss(spoilt(made), objective=options["objective"]) > 3.0 * clean
 
 
-def test_suspects_reach_table_and_json(robot: mc.Robot) -> None:
+def test_suspects_reach_table_and_json(robot):
     made = simulate(robot, 60, 3, seed=15, truth=Truth(compliance=0))
     fit = mc.calibrate(robot, spoilt(made), "point", holdout=0.0, trim=0.1)
     content = json.loads(fit.json())
@@ -72,7 +72,7 @@ def test_suspects_reach_table_and_json(robot: mc.Robot) -> None:
     assert fit.provenance.settings["trim"] == 0.1
 
 
-def test_sigma_of_a_robust_fit_is_its_scatter(robot: mc.Robot) -> None:
+def test_sigma_of_a_robust_fit_is_its_scatter(robot):
     """As for least squares, with one point in twenty off by a millimetre."""
     scores: dict[str, list[float]] = {"huber": [], "tukey": []}
     for seed in range(8):
@@ -92,7 +92,7 @@ def test_sigma_of_a_robust_fit_is_its_scatter(robot: mc.Robot) -> None:
         assert abs(square - 1.0) < 5 * np.sqrt(2 / len(found)) * 2
 
 
-def test_robust_fits_take_priors_and_effects(robot: mc.Robot) -> None:
+def test_robust_fits_take_priors_and_effects(robot):
     made = simulate(robot, 60, 3, seed=16)  # with compliance
     data = spoilt(made)
     held = mc.calibrate(robot, data, "sum", loss="tukey", priors={"a2": 1e-9})

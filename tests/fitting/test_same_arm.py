@@ -1,7 +1,6 @@
 """Measurements and calibrations that are of another arm, or in another unit, are named as such."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,12 +8,6 @@ from conftest import run
 
 import minimax_cal as mc
 from minimax_cal.fitting.same_arm import check_arm
-from minimax_cal.modelling.simulate import Simulation
-
-
-@pytest.fixture(scope="module")
-def fit(robot: mc.Robot, noisy: Simulation) -> mc.Fit:
-    return mc.calibrate(robot, noisy.data, "sum")
 
 
 def turned(data: mc.Measurements, joint: int, angle: float) -> mc.Measurements:
@@ -24,9 +17,7 @@ def turned(data: mc.Measurements, joint: int, angle: float) -> mc.Measurements:
     return replace(data, q=q)
 
 
-def test_another_arm_or_unit_is_refused_before_anything_is_judged(
-    fit: mc.Fit, noisy: Simulation, tmp_path: Path
-) -> None:
+def test_another_arm_or_unit_is_refused_before_anything_is_judged(fit, noisy, tmp_path):
     few = noisy.data.take(np.arange(12))
     check_arm(fit.robot, few)
     with pytest.raises(mc.DataError, match="millimetres given as metres"):
@@ -41,7 +32,7 @@ def test_another_arm_or_unit_is_refused_before_anything_is_judged(
 
 
 @pytest.mark.parametrize("angle", [5e-3, 0.1, 0.5])
-def test_a_zero_may_have_moved_far(fit: mc.Fit, noisy: Simulation, angle: float) -> None:
+def test_a_zero_may_have_moved_far(fit, noisy, angle):
     few = turned(noisy.data.take(np.arange(20)), 1, angle)
     check_arm(fit.robot, few)
     if angle < 0.05:
@@ -49,20 +40,18 @@ def test_a_zero_may_have_moved_far(fit: mc.Fit, noisy: Simulation, angle: float)
         assert {moved.joint for moved in found.moved} == {"J2"}
 
 
-def test_too_few_poses_say_nothing_of_the_arm(fit: mc.Fit) -> None:
+def test_too_few_poses_say_nothing_of_the_arm(fit):
     check_arm(fit.robot, mc.simulate("ur10", 2, 3, seed=5).data)
 
 
-def test_calibrations_of_two_arms_are_not_compared(fit: mc.Fit, robot: mc.Robot) -> None:
+def test_calibrations_of_two_arms_are_not_compared(fit, robot):
     other = mc.calibrate("ur10", mc.simulate("ur10", 40, 3, seed=5).data, "sum")
     with pytest.raises(mc.OptionError, match="drawn as different arms"):
         mc.compare(fit, other)
     assert not any("implausibly" in text for text in mc.compare(fit, fit).notices)
 
 
-def test_a_change_that_no_arm_makes_is_told(
-    fit: mc.Fit, robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_a_change_that_no_arm_makes_is_told(fit, robot, noisy):
     longer, later = np.array([0.2, 0, 0, 0, 0]), np.array([0, 0, 0.3, 0, 0])
     far = replace(fit, cell=replace(fit.cell, robot=robot.with_mdh(robot.mdh + longer)))
     (said,) = (text for text in mc.compare(fit, far).notices if "implausibly" in text)

@@ -32,7 +32,7 @@ def moved(data: Measurements, error: Array, row: int, off: float) -> tuple[Measu
     return data.with_y(y), error
 
 
-def test_the_nearest_other_visit_by_brute_force() -> None:
+def test_the_nearest_other_visit_by_brute_force():
     rng = np.random.default_rng(4)
     points, group = rng.normal(size=(2, 9, 3)), np.array([0, 1, 0, 2, 0, 1, 3, 4, 4])
     points[1, 8] = np.nan
@@ -48,7 +48,7 @@ def test_the_nearest_other_visit_by_brute_force() -> None:
                 assert other[target, row] == rest[int(np.nanargmin(far))]
 
 
-def test_a_point_that_its_own_second_visit_contradicts(robot: mc.Robot) -> None:
+def test_a_point_that_its_own_second_visit_contradicts(robot):
     """Whichever of both is wrong, the fit tells; far less than a fit alone would find."""
     for row, right in ((3, 43), (43, 3)):
         (text,) = contradictions(*moved(*visited(robot), row, 20.0 * NOISE))
@@ -57,7 +57,7 @@ def test_a_point_that_its_own_second_visit_contradicts(robot: mc.Robot) -> None:
         assert text.count("smr") == 1
 
 
-def test_a_fit_that_does_not_know_does_not_say_which(robot: mc.Robot) -> None:
+def test_a_fit_that_does_not_know_does_not_say_which(robot):
     data, error = moved(*visited(robot), 3, 20.0 * NOISE)
     field = 1e-3 * np.ones(3)  # what the model lacks at both visits
     (text,) = contradictions(data, error + field)
@@ -65,7 +65,7 @@ def test_a_fit_that_does_not_know_does_not_say_which(robot: mc.Robot) -> None:
     assert "which fits" not in text
 
 
-def test_three_visits_tell_without_a_fit(robot: mc.Robot) -> None:
+def test_three_visits_tell_without_a_fit(robot):
     data, error = visited(robot)
     rows = np.r_[0:52, 0:12]
     data = replace(data.take(rows), line=np.arange(2, 66))
@@ -79,14 +79,14 @@ def test_three_visits_tell_without_a_fit(robot: mc.Robot) -> None:
     assert text.count("smr") == 1
 
 
-def test_sound_visits_and_few_visits_say_nothing(robot: mc.Robot) -> None:
+def test_sound_visits_and_few_visits_say_nothing(robot):
     """A distance of four times that of 95 % of all is one of eight sigmas."""
     assert not any(list(contradictions(*visited(robot, seed=seed))) for seed in range(60))
     assert not list(contradictions(*moved(*visited(robot, twice=4), 3, 1e-3)))
     assert not list(contradictions(*moved(*visited(robot, twice=0), 3, 1e-3)))
 
 
-def test_calibrate_and_diagnose_tell(robot: mc.Robot) -> None:
+def test_calibrate_and_diagnose_tell(robot):
     data, _ = moved(*visited(robot), 3, 20.0 * NOISE)
     for notices in (
         mc.calibrate(robot, data, objective="sum").notices,
@@ -96,7 +96,7 @@ def test_calibrate_and_diagnose_tell(robot: mc.Robot) -> None:
         assert "line 5 smr1" in text or "from line 5" in text
 
 
-def test_the_same_pose_under_another_load_contradicts_nothing(robot: mc.Robot) -> None:
+def test_the_same_pose_under_another_load_contradicts_nothing(robot):
     data, error = visited(robot)
     for row in (40, 41, 42):
         data, error = moved(data, error, row, 25.0 * NOISE)

@@ -58,7 +58,7 @@ def errors(name: str, seed: int) -> tuple[float, ...]:
 
 
 @pytest.mark.parametrize("name", ["irb2600", "ur10"])
-def test_two_instruments_are_better_than_either(name: str) -> None:
+def test_two_instruments_are_better_than_either(name):
     found = np.array([errors(name, seed) for seed in SEEDS])
     with_sockets = found[:, 3] / np.minimum(found[:, 0], found[:, 1])
     with_wires = found[:, 4] / np.minimum(found[:, 0], found[:, 2])
@@ -69,7 +69,7 @@ def test_two_instruments_are_better_than_either(name: str) -> None:
     assert np.median(with_wires) < 0.85
 
 
-def test_a_rough_instrument_does_not_spoil_a_fine_one() -> None:
+def test_a_rough_instrument_does_not_spoil_a_fine_one():
     """Each counts by its own noise: alike, wires 13 times as rough would triple the error."""
     ratios = []
     for seed in SEEDS:
@@ -86,7 +86,7 @@ def test_a_rough_instrument_does_not_spoil_a_fine_one() -> None:
     assert np.median(ratios) < 1.02
 
 
-def test_a_noise_that_is_given_counts_instead_of_the_residuals() -> None:
+def test_a_noise_that_is_given_counts_instead_of_the_residuals():
     arm, rng = Arm.of("irb2600", 2, 0.0), np.random.default_rng(3)
     seen, wires = tracker(arm, rng, 40, NOISE), SIMULATORS["wires_3"](arm, rng, 60, NOISE).data
     plain = relative(arm.robot, [seen, wires])
@@ -112,7 +112,7 @@ def all_kinds() -> tuple[Arm, RelativeCalibration]:
     return arm, relative(arm.robot, [tracker(arm, rng, 40, NOISE), *data])
 
 
-def test_sigmas_are_the_scatter_of_fits_together() -> None:
+def test_sigmas_are_the_scatter_of_fits_together():
     z = []
     for seed in SEEDS:
         arm = Arm.of("irb2600", seed, 0.0)
@@ -132,7 +132,7 @@ def test_sigmas_are_the_scatter_of_fits_together() -> None:
     assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.25  # some 200 correlated numbers
 
 
-def test_without_noise_all_kinds_together_find_the_true_arm() -> None:
+def test_without_noise_all_kinds_together_find_the_true_arm():
     arm, rng = Arm.of("ur10", 3, 0.0), np.random.default_rng(6)
     kinds = ("closures", "wires_1", "poses")
     data = [SIMULATORS[kind](arm, rng, 60, 0.0).data for kind in kinds]
@@ -142,7 +142,7 @@ def test_without_noise_all_kinds_together_find_the_true_arm() -> None:
     assert all(one.accuracy["holdout"].max_mm < 1e-5 for one in fit.instruments)
 
 
-def test_what_only_one_instrument_determines_is_said() -> None:
+def test_what_only_one_instrument_determines_is_said():
     """A tracker that saw the last joints still gives the base, and wires alone see the wrist."""
     arm, rng = Arm.of("irb2600", 0, 0.0), np.random.default_rng(4)
     sockets = SIMULATORS["closures"](arm, rng, 60, NOISE).data
@@ -161,7 +161,7 @@ def test_what_only_one_instrument_determines_is_said() -> None:
     assert "a5" in table
 
 
-def test_the_result_lists_each_file_and_comes_back(tmp_path: Path) -> None:
+def test_the_result_lists_each_file_and_comes_back(tmp_path):
     _, fit = all_kinds()
     assert [one.name for one in fit.instruments] == ["points", "closures", "distances", "poses"]
     path = tmp_path / "fit.json"
@@ -182,7 +182,7 @@ def test_the_result_lists_each_file_and_comes_back(tmp_path: Path) -> None:
     assert "only by" in Path(report).read_text()
 
 
-def test_files_are_one_fit_and_named_by_their_stems(tmp_path: Path) -> None:
+def test_files_are_one_fit_and_named_by_their_stems(tmp_path):
     arm, rng = Arm.of("irb2600", 1, 0.0), np.random.default_rng(2)
     seen, sockets = tracker(arm, rng, 40, NOISE), SIMULATORS["closures"](arm, rng, 60, NOISE).data
     mc.write_measurements(tmp_path / "tracker.csv", seen)
@@ -199,7 +199,7 @@ def test_files_are_one_fit_and_named_by_their_stems(tmp_path: Path) -> None:
     assert_allclose(other.robot.mdh, fit.robot.mdh, rtol=0, atol=1e-8)
 
 
-def test_a_slip_in_one_of_several_files_is_named() -> None:
+def test_a_slip_in_one_of_several_files_is_named():
     arm, rng = Arm.of("irb2600", 1, 0.0), np.random.default_rng(2)
     seen, sockets = tracker(arm, rng, 40, NOISE), SIMULATORS["closures"](arm, rng, 60, NOISE).data
     metres = mc.measurements(seen.q, 1e-3 * seen.y)
@@ -216,7 +216,7 @@ def test_a_slip_in_one_of_several_files_is_named() -> None:
         relative(arm.robot, [seen, sockets], offset=True)
 
 
-def test_the_right_jacobian_is_the_derivative_of_the_turn(rng: np.random.Generator) -> None:
+def test_the_right_jacobian_is_the_derivative_of_the_turn(rng):
     for size in (0.0, 1e-6, 0.3, 2.0):
         w = size * rng.normal(size=3)
         numbers: list[Array] = []

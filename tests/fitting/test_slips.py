@@ -5,7 +5,6 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from minimax_cal.fitting.common_scale import common_share, scale_of
 from minimax_cal.fitting.unknown_arm import rough
 from minimax_cal.measuring import slips
 from minimax_cal.measuring.slips import mended
-from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.robot import robot_from_dict
 
 ARMS = ("irb2600", "irb120", "ur10", "meca500", "ur5e", "scara_600")
@@ -63,7 +62,7 @@ SLIPS: dict[str, tuple[Callable[[mc.Measurements], mc.Measurements], str]] = {
 
 
 @pytest.mark.parametrize("name", SLIPS)
-def test_a_slip_is_named_with_its_mend(name: str, robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_slip_is_named_with_its_mend(name, robot, noisy):
     make, said = SLIPS[name]
     wrong = make(noisy.data)
     check_plausible(robot, noisy.data)  # what runs for the first time takes its time
@@ -78,7 +77,7 @@ def test_a_slip_is_named_with_its_mend(name: str, robot: mc.Robot, noisy: Simula
         assert right.poses >= noisy.data.poses - 6
 
 
-def test_a_mended_file_calibrates(robot: mc.Robot, noisy: Simulation, tmp_path: Path) -> None:
+def test_a_mended_file_calibrates(robot, noisy, tmp_path):
     robot.save(tmp_path / "arm.json")
     wrong, right = tmp_path / "wrong.csv", tmp_path / "right.csv"
     mc.write_measurements(wrong, lost(noisy.data, 25))
@@ -90,12 +89,12 @@ def test_a_mended_file_calibrates(robot: mc.Robot, noisy: Simulation, tmp_path: 
 
 
 @pytest.mark.parametrize("how", ["", "shift", "shift=0", "shift=1@900..", "joints=1", "scale=-1"])
-def test_what_no_mend_is(how: str, noisy: Simulation) -> None:
+def test_what_no_mend_is(how, noisy):
     with pytest.raises(mc.OptionError, match="mend="):
         mended(noisy.data, [how])
 
 
-def test_the_wrong_convention_is_named(noisy: Simulation, robot: mc.Robot) -> None:
+def test_the_wrong_convention_is_named(noisy, robot):
     standard = robot.to_dict()
     rows = [dict(row) for row in standard["joints"]]
     for key in ("a", "alpha", "beta"):
@@ -110,7 +109,7 @@ def test_the_wrong_convention_is_named(noisy: Simulation, robot: mc.Robot) -> No
         robot_from_dict({**standard, "convention": "modified"})
 
 
-def test_a_common_scale_that_no_drawing_error_explains() -> None:
+def test_a_common_scale_that_no_drawing_error_explains():
     robot = mc.load_robot("fanuc_r2000ic_165f")
     good = simulate(robot, 80, 3, seed=3, truth=Truth(length=0.1e-3, angle=0.2e-3, compliance=0))
     assert abs(scale_of(robot, good.data, fitted(robot, good.data).state).gain) < 16.0
@@ -119,7 +118,7 @@ def test_a_common_scale_that_no_drawing_error_explains() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 3])
-def test_a_scale_is_named_only_where_links_cannot_do_it(seed: int) -> None:
+def test_a_scale_is_named_only_where_links_cannot_do_it(seed):
     """An arm with a slide whose twists are 36 mrad off: links to the noise, a scale to 2 mm."""
     half, rng = np.pi / 2.0, np.random.default_rng(seed)
     mdh = np.zeros((6, 5))
@@ -141,7 +140,7 @@ def test_a_scale_is_named_only_where_links_cannot_do_it(seed: int) -> None:
         mc.calibrate(robot, data.with_y(1.0044 * data.y))
 
 
-def test_a_fit_that_stretches_every_length_alike_says_so(robot: mc.Robot) -> None:
+def test_a_fit_that_stretches_every_length_alike_says_so(robot):
     made = simulate(robot, 60, 3, seed=1, truth=Truth(length=0.05e-3, angle=1e-3, compliance=0))
     stretched = made.data.with_y(1.001 * made.data.y)
     with pytest.warns(mc.CalibrationWarning, match=r"changed by the same share, \+0\.(09|1)"):
@@ -149,7 +148,7 @@ def test_a_fit_that_stretches_every_length_alike_says_so(robot: mc.Robot) -> Non
 
 
 @pytest.mark.parametrize("arm", ["irb2600", "ur10"])
-def test_a_common_scale_of_a_part_in_a_thousand_is_named_before_or_by_the_fit(arm: str) -> None:
+def test_a_common_scale_of_a_part_in_a_thousand_is_named_before_or_by_the_fit(arm):
     drawn = Truth(length=0.1e-3, angle=0.2e-3, compliance=0.0)
     made = simulate(arm, 50, 1, seed=2, truth=drawn)
     plain = mc.calibrate(arm, made.data, "sum")
@@ -166,7 +165,7 @@ def test_a_common_scale_of_a_part_in_a_thousand_is_named_before_or_by_the_fit(ar
     assert re.search(r"scaled by 0\.99|scale=0\.99", text)
 
 
-def test_lengths_that_are_off_at_random_have_no_common_share() -> None:
+def test_lengths_that_are_off_at_random_have_no_common_share():
     rng = np.random.default_rng(0)
     drawn = mc.load_robot("irb2600").mdh
     found, sure = np.ones(drawn.shape, dtype=bool), np.zeros((drawn.size,) * 2)
@@ -182,7 +181,7 @@ def test_lengths_that_are_off_at_random_have_no_common_share() -> None:
     assert common_share(drawn, stretched, found, unsure) == 0.0
 
 
-def test_an_arm_that_bends_is_not_told_to_be_seen_in_another_scale() -> None:
+def test_an_arm_that_bends_is_not_told_to_be_seen_in_another_scale():
     """Gravity stretches its fitted lengths by 0.08 to 0.2 %; the errors that it leaves say so."""
     named, shares = 0, []
     for seed in range(4, 64, 6):
@@ -197,9 +196,7 @@ def test_an_arm_that_bends_is_not_told_to_be_seen_in_another_scale() -> None:
     assert np.mean(shares) > 5e-4
 
 
-def test_rounded_joints_are_noticed_where_rounding_can_cost_what_is_missing(
-    robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_rounded_joints_are_noticed_where_rounding_can_cost_what_is_missing(robot, noisy):
     rounded = replace(noisy.data, q=np.radians(np.round(np.degrees(noisy.data.q))))
     said = coarse_joints(robot, rounded, check_plausible(robot, rounded))
     assert "joint values are whole degrees" in said
@@ -232,12 +229,12 @@ def sound(seed: int) -> tuple[mc.Robot, mc.Measurements]:
 
 
 @pytest.mark.parametrize("seeds", [range(12), pytest.param(range(12, 300), marks=pytest.mark.slow)])
-def test_sound_data_are_never_refused(seeds: range) -> None:
+def test_sound_data_are_never_refused(seeds):
     for seed in seeds:
         check_plausible(*sound(seed))
 
 
 @pytest.mark.parametrize("name", ["fanuc_r2000", "irb120", "meca500_r", "qkm_hl6", "ur10_b"])
-def test_real_data_are_not_refused(name: str) -> None:
+def test_real_data_are_not_refused(name):
     robot, path = shared(name)
     check_plausible(mc.load_robot(robot), mc.read_measurements(path))

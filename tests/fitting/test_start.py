@@ -7,15 +7,13 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-import minimax_cal as mc
 from minimax_cal.modelling import start
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.modelling.start import CUBE, Turning, fit_base
 from minimax_cal.robots.kernels import plain
 
 
-def test_the_only_minimum_is_the_best_of_many(rng: np.random.Generator) -> None:
+def test_the_only_minimum_is_the_best_of_many(rng):
     """Where one start is said to be enough, no other of 24 finds less."""
     alone = 0
     for noise in np.logspace(-4, 0, 40):
@@ -31,16 +29,14 @@ def test_the_only_minimum_is_the_best_of_many(rng: np.random.Generator) -> None:
     assert 5 < alone < 40
 
 
-def test_a_mirrored_frame_fits_far_worse(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_mirrored_frame_fits_far_worse(robot, noisy):
     given = fit_base(model_of(robot, noisy.data), robot.mdh)
     left = noisy.data.with_y(noisy.data.y * [1.0, 1.0, -1.0])
     other = fit_base(model_of(robot, left), robot.mdh)
     assert other.mean_square > 100.0 * given.mean_square
 
 
-def test_poses_in_parts_are_all_poses(
-    robot: mc.Robot, noisy: Simulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_poses_in_parts_are_all_poses(robot, noisy, monkeypatch):
     y = noisy.data.y.copy()
     y[::4, 1] = np.nan
     model = model_of(robot, noisy.data.with_y(y))

@@ -50,7 +50,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[mc.Fit, Path]:
 
 
 @pytest.mark.parametrize("objective", ["sum", "minimax", "pose"])
-def test_two_stations_calibrate_as_well_as_one(objective: str) -> None:
+def test_two_stations_calibrate_as_well_as_one(objective):
     one, two = (mc.calibrate(ROBOT, data, objective) for data in (ONE, TWO))
     assert str(two.status) == "converged"
     assert two.accuracy["holdout"].poses == HELD
@@ -63,7 +63,7 @@ def test_two_stations_calibrate_as_well_as_one(objective: str) -> None:
         assert a.sigma < 1.05 * b.sigma < 1.5 * a.sigma
 
 
-def test_the_station_is_found(saved: tuple[mc.Fit, Path]) -> None:
+def test_the_station_is_found(saved):
     """Points of the second station, in the first one's frame, are those it would have measured."""
     fit, _ = saved
     common = fit.cell.placed(TWO)
@@ -78,7 +78,7 @@ def test_the_station_is_found(saved: tuple[mc.Fit, Path]) -> None:
     assert_allclose(np.linalg.norm(stood(common)[1]), np.linalg.norm(away), rtol=1e-12)
 
 
-def test_a_saved_fit_places_each_session(saved: tuple[mc.Fit, Path]) -> None:
+def test_a_saved_fit_places_each_session(saved):
     fit, path = saved
     again = mc.load_fit(path)
     assert_allclose(again.cell.error(again.data), fit.cell.error(fit.data), rtol=0, atol=1e-13)
@@ -99,9 +99,7 @@ def test_a_saved_fit_places_each_session(saved: tuple[mc.Fit, Path]) -> None:
     assert "no session is named" in said
 
 
-def test_a_fit_of_stations_is_as_good_a_source_as_any(
-    saved: tuple[mc.Fit, Path],
-) -> None:
+def test_a_fit_of_stations_is_as_good_a_source_as_any(saved):
     fit, path = saved
     other = again(fit, objective="sum")
     assert len(other.parameters) == len(fit.parameters)
@@ -112,7 +110,7 @@ def test_a_fit_of_stations_is_as_good_a_source_as_any(
     assert not any("session_jump" in str(text) for text in said)
 
 
-def test_a_session_of_few_poses_is_placed_by_the_others() -> None:
+def test_a_session_of_few_poses_is_placed_by_the_others():
     session = np.where(np.arange(120) < 5, "c", np.where(np.arange(120) % 2, "b", "a"))
     three = elsewhere(ONE, session, seed=3)
     fit = mc.calibrate(ROBOT, three, "sum", holdout=0.0)
@@ -121,20 +119,20 @@ def test_a_session_of_few_poses_is_placed_by_the_others() -> None:
     assert_allclose(fit.accuracy["train"].rms_mm, one.accuracy["train"].rms_mm, rtol=0.02)
 
 
-def test_one_session_costs_nothing() -> None:
+def test_one_session_costs_nothing():
     alone = mc.calibrate(ROBOT, labelled(ONE, np.full(120, "a")), "sum")
     plain = mc.calibrate(ROBOT, ONE, "sum")
     assert alone.cell.sessions.frames == {}
     assert_array_equal(alone.error, plain.error)
 
 
-def test_a_session_without_points_enough_is_refused() -> None:
+def test_a_session_without_points_enough_is_refused():
     data = elsewhere(ONE.only(0), np.where(np.arange(120) < 2, "a", "b"))
     with pytest.raises(mc.DataError, match=r"session 'a' has \d points to place"):
         mc.calibrate(ROBOT, data, "sum", holdout=0.0)
 
 
-def test_a_session_held_out_whole_is_judged_in_the_first_frame() -> None:
+def test_a_session_held_out_whole_is_judged_in_the_first_frame():
     session = np.repeat(["a", "b"], 60)
     fit = mc.calibrate(ROBOT, labelled(ONE, session), "sum", holdout=0.5, holdout_by="session")
     assert fit.cell.sessions.frames == {}
@@ -143,14 +141,14 @@ def test_a_session_held_out_whole_is_judged_in_the_first_frame() -> None:
     assert fit.accuracy["holdout"].rms_mm < 2.0 * fit.accuracy["train"].rms_mm
 
 
-def test_a_station_held_out_whole_fails_in_words() -> None:
+def test_a_station_held_out_whole_fails_in_words():
     fit = mc.calibrate(ROBOT, TWO, "sum", holdout=0.5, holdout_by="session")
     assert str(fit.status) == "failed"
     assert mc.Fit.from_dict(fit.to_dict()).status == fit.status
     assert "NaN" not in fit.json()
 
 
-def test_small_steps_of_frames_are_taken_as_whole_turns() -> None:
+def test_small_steps_of_frames_are_taken_as_whole_turns():
     """Points moved by the step, to first order, are where the new frame puts them."""
     rng = np.random.default_rng(0)
     robot = mc.load_robot(ROBOT)
@@ -175,7 +173,7 @@ def jumped(data: mc.Measurements, row: int) -> mc.Measurements:
                        * SHIFT)  # fmt: skip
 
 
-def test_a_station_that_moved_is_told_with_its_size_and_freed_on_request() -> None:
+def test_a_station_that_moved_is_told_with_its_size_and_freed_on_request():
     moved = jumped(ONE, 70)
     plain, spoilt = mc.calibrate(ROBOT, ONE, "sum"), mc.calibrate(ROBOT, moved, "sum")
     assert not any("stand elsewhere" in text for text in plain.notices)
@@ -196,7 +194,7 @@ def test_a_station_that_moved_is_told_with_its_size_and_freed_on_request() -> No
     assert np.all(np.abs(value - truth) < 4.0 * sigma)
 
 
-def test_no_jump_is_no_moment() -> None:
+def test_no_jump_is_no_moment():
     with pytest.raises(mc.OptionError, match="write session_jump:frame:since=NUMBER"):
         mc.calibrate(ROBOT, ONE, "sum", effects=["session_jump"])
 
@@ -204,7 +202,7 @@ def test_no_jump_is_no_moment() -> None:
 # ---------------------------------------------------------------- the clock
 
 
-def test_a_part_read_as_a_file_of_its_own_has_the_time_of_the_fit(tmp_path: Path) -> None:
+def test_a_part_read_as_a_file_of_its_own_has_the_time_of_the_fit(tmp_path):
     drift = ["frame_drift:frame:constant=0.5"]
     fit = mc.calibrate(ROBOT, ONE, "sum", effects=drift, holdout=0.0)
     fit.save(tmp_path / "fit.json")
@@ -219,7 +217,7 @@ def test_a_part_read_as_a_file_of_its_own_has_the_time_of_the_fit(tmp_path: Path
     assert "does not run here" in said
 
 
-def test_play_on_data_without_an_order_is_told() -> None:
+def test_play_on_data_without_an_order_is_told():
     cell = mc.calibrate(ROBOT, ONE, "sum", effects=["backlash:all"]).cell
     assert strangers(cell, ONE) == ()
     unordered = replace(ONE, columns={})

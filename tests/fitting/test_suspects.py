@@ -36,7 +36,7 @@ def plain_scores(case: Case) -> Scores:
     return scores(case.model, state_of(case.found), case.model.seen.astype(float))
 
 
-def test_covariance_is_that_of_the_whole_hat_matrix(robot: mc.Robot) -> None:
+def test_covariance_is_that_of_the_whole_hat_matrix(robot):
     """All rows at once, any weights, a prior: C from R R' with R = I - J A^-1 J' W."""
     case = shifted(robot, 0.0, 0.0, poses=12)
     prior = np.zeros(case.model.names.count)
@@ -64,7 +64,7 @@ def test_covariance_is_that_of_the_whole_hat_matrix(robot: mc.Robot) -> None:
     assert_allclose(found.square.reshape(-1)[full], expected[full], rtol=1e-7)
 
 
-def test_a_point_is_judged_as_if_it_were_not_in_the_fit(robot: mc.Robot) -> None:
+def test_a_point_is_judged_as_if_it_were_not_in_the_fit(robot):
     """e'(I - H)^-1 e from the fit is e'(I + H)^-1 e from the fit without the point."""
     case = shifted(robot, 0.05, 2e-4, poses=30)
     plain = plain_scores(case)
@@ -78,7 +78,7 @@ def test_a_point_is_judged_as_if_it_were_not_in_the_fit(robot: mc.Robot) -> None
         assert own == pytest.approx(plain.square[target, pose], rel=5e-3)
 
 
-def test_directions_that_the_fit_follows_are_not_judged(robot: mc.Robot) -> None:
+def test_directions_that_the_fit_follows_are_not_judged(robot):
     """The single pose of a target is explained by the target's own place."""
     case = shifted(robot, 0.0, 0.0, poses=40)
     weight = case.model.weight.copy()
@@ -107,14 +107,14 @@ def clean(robot: mc.Robot) -> list[tuple[Scores, float]]:
     return out
 
 
-def test_scores_of_clean_points_are_chi_square(clean: list[tuple[Scores, float]]) -> None:
+def test_scores_of_clean_points_are_chi_square(clean):
     """Kolmogorov and Smirnov over 3000 points of fits with 33 parameters from 225 coordinates."""
     full = np.concatenate([found.square[found.directions == 3] for found, _ in clean])
     assert len(full) > 2900
     assert stats.kstest(full / NOISE**2, stats.chi2(3).cdf).pvalue > 1e-3
 
 
-def test_clean_points_are_rarely_listed(clean: list[tuple[Scores, float]]) -> None:
+def test_clean_points_are_rarely_listed(clean):
     """At most 1 % of the data sets have suspects; 4 of 40 would be a chance of 1 in 2000."""
     lists, low, count = 0, 0, 0
     for found, dof in clean:
@@ -125,7 +125,7 @@ def test_clean_points_are_rarely_listed(clean: list[tuple[Scores, float]]) -> No
     assert abs(low / count - 0.05) < 4.0 * np.sqrt(0.05 * 0.95 / count)
 
 
-def test_scale_is_that_of_the_noise(clean: list[tuple[Scores, float]]) -> None:
+def test_scale_is_that_of_the_noise(clean):
     scale = [spread_of(found, dof).scale for found, dof in clean]
     assert_allclose(np.mean(scale), NOISE, rtol=0.02)
 
@@ -137,9 +137,7 @@ def drawn(rng: np.random.Generator, count: int, tail: float) -> Array:
 
 
 @pytest.mark.parametrize("tail", [3.0, 10.0, 1e4])
-def test_the_likeliest_scale_is_where_the_density_is_largest(
-    rng: np.random.Generator, tail: float
-) -> None:
+def test_the_likeliest_scale_is_where_the_density_is_largest(rng, tail):
     square = drawn(rng, 500, tail)[0]
     found = fit_log_scale(square, np.full(500, 1.5), tail, float(np.log(NOISE)) + 1.0)
 
@@ -152,7 +150,7 @@ def test_the_likeliest_scale_is_where_the_density_is_largest(
 
 
 @pytest.mark.parametrize("tail", [3.0, 6.0, 1e5])
-def test_scale_and_tails_are_found_beside_outliers(rng: np.random.Generator, tail: float) -> None:
+def test_scale_and_tails_are_found_beside_outliers(rng, tail):
     square = drawn(rng, 2000, tail)
     for share in (0.0, 0.2):
         wrong = np.arange(2000)[None] < share * 2000
@@ -168,7 +166,7 @@ def test_scale_and_tails_are_found_beside_outliers(rng: np.random.Generator, tai
         assert (listed & ~wrong).sum() <= 0.03 * max(int(listed.sum()), 1) + 1
 
 
-def test_heavy_tails_make_the_list_short(rng: np.random.Generator) -> None:
+def test_heavy_tails_make_the_list_short(rng):
     """What a Gaussian would call unlikely is what a model that lacks an effect leaves."""
     found = Scores(drawn(rng, 1000, 3.0), np.full((1, 1000), 3))
     gaussian = Spread(spread_of(found, 3000.0).scale, 3000.0)
@@ -176,7 +174,7 @@ def test_heavy_tails_make_the_list_short(rng: np.random.Generator) -> None:
     assert unlikely(spread_of(found, 3000.0).p_value(found)).sum() <= 3
 
 
-def test_points_without_error_are_no_suspects(robot: mc.Robot) -> None:
+def test_points_without_error_are_no_suspects(robot):
     """Rounding has tails too; no instrument tells less than a tenth of a micrometre."""
     exact = Truth(compliance=0.0, noise=0.0, noise_per_metre=0.0)
     assert not shifted(robot, 0.0, 0.0, truth=exact).robust("tukey").suspects
@@ -186,7 +184,7 @@ def test_points_without_error_are_no_suspects(robot: mc.Robot) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(1e-9, 1.0), min_size=0, max_size=30), st.sampled_from([0.01, 0.1, 0.5]))
-def test_lists_are_those_of_benjamini_and_hochberg(chances: list[float], level: float) -> None:
+def test_lists_are_those_of_benjamini_and_hochberg(chances, level):
     n = len(chances)
     longest = max(
         (r for r in range(n + 1) if r == 0 or sorted(chances)[r - 1] <= level * r / n), default=0
@@ -200,7 +198,7 @@ def test_lists_are_those_of_benjamini_and_hochberg(chances: list[float], level: 
 
 
 @pytest.mark.parametrize("loss", ["square", "tukey"])
-def test_wrong_points_are_listed_and_few_others(robot: mc.Robot, loss: str) -> None:
+def test_wrong_points_are_listed_and_few_others(robot, loss):
     hits, misses, others = 0, 0, 0
     for seed in range(6):
         case = shifted(robot, 0.05, 1e-3, poses=40, seed=seed)
@@ -212,7 +210,7 @@ def test_wrong_points_are_listed_and_few_others(robot: mc.Robot, loss: str) -> N
     assert others <= 0.1 * (hits + others)
 
 
-def test_a_list_tells_where_and_how_far(robot: mc.Robot) -> None:
+def test_a_list_tells_where_and_how_far(robot):
     case = misread(robot, 0.04, 5e-3)
     y = case.data.y.copy()
     alone = int(np.flatnonzero(~case.bad.any(axis=0))[0])
@@ -242,7 +240,7 @@ def test_a_list_tells_where_and_how_far(robot: mc.Robot) -> None:
     assert "\n" not in found.notices[0]
 
 
-def test_the_table_has_a_row_a_suspect() -> None:
+def test_the_table_has_a_row_a_suspect():
     one = Suspect(7, "smr2", 1.2e-3, 40.0, 1e-30, together=True)
     data = simulate("irb120", 10, seed=1).data
     table = table_of([one], data)
@@ -256,7 +254,7 @@ def test_the_table_has_a_row_a_suspect() -> None:
     assert table_of([], data).rows == ()
 
 
-def test_the_list_is_the_least_likely_first(robot: mc.Robot) -> None:
+def test_the_list_is_the_least_likely_first(robot):
     case = shifted(robot, 0.1, 1e-3)
     found = plain_scores(case)
     state = state_of(case.found)
@@ -264,7 +262,7 @@ def test_the_list_is_the_least_likely_first(robot: mc.Robot) -> None:
     assert [one.p_value for one in listed] == sorted(one.p_value for one in listed)
 
 
-def test_lines_are_those_of_the_file(robot: mc.Robot) -> None:
+def test_lines_are_those_of_the_file(robot):
     case = shifted(robot, 0.02, 1e-3, truth=EVEN)
     moved = replace(case, data=replace(case.data, line=case.data.line + 100))
     lines = [[one.line for one in each.robust().suspects] for each in (case, moved)]

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -100,9 +99,7 @@ def alike(found: Array, expected: Array, tolerance: float) -> None:
 # ---- parameters ----------------------------------------------------------------------------------
 
 
-def test_plain_noise_is_the_inverse_of_the_normal_matrix(
-    robot: mc.Robot, noisy: Simulation, fit: Solved
-) -> None:
+def test_plain_noise_is_the_inverse_of_the_normal_matrix(robot, noisy, fit):
     J, _, _ = dense(robot, noisy.data, fit)
     flat = J.reshape(-1, J.shape[-1])
     still = Noise(0.0, NOISE.variance, 0.0)
@@ -111,9 +108,7 @@ def test_plain_noise_is_the_inverse_of_the_normal_matrix(
 
 
 @pytest.mark.parametrize("kind", ["sum", "shares", "u95", "pose", "missing"])
-def test_the_sandwich_is_the_dense_one(
-    kind: str, robot: mc.Robot, noisy: Simulation, rng: np.random.Generator
-) -> None:
+def test_the_sandwich_is_the_dense_one(kind, robot, noisy, rng):
     """Every way to weigh the points, with noise and jitter, against dense matrices."""
     data, k = noisy.data, 3
     if kind == "u95":
@@ -140,7 +135,7 @@ def test_the_sandwich_is_the_dense_one(
     alike(found_covariance, sandwich(J, A, V, np.zeros(J.shape[-1])), SLOPES)
 
 
-def test_one_target_alone_is_weighed_once(robot: mc.Robot, noisy: Simulation) -> None:
+def test_one_target_alone_is_weighed_once(robot, noisy):
     """The others' share stands beside the instrument's weights, not in them too."""
     found = fitted(robot, noisy.data, objective="smr:2")
     assert np.all(found.estimator.model.weight == 1.0)
@@ -148,7 +143,7 @@ def test_one_target_alone_is_weighed_once(robot: mc.Robot, noisy: Simulation) ->
     assert np.all(found.estimator.share[[0, 2]] < 1e-6)
 
 
-def test_a_slide_jitters_along_its_axis() -> None:
+def test_a_slide_jitters_along_its_axis():
     robot = mc.load_robot("scara_600")
     data = simulate(robot, 40, 3, seed=2).data
     found = fitted(robot, data)
@@ -159,9 +154,7 @@ def test_a_slide_jitters_along_its_axis() -> None:
     alike(covariance, sandwich(J, A, V, np.zeros(J.shape[-1])), SLOPES)
 
 
-def test_leaving_out_each_pose_is_the_jackknife(
-    robot: mc.Robot, noisy: Simulation, fit: Solved
-) -> None:
+def test_leaving_out_each_pose_is_the_jackknife(robot, noisy, fit):
     """The linear least squares of all poses but one, solved anew each time."""
     J, _, error = dense(robot, noisy.data, fit)
     m, _, p = J.shape
@@ -176,9 +169,7 @@ def test_leaving_out_each_pose_is_the_jackknife(
     alike(found, expected, 1e-5)
 
 
-def test_leaving_out_a_pose_is_what_a_fit_without_it_gives(
-    robot: mc.Robot, noisy: Simulation, fit: Solved
-) -> None:
+def test_leaving_out_a_pose_is_what_a_fit_without_it_gives(robot, noisy, fit):
     """Nonlinear refits of three reduced data sets: within a hundredth of a sigma."""
     poses = Poses.of(fit.estimator, fit.state)
     sigma = fit.uncertainty.sigma[fit.identification.active]
@@ -202,7 +193,7 @@ def test_leaving_out_a_pose_is_what_a_fit_without_it_gives(
         assert_allclose((moved / sigma)[linear], (expected / sigma)[linear], rtol=0, atol=0.01)
 
 
-def test_a_pose_measured_twice_is_one_pose(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_pose_measured_twice_is_one_pose(robot, noisy):
     """Rows that stand twice: nothing is known better by the poses, all by the noise."""
     data = noisy.data
     twice = data.take(np.repeat(np.arange(data.poses), 2))
@@ -214,7 +205,7 @@ def test_a_pose_measured_twice_is_one_pose(robot: mc.Robot, noisy: Simulation) -
     alike(2.0 * halves[1], halves[0], 1e-6)
 
 
-def test_a_prior_is_knowledge(robot: mc.Robot, noisy: Simulation, fit: Solved) -> None:
+def test_a_prior_is_knowledge(robot, noisy, fit):
     """With noise of one kind: (J'J / s^2 + 1 / sigma^2)^-1, Bayes' rule for the linear model."""
     model = fit.estimator.model
     weight = np.zeros(model.names.count)
@@ -237,14 +228,14 @@ def test_a_prior_is_knowledge(robot: mc.Robot, noisy: Simulation, fit: Solved) -
     assert np.all(np.sqrt(np.diag(held)[place]) < 1.5 * sigma[at])
 
 
-def test_a_tight_prior_keeps_its_sigma(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_tight_prior_keeps_its_sigma(robot, noisy):
     """What the data cannot improve is as sure as the prior says: within 2 %."""
     found = mc.calibrate(robot, noisy.data, "sum", holdout=0.0, priors={"a2": 1e-7})
     sigma = next(p.sigma for p in found.parameters if p.name == "a2")
     assert sigma == pytest.approx(1e-7, rel=0.02)
 
 
-def test_both_noises_are_found_whatever_the_weights(robot: mc.Robot) -> None:
+def test_both_noises_are_found_whatever_the_weights(robot):
     """Means over eight runs: noise and jitter that went in, within 12 %; so with 4-fold u95."""
     truth = Truth(compliance=0.0, noise=15e-6, noise_per_metre=0.0)
     found = []
@@ -263,9 +254,7 @@ def test_both_noises_are_found_whatever_the_weights(robot: mc.Robot) -> None:
 
 
 @pytest.mark.parametrize(("objective", "runs"), [("sum", 40), ("minimax", 25)])
-def test_jitter_raises_sigma_as_it_raises_the_scatter(
-    robot: mc.Robot, objective: str, runs: int
-) -> None:
+def test_jitter_raises_sigma_as_it_raises_the_scatter(robot, objective, runs):
     """Runs at the same poses, with strong jitter: sigma by either way is the true scatter.
 
     The scatter of one parameter is known to 1/sqrt(2 R); of 33, say 10 that are independent, to
@@ -301,9 +290,7 @@ def step_between(start: State, end: State) -> Array:
     return np.concatenate([links_of(end.mdh - start.mdh), move, turn, spots])
 
 
-def test_sigma_does_not_depend_on_where_the_instrument_stands(
-    robot: mc.Robot, noisy: Simulation, result: mc.Fit
-) -> None:
+def test_sigma_does_not_depend_on_where_the_instrument_stands(robot, noisy, result):
     turn = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
     y = noisy.data.y @ turn.T + [4.0, -2.0, 1.0]
     moved = mc.calibrate(robot, noisy.data.with_y(y), "sum", holdout=0.0)
@@ -318,7 +305,7 @@ def test_sigma_does_not_depend_on_where_the_instrument_stands(
     assert_allclose(own[1], own[0], rtol=0, atol=1e-6 * own[0].max())
 
 
-def test_a_fit_that_needs_every_pose_asks_the_noise(robot: mc.Robot) -> None:
+def test_a_fit_that_needs_every_pose_asks_the_noise(robot):
     data = simulate(robot, 60, 1, seed=12, truth=Truth(compliance=0)).data
     few = fitted(robot, data.take(np.arange(10)))
     assert few.uncertainty.source == "noise"
@@ -326,16 +313,14 @@ def test_a_fit_that_needs_every_pose_asks_the_noise(robot: mc.Robot) -> None:
     assert fitted(robot, data).uncertainty.source == "poses"
 
 
-def test_without_spare_rows_nothing_is_known(
-    robot: mc.Robot, noisy: Simulation, fit: Solved
-) -> None:
+def test_without_spare_rows_nothing_is_known(robot, noisy, fit):
     estimator = fit.estimator.at(np.arange(3))
     found = uncertainty_of(estimator, fit.state, np.arange(3))
     assert np.isnan(found.covariance).all()
     assert found.to_dict()["names"] == []
 
 
-def test_many_poses_are_thinned_fairly(robot: mc.Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_poses_are_thinned_fairly(robot, monkeypatch):
     """A quarter of the poses tells the covariance of all: sigma within 15 %, the median 5 %."""
     data = simulate(robot, 600, 1, 5, Truth(compliance=0)).data
     found = fitted(robot, data)
@@ -347,16 +332,14 @@ def test_many_poses_are_thinned_fairly(robot: mc.Robot, monkeypatch: pytest.Monk
     assert abs(np.median(ratio) - 1.0) < 0.1
 
 
-def test_points_of_a_worst_point_fit_weigh_by_their_multipliers() -> None:
+def test_points_of_a_worst_point_fit_weigh_by_their_multipliers():
     seen = np.array([[True, False, True], [True, True, True]])
     share = point_share(np.array([0.6, 0.0, 0.4, 0.0, 0.0]), seen)
     least = uncertainty.LEAST_POINT
     assert_allclose(share, [[3.0, 0.0, least], [2.0, least, least]])
 
 
-def test_worst_point_sigma_is_larger_than_that_of_the_sum(
-    robot: mc.Robot, noisy: Simulation, result: mc.Fit
-) -> None:
+def test_worst_point_sigma_is_larger_than_that_of_the_sum(robot, noisy, result):
     point = mc.calibrate(robot, noisy.data, "point", holdout=0.0)
     assert point.uncertainty.source == "noise"
     active = result.uncertainty.active
@@ -364,7 +347,7 @@ def test_worst_point_sigma_is_larger_than_that_of_the_sum(
     assert np.median(ratio) > 1.2
 
 
-def test_correlation_and_root(result: mc.Fit) -> None:
+def test_correlation_and_root(result):
     known = result.uncertainty
     inside = np.ix_(known.active, known.active)
     assert_allclose(np.diag(known.correlation)[known.active], 1.0, rtol=1e-12)
@@ -381,9 +364,7 @@ def anywhere(robot: mc.Robot) -> Array:
     return random_poses(robot, 6, np.random.default_rng(8))
 
 
-def test_position_covariance_is_that_of_the_prediction(
-    robot: mc.Robot, noisy: Simulation, fit: Solved, anywhere: Array
-) -> None:
+def test_position_covariance_is_that_of_the_prediction(robot, noisy, fit, anywhere):
     """Central differences of the predicted points by all parameters, in both frames."""
     known, targets = fit.uncertainty, noisy.data.target_names
     cell = Cell.of(robot, fit.state, targets)
@@ -406,7 +387,7 @@ def test_position_covariance_is_that_of_the_prediction(
 
 
 @pytest.mark.parametrize("frame", uncertainty.FRAMES)
-def test_jitter_of_a_new_pose_is_added(frame: str, result: mc.Fit, anywhere: Array) -> None:
+def test_jitter_of_a_new_pose_is_added(frame, result, anywhere):
     cell = result.cell if frame == "measurement" else replace(result.cell, base=np.eye(4))
     S = differences(lambda turn: cell.predict(anywhere + turn), 6)
     still, moving = (
@@ -418,9 +399,7 @@ def test_jitter_of_a_new_pose_is_added(frame: str, result: mc.Fit, anywhere: Arr
     assert_allclose(moving - still, expected, rtol=0, atol=SLOPES * moving.max())
 
 
-def test_the_centroid_is_the_mean_of_the_factors(
-    robot: mc.Robot, noisy: Simulation, fit: Solved, anywhere: Array
-) -> None:
+def test_the_centroid_is_the_mean_of_the_factors(robot, noisy, fit, anywhere):
     known = fit.uncertainty
     cell = Cell.of(robot, fit.state, noisy.data.target_names)
     factor = position_factor(cell, known, anywhere, "measurement").mean(axis=1)
@@ -435,9 +414,7 @@ def test_the_centroid_is_the_mean_of_the_factors(
 
 @pytest.mark.parametrize("free", [["d6"], ["theta6", "alpha6"], ["a6", "beta4"], ["d1", "theta1"]])
 @pytest.mark.parametrize("targets", [1, 3])
-def test_which_redundant_parameter_is_kept_does_not_matter(
-    free: list[str], targets: int, robot: mc.Robot, anywhere: Array
-) -> None:
+def test_which_redundant_parameter_is_kept_does_not_matter(free, targets, robot, anywhere):
     """Positions in the measurement frame are as sure, whichever member of a family is fitted.
 
     So are those in the base frame, unless the base's own parameters were exchanged: that frame
@@ -457,7 +434,7 @@ def test_which_redundant_parameter_is_kept_does_not_matter(
         assert apart < 1e-5 if same else apart > 1e-3
 
 
-def test_positions_move_as_effects_do(robot: mc.Robot, noisy: Simulation, anywhere: Array) -> None:
+def test_positions_move_as_effects_do(robot, noisy, anywhere):
     """A fit with a compliance: its sigma enters, by differences of the cell's own prediction."""
     result = mc.calibrate(robot, noisy.data, "sum", holdout=0.0, effects="joint_compliance:J2")
     known, (values,) = result.uncertainty, result.cell.effects.values
@@ -482,9 +459,7 @@ def test_positions_move_as_effects_do(robot: mc.Robot, noisy: Simulation, anywhe
     assert_allclose(found, expected, rtol=0, atol=5e-3 * expected.max())
 
 
-def test_positions_in_many_chunks(
-    result: mc.Fit, anywhere: Array, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_positions_in_many_chunks(result, anywhere, monkeypatch):
     whole = position_covariance(result.cell, result.uncertainty, anywhere)
     monkeypatch.setattr(uncertainty, "CHUNK", 4)
     parts = position_covariance(result.cell, result.uncertainty, anywhere)
@@ -493,12 +468,12 @@ def test_positions_in_many_chunks(
     assert_allclose(one[0], whole[0], rtol=1e-12)
 
 
-def test_a_frame_that_does_not_exist(result: mc.Fit, anywhere: Array) -> None:
+def test_a_frame_that_does_not_exist(result, anywhere):
     with pytest.raises(mc.OptionError, match="no frame 'world'; choose measurement or base"):
         position_covariance(result.cell, result.uncertainty, anywhere, "world")
 
 
-def test_radius_that_holds_a_share(rng: np.random.Generator) -> None:
+def test_radius_that_holds_a_share(rng):
     """Closed forms, and a million samples of a skew covariance within 1 %."""
     assert holding_radius(np.diag([4.0, 0.0, 0.0])) == pytest.approx(2.0 * 1.959964, rel=1e-6)
     assert holding_radius(np.eye(3)) == pytest.approx(2.795483, rel=1e-6)
@@ -512,9 +487,7 @@ def test_radius_that_holds_a_share(rng: np.random.Generator) -> None:
 # ---- saved fits ----------------------------------------------------------------------------------
 
 
-def test_saved_uncertainty_comes_back(
-    robot: mc.Robot, noisy: Simulation, anywhere: Array, tmp_path: Path
-) -> None:
+def test_saved_uncertainty_comes_back(robot, noisy, anywhere, tmp_path):
     fit = mc.calibrate(robot, noisy.data, "sum", effects="joint_compliance:J2")
     fit.save(tmp_path / "fit.json")
     saved = mc.load_fit(tmp_path / "fit.json")
@@ -531,7 +504,7 @@ def test_saved_uncertainty_comes_back(
         np.testing.assert_allclose(two, one, rtol=1e-9)
 
 
-def test_the_saved_block_is_in_millimetres(result: mc.Fit) -> None:
+def test_the_saved_block_is_in_millimetres(result):
     block = result.uncertainty.to_dict()
     json.dumps(block, allow_nan=False)
     sigma = {p.name: p.sigma for p in result.parameters}
@@ -550,14 +523,14 @@ def test_the_saved_block_is_in_millimetres(result: mc.Fit) -> None:
         ({"noise_mm": None}, "does not fit"),
     ],
 )
-def test_a_broken_block_is_told(change: dict[str, object], say: str, result: mc.Fit) -> None:
+def test_a_broken_block_is_told(change, say, result):
     content = {"covariance": {**result.uncertainty.to_dict(), **change}}
     with pytest.raises(mc.CalibrationError, match=say) as caught:
         uncertainty_from_dict(content, result.cell, "fit.json")
     assert "\n" not in str(caught.value)
 
 
-def test_a_matrix_that_is_none_is_told(result: mc.Fit) -> None:
+def test_a_matrix_that_is_none_is_told(result):
     block = result.uncertainty.to_dict()
     block["rows"][0][1] *= 2.0
     with pytest.raises(mc.CalibrationError, match="no symmetric matrix"):
@@ -569,7 +542,7 @@ def test_a_matrix_that_is_none_is_told(result: mc.Fit) -> None:
 # ---- the study of coverage -----------------------------------------------------------------------
 
 
-def test_the_equivalent_truth_is_the_arm() -> None:
+def test_the_equivalent_truth_is_the_arm():
     """What redundant parameters are off, the identified ones absorb: the same arm to 1e-9 m."""
     case = coverage.CASES[1]
     arm = coverage.arm_of(case, 0)
@@ -587,7 +560,7 @@ def test_the_equivalent_truth_is_the_arm() -> None:
     assert not np.allclose(arm.robot.mdh, true.state.mdh, atol=1e-5)
 
 
-def test_the_base_is_told_along_the_nominal_axes(robot: mc.Robot, noisy: Simulation) -> None:
+def test_the_base_is_told_along_the_nominal_axes(robot, noisy):
     fit = mc.calibrate(robot, noisy.data, "sum", holdout=0.0)
     axes, base, told = fit.nominal.base[:3, :3], fit.cell.base, fit.parameters
     turn = Rotation.from_matrix(axes.T @ base[:3, :3]).as_rotvec()
@@ -597,7 +570,7 @@ def test_the_base_is_told_along_the_nominal_axes(robot: mc.Robot, noisy: Simulat
     assert list(links.values()) == fit.robot.mdh[:, 2].tolist()
 
 
-def test_coverage_is_counted(rng: np.random.Generator) -> None:
+def test_coverage_is_counted(rng):
     """Normal errors with sigmas right and half: 95 % and 67.3 %, within the band and not."""
     runs, width = 1000, 1.959964
     error = rng.normal(size=(runs, 3))

@@ -1,7 +1,6 @@
 """Robot files of arms that nothing is drawn of."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -67,7 +66,7 @@ def names_of(robot: mc.Robot) -> list[str]:
     return ["prismatic" if slides else "revolute" for slides in robot.prismatic]
 
 
-def test_axes_of_exact_sweeps_are_the_arm(rng: np.random.Generator) -> None:
+def test_axes_of_exact_sweeps_are_the_arm(rng):
     for _ in range(5):
         robot = drawn(rng)
         data = measured(robot, rng, noise=0.0)
@@ -79,19 +78,17 @@ def test_axes_of_exact_sweeps_are_the_arm(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("first", [0, pytest.param(10, marks=pytest.mark.slow)])
-def test_arms_by_circle_sweeps_reach_the_noise(first: int) -> None:
+def test_arms_by_circle_sweeps_reach_the_noise(first):
     count = 200 if first else 8
     good = [reaches_the_noise(first + seed) for seed in range(count)]
     assert np.mean(good) >= 0.98
 
 
-def test_an_arm_by_random_poses_alone() -> None:
+def test_an_arm_by_random_poses_alone():
     assert reaches_the_noise(3, swept=False)
 
 
-def test_the_command_writes_a_rough_robot_that_calibrates(
-    rng: np.random.Generator, tmp_path: Path
-) -> None:
+def test_the_command_writes_a_rough_robot_that_calibrates(rng, tmp_path):
     robot = drawn(rng, 5)
     data, path, out = measured(robot, rng), tmp_path / "sweeps.csv", tmp_path / "robot.json"
     mc.write_measurements(path, data)
@@ -106,9 +103,7 @@ def test_the_command_writes_a_rough_robot_that_calibrates(
     assert run("identify", path, "--joints", "hinge") == 2
 
 
-def test_joints_that_never_move_alone_are_named(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_joints_that_never_move_alone_are_named(rng, monkeypatch):
     monkeypatch.setattr(unknown_arm, "TRIALS", 1)
     monkeypatch.setattr(unknown_arm, "ROUNDS", 0)
     robot = drawn(rng, 4)
@@ -118,7 +113,7 @@ def test_joints_that_never_move_alone_are_named(
         identify_arm(noisy, names_of(robot))
 
 
-def test_types_of_joints() -> None:
+def test_types_of_joints():
     assert types_of("R, prismatic,p").tolist() == [False, True, True]
     with pytest.raises(mc.OptionError, match="write revolute or prismatic"):
         types_of("")

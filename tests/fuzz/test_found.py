@@ -45,9 +45,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return line
 
 
-def test_cells_of_a_diagnosis_are_of_one_arm(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_cells_of_a_diagnosis_are_of_one_arm(tmp_path, capsys):
     """The page drew the last one at the joints of the first."""
 
     def shorter(content: Any) -> None:
@@ -61,18 +59,14 @@ def test_cells_of_a_diagnosis_are_of_one_arm(
     ("part", "value"),
     [("split", None), ("line", [None]), ("q", [[1.0], [1.0, 2.0]]), ("measured_mm", "x")],
 )
-def test_a_broken_list_of_poses_is_told_in_our_words(
-    part: str, value: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_broken_list_of_poses_is_told_in_our_words(part, value, tmp_path, capsys):
     path = broken(tmp_path, "fit.json", lambda content: content["poses"].update({part: value}))
     line = refused(capsys, "iso9283", path)
     assert "its list of poses cannot be read" in line
     assert not any(word in line for word in ("NoneType", "shape", "inhomogeneous", "convert"))
 
 
-def test_arrays_of_another_size_are_told_in_our_words(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_arrays_of_another_size_are_told_in_our_words(tmp_path, capsys):
     for name, values, says in (
         ("prior", [0.0] * 5, "prior is not of"),
         ("prior", [[1.0], [1.0, 2.0]], "something else"),
@@ -84,7 +78,7 @@ def test_arrays_of_another_size_are_told_in_our_words(
 
 
 @pytest.mark.parametrize("cell", ["1e308", "-1e300", "100001"])
-def test_joints_that_cannot_be_are_refused(cell: str, tmp_path: Path) -> None:
+def test_joints_that_cannot_be_are_refused(cell, tmp_path):
     """Rounding them overflowed."""
     for name, read in (("data.csv", mc.read_measurements), ("wires.csv", read_relative)):
         lines = material()[name].decode().splitlines()
@@ -97,7 +91,7 @@ def test_joints_that_cannot_be_are_refused(cell: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_positions_that_are_told_badly_are_told_in_numbers(tmp_path: Path) -> None:
+def test_positions_that_are_told_badly_are_told_in_numbers(tmp_path):
     """A variance that rounding made negative was a warning, and "good to nan mm"."""
     robot = mc.load_robot("irb120")
     mdh = robot.mdh.copy()
@@ -108,9 +102,7 @@ def test_positions_that_are_told_badly_are_told_in_numbers(tmp_path: Path) -> No
     assert not any("nan" in notice for notice in found.notices)
 
 
-def test_the_name_of_an_output_moves_no_cursor(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_name_of_an_output_moves_no_cursor(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     odd = "\x1b]0;owned\x07"
     for name in ("data.csv", "truth.json"):
@@ -127,9 +119,7 @@ def test_the_name_of_an_output_moves_no_cursor(
     assert "\x1b" not in out + err
 
 
-def test_a_lever_that_cannot_be_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_lever_that_cannot_be_is_refused(tmp_path, monkeypatch, capsys):
     """Its square overflowed."""
     monkeypatch.chdir(tmp_path)
     for name in ("fit.json", "targets.csv"):
@@ -142,14 +132,14 @@ def test_a_lever_that_cannot_be_is_refused(
     assert "cannot be" in refused(capsys, "plan", "irb120", "--poses", 9, "--noise", "-1e300")
 
 
-def test_targets_on_a_terminal_move_no_cursor() -> None:
+def test_targets_on_a_terminal_move_no_cursor():
     """In a pipe they are the file as it is; `compensate` without -o prints them."""
     from minimax_cal.cli.compensate import on_terminal
 
     assert on_terminal("q1_rad,\x1b[31m\n1,2\n") == "q1_rad,\N{REPLACEMENT CHARACTER}[31m\n1,2\n"
 
 
-def test_a_picture_without_room_is_drawn_without_a_warning(tmp_path: Path) -> None:
+def test_a_picture_without_room_is_drawn_without_a_warning(tmp_path):
     figure = new_figure(0.5, 0.5)
     axes = figure.subplots()
     axes.set_ylabel("long" * 40)
@@ -159,9 +149,7 @@ def test_a_picture_without_room_is_drawn_without_a_warning(tmp_path: Path) -> No
     assert (tmp_path / "a.png").stat().st_size > 0
 
 
-def test_numbers_that_no_result_has_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_numbers_that_no_result_has_are_refused(tmp_path, capsys):
     """The charts of a diagnosis drew them with warnings of overflow."""
     for value in (1e308, -1e160, 10**300):
 
@@ -177,9 +165,7 @@ def test_numbers_that_no_result_has_are_refused(
             json_of(text)
 
 
-def test_two_outputs_are_two_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_outputs_are_two_files(tmp_path, monkeypatch, capsys):
     """The second result replaced the first."""
     monkeypatch.chdir(tmp_path)
     Path("link").symlink_to("a.csv")
@@ -191,9 +177,7 @@ def test_two_outputs_are_two_files(
     assert run("simulate", "irb120", "--poses", 9, *same) == 0
 
 
-def test_a_file_whose_link_is_named_is_an_input(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_whose_link_is_named_is_an_input(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("robot.urdf").write_bytes(material()["robot.urdf"])
     for named in ("robot.urdf", "robot.urdf#tool0"):
@@ -202,15 +186,13 @@ def test_a_file_whose_link_is_named_is_an_input(
     assert Path("robot.urdf").read_bytes() == material()["robot.urdf"]
 
 
-def test_a_fleet_has_no_more_processes_than_cells_can_use(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_fleet_has_no_more_processes_than_cells_can_use(capsys):
     for jobs in ("0", "-2", "9" * 20):
         assert "give their number" in refused(capsys, "fleet", "cells.toml", "--jobs", jobs)
 
 
 @pytest.mark.slow
-def test_a_joint_zero_off_by_a_quarter_turn_is_found_by_whole_poses(tmp_path: Path) -> None:
+def test_a_joint_zero_off_by_a_quarter_turn_is_found_by_whole_poses(tmp_path):
     """Several starts are compared there; two that end alike were a batch of two."""
     path = tmp_path / "data.csv"
     path.write_bytes(material()["data.csv"])
@@ -220,18 +202,14 @@ def test_a_joint_zero_off_by_a_quarter_turn_is_found_by_whole_poses(tmp_path: Pa
     assert found.accuracy["train"].rms_mm == pytest.approx(right.accuracy["train"].rms_mm, rel=1e-3)
 
 
-def test_a_diagnosis_of_another_arm_says_so(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_diagnosis_of_another_arm_says_so(tmp_path, capsys):
     path = tmp_path / "data.csv"
     path.write_bytes(material()["data.csv"])
     run("diagnose", "irb2600", path, "--quick")
     assert "check" in capsys.readouterr().err
 
 
-def test_a_fit_without_targets_is_told_in_our_words(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_fit_without_targets_is_told_in_our_words(tmp_path, capsys):
     """Its lever was the root of a mean of nothing."""
     targets = tmp_path / "targets.csv"
     targets.write_bytes(material()["targets.csv"])
@@ -242,7 +220,7 @@ def test_a_fit_without_targets_is_told_in_our_words(
     assert all(np.isfinite(row["residual_mm"]) for row in json.loads(out)["targets"])
 
 
-def test_fifty_notices_are_enough(capsys: pytest.CaptureFixture[str]) -> None:
+def test_fifty_notices_are_enough(capsys):
     from minimax_cal.cli.options import Output
 
     Output(None, False, None, False).notice(*map(str, range(20_000)))
@@ -251,7 +229,7 @@ def test_fifty_notices_are_enough(capsys: pytest.CaptureFixture[str]) -> None:
     assert lines[50:] == ["notice: and 19950 more, in the JSON"]
 
 
-def test_exact_measurements_are_a_success() -> None:
+def test_exact_measurements_are_a_success():
     """Steps below rounding were called stalled."""
     for objective in ("sum", "minimax", "point"):
         made = simulate("irb120", 24, 3, 1, Truth(noise=0.0, noise_per_metre=0.0, compliance=0.0))
@@ -260,9 +238,7 @@ def test_exact_measurements_are_a_success() -> None:
         assert fit.accuracy["train"].max_mm < 1e-6
 
 
-def test_a_backends_process_imports_nothing_from_the_current_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_backends_process_imports_nothing_from_the_current_folder(tmp_path, monkeypatch):
     """A numpy.py that lies about would have run."""
     (tmp_path / "numpy.py").write_text("raise SystemExit('imported')")
     monkeypatch.chdir(tmp_path)
@@ -271,9 +247,7 @@ def test_a_backends_process_imports_nothing_from_the_current_folder(
     np.testing.assert_allclose(found.x, 1.0, rtol=0, atol=1e-9)
 
 
-def test_measurements_without_a_joint_are_not_those_of_the_fit(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_measurements_without_a_joint_are_not_those_of_the_fit(tmp_path, capsys):
     """Their joints were looked for among the training poses."""
     fit, path = tmp_path / "fit.json", tmp_path / "data.csv"
     fit.write_bytes(material()["fit.json"])
@@ -284,9 +258,7 @@ def test_measurements_without_a_joint_are_not_those_of_the_fit(
         assert "has 5 joint columns" in refused(capsys, command, fit, path, *more)
 
 
-def test_of_two_outputs_none_is_left_where_one_cannot_be_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_two_outputs_none_is_left_where_one_cannot_be_written(tmp_path, capsys, monkeypatch):
     """A fleet's page stood there when its rows could not be written."""
     for name in ("cells.toml", "robot.json", "data.csv", "fit.json"):
         (tmp_path / name).write_bytes(material()[name])
@@ -306,18 +278,14 @@ def test_of_two_outputs_none_is_left_where_one_cannot_be_written(
 
 
 @pytest.mark.parametrize("value", ["9" * 5000, "[" * 5000, "2020-02-31"])
-def test_a_fleet_that_python_does_not_read_is_refused(
-    value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_fleet_that_python_does_not_read_is_refused(value, tmp_path, capsys):
     """A number of 5000 digits was a traceback."""
     path = tmp_path / "cells.toml"
     path.write_text(f"[[cells]]\nname = {value}\n")
     assert "is not TOML" in refused(capsys, "fleet", path)
 
 
-def test_what_is_no_scheduler_is_told_in_our_words(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_scheduler_is_told_in_our_words(tmp_path, capsys, monkeypatch):
     """Dask took the first bytes of another server for the size of an array."""
     distributed = pytest.importorskip("distributed")
     for name in ("cells.toml", "robot.json", "data.csv", "fit.json"):
@@ -334,16 +302,14 @@ def test_what_is_no_scheduler_is_told_in_our_words(
     assert not (tmp_path / "made").exists()  # an empty folder was left
 
 
-def test_targets_without_names_are_told_in_our_words(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_targets_without_names_are_told_in_our_words(tmp_path, capsys):
     """A list of a number was looked up at that number."""
     path = broken(tmp_path, "truth.json", lambda content: content.update(targets_mm=[7]))
     (tmp_path / "data.csv").write_bytes(material()["data.csv"])
     assert "is not a saved calibration" in refused(capsys, "evaluate", path, tmp_path / "data.csv")
 
 
-def test_a_seed_below_zero_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_seed_below_zero_is_refused(tmp_path, capsys):
     """NumPy's generator said so in the middle of a check."""
     for name in ("data.csv", "fit.json"):
         (tmp_path / name).write_bytes(material()[name])
@@ -353,9 +319,7 @@ def test_a_seed_below_zero_is_refused(tmp_path: Path, capsys: pytest.CaptureFixt
     )
 
 
-def test_a_folder_of_results_is_no_file_of_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_results_is_no_file_of_them(tmp_path, capsys):
     """The folder was made, the cells were done, and their rows could not be written."""
     for name in ("cells.toml", "robot.json", "data.csv", "fit.json"):
         (tmp_path / name).write_bytes(material()[name])
@@ -364,9 +328,7 @@ def test_a_folder_of_results_is_no_file_of_them(
     assert not (tmp_path / "a").exists()
 
 
-def test_a_chart_of_nothing_is_told_in_our_words(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_chart_of_nothing_is_told_in_our_words(tmp_path, capsys):
     """A curve without a view was NumPy's empty maximum."""
 
     def empty(content: Any) -> None:
@@ -377,7 +339,7 @@ def test_a_chart_of_nothing_is_told_in_our_words(
     assert "has no values" in refused(capsys, "report", path, "-o", tmp_path / "page.html")
 
 
-def test_a_joint_that_never_comes_to_zero_is_no_trouble() -> None:
+def test_a_joint_that_never_comes_to_zero_is_no_trouble():
     """Limits of 3.5 to 7 rad, or of 1 to 3 m, left nothing to draw from."""
     for lower, upper in ((3.5, 7.0), (-20.0, -15.0), (4.0, np.inf), (-np.inf, -4.0), (-1.0, 9.0)):
         low, high = near_zero(np.array([lower]), np.array([upper]))
@@ -390,9 +352,7 @@ def test_a_joint_that_never_comes_to_zero_is_no_trouble() -> None:
     assert_allclose([low[0], high[0]], [1.0, 2.0])
 
 
-def test_a_simulator_keeps_no_log_beside_the_results(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_simulator_keeps_no_log_beside_the_results(tmp_path, monkeypatch):
     """MuJoCo wrote its warnings to a file in the folder where it was called."""
     pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
     from minimax_cal.robots.mjcf import mujoco
@@ -408,7 +368,7 @@ def test_a_simulator_keeps_no_log_beside_the_results(
 
 
 @pytest.mark.parametrize("code", ["utf-16", "utf-8"])
-def test_xml_in_another_encoding_than_it_says_is_refused(code: str, tmp_path: Path) -> None:
+def test_xml_in_another_encoding_than_it_says_is_refused(code, tmp_path):
     """One of the two parsers that read a model did not mind."""
     pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
     from minimax_cal.robots.document import read_document
@@ -420,9 +380,7 @@ def test_xml_in_another_encoding_than_it_says_is_refused(code: str, tmp_path: Pa
         read_document(path)
 
 
-def test_import_writes_nothing_that_cannot_be_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_import_writes_nothing_that_cannot_be_read(tmp_path, capsys):
     """What was left of a target could not be used, which was seen after writing."""
     header, *rows = material()["data.csv"].decode().splitlines()
     out, data = tmp_path / "out.csv", tmp_path / "data.csv"
@@ -434,9 +392,7 @@ def test_import_writes_nothing_that_cannot_be_read(
 
 
 @pytest.mark.parametrize("options", [("--holdout", "nan"), ("--holdout", 7), ("--seed", -1)])
-def test_a_share_that_cannot_be_is_refused_where_it_is_not_needed(
-    options: tuple[object, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_share_that_cannot_be_is_refused_where_it_is_not_needed(options, tmp_path, capsys):
     """A given fit has its split; the odd share went into the answer."""
     pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
     for name in ("arm.xml", "data.csv", "fit.json"):
@@ -446,16 +402,14 @@ def test_a_share_that_cannot_be_is_refused_where_it_is_not_needed(
     assert str(options[0]).strip("-") in told
 
 
-def test_more_replicates_than_memory_holds_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_more_replicates_than_memory_holds_are_refused(tmp_path, capsys):
     (tmp_path / "data.csv").write_bytes(material()["data.csv"])
     line = refused(capsys, "calibrate", "irb120", tmp_path / "data.csv", "--objective", "sum",
                    "--bootstrap", 10**20)  # fmt: skip
     assert "give 2 to 100000" in line
 
 
-def test_a_part_of_held_out_poses_alone_judges_a_diagnosis(tmp_path: Path) -> None:
+def test_a_part_of_held_out_poses_alone_judges_a_diagnosis(tmp_path):
     """Of the 12 training poses it left out none, and products of no rows were a traceback."""
     path = tmp_path / "data.csv"
     path.write_bytes(material()["data.csv"])
@@ -465,7 +419,7 @@ def test_a_part_of_held_out_poses_alone_judges_a_diagnosis(tmp_path: Path) -> No
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_joint_limit_beyond_all_numbers_is_no_warning() -> None:
+def test_a_joint_limit_beyond_all_numbers_is_no_warning():
     """Twice 1e308 overflowed."""
     robot = mc.load_robot("irb120")
     upper = np.where(np.arange(6) == 0, 1e308, robot.upper)
@@ -476,9 +430,7 @@ def test_a_joint_limit_beyond_all_numbers_is_no_warning() -> None:
     ("name", "value"), [("objective", 1), ("distance_tolerance", [0.1]), ("seed", -1)]
 )
 @pytest.mark.parametrize("file", ["fit.json", "effects.json"])
-def test_an_option_of_another_kind_in_a_result_is_refused(
-    file: str, name: str, value: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_option_of_another_kind_in_a_result_is_refused(file, name, value, tmp_path, capsys):
     path = broken(
         tmp_path, file, lambda content: content["provenance"]["settings"].update({name: value})
     )
@@ -500,17 +452,13 @@ def lengthen_a_step(content: Any) -> None:
         lambda content: content["effects"][0].update(parameters=[]),
     ],
 )
-def test_a_motion_diagnosis_of_other_parts_is_refused(
-    change: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_motion_diagnosis_of_other_parts_is_refused(change, tmp_path, capsys):
     path = broken(tmp_path, "motion.json", change)
     assert "motion.json" in refused(capsys, "report", path)
 
 
 @pytest.mark.parametrize("option", ["payload", "ratio"])
-def test_numbers_beyond_all_arms_are_refused(
-    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_numbers_beyond_all_arms_are_refused(option, tmp_path, capsys):
     for name in ("links.json", "run1.csv"):
         (tmp_path / name).write_bytes(material()[name])
     line = refused(
@@ -519,11 +467,11 @@ def test_numbers_beyond_all_arms_are_refused(
     assert option in line
 
 
-def test_a_payload_that_is_no_number_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_payload_that_is_no_number_is_refused(capsys):
     assert "payload" in refused(capsys, "plan", "irb120", "--motion", "--payload", "null")
 
 
-def test_a_board_larger_than_a_hall_is_refused(tmp_path: Path) -> None:
+def test_a_board_larger_than_a_hall_is_refused(tmp_path):
     path = tmp_path / "board.csv"
     path.write_text("target,x_mm,y_mm,z_mm\na,0,0,0\nb,1e300,0,0\nc,0,40,0\n")
     with pytest.raises(mc.DataError, match=r"board\.csv:3: target 'b' is more than 100 m"):

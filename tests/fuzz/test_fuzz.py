@@ -44,7 +44,7 @@ def bad(found: list[Outcome]) -> list[Outcome]:
     return [each for each in found if each.kind not in GOOD]
 
 
-def test_hostile_runs_end_well() -> None:
+def test_hostile_runs_end_well():
     found = list(outcomes(SEED, range(CASES)))
     assert len(found) == CASES
     assert bad(found) == []
@@ -52,18 +52,18 @@ def test_hostile_runs_end_well() -> None:
 
 
 @pytest.mark.slow
-def test_command_lines_that_nobody_broke_work() -> None:
+def test_command_lines_that_nobody_broke_work():
     """A template that fails by itself would hide whatever is broken in it."""
     found = list(outcomes(PLAIN, range(len(TEMPLATES))))
     assert [(TEMPLATES[each.number], each.kind) for each in found if each.kind != "ok"] == []
 
 
 @pytest.mark.slow
-def test_ten_thousand_hostile_runs_end_well() -> None:
+def test_ten_thousand_hostile_runs_end_well():
     assert bad(list(outcomes(FRESH, range(MANY)))) == []
 
 
-def test_a_case_comes_again_by_its_number() -> None:
+def test_a_case_comes_again_by_its_number():
     one, other = case(5, 17), case(5, 17)
     assert (one.arguments, one.files) == (other.arguments, other.files)
     left = {line.split()[0] for line in TEMPLATES} - {"robots", "backends", "diagnose"}
@@ -128,13 +128,7 @@ def crash(_: Any) -> None:
         (crash, "", "traceback"),
     ],
 )
-def test_the_judge_sees(
-    command: Callable[[Any], None],
-    expect: str,
-    kind: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_judge_sees(command, expect, kind, tmp_path, monkeypatch):
     assert judge(monkeypatch, tmp_path, command, expect) == kind
 
 
@@ -147,9 +141,7 @@ def test_the_judge_sees(
         ("gap arm.xml data.csv --write out.xml", WILD),
     ],
 )
-def test_what_is_written_is_read_again(
-    words: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_written_is_read_again(words, text, tmp_path, monkeypatch):
     if "<mujoco" in text:
         pytest.importorskip("mujoco")
 
@@ -161,7 +153,7 @@ def test_what_is_written_is_read_again(
     assert kind == "silently wrong"
 
 
-def test_the_independent_code_agrees_and_catches() -> None:
+def test_the_independent_code_agrees_and_catches():
     files = material()
     data = files["data.csv"]
     answer = files["fit.json"].decode()
@@ -174,9 +166,7 @@ def test_the_independent_code_agrees_and_catches() -> None:
     assert "train: says" in disagreement(json.dumps(content), data, None)
 
 
-def test_the_independent_code_knows_the_arm_before_calibration(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_independent_code_knows_the_arm_before_calibration(tmp_path, capsys):
     files = material()
     for name in ("fit.json", "data.csv"):
         (tmp_path / name).write_bytes(files[name])
@@ -189,7 +179,7 @@ def test_the_independent_code_knows_the_arm_before_calibration(
     assert disagreement(answer, data, fit).startswith("says")
 
 
-def test_every_option_of_every_command_is_among_the_cases() -> None:
+def test_every_option_of_every_command_is_among_the_cases():
     lines = each_option()
     given = {(words[0], flag) for words in lines for flag in words}
     for name in {line.split()[0] for line in TEMPLATES}:
@@ -202,7 +192,7 @@ def test_every_option_of_every_command_is_among_the_cases() -> None:
 
 
 @pytest.mark.parametrize("way", [*HARMLESS, *FATAL])
-def test_known_changes_do_what_they_say(way: Callable[..., None]) -> None:
+def test_known_changes_do_what_they_say(way):
     """Harmless ones leave what is measured; fatal ones do not."""
     raw = material()["data.csv"]
     changed = with_known(raw, way, np.random.default_rng(2))
@@ -227,7 +217,7 @@ def distances(raw: bytes) -> list[list[float]]:
     return out
 
 
-def test_the_table_counts_everything_once() -> None:
+def test_the_table_counts_everything_once():
     found = [
         Outcome(0, "a", "ok", "", (), 1.0),
         Outcome(1, "a", "hang", "", (), 1.0),
@@ -257,7 +247,7 @@ QUIET = settings(deadline=None, derandomize=True, max_examples=100)
 
 @QUIET
 @given(st.dictionaries(KEY, TREE))
-def test_any_tree_is_a_robot_or_refused(tree: dict[str, Any]) -> None:
+def test_any_tree_is_a_robot_or_refused(tree):
     with suppress(CalibrationError):
         assert robot_from_dict(tree).joints > 0
 
@@ -269,7 +259,7 @@ def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @QUIET
 @given(st.lists(st.lists(LEAF.map(str) | st.sampled_from(["q1_rad", "smr1_x_mm"]), max_size=5)))
-def test_any_text_is_measurements_or_refused(scratch: Path, rows: list[list[str]]) -> None:
+def test_any_text_is_measurements_or_refused(scratch, rows):
     scratch.write_text("\n".join(map(",".join, rows)), errors="replace")
     with pytest.raises(CalibrationError):
         mc.read_measurements(scratch)
@@ -277,7 +267,7 @@ def test_any_text_is_measurements_or_refused(scratch: Path, rows: list[list[str]
 
 @QUIET
 @given(TREE)
-def test_any_json_is_no_fit(scratch: Path, tree: Any) -> None:
+def test_any_json_is_no_fit(scratch, tree):
     scratch.write_text(json.dumps(tree))
     with pytest.raises(CalibrationError):
         mc.load_fit(scratch)

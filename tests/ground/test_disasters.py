@@ -37,7 +37,7 @@ def writer(path: Path, letter: str, count: int) -> subprocess.Popen[str]:
     return process
 
 
-def test_a_writer_that_is_killed_leaves_the_file_whole(tmp_path: Path) -> None:
+def test_a_writer_that_is_killed_leaves_the_file_whole(tmp_path):
     path = tmp_path / "fit.json"
     path.write_text(OTHER)
     for wait in (0.0, 0.003, 0.011, 0.031):
@@ -48,7 +48,7 @@ def test_a_writer_that_is_killed_leaves_the_file_whole(tmp_path: Path) -> None:
         assert path.read_text() in (ONE, OTHER)
 
 
-def test_two_writers_leave_the_file_of_one(tmp_path: Path) -> None:
+def test_two_writers_leave_the_file_of_one(tmp_path):
     path = tmp_path / "fit.json"
     both = [writer(path, letter, 20) for letter in "ab"]
     seen = set()
@@ -62,7 +62,7 @@ def test_two_writers_leave_the_file_of_one(tmp_path: Path) -> None:
     assert [each.name for each in tmp_path.iterdir()] == ["fit.json"]  # nothing left beside it
 
 
-def test_a_full_disk_is_said_and_the_old_file_stays(tmp_path: Path) -> None:
+def test_a_full_disk_is_said_and_the_old_file_stays(tmp_path):
     """A limit on the size of files ends a write as a full disk does: half way."""
     path = tmp_path / "poses.csv"
     path.write_text("old")
@@ -75,7 +75,7 @@ def test_a_full_disk_is_said_and_the_old_file_stays(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
-def test_a_full_stdout_is_said() -> None:
+def test_a_full_stdout_is_said():
     with open("/dev/full", "w") as full:
         done = subprocess.run(
             [sys.executable, "-m", "minimax_cal.cli", "robots", "--json"],

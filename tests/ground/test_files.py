@@ -12,7 +12,7 @@ from minimax_cal.ground.errors import CalibrationError, DataError
 from minimax_cal.ground.files import check_writable, read_raw, read_text, write_whole
 
 
-def test_links_in_a_circle_are_said(tmp_path: Path) -> None:
+def test_links_in_a_circle_are_said(tmp_path):
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
     for write in (check_writable, lambda path: write_whole(path, "text")):
@@ -20,7 +20,7 @@ def test_links_in_a_circle_are_said(tmp_path: Path) -> None:
             write(loop)
 
 
-def test_a_file_keeps_its_permissions(tmp_path: Path) -> None:
+def test_a_file_keeps_its_permissions(tmp_path):
     path = tmp_path / "result.json"
     path.write_text("")
     path.chmod(0o600)
@@ -30,19 +30,19 @@ def test_a_file_keeps_its_permissions(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="there is no /dev/zero to read")
-def test_what_never_ends_is_refused() -> None:
+def test_what_never_ends_is_refused():
     with pytest.raises(DataError, match="is larger than 1 MiB"):
         read_raw("/dev/zero", kind=DataError, most=1 << 20)
 
 
-def test_lines_end_alike(tmp_path: Path) -> None:
+def test_lines_end_alike(tmp_path):
     path = tmp_path / "text"
     path.write_bytes(b"\xef\xbb\xbfa\r\nb\rc\n")
     assert read_text(path) == "a\nb\nc\n"
     assert os.listdir(tmp_path) == ["text"]
 
 
-def test_a_name_may_be_long_and_not_longer(tmp_path: Path) -> None:
+def test_a_name_may_be_long_and_not_longer(tmp_path):
     write_whole(tmp_path / ("n" * 255), "text")
     assert os.listdir(tmp_path) == ["n" * 255]
     check_writable(tmp_path / ("n" * 254))
@@ -71,7 +71,7 @@ def listen(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows cannot open a folder")
-def test_file_and_folder_are_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_and_folder_are_on_the_disk(tmp_path, monkeypatch):
     """A name must not reach the disk before its content, nor the caller hear "done" before both."""
     heard = listen(monkeypatch)
     monkeypatch.delenv("MINIMAX_CAL_NO_FSYNC", raising=False)
@@ -84,9 +84,7 @@ def test_file_and_folder_are_on_the_disk(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(("number", "is_refused"), [(errno.EIO, True), (errno.EINVAL, False)])
-def test_a_disk_that_fails_is_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, is_refused: bool
-) -> None:
+def test_a_disk_that_fails_is_said(tmp_path, monkeypatch, number, is_refused):
     """EIO is a broken disk, EINVAL a file system that has no fsync."""
     path = tmp_path / "fit.json"
     path.write_text("old")

@@ -49,7 +49,7 @@ def died(parent: int) -> None:
 
 
 @pytest.mark.parametrize("processes", [1, 2, 3])
-def test_every_call_is_made_once(processes: int) -> None:
+def test_every_call_is_made_once(processes):
     count = int(1.5 * START / LONG)
     found = list(share(squared, [(n, LONG) for n in range(count)], processes=processes))
     assert sorted((number, each[0]) for number, each in found) == [(n, n**2) for n in range(count)]
@@ -58,7 +58,7 @@ def test_every_call_is_made_once(processes: int) -> None:
     assert len(pids) <= processes
 
 
-def test_both_ways_work_in_one_process() -> None:
+def test_both_ways_work_in_one_process():
     """The pool of the first is none of joblib's, which would lack what joblib gives its own."""
     brief = int(1.5 * START / LONG)
     for _ in range(2):
@@ -68,12 +68,12 @@ def test_both_ways_work_in_one_process() -> None:
         assert [whole[n][0] for n in range(4)] == [0, 1, 4, 9]
 
 
-def test_brief_work_starts_no_process() -> None:
+def test_brief_work_starts_no_process():
     found = dict(share(squared, [(n,) for n in range(300)], processes=2))
     assert {pid for _, pid in found.values()} == {os.getpid()}
 
 
-def test_chunks_shrink_towards_the_end() -> None:
+def test_chunks_shrink_towards_the_end():
     waiting = deque((squared, n, (n,)) for n in range(100))
     sizes = [len(chunk) for chunk in chunked(waiting, 0.05, 4)]
     assert sum(sizes) == 100
@@ -82,13 +82,13 @@ def test_chunks_shrink_towards_the_end() -> None:
     assert sizes[-1] == 1
 
 
-def test_a_process_that_dies_is_said() -> None:
+def test_a_process_that_dies_is_said():
     calls = [(os.getpid(),)] * int(3.0 * START / LONG)
     with pytest.raises(WorkersLost, match="a process died"):
         list(share(died, calls, processes=2))
 
 
-def test_no_processes_are_refused() -> None:
+def test_no_processes_are_refused():
     with pytest.raises(OptionError, match="0 processes"):
         list(share(squared, [(1,)], processes=0))
 
@@ -105,14 +105,14 @@ class Future:
         return self.given
 
 
-def test_a_result_that_is_lost_is_waited_for_again() -> None:
+def test_a_result_that_is_lost_is_waited_for_again():
     assert fetched(Future("finished", (3, "x")), TimeoutError) == [(3, "x")]
     assert fetched(Future("finished", TimeoutError()), TimeoutError) == []
     with pytest.raises(TimeoutError):  # the call's own
         fetched(Future("error", TimeoutError()), TimeoutError)
 
 
-def test_calls_are_packed_where_others_are_made() -> None:
+def test_calls_are_packed_where_others_are_made():
     """In another thread they might change meanwhile, by what a call made here keeps for later."""
     calls = [(Noted(), LONG)] * int(4 * START / LONG)
     found = {number: result for number, (result, _) in share(squared, calls, processes=2)}

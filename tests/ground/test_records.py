@@ -96,11 +96,11 @@ FILE = {
 }
 
 
-def test_a_record_is_written_by_its_keys_and_units() -> None:
+def test_a_record_is_written_by_its_keys_and_units():
     assert json.loads(json_text(plain(WIRE))) == FILE
 
 
-def test_a_record_comes_back_bit_by_bit() -> None:
+def test_a_record_comes_back_bit_by_bit():
     found = read(Wire, FILE | {"later": "unknown to this version"})
     assert plain(found) == FILE
     assert (found.length, found.kind, found.hidden) == (1.25, Kind.THIN, None)
@@ -109,14 +109,14 @@ def test_a_record_comes_back_bit_by_bit() -> None:
     assert facts_in_words(found) == "2.0 mm on average"
 
 
-def test_what_may_miss_is_filled_in() -> None:
+def test_what_may_miss_is_filled_in():
     content: dict[str, Any] = {k: v for k, v in FILE.items() if k not in ("used", "tension")}
     content["knots"] = [{"at": 1}]
     found = read(Wire, content)
     assert (found.used, found.tension.value, found.knots) == (None, 7.0, (Knot(1.0),))
 
 
-def test_the_schema_is_of_the_file() -> None:
+def test_the_schema_is_of_the_file():
     made = record_schema(Wire)
     jsonschema.Draft202012Validator.check_schema(made)
     assert not list(jsonschema.Draft202012Validator(made).iter_errors(FILE))
@@ -148,7 +148,7 @@ def test_the_schema_is_of_the_file() -> None:
         ({"used": "yes"}, "used: should be true or false"),
     ],
 )
-def test_what_is_wrong_is_named_with_its_place(change: dict[str, Any], says: str) -> None:
+def test_what_is_wrong_is_named_with_its_place(change, says):
     with pytest.raises(ValueError, match=f"^{says}"):
         read(Wire, FILE | change)
     errors = jsonschema.Draft202012Validator(record_schema(Wire)).iter_errors(FILE | change)

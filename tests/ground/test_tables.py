@@ -1,5 +1,4 @@
 import math
-from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
@@ -16,7 +15,7 @@ TABLE = Table(
 )
 
 
-def test_a_table_of_records() -> None:
+def test_a_table_of_records():
     records = [("a", {"x": 1.5, "seen": True}), ("b", {"x": None, "seen": False})]
     made = Table.of("t", records, "0=name | 1.x=size of |x| mm .2f | 1.seen=", "1.x=a | b=c .1f")
     assert made.header == ("name", "size of |x| mm", "", "a | b=c")
@@ -25,7 +24,7 @@ def test_a_table_of_records() -> None:
     ]  # fmt: skip
 
 
-def test_one_number_reads_the_same_everywhere() -> None:
+def test_one_number_reads_the_same_everywhere():
     for text in (TABLE.text(), TABLE.markdown(), TABLE.latex(), TABLE.html()):
         assert "0.123" in text
         assert "0.1234" not in text
@@ -38,18 +37,18 @@ def test_one_number_reads_the_same_everywhere() -> None:
     [(-0.2, ".0f", "0"), (-0.001, ".2f", "0.00"), (-0.6, ".0f", "-1"), (-0.0, "", "0.0"),
      (-12, "d", "-12"), (-0.01, ".2f", "-0.01")],
 )  # fmt: skip
-def test_nothing_has_no_sign(value: float, spec: str, text: str) -> None:
+def test_nothing_has_no_sign(value, spec, text):
     assert show(value, spec) == text
 
 
-def test_cells_are_literal_text() -> None:
+def test_cells_are_literal_text():
     assert "[bold]a|b[/]" in TABLE.text()
     assert r"a\|b" in TABLE.markdown()
     assert r"c\_d" in TABLE.latex()
     assert r"errors \& more" in TABLE.latex()
 
 
-def test_html_is_a_table_with_headers() -> None:
+def test_html_is_a_table_with_headers():
     table = Table("a < b", ("name", "size mm"), (("<script>x</script>", 1.5), ('"&', math.nan)))
     read = ElementTree.fromstring(table.html())  # well formed, and every letter itself again
     assert read.findtext("caption") == "a < b"
@@ -60,7 +59,7 @@ def test_html_is_a_table_with_headers() -> None:
     assert rows == [["name", "size mm"], ["<script>x</script>", "1.5"], ['"&', "-"]]
 
 
-def test_files_are_whole_or_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_are_whole_or_absent(tmp_path, monkeypatch):
     path = tmp_path / "a.json"
     write_whole(path, "first")
     monkeypatch.setattr("os.replace", lambda *a: (_ for _ in ()).throw(OSError(28, "disk full")))
@@ -78,7 +77,7 @@ def test_files_are_whole_or_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         json_text({"x": math.nan})
 
 
-def test_a_pipe_is_written_into_not_replaced(tmp_path: Path) -> None:
+def test_a_pipe_is_written_into_not_replaced(tmp_path):
     import os
     import stat
     import threading
@@ -95,7 +94,7 @@ def test_a_pipe_is_written_into_not_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("width", [110, 80, 60, 40])
-def test_no_number_unit_or_name_is_broken(width: int) -> None:
+def test_no_number_unit_or_name_is_broken(width):
     said = "as 0.333 mrad/N and more words that go on for longer than any line has room for"
     numbers = (0.1234, 12.3456, 1234.5678, 3.3, 0.0001, 22.5)
     header = ("model", *(f"number{i} mrad" for i in range(len(numbers))), "why")

@@ -26,15 +26,10 @@ from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import SumOfSquares, with_poses
 from minimax_cal.modelling.parameters import State
-from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.solvers import least_squares
 
 SAME = 2e-3  # of a sigma: what two Gauss-Newton steps leave [60 poses, errors of 0.2 mm]
-
-
-@pytest.fixture(scope="module")
-def fit(robot: mc.Robot, noisy: Simulation) -> mc.Fit:
-    return mc.calibrate(robot, noisy.data, "sum")
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +54,7 @@ def refitted(estimator: Estimator, state: State) -> State:
 
 
 @pytest.mark.parametrize("objective", ["sum", "smr:2", "pose"])
-def test_replicates_are_true_refits(objective: str, robot: mc.Robot, noisy: Simulation) -> None:
+def test_replicates_are_true_refits(objective, robot, noisy):
     """Rows repeated as drawn, and the fit solved from the same start."""
     one, draws = inner(robot, noisy.data, objective)
     change, good = stepped(one, draws, silent)
@@ -75,7 +70,7 @@ def test_replicates_are_true_refits(objective: str, robot: mc.Robot, noisy: Simu
         )
 
 
-def test_replicates_heed_priors_and_weights(robot: mc.Robot, noisy: Simulation) -> None:
+def test_replicates_heed_priors_and_weights(robot, noisy):
     u95 = 1e-5 * np.random.default_rng(0).uniform(1.0, 3.0, noisy.data.poses)
     data = replace(noisy.data, columns={**noisy.data.columns, "u95": u95})
     one, draws = inner(robot, data, "sum", priors={"a*": 1e-4})
@@ -90,7 +85,7 @@ def test_replicates_heed_priors_and_weights(robot: mc.Robot, noisy: Simulation) 
         )
 
 
-def test_replicates_of_a_robust_fit_give_way_as_it_does(robot: mc.Robot, noisy: Simulation) -> None:
+def test_replicates_of_a_robust_fit_give_way_as_it_does(robot, noisy):
     """Fitted from scratch on the rows drawn, each point weighed anew: alike on the whole, to 15 %.
 
     The weights are kept, and one number (`robust.flatness`) stands for what they would give way.
@@ -113,7 +108,7 @@ def test_replicates_of_a_robust_fit_give_way_as_it_does(robot: mc.Robot, noisy: 
     assert np.corrcoef(theirs.ravel(), ours.ravel())[0, 1] > 0.9
 
 
-def test_replicates_of_a_minimax_are_minimax_fits(robot: mc.Robot, noisy: Simulation) -> None:
+def test_replicates_of_a_minimax_are_minimax_fits(robot, noisy):
     """Fitted from scratch on the rows drawn: no worse a worst target, to 1e-6."""
     one, draws = inner(robot, noisy.data, "minimax")
     change, good = solved_again(one, draws, silent)
@@ -131,7 +126,7 @@ def test_replicates_of_a_minimax_are_minimax_fits(robot: mc.Robot, noisy: Simula
         assert ours == pytest.approx(theirs, rel=1e-6)
 
 
-def test_the_scatter_is_the_sigma(found: Bootstrap, fit: mc.Fit) -> None:
+def test_the_scatter_is_the_sigma(found, fit):
     """By the same poses: both ask them.  120 replicates know a sigma to 6.5 %, five times that."""
     sigma = {p.name: p.sigma for p in fit.parameters}
     ratio = found.sigma / [sigma[name] for name in found.names]
@@ -139,7 +134,7 @@ def test_the_scatter_is_the_sigma(found: Bootstrap, fit: mc.Fit) -> None:
     assert abs(np.median(ratio) - 1.0) < 0.15
 
 
-def test_percentiles_lie_about_the_value(found: Bootstrap, fit: mc.Fit) -> None:
+def test_percentiles_lie_about_the_value(found, fit):
     value = {p.name: p.value for p in fit.parameters}
     assert_allclose(found.value, [value[name] for name in found.names], rtol=0, atol=0)
     low, high = found.interval(0.95).T
@@ -150,13 +145,13 @@ def test_percentiles_lie_about_the_value(found: Bootstrap, fit: mc.Fit) -> None:
     assert np.all(np.ptp(narrow, axis=1) < high - low)
 
 
-def test_the_same_seed_draws_the_same_poses(fit: mc.Fit) -> None:
+def test_the_same_seed_draws_the_same_poses(fit):
     one, same, other = (bootstrap(fit, 5, seed=seed).change for seed in (1, 1, 2))
     assert np.array_equal(one, same)
     assert not np.allclose(one, other)
 
 
-def test_rows_of_a_pose_are_drawn_together(rng: np.random.Generator) -> None:
+def test_rows_of_a_pose_are_drawn_together(rng):
     group = np.array([4, 4, 9, 1, 9, 9])
     draws = draw(group, 50, rng)
     assert draws.times.shape == (50, 3)
@@ -168,9 +163,7 @@ def test_rows_of_a_pose_are_drawn_together(rng: np.random.Generator) -> None:
     assert abs(draw(np.arange(40), 4000, rng).times.mean(axis=0) - 1.0).max() < 5 / np.sqrt(4000)
 
 
-def test_positions_are_those_of_the_replicates(
-    robot: mc.Robot, found: Bootstrap, fit: mc.Fit
-) -> None:
+def test_positions_are_those_of_the_replicates(robot, found, fit):
     """The whole prediction with the replicate's parameters: to second order in changes of 1e-4."""
     q = np.random.default_rng(5).uniform(-1.5, 1.5, (7, 6))
     places = found.positions(q)
@@ -191,9 +184,7 @@ def whole(robot: mc.Robot, found: Bootstrap, number: int) -> Cell:
     return Cell.of(robot, state.step(step), cell.target_names)
 
 
-def test_poses_left_out_judge_a_replicate(
-    robot: mc.Robot, noisy: Simulation, found: Bootstrap, fit: mc.Fit
-) -> None:
+def test_poses_left_out_judge_a_replicate(robot, noisy, found, fit):
     train = fit.data.take(~fit.held)
     draws = draw(groups(train), 120, np.random.default_rng(3))
     for number in (0, 60):
@@ -205,7 +196,7 @@ def test_poses_left_out_judge_a_replicate(
     assert 0.5 * held < interval.low < interval.high < 2.0 * held
 
 
-def test_a_draw_that_shows_a_parameter_no_more_is_lost() -> None:
+def test_a_draw_that_shows_a_parameter_no_more_is_lost():
     """Two poses that tell one parameter each: a draw must hold both."""
     gram = np.zeros((2, 2, 2))
     gram[0, 0, 0], gram[1, 1, 1] = 1.0, 1e-9
@@ -216,14 +207,14 @@ def test_a_draw_that_shows_a_parameter_no_more_is_lost() -> None:
     assert told.all()
 
 
-def test_too_few_poses_are_told(robot: mc.Robot) -> None:
+def test_too_few_poses_are_told(robot):
     data = simulate(robot, 60, 1, seed=12, truth=Truth(compliance=0)).data.take(np.arange(11))
     fit = mc.calibrate(robot, data, "sum", holdout=0.0)
     with pytest.raises(mc.DataError, match=r"of 30 draws of 11 poses do not determine the 27"):
         bootstrap(fit, 30)
 
 
-def test_a_fit_with_effects_is_drawn_again(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_fit_with_effects_is_drawn_again(robot, noisy):
     fit = mc.calibrate(robot, noisy.data, "sum", effects="joint_compliance:J2")
     found = bootstrap(fit, 40)
     names = [name for name in found.names if name.startswith("joint_compliance:J2")]
@@ -234,7 +225,7 @@ def test_a_fit_with_effects_is_drawn_again(robot: mc.Robot, noisy: Simulation) -
     assert 0.7 < np.median(ratio) < 1.3  # 40 replicates: 11 % each
 
 
-def test_options_are_those_of_the_fit(robot: mc.Robot, noisy: Simulation) -> None:
+def test_options_are_those_of_the_fit(robot, noisy):
     fit = mc.calibrate(
         robot, noisy.data, "minimax", fix=["beta2"], priors={"a*": 1e-3}, distance="off", seed=4
     )
@@ -247,7 +238,7 @@ def test_options_are_those_of_the_fit(robot: mc.Robot, noisy: Simulation) -> Non
     assert again.lever is None
 
 
-def test_table_and_json(found: Bootstrap) -> None:
+def test_table_and_json(found):
     table = found.table()
     assert len(table.rows) == len(found.names)
     row = next(row for row in table.rows if row[0] == "a2")
@@ -260,7 +251,7 @@ def test_table_and_json(found: Bootstrap) -> None:
     assert first["interval"][0] < 1e3 * found.value[0] < first["interval"][1]
 
 
-def test_progress_is_told(fit: mc.Fit) -> None:
+def test_progress_is_told(fit):
     said: list[str] = []
     bootstrap(fit, 30, progress=said.append)
     assert said == ["replicate 1 of 30", "replicate 26 of 30"]
@@ -275,16 +266,14 @@ def test_progress_is_told(fit: mc.Fit) -> None:
         ("point", {}, "objective point depends on the few worst points"),
     ],
 )
-def test_wrong_choices_are_refused(
-    objective: str, options: dict[str, int], say: str, robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_wrong_choices_are_refused(objective, options, say, robot, noisy):
     fit = mc.calibrate(robot, noisy.data, objective)
     with pytest.raises(mc.OptionError, match=say) as caught:
         bootstrap(fit, **options)
     assert "\n" not in str(caught.value)
 
 
-def test_between_undoes_a_step(rng: np.random.Generator, fit: mc.Fit) -> None:
+def test_between_undoes_a_step(rng, fit):
     cell = fit.cell
     state = cell.state
     step: Array = 1e-3 * rng.normal(size=len(fit.uncertainty.names.all))

@@ -37,14 +37,14 @@ def drawn(rng: np.random.Generator, noise: float = NOISE) -> tuple[Both, list[np
     return Both(tuple(parts), FREE, RANDOM, component, asked, asked < 1, np.ones(0)), rows
 
 
-def test_variances_are_those_that_were_drawn() -> None:
+def test_variances_are_those_that_were_drawn():
     rng = np.random.default_rng(0)
     found = [fit_variances(drawn(rng)[0]) for _ in range(20)]
     assert np.mean([v.noise[OLD] for v in found]) == pytest.approx(NOISE, rel=0.05)
     assert np.mean([v.factor[0] for v in found]) == pytest.approx(FACTOR, rel=0.2)
 
 
-def test_new_poses_may_be_noisier() -> None:
+def test_new_poses_may_be_noisier():
     rng = np.random.default_rng(1)
     found = [drawn(rng, 9.0 * NOISE)[0].noise_ratio for _ in range(20)]
     assert np.mean(found) == pytest.approx(3.0, rel=0.1)
@@ -52,7 +52,7 @@ def test_new_poses_may_be_noisier() -> None:
     assert quiet.noise_ratio == 1.0
 
 
-def test_scores_spread_as_their_sigmas_say() -> None:
+def test_scores_spread_as_their_sigmas_say():
     rng, none = np.random.default_rng(2), np.zeros(0, dtype=int)
     z = []
     for _ in range(40):
@@ -62,7 +62,7 @@ def test_scores_spread_as_their_sigmas_say() -> None:
     assert abs(np.sqrt(np.mean(np.square(z))) - 1.0) < 4.0 / np.sqrt(2 * np.size(z))
 
 
-def test_a_part_left_out_is_judged_by_a_fit_of_the_others() -> None:
+def test_a_part_left_out_is_judged_by_a_fit_of_the_others():
     both, rows = drawn(np.random.default_rng(3))
     noise = both.variances.noise
     fitted = both.fitted(np.array([1]))
@@ -76,14 +76,14 @@ def test_a_part_left_out_is_judged_by_a_fit_of_the_others() -> None:
     assert_allclose(both.square(both.parts[left], fitted), error @ error, rtol=1e-6)
 
 
-def test_folds_scatter_as_the_estimate_does() -> None:
+def test_folds_scatter_as_the_estimate_does():
     rng, none = np.random.default_rng(4), np.zeros(0, dtype=int)
     found = [drawn(rng)[0] for _ in range(40)]
     ratio = [both.scatter(none, 1) / both.scores(none)[1][1] for both in found]
     assert np.sqrt(np.mean(np.square(ratio))) == pytest.approx(1.0, abs=0.3)
 
 
-def test_an_inverse_is_a_solution() -> None:
+def test_an_inverse_is_a_solution():
     rng = np.random.default_rng(5)
     rows = rng.normal(size=(30, 8)) * 10.0 ** np.arange(-4, 4)
     gram = rows.T @ rows

@@ -33,9 +33,7 @@ def later(sim: Simulation, poses: int = 30) -> Measurements:
     return replace(data.with_y(y), simulated=False, line=np.arange(poses) + 2)
 
 
-def test_evaluate_counts_with_them(
-    arm: tuple[Path, Simulation], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_evaluate_counts_with_them(arm, capsys):
     folder, sim = arm
     data = later(sim)
     mc.write_measurements(folder / "new.csv", data)
@@ -59,7 +57,7 @@ def test_evaluate_counts_with_them(
                         rtol=1e-9)  # fmt: skip
 
 
-def test_check_counts_with_them(arm: tuple[Path, Simulation]) -> None:
+def test_check_counts_with_them(arm):
     folder, sim = arm
     data = later(sim)
     cells = np.where(np.arange(data.poses) == 6, "looks odd", "")
@@ -76,9 +74,7 @@ def test_check_counts_with_them(arm: tuple[Path, Simulation]) -> None:
     assert "holdout_with_them" not in found.fit.to_dict()["accuracy"]  # none is held out
 
 
-def test_a_reseat_is_told_by_check_and_import(
-    arm: tuple[Path, Simulation], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_reseat_is_told_by_check_and_import(arm, capsys):
     folder, sim = arm
     data = later(sim, 40)
     spots = sim.cell.target_positions + np.array([[0, 0, 0], [3e-3, 4e-3, 0], [0, 0, 0]])

@@ -31,7 +31,6 @@ from minimax_cal.judging.iso9283.result import CYCLES
 from minimax_cal.judging.iso9283.visits import stops_of
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements, measurements
-from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.robots.sampling import random_poses
 
 TRIANGLE = np.array([[0.1, 0.0, 0.03], [-0.05, 0.09, 0.03], [-0.05, -0.09, 0.03]])
@@ -75,7 +74,7 @@ def turned(cell: mc.Cell, y: Array, shift: Array, turn: Array) -> Array:
 # ---- formulas ------------------------------------------------------------------------------------
 
 
-def test_repeatability_by_hand() -> None:
+def test_repeatability_by_hand():
     # a square around (1, 2, 3): every l is 2, so S_l = 0; two points 6 apart: l = 3, S_l = 0
     square = np.array([[3, 2, 3], [-1, 2, 3], [1, 4, 3], [1, 0, 3]])
     pair = np.array([[0, 0, 0], [0, 0, 6]])
@@ -88,7 +87,7 @@ def test_repeatability_by_hand() -> None:
     assert np.isnan(found[3:]).all()  # one visit that was measured, and none
 
 
-def test_repeatability_of_known_scatter() -> None:
+def test_repeatability_of_known_scatter():
     # l is sigma times a chi variable of three degrees of freedom, about the barycentre of n
     n, sigma, rng = 4000, 2e-5, np.random.default_rng(1)
     found = repeatability(sigma * rng.normal(size=(n, 3)), np.zeros(n, dtype=int), 1)[0]
@@ -98,7 +97,7 @@ def test_repeatability_of_known_scatter() -> None:
     assert found == pytest.approx(sigma * (mean + 3.0 * sd), abs=4.0 * error)
 
 
-def test_direction_variation_by_hand() -> None:
+def test_direction_variation_by_hand():
     points = np.array([[0, 0, 0], [2, 0, 0], [0, 3, 0], [2, 3, 0], [1, 1, 2.0], [50, 0, 0]])
     way = np.array([4, 4, 7, 7, 9, -1])  # barycentres (1,0,0), (1,3,0), (1,1,2); one unknown
     pose = np.zeros(6, dtype=int)
@@ -106,7 +105,7 @@ def test_direction_variation_by_hand() -> None:
     assert np.isnan(direction_variation(points, pose, np.full(6, -1), 1)).all()
 
 
-def test_rigid_fit_is_that_of_scipy(rng: np.random.Generator) -> None:
+def test_rigid_fit_is_that_of_scipy(rng):
     points = rng.normal(size=(40, 3, 3))
     points[7, 1] = np.nan
     found = turns_of(TRIANGLE, points)
@@ -118,7 +117,7 @@ def test_rigid_fit_is_that_of_scipy(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("flat", [TRIANGLE[:2], np.outer([0.0, 1.0, 2.0], [1.0, 2.0, 0.5])])
-def test_two_targets_or_a_line_show_no_orientation(flat: Array, rng: np.random.Generator) -> None:
+def test_two_targets_or_a_line_show_no_orientation(flat, rng):
     assert np.isnan(turns_of(flat, rng.normal(size=(5, len(flat), 3)))).all()
 
 
@@ -127,7 +126,7 @@ def test_two_targets_or_a_line_show_no_orientation(flat: Array, rng: np.random.G
     st.integers(0, 2**32 - 1),
     st.one_of(st.floats(0.0, np.pi), st.floats(0.0, 1e-6), st.floats(np.pi - 1e-6, np.pi)),
 )
-def test_orientation_error_is_the_angle_of_the_turn(seed: int, angle: float) -> None:
+def test_orientation_error_is_the_angle_of_the_turn(seed, angle):
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
     one = Rotation.random(rng=rng)
@@ -137,12 +136,12 @@ def test_orientation_error_is_the_angle_of_the_turn(seed: int, angle: float) -> 
     assert_allclose(found, (one.inv() * other).magnitude(), rtol=0, atol=1e-14)
 
 
-def test_euler_angles_are_those_of_scipy(rng: np.random.Generator) -> None:
+def test_euler_angles_are_those_of_scipy(rng):
     turn = Rotation.random(200, rng=rng)
     assert_allclose(euler_angles(turn.as_matrix()), turn.as_euler("xyz"), rtol=0, atol=1e-10)
 
 
-def test_euler_deviation_takes_the_short_way() -> None:
+def test_euler_deviation_takes_the_short_way():
     one, other = (
         Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
         for angles in ([170, 5, -179], [-170, 2, 178])
@@ -150,14 +149,14 @@ def test_euler_deviation_takes_the_short_way() -> None:
     assert_allclose(euler_deviation(one, other), np.radians([-20, 3, 3]), **EXACT)
 
 
-def test_mean_turn_is_that_of_scipy(rng: np.random.Generator) -> None:
+def test_mean_turn_is_that_of_scipy(rng):
     turn = Rotation.from_rotvec(0.1 * rng.normal(size=(30, 3))) * Rotation.random(rng=rng)
     found = mean_turn(turn.as_matrix(), np.zeros(30, dtype=int), 2)
     assert_allclose(found[0], turn.mean().as_matrix(), rtol=0, atol=1e-12)
     assert np.isnan(found[1]).all()
 
 
-def test_distance_errors_pair_by_pair(rng: np.random.Generator) -> None:
+def test_distance_errors_pair_by_pair(rng):
     real, told = rng.normal(size=(2, 6, 3))
     every = [
         np.linalg.norm(real[i] - real[j]) - np.linalg.norm(told[i] - told[j])
@@ -167,7 +166,7 @@ def test_distance_errors_pair_by_pair(rng: np.random.Generator) -> None:
     assert_allclose(distance_errors(real, told), every, **EXACT)
 
 
-def test_repeated_distances_by_hand() -> None:
+def test_repeated_distances_by_hand():
     # P at 0 thrice, Q at 1, 2, 3 along x (a fourth P has no partner): D = 1 2 3, D_c = 1.5
     x = np.array([0.0, 1.0, 0.0, 2.0, 0.0, 3.0, 0.4, 9.0])
     pose = np.array(["P", "Q", "P", "Q", "P", "Q", "P", "once"])
@@ -181,7 +180,7 @@ def test_repeated_distances_by_hand() -> None:
 # ---- motions that are known ----------------------------------------------------------------------
 
 
-def test_an_arm_that_does_as_told_has_no_error(cell: mc.Cell) -> None:
+def test_an_arm_that_does_as_told_has_no_error(cell):
     found = of(cell, seen_at(cell, level_poses(cell.robot, 20)))
     values = found.parts["train"].values["after"]
     for part in (values.position, values.targets, values.angle, values.euler, values.pairs):
@@ -189,7 +188,7 @@ def test_an_arm_that_does_as_told_has_no_error(cell: mc.Cell) -> None:
     assert list(found.parts) == ["train"]
 
 
-def test_a_shift_and_a_turn_are_found_back(cell: mc.Cell) -> None:
+def test_a_shift_and_a_turn_are_found_back(cell):
     """AP is the shift in base axes; AO' and, for a turn about z, AO_c are the turn; AD is 0."""
     data = seen_at(cell, level_poses(cell.robot, 20))
     shift, angle = np.array([3e-4, -1e-4, 2e-4]), 2e-3
@@ -207,7 +206,7 @@ def test_a_shift_and_a_turn_are_found_back(cell: mc.Cell) -> None:
     assert_allclose(values.targets, moved, **EXACT)
 
 
-def test_moving_the_base_changes_ap_but_not_ad(cell: mc.Cell) -> None:
+def test_moving_the_base_changes_ap_but_not_ad(cell):
     data = seen_at(cell, level_poses(cell.robot, 20))
     data = data.with_y(data.y + 1e-4 * np.random.default_rng(0).normal(size=data.y.shape))
     moved = cell.base.copy()
@@ -222,9 +221,7 @@ def test_moving_the_base_changes_ap_but_not_ad(cell: mc.Cell) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_values_do_not_depend_on_where_the_instrument_stands(
-    cell: mc.Cell, noisy: Simulation, seed: int
-) -> None:
+def test_values_do_not_depend_on_where_the_instrument_stands(cell, noisy, seed):
     rng = np.random.default_rng(seed)
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = Rotation.random(rng=rng).as_matrix(), rng.uniform(-5, 5, 3)
@@ -237,7 +234,7 @@ def test_values_do_not_depend_on_where_the_instrument_stands(
         assert_allclose(getattr(one, name), getattr(other, name), rtol=0, atol=1e-11, err_msg=name)
 
 
-def test_a_tcp_anywhere_on_the_flange(cell: mc.Cell) -> None:
+def test_a_tcp_anywhere_on_the_flange(cell):
     """A body that moved rigidly: its points have the errors that the motion gives them."""
     data = seen_at(cell, level_poses(cell.robot, 10))
     y = turned(cell, data.y, np.array([1e-4, 0, 0]), np.array([1e-3, -2e-3, 5e-4]))
@@ -254,7 +251,7 @@ def test_a_tcp_anywhere_on_the_flange(cell: mc.Cell) -> None:
     assert_allclose(far.position, [1e-4, 0, 0] + flange @ spot @ spin.T, **EXACT)
 
 
-def test_near_gimbal_lock_a_and_c_are_left_out(cell: mc.Cell) -> None:
+def test_near_gimbal_lock_a_and_c_are_left_out(cell):
     """AO_b and AO' stay: a turn of 1 mrad is 1 mrad everywhere, while a and c run away."""
     q = random_poses(cell.robot, 3000, np.random.default_rng(8))
     level = np.cos(euler_angles(cell.robot.pose(q)[:, :3, :3])[:, 1])
@@ -287,7 +284,7 @@ def revisited(cell: mc.Cell, visits: int, sigma: float, poses: int = 4) -> Measu
     return data.with_y(data.y + sigma * rng.normal(size=data.y.shape))
 
 
-def test_simulated_revisits_have_the_repeatability_they_were_given(cell: mc.Cell) -> None:
+def test_simulated_revisits_have_the_repeatability_they_were_given(cell):
     n, sigma = 400, 30e-6
     found = of(cell, revisited(cell, n, sigma)).parts["train"].scatter
     assert_array_equal(found.stops, 4 * [n])
@@ -315,7 +312,7 @@ def test_simulated_revisits_have_the_repeatability_they_were_given(cell: mc.Cell
     assert np.abs(found.euler[:, 1] / size_b - 1.0).max() < 4.0 / np.sqrt(2.0 * n)
 
 
-def test_the_barycentre_gains_with_the_visits(cell: mc.Cell) -> None:
+def test_the_barycentre_gains_with_the_visits(cell):
     few, many = (
         of(cell, revisited(cell, n, 1e-4, poses=40)).parts["train"].values["after"].position
         for n in (1, 25)
@@ -324,7 +321,7 @@ def test_the_barycentre_gains_with_the_visits(cell: mc.Cell) -> None:
     assert sizes[0] / sizes[1] == pytest.approx(5.0, rel=4.0 * np.sqrt(2.0 / (2.0 * 120.0)))
 
 
-def test_play_shows_between_ways_and_not_within_one(cell: mc.Cell) -> None:
+def test_play_shows_between_ways_and_not_within_one(cell):
     """Two ways of approach, 0.2 mm apart: vAP tells it, and RP one way is that of the noise."""
     rng, n = np.random.default_rng(5), 40
     q = np.tile(level_poses(cell.robot, 2), (n, 1))
@@ -342,7 +339,7 @@ def test_play_shows_between_ways_and_not_within_one(cell: mc.Cell) -> None:
     assert s.all_ways.min() > 9e-5
 
 
-def test_what_was_not_moved_is_one_stop(cell: mc.Cell) -> None:
+def test_what_was_not_moved_is_one_stop(cell):
     """The same pose measured twice without a move tells nothing of repeatability."""
     q = level_poses(cell.robot, 3)[[0, 0, 0, 1, 2, 0]]
     data = seen_at(cell, q)
@@ -360,7 +357,7 @@ def test_what_was_not_moved_is_one_stop(cell: mc.Cell) -> None:
     assert_array_equal(again.scatter.stops, [4, 1, 1])
 
 
-def test_one_reflector_at_one_nest_after_the_other(cell: mc.Cell) -> None:
+def test_one_reflector_at_one_nest_after_the_other(cell):
     """Three rounds through the poses with another nest each: AP and AO, but no repeatability."""
     q = np.tile(level_poses(cell.robot, 8), (3, 1))
     data = seen_at(cell, q)
@@ -376,7 +373,7 @@ def test_one_reflector_at_one_nest_after_the_other(cell: mc.Cell) -> None:
     assert found.conditions[-1][2].startswith("3 visits")
 
 
-def test_pairs_keep_to_their_part(cell: mc.Cell) -> None:
+def test_pairs_keep_to_their_part(cell):
     data = seen_at(cell, level_poses(cell.robot, 9))
     held = np.array([0, 0, 1, 1, 0, 1, 0, 0, 1], dtype=bool)
     parts = iso9283({"after": cell}, data, held).parts
@@ -389,7 +386,7 @@ def test_pairs_keep_to_their_part(cell: mc.Cell) -> None:
 # ---- the result ----------------------------------------------------------------------------------
 
 
-def test_two_targets_say_why_there_is_no_orientation(cell: mc.Cell, noisy: Simulation) -> None:
+def test_two_targets_say_why_there_is_no_orientation(cell, noisy):
     found = of(noisy.cell, noisy.data.keep(np.array([True, False, True])))
     assert "needs three reflectors" in found.summary()
     content = json.loads(json.dumps(found.to_dict(), allow_nan=False))
@@ -404,7 +401,7 @@ def test_two_targets_say_why_there_is_no_orientation(cell: mc.Cell, noisy: Simul
     assert part["cells"]["after"]["AP_mm"]["count"] == 60
 
 
-def test_json_holds_what_the_tables_say(cell: mc.Cell) -> None:
+def test_json_holds_what_the_tables_say(cell):
     found = of(cell, revisited(cell, 5, 1e-4))
     content = json.loads(json.dumps(found.to_dict(), allow_nan=False))["parts"]["train"]
     text = found.summary(200)
@@ -422,7 +419,7 @@ def test_json_holds_what_the_tables_say(cell: mc.Cell) -> None:
     assert [row[0] for row in rows] == ["P1", "P2", "P3", "P4"]
 
 
-def test_conditions_say_what_the_data_tell(cell: mc.Cell) -> None:
+def test_conditions_say_what_the_data_tell(cell):
     q = level_poses(cell.robot, 4)
     columns = {
         "temperature": np.array([20.5, 22.0, np.nan, 21.0]),
@@ -439,12 +436,12 @@ def test_conditions_say_what_the_data_tell(cell: mc.Cell) -> None:
 @pytest.mark.parametrize(
     ("tcp", "words"), [("smr9", "smr1, smr2, smr3"), ([1.0, 2.0], "three numbers")]
 )
-def test_a_tcp_that_is_none_is_refused(cell: mc.Cell, tcp: object, words: str) -> None:
+def test_a_tcp_that_is_none_is_refused(cell, tcp, words):
     with pytest.raises(OptionError, match=words):
         of(cell, seen_at(cell, level_poses(cell.robot, 4)), tcp=tcp)
 
 
-def test_wrong_targets_and_joints_are_refused(cell: mc.Cell) -> None:
+def test_wrong_targets_and_joints_are_refused(cell):
     data = seen_at(cell, level_poses(cell.robot, 4))
     with pytest.raises(DataError, match="target smr7"):
         of(cell, replace(data, target_names=("smr1", "smr2", "smr7")))
@@ -454,7 +451,7 @@ def test_wrong_targets_and_joints_are_refused(cell: mc.Cell) -> None:
         of(cell, data.only(0), tcp=[0.0, 0.0, 0.1])
 
 
-def test_many_poses_form_pairs_of_some(cell: mc.Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_poses_form_pairs_of_some(cell, monkeypatch):
     monkeypatch.setattr("minimax_cal.judging.iso9283.visits.MAX_PAIRED_POSES", 10)
     monkeypatch.setattr("minimax_cal.judging.iso9283.result.MAX_PAIRED_POSES", 10)
     found = of(cell, seen_at(cell, level_poses(cell.robot, 30)))
@@ -463,7 +460,7 @@ def test_many_poses_form_pairs_of_some(cell: mc.Cell, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("target", range(3))
-def test_a_real_arm_agrees_with_the_accuracy_of_its_calibration(target: int) -> None:
+def test_a_real_arm_agrees_with_the_accuracy_of_its_calibration(target):
     robot, path = shared("irb120")
     data = mc.read_measurements(path).only(target)
     fit = mc.calibrate(robot, data, "sum", holdout=0.3)
@@ -478,7 +475,7 @@ def test_a_real_arm_agrees_with_the_accuracy_of_its_calibration(target: int) -> 
             assert np.sqrt(np.mean(size**2)) == pytest.approx(told.rms_mm, rel=1e-9)
 
 
-def test_one_label_at_two_poses_is_no_repeatability(cell: mc.Cell) -> None:
+def test_one_label_at_two_poses_is_no_repeatability(cell):
     data = seen_at(cell, level_poses(cell.robot, 6), pose=np.repeat(["a", "b", "c"], 2))
     with pytest.raises(DataError, match="pose 'a' is also that of line 1"):
         of(cell, data)

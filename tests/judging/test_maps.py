@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -54,16 +53,14 @@ def height_of(cell: mc.Cell) -> Predict:
     return predict
 
 
-def test_the_place_is_that_of_the_centroid(noisy: Simulation) -> None:
+def test_the_place_is_that_of_the_centroid(noisy):
     q = noisy.data.q
     seen = noisy.cell.predict(q).mean(axis=1)
     base = noisy.cell.base
     assert_allclose(tcp_place(noisy.cell, q), (seen - base[:3, 3]) @ base[:3, :3], atol=1e-12)
 
 
-def test_the_radius_holds_95_percent_of_the_arms_that_the_covariance_allows(
-    noisy: Simulation, robot: mc.Robot
-) -> None:
+def test_the_radius_holds_95_percent_of_the_arms_that_the_covariance_allows(noisy, robot):
     """Parameters drawn from the covariance, and the exact kinematics of each such arm."""
     fit = mc.calibrate(robot, noisy.data, "sum")
     names, draws = Names(6, fit.cell.target_names), 20_000
@@ -93,9 +90,7 @@ def test_the_radius_holds_95_percent_of_the_arms_that_the_covariance_allows(
     assert np.abs(held - 0.95).max() < 4.0 * np.sqrt(0.95 * 0.05 / draws) + 0.005
 
 
-def test_the_radius_of_a_measurement_holds_95_percent_of_those_not_fitted(
-    robot: mc.Robot,
-) -> None:
+def test_the_radius_of_a_measurement_holds_95_percent_of_those_not_fitted(robot):
     """Twelve arms of 40 poses each; without the noise of a measurement it holds far fewer."""
     held, bare = [], []
     for seed in range(12):
@@ -111,7 +106,7 @@ def test_the_radius_of_a_measurement_holds_95_percent_of_those_not_fitted(
     assert np.mean(bare) < 0.9
 
 
-def test_bins_hold_the_median_and_the_worst(rng: np.random.Generator) -> None:
+def test_bins_hold_the_median_and_the_worst(rng):
     x, y, radius = rng.uniform(-1, 1, (3, 500))
     reached = rng.uniform(size=500) < 0.4
     some = Sampled(np.stack([x, y, 0 * x], axis=1), 2.0 + radius, reached, ~reached)
@@ -130,7 +125,7 @@ def test_bins_hold_the_median_and_the_worst(rng: np.random.Generator) -> None:
                 assert np.isnan([found.median[i, j], found.worst[i, j], found.reached[i, j]]).all()
 
 
-def test_a_known_field_lies_between_the_edges_of_its_bin(saved: Saved) -> None:
+def test_a_known_field_lies_between_the_edges_of_its_bin(saved):
     found = workspace_map(saved, height_of(saved.cells["after"]), SMALL)
     vertical, horizontal = found.sections
     away, height = vertical.edges
@@ -146,7 +141,7 @@ def test_a_known_field_lies_between_the_edges_of_its_bin(saved: Saved) -> None:
     assert away[0] == 0.0
 
 
-def test_reached_is_within_the_ranges_and_near(rng: np.random.Generator) -> None:
+def test_reached_is_within_the_ranges_and_near(rng):
     train, q = rng.uniform(-1, 1, (40, 3)) * [1, 2, 3], rng.uniform(-4, 4, (300, 3))
     train = np.concatenate([train, train[:7]])  # poses that were visited again
     found = reached_by(train, q)
@@ -161,7 +156,7 @@ def test_reached_is_within_the_ranges_and_near(rng: np.random.Generator) -> None
     assert reached_by(train, train).all()
 
 
-def test_a_joint_that_never_moved_is_not_known_elsewhere() -> None:
+def test_a_joint_that_never_moved_is_not_known_elsewhere():
     rng = np.random.default_rng(1)
     train = rng.uniform(-1, 1, (40, 3)) * [1, 1, 0] + [0, 0, 0.7]
     elsewhere = train + np.array([0, 0, 0.1])
@@ -170,7 +165,7 @@ def test_a_joint_that_never_moved_is_not_known_elsewhere() -> None:
     assert not reached_by(train[:2], train).any()  # two poses tell no spacing
 
 
-def test_joints_are_sampled_within_their_limits(robot: mc.Robot) -> None:
+def test_joints_are_sampled_within_their_limits(robot):
     low, high = joint_range(robot, np.zeros((0, 6)))
     assert_allclose(low, np.maximum(robot.lower, -np.pi))
     assert_allclose(high, np.minimum(robot.upper, np.pi))
@@ -184,7 +179,7 @@ def test_joints_are_sampled_within_their_limits(robot: mc.Robot) -> None:
 
 
 @pytest.mark.parametrize("name", ["scara_600", "ur10"])
-def test_other_arms(name: str) -> None:
+def test_other_arms(name):
     robot = mc.load_robot(name)
     base, spots = np.eye(4), 0.1 * np.eye(3)
     cell = mc.Cell(robot, base, ("smr1", "smr2", "smr3"), spots)
@@ -199,7 +194,7 @@ def test_other_arms(name: str) -> None:
     assert np.all(q <= high + 1e-12)
 
 
-def test_observed_errors_are_those_of_the_cells(saved: Saved) -> None:
+def test_observed_errors_are_those_of_the_cells(saved):
     found = workspace_map(saved, unknown, SMALL)
     for name, cell in saved.cells.items():
         told = np.linalg.norm(cell.error(saved.data).mean(axis=0), axis=-1)
@@ -213,7 +208,7 @@ def test_observed_errors_are_those_of_the_cells(saved: Saved) -> None:
     assert_allclose(part.after[3], np.linalg.norm(one), atol=1e-15)
 
 
-def test_a_prediction_that_held_out_poses_belie_is_doubted(saved: Saved) -> None:
+def test_a_prediction_that_held_out_poses_belie_is_doubted(saved):
     error = workspace_map(saved, unknown, SMALL).seen.after[saved.held]
     few, more = np.sort(error)[[7, 8]]  # of 12 by chance: 8 in 0.2 %, 9 in 2 % of all cases
     for radius, count, doubted in ((few, 8, True), (more, 9, False), (1.0, 12, False)):
@@ -223,7 +218,7 @@ def test_a_prediction_that_held_out_poses_belie_is_doubted(saved: Saved) -> None
         assert any("not 95 %" in notice for notice in found.notices) == doubted
 
 
-def test_the_same_seed_gives_the_same_map(saved: Saved) -> None:
+def test_the_same_seed_gives_the_same_map(saved):
     field = height_of(saved.cells["after"])
     maps = [workspace_map(saved, field, replace(SMALL, seed=s)) for s in (1, 1, 2)]
     texts = [json.dumps(each.to_dict(), allow_nan=False) for each in maps]
@@ -231,7 +226,7 @@ def test_the_same_seed_gives_the_same_map(saved: Saved) -> None:
     assert texts[0] != texts[2]
 
 
-def test_beyond_the_data_is_told_apart(saved: Saved) -> None:
+def test_beyond_the_data_is_told_apart(saved):
     """What is reached has joint 1 on the side that was measured, and is told by its bins."""
     side = saved.data.q[:, 0] > 0.2
     half = replace(saved, data=saved.data.take(side), held=np.zeros(side.sum(), dtype=bool))
@@ -246,12 +241,12 @@ def test_beyond_the_data_is_told_apart(saved: Saved) -> None:
     assert any("J1 moved over" in notice for notice in found.notices)
 
 
-def test_what_is_predicted_is_drawn(saved: Saved, tmp_path: Path) -> None:
+def test_what_is_predicted_is_drawn(saved, tmp_path):
     save_map(workspace_map(saved, height_of(saved.cells["after"]), SMALL), tmp_path / "map.png")
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_without_a_covariance_only_what_was_observed_is_drawn(saved: Saved, tmp_path: Path) -> None:
+def test_without_a_covariance_only_what_was_observed_is_drawn(saved, tmp_path):
     found = workspace_map(saved, unknown, SMALL)
     assert not found.predicted
     for name in ("seen", "again"):
@@ -263,7 +258,7 @@ def test_without_a_covariance_only_what_was_observed_is_drawn(saved: Saved, tmp_
     assert found.to_dict()["sections"][0]["radius95_median_mm"][0][0] is None
 
 
-def test_the_line_parts_what_is_reached_from_what_is_not(saved: Saved) -> None:
+def test_the_line_parts_what_is_reached_from_what_is_not(saved):
     """Each edge of the line has a bin that the training poses reach on one side alone."""
     from matplotlib.figure import Figure
 

@@ -37,11 +37,11 @@ def claim(poses: int, value: float = 0.1, high: float = 0.15) -> Claim:
         (2, 0.30, math.nan, 0.2, NOT_PASSED),  # seen is seen
     ],
 )
-def test_rms(poses: int, value: float, high: float, limit: float, verdict: str) -> None:
+def test_rms(poses, value, high, limit, verdict):
     assert judge(Limit("rms", limit), claim(poses, value, high)).verdict == verdict
 
 
-def test_a_maximum_needs_poses_and_says_how_many() -> None:
+def test_a_maximum_needs_poses_and_says_how_many():
     """The next pose exceeds all n so far with probability 1/(n + 1): at most 5 % from 19 on."""
     assert MIN_POSES == 19
     few, enough = (judge(Limit("max", 1.0), claim(n)) for n in (18, 19))
@@ -51,7 +51,7 @@ def test_a_maximum_needs_poses_and_says_how_many() -> None:
     assert judge(Limit("max", 0.2), claim(5)).verdict == NOT_PASSED  # 0.3 was seen
 
 
-def test_all_together() -> None:
+def test_all_together():
     limits = Limit("rms", 1.0), Limit("rms", 0.01), Limit("max", 1.0)
     good, bad, open_ = (judge(limit, claim(10)) for limit in limits)
     assert overall((good,)) == PASSED
@@ -59,7 +59,7 @@ def test_all_together() -> None:
     assert overall((good, open_, bad)) == NOT_PASSED
 
 
-def test_beyond_is_of_the_worst_part() -> None:
+def test_beyond_is_of_the_worst_part():
     folds = (Fold("one end", 20, 0.2, 0.9, 0.2), Fold("the other", 30, 0.4, 0.8, 0.4))
     found = beyond(Beyond(folds, 0.3, 0.3, "", 0.5, 1.2))
     assert (found.rms, found.largest) == (Bound(0.4, 0.5), Bound(0.9, 1.2))
@@ -70,7 +70,7 @@ def test_beyond_is_of_the_worst_part() -> None:
     assert (nothing.verdict, nothing.why) == (NOT_STATED, "no part can be spared")
 
 
-def test_nothing_is_passed_beyond_while_parts_could_not_be_judged() -> None:
+def test_nothing_is_passed_beyond_while_parts_could_not_be_judged():
     folds = (Fold("one end", 20, 0.2, 0.9, 0.2),)
     some = Beyond(folds, 0.2, 0.2, "", 0.3, 1.2, missed=("joint 2 at its low end",))
     found = judge(Limit("rms", 0.5), beyond(some))
@@ -80,7 +80,7 @@ def test_nothing_is_passed_beyond_while_parts_could_not_be_judged() -> None:
     assert judge(Limit("rms", 0.1), beyond(some)).verdict == NOT_PASSED  # seen is seen
 
 
-def test_what_is_passed_does_not_hide_what_is_seen_beyond() -> None:
+def test_what_is_passed_does_not_hide_what_is_seen_beyond():
     inside = claim(30)
     passed, failed = (judge(Limit("rms", size), inside) for size in (0.2, 0.12))
     away = beyond(Beyond((Fold("one end", 20, 0.3, 0.9, 0.2),), 0.3, 0.3, "", 0.4, 1.2))
@@ -94,7 +94,7 @@ def test_what_is_passed_does_not_hide_what_is_seen_beyond() -> None:
     assert elsewhere(passed, beyond(Beyond(reason="none"))) == ""
 
 
-def test_limits_are_read() -> None:
+def test_limits_are_read():
     assert limits_of("rms 0.2, max 0.5") == (Limit("rms", 0.2), Limit("max", 0.5))
     assert limits_of("MAX=1mm") == (Limit("max", 1.0),)
     assert limits_of("") == ()
@@ -114,7 +114,7 @@ def test_limits_are_read() -> None:
         limits_of("rms 0.2, rms 0.3")
 
 
-def test_the_upper_limits_of_beyond_are_in_the_file(robot: mc.Robot) -> None:
+def test_the_upper_limits_of_beyond_are_in_the_file(robot):
     fit = mc.calibrate(robot, mc.simulate(robot, 100, 3, seed=1).data, "sum")
     assert fit.beyond.worst is not None
     assert fit.beyond.rms_high_mm > fit.beyond.worst_mm

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,7 +48,7 @@ def knocked(fit: mc.Fit, made: Simulation):  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.parametrize("arm", ["irb120", "ur10"])
-def test_a_shifted_joint_is_found_and_nothing_else(arm: str) -> None:
+def test_a_shifted_joint_is_found_and_nothing_else(arm):
     for seed in (0, 1):
         found = checked(arm, seed)
         assert found.named == (found.joint,)
@@ -59,13 +58,13 @@ def test_a_shifted_joint_is_found_and_nothing_else(arm: str) -> None:
 
 
 @pytest.mark.slow
-def test_rates_are_those_promised() -> None:
+def test_rates_are_those_promised():
     results = [checked(arm, seed) for arm in ("irb2600", "ur10") for seed in range(150)]
     assert np.mean([r.joint in r.named for r in results]) >= 0.95
     assert np.mean([bool(r.alarms) for r in results]) < 0.01
 
 
-def test_the_size_of_the_shift_is_told(knocked) -> None:  # type: ignore[no-untyped-def]
+def test_the_size_of_the_shift_is_told(knocked):  # type: ignore[no-untyped-def]
     (moved,) = knocked.moved
     assert moved.parameter == "theta3"
     assert abs(moved.by - SHIFT) < SIGMAS * moved.sigma
@@ -78,9 +77,7 @@ def test_the_size_of_the_shift_is_told(knocked) -> None:  # type: ignore[no-unty
     }
 
 
-def test_the_refit_is_a_calibration_that_holds(
-    knocked, fit: mc.Fit, made: Simulation, tmp_path: Path
-) -> None:  # type: ignore[no-untyped-def]
+def test_the_refit_is_a_calibration_that_holds(knocked, fit, made, tmp_path):  # type: ignore[no-untyped-def]
     knocked.save(tmp_path / "refit.json")
     again = mc.load_fit(tmp_path / "refit.json")
     change = again.robot.mdh - fit.robot.mdh
@@ -94,7 +91,7 @@ def test_the_refit_is_a_calibration_that_holds(
     assert [m.joint for m in back.moved] == ["J3"]
 
 
-def test_not_valid_and_not_decided(fit: mc.Fit, made: Simulation) -> None:
+def test_not_valid_and_not_decided(fit, made):
     far = mc.check(fit, poses(made, 10, 4, 0.02), "rms 0.2, max 1")
     assert far.valid is False
     assert [m.joint for m in far.moved] == ["J4"]
@@ -104,7 +101,7 @@ def test_not_valid_and_not_decided(fit: mc.Fit, made: Simulation) -> None:
     assert close.confidence < 0.975
 
 
-def test_a_known_frame_tells_joint_one(fit: mc.Fit, made: Simulation) -> None:
+def test_a_known_frame_tells_joint_one(fit, made):
     rng = np.random.default_rng(4)
     q = random_poses(made.cell.robot, 10, rng)
     cell = shifted(made.cell, 0, SHIFT)
@@ -118,7 +115,7 @@ def test_a_known_frame_tells_joint_one(fit: mc.Fit, made: Simulation) -> None:
     assert [h.parameter for h in alone.hidden] == ["theta6"]
 
 
-def test_what_moved_has_the_sign_of_the_file() -> None:
+def test_what_moved_has_the_sign_of_the_file():
     """A first row of modified DH that turns by 180 degrees turns the sense of joint 1 around."""
     rows = [(0, -675, 0, 180), (350, 0, 0, 90), (1150, 0, -90, 0), (41, -1200, 0, 90),
             (0, 0, 0, -90), (0, -215, 180, 90)]  # fmt: skip
@@ -150,7 +147,7 @@ def with_foot(
     return replace(data, columns={**data.columns, **more})
 
 
-def test_reflectors_on_the_foot_tell_joint_one(made: Simulation) -> None:
+def test_reflectors_on_the_foot_tell_joint_one(made):
     rng = np.random.default_rng(8)
     fit = mc.calibrate("irb2600", with_foot(made.data, made.cell.base, rng), "sum")
     q = random_poses(made.cell.robot, 10, rng)
@@ -164,7 +161,7 @@ def test_reflectors_on_the_foot_tell_joint_one(made: Simulation) -> None:
     assert abs(found.moved[0].by - SHIFT) < SIGMAS * found.moved[0].sigma
 
 
-def test_a_foot_that_tells_less_than_the_instrument_names_nothing(made: Simulation) -> None:
+def test_a_foot_that_tells_less_than_the_instrument_names_nothing(made):
     """The foot gives way at each pose: the calibration's own poses say how much."""
     rng = np.random.default_rng(11)
     base = made.cell.base
@@ -202,7 +199,7 @@ def rms(fit: mc.Fit, data: mc.Measurements) -> float:
     return float(np.sqrt(np.square(fit.cell.error(data)).sum(axis=-1).mean()))
 
 
-def test_a_refit_of_an_arm_that_did_not_move_is_as_good_as_its_fit(giving_way) -> None:  # type: ignore[no-untyped-def]
+def test_a_refit_of_an_arm_that_did_not_move_is_as_good_as_its_fit(giving_way):  # type: ignore[no-untyped-def]
     fit, seen = giving_way
     many = seen(150)
     before, own, after = [], [], []
@@ -217,7 +214,7 @@ def test_a_refit_of_an_arm_that_did_not_move_is_as_good_as_its_fit(giving_way) -
     assert np.mean(after) < 1.1 * rms(fit, many)
 
 
-def test_a_correction_helps_the_poses_that_it_is_made_from(giving_way) -> None:  # type: ignore[no-untyped-def]
+def test_a_correction_helps_the_poses_that_it_is_made_from(giving_way):  # type: ignore[no-untyped-def]
     fit, seen = giving_way
     for joint in (1, 2, 4):
         ten = seen(10, joint, 4e-3)
@@ -227,7 +224,7 @@ def test_a_correction_helps_the_poses_that_it_is_made_from(giving_way) -> None: 
         assert rms(found.fit, ten) < rms(fit, ten)
 
 
-def test_one_rms_is_told(giving_way) -> None:  # type: ignore[no-untyped-def]
+def test_one_rms_is_told(giving_way):  # type: ignore[no-untyped-def]
     fit, seen = giving_way
     found = mc.check(fit, seen(10, 2, 4e-3), "rms 1")
     (verdict,) = found.verdicts
@@ -243,16 +240,14 @@ CUTS = [("irb120", 7, "2"), ("ur10", 8, "2"), ("irb2600", 12, "3"), ("irb120", 2
 
 
 @pytest.mark.parametrize(("arm", "seed", "way"), CUTS)
-def test_halves_of_a_session_whose_model_lacks_something_do_not_differ(
-    arm: str, seed: int, way: str
-) -> None:
+def test_halves_of_a_session_whose_model_lacks_something_do_not_differ(arm, seed, way):
     found = one_session.run(Job(arm, seed, way, commands=("compare", "check")))
     assert found.compared == ()
     assert found.checked == ()
 
 
 @pytest.mark.parametrize(("arm", "seed", "way"), [("irb2600", 0, "1"), ("irb120", 4, "time")])
-def test_a_joint_that_moved_between_halves_is_named_alone(arm: str, seed: int, way: str) -> None:
+def test_a_joint_that_moved_between_halves_is_named_alone(arm, seed, way):
     job = Job(arm, seed, way, one_session.DRAWN, commands=("compare", "check"))
     found = one_session.run(job)
     assert found.joint
@@ -261,7 +256,7 @@ def test_a_joint_that_moved_between_halves_is_named_alone(arm: str, seed: int, w
 
 
 @pytest.mark.parametrize(("name", "way"), [("qkm_hl6", "q5"), ("irb120", "q2"), ("ur10_b", "q3")])
-def test_halves_of_a_real_session_do_not_differ(name: str, way: str) -> None:
+def test_halves_of_a_real_session_do_not_differ(name, way):
     robot, path = shared(name)
     data = mc.read_measurements(path)
     data = data.take(np.linspace(0, data.poses - 1, min(data.poses, 300)).astype(int))
@@ -271,7 +266,7 @@ def test_halves_of_a_real_session_do_not_differ(name: str, way: str) -> None:
     assert mc.check(a, data.take(~first), "rms 1").moved == ()
 
 
-def test_ten_poses_of_a_session_name_nothing_in_it() -> None:
+def test_ten_poses_of_a_session_name_nothing_in_it():
     """A real arm with reflectors on its foot: what its model lacks is no movement."""
     robot, path = shared("irb120")
     data = mc.read_measurements(path)
@@ -287,7 +282,7 @@ def test_ten_poses_of_a_session_name_nothing_in_it() -> None:
         assert knocked.refitted.rms_mm < knocked.accuracy.rms_mm
 
 
-def test_few_poses_suffice(fit: mc.Fit, made: Simulation) -> None:
+def test_few_poses_suffice(fit, made):
     data = poses(made, 12)
     found = mc.check(fit, data, "rms 0.2")
     assert found.enough is not None
@@ -298,9 +293,7 @@ def test_few_poses_suffice(fit: mc.Fit, made: Simulation) -> None:
     assert few.asked > 3 or few.enough == 3
 
 
-def test_the_command_says_what_the_function_says(
-    fit: mc.Fit, made: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_says_what_the_function_says(fit, made, tmp_path, capsys):
     fit.save(tmp_path / "fit.json")
     mc.write_measurements(tmp_path / "new.csv", poses(made, 10, 3, SHIFT))
     words = ["check", tmp_path / "fit.json", tmp_path / "new.csv", "--tolerance"]
@@ -328,14 +321,7 @@ def test_the_command_says_what_the_function_says(
         ([], "Missing option"),
     ],
 )
-def test_a_wrong_option_is_one_line(
-    fit: mc.Fit,
-    made: Simulation,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    options: list[str],
-    said: str,
-) -> None:
+def test_a_wrong_option_is_one_line(fit, made, tmp_path, capsys, options, said):
     fit.save(tmp_path / "fit.json")
     mc.write_measurements(tmp_path / "new.csv", poses(made, 10))
     assert run("check", tmp_path / "fit.json", tmp_path / "new.csv", *options) == 2
@@ -344,7 +330,7 @@ def test_a_wrong_option_is_one_line(
     assert len(err.splitlines()) == 1
 
 
-def test_data_that_say_nothing_are_one_line(fit: mc.Fit, made: Simulation) -> None:
+def test_data_that_say_nothing_are_one_line(fit, made):
     data = poses(made, 2)
     with pytest.raises(mc.DataError, match="measure more"):
         mc.check(fit, data.take(np.arange(1)), "rms 0.2")
@@ -364,7 +350,7 @@ def repaired(made: Simulation) -> mc.Fit:
     return mc.calibrate("irb2600", poses(made, 40, 4, 3e-4, seed=21), "sum")
 
 
-def test_a_repair_is_named(fit: mc.Fit, repaired: mc.Fit) -> None:
+def test_a_repair_is_named(fit, repaired):
     found = mc.compare(fit, repaired)
     (changed,) = found.changed
     assert changed.parameter == "theta4"
@@ -380,7 +366,7 @@ def test_a_repair_is_named(fit: mc.Fit, repaired: mc.Fit) -> None:
     assert b_on_b.rms_mm < a_on_b.rms_mm
 
 
-def test_which_parameters_were_kept_does_not_matter(made: Simulation, fit: mc.Fit) -> None:
+def test_which_parameters_were_kept_does_not_matter(made, fit):
     """d1 in place of the base's z: nothing moved, and nothing is told to have."""
     data = poses(made, 40, seed=33)
     usual, odd = (mc.calibrate("irb2600", data, "sum", free=free) for free in ("", "d6,theta6"))
@@ -392,9 +378,7 @@ def test_which_parameters_were_kept_does_not_matter(made: Simulation, fit: mc.Fi
     assert mc.compare(usual, odd).notices
 
 
-def test_compare_command(
-    fit: mc.Fit, repaired: mc.Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_compare_command(fit, repaired, tmp_path, capsys):
     fit.save(tmp_path / "a.json")
     repaired.save(tmp_path / "b.json")
     assert run("compare", tmp_path / "a.json", tmp_path / "b.json", "--json") == 0
@@ -411,7 +395,7 @@ def test_compare_command(
         mc.compare(fit, ur10)
 
 
-def test_the_pick_explains_most_and_zero_positions_go_first() -> None:
+def test_the_pick_explains_most_and_zero_positions_go_first():
     every, none = np.ones(3, dtype=bool), np.zeros(3, dtype=bool)
     first = np.array([True, False, False])
     square = np.array([30.0, 38.0, 20.0])
@@ -424,6 +408,6 @@ def test_the_pick_explains_most_and_zero_positions_go_first() -> None:
     assert rivals == (0, [1])
 
 
-def test_laws_of_the_session_end_with_it() -> None:
+def test_laws_of_the_session_end_with_it():
     ended = {name for name, effect in EFFECTS.items() if effect.of_session}
     assert ended == {"frame_drift", "session_jump", "target_shift", "target_reseat"}

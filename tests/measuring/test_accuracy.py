@@ -16,7 +16,7 @@ ERROR = 1e-3 * np.array(
 )
 
 
-def test_all_points_and_each_target() -> None:
+def test_all_points_and_each_target():
     found = accuracy(ERROR)
     assert found.rms_mm == pytest.approx(math.sqrt(34.0 / 5.0), rel=1e-14)
     assert (found.max_mm, found.mean_mm) == pytest.approx((5.0, 2.0), rel=1e-14)
@@ -31,7 +31,7 @@ def test_all_points_and_each_target() -> None:
     assert every == ("all", 5, found.rms_mm, found.mean_mm, found.max_mm, pytest.approx(34.0))
 
 
-def test_no_point_is_no_number() -> None:
+def test_no_point_is_no_number():
     found = accuracy(np.full((2, 0, 3), np.nan))
     assert (found.poses, found.counts, found.worst) == (0, (0, 0), (-1, -1))
     assert all(map(math.isnan, (found.rms_mm, found.max_mm, *found.by_target())))

@@ -7,7 +7,7 @@ import pytest
 from conftest import shared
 
 import minimax_cal as mc
-from minimax_cal.modelling.simulate import Simulation, simulate
+from minimax_cal.modelling.simulate import simulate
 
 
 def refused(robot: mc.Robot, data: mc.Measurements) -> str:
@@ -17,12 +17,12 @@ def refused(robot: mc.Robot, data: mc.Measurements) -> str:
     return str(caught.value)
 
 
-def test_degrees_in_a_radian_column(robot: mc.Robot, noisy: Simulation) -> None:
+def test_degrees_in_a_radian_column(robot, noisy):
     message = refused(robot, replace(noisy.data, q=np.degrees(noisy.data.q)))
     assert "q1_deg" in message
 
 
-def test_small_degrees_in_a_radian_column(robot: mc.Robot) -> None:
+def test_small_degrees_in_a_radian_column(robot):
     """Angles below two turns of radians even in degrees: found because nothing else fits."""
     made = simulate(robot, 60, 3, seed=1)
     q = np.random.default_rng(0).uniform(-0.2, 0.2, (60, 6))
@@ -30,34 +30,32 @@ def test_small_degrees_in_a_radian_column(robot: mc.Robot) -> None:
     assert "look like degrees" in refused(robot, data)
 
 
-def test_radians_in_a_degree_column(robot: mc.Robot, noisy: Simulation) -> None:
+def test_radians_in_a_degree_column(robot, noisy):
     assert "look like radians" in refused(robot, replace(noisy.data, q=np.radians(noisy.data.q)))
 
 
 @pytest.mark.parametrize(("factor", "say"), [(1e3, "smr1_x_mm"), (1e-3, "smr1_x_m")])
-def test_wrong_length_unit(factor: float, say: str, robot: mc.Robot, noisy: Simulation) -> None:
+def test_wrong_length_unit(factor, say, robot, noisy):
     assert say in refused(robot, noisy.data.with_y(noisy.data.y * factor))
 
 
-def test_mirrored_frame(robot: mc.Robot, noisy: Simulation) -> None:
+def test_mirrored_frame(robot, noisy):
     assert "left-handed" in refused(robot, noisy.data.with_y(noisy.data.y * [1, -1, 1]))
 
 
-def test_reversed_joint(robot: mc.Robot, noisy: Simulation) -> None:
+def test_reversed_joint(robot, noisy):
     q = noisy.data.q * [1, 1, -1, 1, 1, 1]
     assert "sign of joint 3 looks reversed" in refused(robot, replace(noisy.data, q=q))
 
 
-def test_coupled_joints(robot: mc.Robot, noisy: Simulation) -> None:
+def test_coupled_joints(robot, noisy):
     q = noisy.data.q.copy()
     q[:, 2] -= q[:, 1]
     assert "look coupled" in refused(robot, replace(noisy.data, q=q))
 
 
 @pytest.mark.parametrize("order", [(1, 0, 2), (1, 2, 0)])
-def test_targets_swapped_in_some_rows(
-    order: tuple[int, ...], robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_targets_swapped_in_some_rows(order, robot, noisy):
     """Every swapped row is named, held out or not."""
     y = noisy.data.y.copy()
     rows = [3, 17, 40]
@@ -69,7 +67,7 @@ def test_targets_swapped_in_some_rows(
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2, 0.33])
-def test_a_third_of_the_rows_swapped_on_a_real_equilateral_triangle(share: float) -> None:
+def test_a_third_of_the_rows_swapped_on_a_real_equilateral_triangle(share):
     robot, path = shared("irb120")
     data = mc.read_measurements(path)
     rng = np.random.default_rng(int(100 * share))
@@ -80,7 +78,7 @@ def test_a_third_of_the_rows_swapped_on_a_real_equilateral_triangle(share: float
     assert f"targets look swapped in {len(rows)} rows" in message
 
 
-def test_a_target_seen_too_rarely_is_left_out(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_target_seen_too_rarely_is_left_out(robot, noisy):
     for count in (1, 2):
         y = noisy.data.y.copy()
         y[count:, 2] = np.nan
@@ -90,13 +88,13 @@ def test_a_target_seen_too_rarely_is_left_out(robot: mc.Robot, noisy: Simulation
         assert fit.json()
 
 
-def test_one_target_in_another_unit(robot: mc.Robot, noisy: Simulation) -> None:
+def test_one_target_in_another_unit(robot, noisy):
     message = refused(robot, noisy.data.with_y(noisy.data.y * np.array([1, 1e3, 1])[:, None]))
     assert "smr2" in message
     assert "wrong unit" in message
 
 
-def test_targets_that_are_one_are_refused(robot: mc.Robot, noisy: Simulation) -> None:
+def test_targets_that_are_one_are_refused(robot, noisy):
     """A column that was copied: also where some of its points are missing."""
     y = noisy.data.y.copy()
     y[:, 2], y[4, 2], y[9, 0] = y[:, 0], np.nan, np.nan
@@ -107,12 +105,12 @@ def test_targets_that_are_one_are_refused(robot: mc.Robot, noisy: Simulation) ->
 
 
 @pytest.mark.parametrize("factor", [1e-12, 1e-2])
-def test_points_of_no_arm_are_refused(factor: float, robot: mc.Robot, noisy: Simulation) -> None:
+def test_points_of_no_arm_are_refused(factor, robot, noisy):
     message = refused(robot, noisy.data.with_y(noisy.data.y * factor))
     assert "but the flange of" in message
 
 
-def test_an_outlier_is_named_wherever_it_is(robot: mc.Robot, noisy: Simulation) -> None:
+def test_an_outlier_is_named_wherever_it_is(robot, noisy):
     y = noisy.data.y.copy()
     y[30, 1] += [0.0, 0.05, 0.0]
     for seed in range(3):
@@ -124,43 +122,43 @@ def test_an_outlier_is_named_wherever_it_is(robot: mc.Robot, noisy: Simulation) 
     assert not any("outliers" in note for note in mc.calibrate(robot, noisy.data).notices)
 
 
-def test_another_robot_is_doubted(noisy: Simulation) -> None:
+def test_another_robot_is_doubted(noisy):
     fit = mc.calibrate("irb120", noisy.data)
     text = " ".join(fit.notices)
     assert "nominal robot misses" in text
     assert "implausibly large changes" in text
 
 
-def test_one_pose_repeated(robot: mc.Robot, noisy: Simulation) -> None:
+def test_one_pose_repeated(robot, noisy):
     data = noisy.data.take(np.zeros(30, dtype=int))
     assert "all 30 rows have the same joint values" in refused(robot, data)
 
 
-def test_one_label_for_all_poses(robot: mc.Robot, noisy: Simulation) -> None:
+def test_one_label_for_all_poses(robot, noisy):
     data = replace(noisy.data, columns={"pose": np.full(noisy.data.poses, "p")})
     first = noisy.data.line[0]
     assert f"pose 'p' is also that of line {first}, where joint" in refused(robot, data)
 
 
-def test_two_poses(robot: mc.Robot, noisy: Simulation) -> None:
+def test_two_poses(robot, noisy):
     message = refused(robot, noisy.data.take(np.array([0, 1])))
     assert "2 different poses" in message
     assert "at least" in message
 
 
-def test_wrong_number_of_joints(robot: mc.Robot, noisy: Simulation) -> None:
+def test_wrong_number_of_joints(robot, noisy):
     five = replace(noisy.data, q=noisy.data.q[:, :5], sliding=noisy.data.sliding[:5])
     assert "5 joint columns" in refused(robot, five)
 
 
-def test_slide_given_as_an_angle() -> None:
+def test_slide_given_as_an_angle():
     robot = mc.load_robot("scara_600")
     data = simulate(robot, 40, 3, seed=1).data
     message = refused(robot, replace(data, sliding=np.zeros(4, dtype=bool)))
     assert "q3_mm" in message
 
 
-def test_honest_data_pass_the_gates(robot: mc.Robot) -> None:
+def test_honest_data_pass_the_gates(robot):
     """Large geometric errors and noise are not mistaken for slips."""
     from minimax_cal.modelling.simulate import Truth
 
@@ -170,13 +168,13 @@ def test_honest_data_pass_the_gates(robot: mc.Robot) -> None:
         assert mc.calibrate(robot, data, objective).status == "converged"
 
 
-def test_joints_outside_their_limits_are_a_notice(robot: mc.Robot, noisy: Simulation) -> None:
+def test_joints_outside_their_limits_are_a_notice(robot, noisy):
     narrow = replace(robot, upper=np.where(np.arange(6) == 1, 0.5, robot.upper))
     fit = mc.calibrate(narrow, noisy.data)
     assert any("joint 2 is outside the limits" in note for note in fit.notices)
 
 
-def test_an_arm_without_lengths(robot: mc.Robot, noisy: Simulation) -> None:
+def test_an_arm_without_lengths(robot, noisy):
     flat = robot.with_mdh(robot.mdh * [0, 0, 1, 1, 1])
     assert "has no lengths: every a and d of its joints is 0" in refused(flat, noisy.data)
     short = robot.with_mdh(robot.mdh * [1e-6, 1e-6, 1, 1, 1])

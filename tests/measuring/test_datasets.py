@@ -59,9 +59,7 @@ def sha_of(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_from_a_folder(
-    published: Path, truth: mc.Measurements, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_from_a_folder(published, truth, monkeypatch):
     robot, data = datasets.fetch_ur10("B", published)
     assert robot.joints == 6
     assert_allclose(data.q, truth.q, atol=1e-8)
@@ -78,9 +76,7 @@ def test_from_a_folder(
     assert_allclose(again.y, data.y, rtol=0, atol=0)
 
 
-def test_a_folder_without_the_file(
-    published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_without_the_file(published, tmp_path, monkeypatch):
     with pytest.raises(
         mc.DataError, match=r"measurements_random_poses.csv: is not there; download"
     ):
@@ -92,16 +88,14 @@ def test_a_folder_without_the_file(
         datasets.fetch_ur10("E")
 
 
-def test_an_unknown_hash_is_not_downloaded(published: Path) -> None:
+def test_an_unknown_hash_is_not_downloaded(published):
     for series, source in datasets.UR10.items():
         if not source.sha256:
             with pytest.raises(mc.DataError, match=r"not known.*unverified=True"):
                 datasets.fetch_ur10(series)
 
 
-def test_download_with_a_known_hash_is_cached(
-    published: Path, server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_download_with_a_known_hash_is_cached(published, server, tmp_path, monkeypatch):
     source = source_at(server, sha_of(published / NAME))
     path = datasets.fetch(source)
     assert path.is_relative_to(tmp_path / "cache")
@@ -110,9 +104,7 @@ def test_download_with_a_known_hash_is_cached(
     assert datasets.fetch(source) == path  # from the cache
 
 
-def test_download_with_another_hash_is_refused(
-    published: Path, server: str, tmp_path: Path
-) -> None:
+def test_download_with_another_hash_is_refused(published, server, tmp_path):
     source = source_at(server, "0" * 64)
     with pytest.raises(mc.DataError, match="is not the file that was published"):
         datasets.fetch(source)
@@ -121,9 +113,7 @@ def test_download_with_another_hash_is_refused(
         datasets.fetch(source, published)
 
 
-def test_download_unverified_and_not_there(
-    published: Path, server: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_download_unverified_and_not_there(published, server, monkeypatch):
     monkeypatch.setitem(datasets.UR10, "B", source_at(server, datasets.UNKNOWN))
     _, data = datasets.fetch_ur10("B", unverified=True)
     assert "not verified" in data.notices[0]

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import escape
 
 import numpy as np
 import pytest
@@ -142,36 +143,47 @@ def chinese(d: mc.Measurements) -> Export:
                   {"units": "smr=mm"})  # fmt: skip
 
 
-def workbook(rows: list[list[object]]) -> bytes:
-    """A workbook of one sheet, in as little XML as a reader takes.  Skips without a reader."""
+def workbook(rows: list[list[object]] | dict[str, list[list[object]]]) -> bytes:
+    """A workbook of one sheet or several, in as little XML as a reader takes.
+
+    Skips without a reader.
+    """
     pytest.importorskip("python_calamine", reason="python-calamine is not installed")
+    sheets = rows if isinstance(rows, dict) else {"Tabelle1": rows}
 
     def cell(value: object) -> str:
         if isinstance(value, str):
-            return f'<c t="inlineStr"><is><t>{value}</t></is></c>'
-        return f"<c><v>{value!r}</v></c>"
+            return f'<c t="inlineStr"><is><t>{escape(value)}</t></is></c>'
+        return "<c/>" if value is None else f"<c><v>{value!r}</v></c>"
 
-    sheet = "".join(f"<row>{''.join(map(cell, row))}</row>" for row in rows)
+    numbers = range(1, len(sheets) + 1)
     main = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
     office = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
     package = "http://schemas.openxmlformats.org/package/2006"
     kind = "application/vnd.openxmlformats-officedocument.spreadsheetml"
+    named = "".join(f'<sheet name="{name}" sheetId="{i}" r:id="r{i}"/>'
+                    for i, name in zip(numbers, sheets, strict=True))  # fmt: skip
+    types = "".join(f'<Override PartName="/xl/worksheets/sheet{i}.xml" ContentType='
+                    f'"{kind}.worksheet+xml"/>' for i in numbers)  # fmt: skip
+    related = "".join(f'<Relationship Id="r{i}" Type="{office}/worksheet" Target='
+                      f'"worksheets/sheet{i}.xml"/>' for i in numbers)  # fmt: skip
     parts = {
         "[Content_Types].xml": f'<Types xmlns="{package}/content-types"><Default Extension="xml" '
         'ContentType="application/xml"/><Default Extension="rels" ContentType='
         '"application/vnd.openxmlformats-package.relationships+xml"/><Override PartName='
-        f'"/xl/workbook.xml" ContentType="{kind}.sheet.main+xml"/><Override PartName='
-        f'"/xl/worksheets/sheet1.xml" ContentType="{kind}.worksheet+xml"/></Types>',
+        f'"/xl/workbook.xml" ContentType="{kind}.sheet.main+xml"/>{types}</Types>',
         "_rels/.rels": f'<Relationships xmlns="{package}/relationships"><Relationship Id="r1" '
         f'Type="{office}/officeDocument" Target="xl/workbook.xml"/></Relationships>',
-        "xl/workbook.xml": f'<workbook xmlns="{main}" xmlns:r="{office}"><sheets>'
-        '<sheet name="Tabelle1" sheetId="1" r:id="r1"/></sheets></workbook>',
-        "xl/_rels/workbook.xml.rels": f'<Relationships xmlns="{package}/relationships">'
-        f'<Relationship Id="r1" Type="{office}/worksheet" Target="worksheets/sheet1.xml"/>'
+        "xl/workbook.xml": f'<workbook xmlns="{main}" xmlns:r="{office}"><sheets>{named}</sheets>'
+        "</workbook>",
+        "xl/_rels/workbook.xml.rels": f'<Relationships xmlns="{package}/relationships">{related}'
         "</Relationships>",
-        "xl/worksheets/sheet1.xml": f'<worksheet xmlns="{main}"><sheetData>{sheet}</sheetData>'
-        "</worksheet>",
     }
+    for i, sheet in zip(numbers, sheets.values(), strict=True):
+        data = "".join(f"<row>{''.join(map(cell, row))}</row>" for row in sheet)
+        parts[f"xl/worksheets/sheet{i}.xml"] = (
+            f'<worksheet xmlns="{main}"><sheetData>{data}</sheetData></worksheet>'
+        )
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as file:
         for name, text in parts.items():
@@ -228,9 +240,7 @@ def read(export: Export, folder: Path) -> Imported:
 
 
 @pytest.mark.parametrize("name", EXPORTS)
-def test_an_export_is_read_with_nothing_lost(
-    name: str, truth: mc.Measurements, tmp_path: Path
-) -> None:
+def test_an_export_is_read_with_nothing_lost(name, truth, tmp_path):
     export = EXPORTS[name](truth)
     found = read(export, tmp_path)
     assert_allclose(found.data.q, truth.q, rtol=0, atol=2e-8)
@@ -247,7 +257,7 @@ def test_an_export_is_read_with_nothing_lost(
     assert "smr3 z" in shown
 
 
-def test_what_was_read_calibrates(truth: mc.Measurements, tmp_path: Path, capsys: Any) -> None:
+def test_what_was_read_calibrates(truth, tmp_path, capsys):
     export = german(truth)
     read(export, tmp_path)
     out = tmp_path / "out.csv"
@@ -259,7 +269,7 @@ def test_what_was_read_calibrates(truth: mc.Measurements, tmp_path: Path, capsys
     assert run("calibrate", "irb2600", out, "--quiet") == 0
 
 
-def test_two_points_of_one_name_are_reported(truth: mc.Measurements, tmp_path: Path) -> None:
+def test_two_points_of_one_name_are_reported(truth, tmp_path):
     export = german(truth)
     text = export.files["bericht.csv"]
     assert isinstance(text, bytes)
@@ -268,9 +278,7 @@ def test_two_points_of_one_name_are_reported(truth: mc.Measurements, tmp_path: P
         read(export, tmp_path)
 
 
-def test_names_that_have_nothing_in_common_go_by_order(
-    truth: mc.Measurements, tmp_path: Path
-) -> None:
+def test_names_that_have_nothing_in_common_go_by_order(truth, tmp_path):
     points = "name,x_mm,y_mm,z_mm\n" + "".join(
         f"nest-{chr(97 + j % 26)}{chr(97 + j // 26)},{','.join(f'{1e3 * v:.6f}' for v in y[0])}\n"
         for j, y in enumerate(truth.y)
@@ -294,15 +302,13 @@ def test_names_that_have_nothing_in_common_go_by_order(
         (["P1_2_1"], ["P1_2", "P1"], (0,), ("1",)),
     ],
 )
-def test_patterns_of_names(
-    points: list[str], poses: list[str], pose: tuple[int, ...], label: tuple[str, ...]
-) -> None:
+def test_patterns_of_names(points, poses, pose, label):
     match = match_names(points, poses)
     assert match is not None
     assert (match.pose, match.label) == (pose, label)
 
 
-def test_a_pose_keeps_its_name(truth: mc.Measurements, tmp_path: Path, capsys: Any) -> None:
+def test_a_pose_keeps_its_name(truth, tmp_path, capsys):
     """What the file of joints calls a pose, whatever the tracker calls its points."""
     points = ["name,X [mm],Y [mm],Z [mm]"]
     points += [f"P{i + 1:03d}_{k + 1},{','.join(f'{1e3 * v:.6f}' for v in truth.y[i, k])}"
@@ -320,7 +326,7 @@ def test_a_pose_keeps_its_name(truth: mc.Measurements, tmp_path: Path, capsys: A
     assert again.notices == ()
 
 
-def test_a_workbook_is_measurements(truth: mc.Measurements, tmp_path: Path) -> None:
+def test_a_workbook_is_measurements(truth, tmp_path):
     head: list[object] = [*(f"q{i + 1}_rad" for i in range(6)), "smr1_x_mm", "smr1_y_mm"]
     rows: list[list[object]] = [[*head, "smr1_z_mm", "session"]]
     rows += [[*q.tolist(), *(1e3 * y[0]).tolist(), "may"]
@@ -332,7 +338,7 @@ def test_a_workbook_is_measurements(truth: mc.Measurements, tmp_path: Path) -> N
     assert set(data.columns["session"]) == {"may"}
 
 
-def test_a_workbook_is_a_robot(tmp_path: Path) -> None:
+def test_a_workbook_is_a_robot(tmp_path):
     rows = [["Robot", "KR 10"], ["Konvention", "modifiziert"],
             ["Gelenk", "a [mm]", "alpha [°]", "d [mm]", "theta [°]"],
             [1, 0, 0, 660.5, 0], [2, 0, -90, 0, 90], [3, 432, 0, 149, 0]]  # fmt: skip
@@ -350,7 +356,7 @@ def test_a_workbook_is_a_robot(tmp_path: Path) -> None:
         ("xl/sharedStrings.xml", "", '<sst count="99999999999" uniqueCount="99999999999"></sst>'),
     ],
 )
-def test_a_workbook_that_asks_for_any_memory(part: str, old: str, new: str, tmp_path: Path) -> None:
+def test_a_workbook_that_asks_for_any_memory(part, old, new, tmp_path):
     path, packed = tmp_path / "bomb.xlsx", io.BytesIO(workbook([[1, 2, 3], [4, 5, 6]]))
     with zipfile.ZipFile(packed) as source, zipfile.ZipFile(path, "w") as bomb:
         for name in source.namelist():

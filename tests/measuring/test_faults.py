@@ -51,21 +51,21 @@ def pushes(sim: Simulation, data: Measurements) -> Array:
     return np.moveaxis(np.stack([(a - b) / 2e-6 for a, b in sides], axis=-1), 1, 0)
 
 
-def test_ranks_are_those_of_scipy_to_the_bit(rng: np.random.Generator) -> None:
+def test_ranks_are_those_of_scipy_to_the_bit(rng):
     for value in (rng.normal(size=80), rng.normal(size=81).round(1), np.ones(9)):
         score = scipy.stats.norm.ppf((scipy.stats.rankdata(value) - 0.5) / len(value))
         wanted = (score - score.mean()) / max(float(score.std()), 1e-12)
         assert_array_equal(ranked(value), wanted)
 
 
-def test_good_data_are_left_alone(robot: mc.Robot) -> None:
+def test_good_data_are_left_alone(robot):
     for seed in range(40):
         data = simulate(robot, 100 + 2 * seed, 3, seed=seed, truth=TRUTH).data
         assert find_faults(data) == ()
         assert_array_equal(mended(data, ()).y, data.y)
 
 
-def test_a_point_moved_within_the_plane_of_the_targets_is_found(robot: mc.Robot) -> None:
+def test_a_point_moved_within_the_plane_of_the_targets_is_found(robot):
     rng, hits, named = np.random.default_rng(3), 0, 0
     for seed in range(40):
         data = simulate(robot, 120, 3, seed=seed, truth=TRUTH).data
@@ -80,7 +80,7 @@ def test_a_point_moved_within_the_plane_of_the_targets_is_found(robot: mc.Robot)
     assert named >= 15  # across an edge one distance changes, and two are suspected
 
 
-def test_a_fit_shows_points_moved_across_the_plane(robot: mc.Robot) -> None:
+def test_a_fit_shows_points_moved_across_the_plane(robot):
     for seed in range(5):
         data = simulate(robot, 120, 3, seed=seed, truth=RIGID).data
         across = flange(data)[2]
@@ -90,7 +90,7 @@ def test_a_fit_shows_points_moved_across_the_plane(robot: mc.Robot) -> None:
         assert points(find_faults(bad, error)) == {(17, 1)}
 
 
-def test_two_bad_points_in_a_row_and_a_gross_one(robot: mc.Robot) -> None:
+def test_two_bad_points_in_a_row_and_a_gross_one(robot):
     data = simulate(robot, 120, 4, seed=2, truth=RIGID).data
     bad = displaced(data, 5, 0, np.array([2e-3, 1e-3, -1e-3]))
     bad = displaced(bad, 5, 3, np.array([-1e-3, 2e-3, 1e-3]))
@@ -103,7 +103,7 @@ def test_two_bad_points_in_a_row_and_a_gross_one(robot: mc.Robot) -> None:
     assert_array_equal(y[np.isfinite(y)], data.y[np.isfinite(y)])
 
 
-def test_missing_points_are_no_outliers(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_missing_points_are_no_outliers(robot, rng):
     data = simulate(robot, 150, 3, seed=4, truth=TRUTH).data
     y = data.y.copy()
     y[rng.uniform(size=(150, 3)) < 0.2] = np.nan
@@ -116,14 +116,14 @@ def test_missing_points_are_no_outliers(robot: mc.Robot, rng: np.random.Generato
 
 
 @pytest.mark.parametrize("targets", [1, 2])
-def test_few_targets_need_the_fit(robot: mc.Robot, targets: int) -> None:
+def test_few_targets_need_the_fit(robot, targets):
     data = simulate(robot, 80, targets, seed=1, truth=TRUTH).data
     bad = displaced(data, 11, targets - 1, np.array([0.0, 0.03, 0.02]))
     error = mc.calibrate(robot, bad, "sum", holdout=0.0).cell.error(bad)
     assert points(find_faults(bad, error)) == {(11, targets - 1)}
 
 
-def test_swapped_rows_are_found_and_put_right(robot: mc.Robot) -> None:
+def test_swapped_rows_are_found_and_put_right(robot):
     data = simulate(robot, 100, 3, seed=8, truth=TRUTH).data
     y = data.y.copy()
     y[[3, 50]] = y[[3, 50]][:, [1, 0, 2]]
@@ -135,7 +135,7 @@ def test_swapped_rows_are_found_and_put_right(robot: mc.Robot) -> None:
     assert_array_equal(mended(bad, found).y, data.y)
 
 
-def test_a_fit_names_the_targets_of_an_even_triangle(robot: mc.Robot) -> None:
+def test_a_fit_names_the_targets_of_an_even_triangle(robot):
     sim = simulate(robot, 100, 3, seed=8, truth=RIGID)
     angle = 2.0 * np.pi * np.arange(3) / 3
     spots = np.stack([np.cos(angle), np.sin(angle) * 1.4, 3.0 + 0.0 * angle], axis=1) * 0.1
@@ -151,7 +151,7 @@ def test_a_fit_names_the_targets_of_an_even_triangle(robot: mc.Robot) -> None:
     assert_array_equal(faults.swapped_rows(good.with_y(y))[0].rows, [40])
 
 
-def test_a_nest_that_moved_is_found_with_its_time_and_size(robot: mc.Robot) -> None:
+def test_a_nest_that_moved_is_found_with_its_time_and_size(robot):
     rng, sure = np.random.default_rng(5), 0
     for seed in range(15):
         data = simulate(robot, 120, 3, seed=seed, truth=TRUTH).data
@@ -175,7 +175,7 @@ def test_a_nest_that_moved_is_found_with_its_time_and_size(robot: mc.Robot) -> N
     assert sure >= 8
 
 
-def test_a_nest_that_moved_hides_no_outlier(robot: mc.Robot) -> None:
+def test_a_nest_that_moved_hides_no_outlier(robot):
     data = simulate(robot, 120, 3, seed=3, truth=TRUTH).data
     e1, e2, _ = flange(data)
     bad = displaced(data, slice(50, None), 1, 0.5e-3 * e2[50:])
@@ -185,14 +185,14 @@ def test_a_nest_that_moved_hides_no_outlier(robot: mc.Robot) -> None:
     assert {row for row, _ in points(found)} == {80}
 
 
-def test_a_steady_drift_is_no_shift(robot: mc.Robot) -> None:
+def test_a_steady_drift_is_no_shift(robot):
     data = simulate(robot, 150, 3, seed=3, truth=TRUTH).data
     grown = flange(data)[0] * np.linspace(0.0, 0.2e-3, 150)[:, None]
     assert of(find_faults(displaced(data, slice(None), 1, grown)), "target_shift") == []
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_real_arms_raise_no_false_alarm(name: str) -> None:
+def test_real_arms_raise_no_false_alarm(name):
     robot, path = shared(name)
     data = mc.read_measurements(path)
     error = mc.calibrate(robot, data, "sum", holdout=0.0).cell.error(data)
@@ -200,7 +200,7 @@ def test_real_arms_raise_no_false_alarm(name: str) -> None:
         assert [f.effect for f in found] == (["readback"] if name == "irb120" else [])
 
 
-def test_irb120_with_points_spoilt_on_purpose() -> None:
+def test_irb120_with_points_spoilt_on_purpose():
     data = mc.read_measurements(shared("irb120")[1])
     e1, _, _ = flange(data)
     bad = displaced(data, 100, 1, 0.15e-3 * e1[100])
@@ -212,7 +212,7 @@ def test_irb120_with_points_spoilt_on_purpose() -> None:
     assert abs(int(shift.rows[0]) - 300) <= 3
 
 
-def test_irb120_read_its_joints_back_too_early() -> None:
+def test_irb120_read_its_joints_back_too_early():
     data = mc.read_measurements(shared("irb120")[1])
     (late,) = faults.unsettled(data)
     amounts = {amount.name: amount.value for amount in late.parameters}
@@ -226,7 +226,7 @@ def test_irb120_read_its_joints_back_too_early() -> None:
 
 
 @pytest.mark.parametrize("which", ["commanded", "read back"])
-def test_irb120_tells_commanded_from_read_joints_by_its_errors(which: str) -> None:
+def test_irb120_tells_commanded_from_read_joints_by_its_errors(which):
     path, file = shared("irb120")
     robot, data = mc.load_robot(path), mc.read_measurements(file)
     if which == "read back":
@@ -236,7 +236,7 @@ def test_irb120_tells_commanded_from_read_joints_by_its_errors(which: str) -> No
     assert bool(found) == (which == "read back")
 
 
-def test_backlash_is_not_taken_for_read_back_joints(robot: mc.Robot) -> None:
+def test_backlash_is_not_taken_for_read_back_joints(robot):
     sim = simulate(robot, 150, 3, seed=1, truth=TRUTH)
     data, push = sim.data, pushes(sim, sim.data)
     slack = np.einsum("kmcj,mj->mkc", push, 150e-6 * np.sign(moves(data)))
@@ -248,7 +248,7 @@ def test_backlash_is_not_taken_for_read_back_joints(robot: mc.Robot) -> None:
         assert len(faults.looks_read_back(bad, error, push)) == expected
 
 
-def test_read_joints_that_agree_are_nothing(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_read_joints_that_agree_are_nothing(robot, rng):
     data = simulate(robot, 50, 3, seed=1).data
     for size, count in ((1e-6, 0), (1e-3, 1)):
         read = data.q + size * rng.normal(size=data.q.shape)
@@ -263,7 +263,7 @@ def halves(data: Measurements) -> Measurements:
     return replace(data, columns={**data.columns, "session": session})
 
 
-def test_sessions_in_other_units(robot: mc.Robot) -> None:
+def test_sessions_in_other_units(robot):
     data = halves(simulate(robot, 100, 3, seed=1).data)
     assert find_faults(data) == ()
     later = data.columns["session"] == "b"
@@ -274,7 +274,7 @@ def test_sessions_in_other_units(robot: mc.Robot) -> None:
         assert_array_equal(fault.rows, np.flatnonzero(later))
 
 
-def test_a_base_that_jumps_is_found_at_its_rows(robot: mc.Robot) -> None:
+def test_a_base_that_jumps_is_found_at_its_rows(robot):
     """In the visiting order, not that of the rows; two jumps are two."""
     data = simulate(robot, 100, 3, seed=1, truth=TRUTH).data
     rng = np.random.default_rng(0)
@@ -291,7 +291,7 @@ def test_a_base_that_jumps_is_found_at_its_rows(robot: mc.Robot) -> None:
 
 
 @pytest.mark.parametrize("targets", [1, 3])
-def test_noise_other_than_declared(robot: mc.Robot, targets: int) -> None:
+def test_noise_other_than_declared(robot, targets):
     data = simulate(robot, 60, targets, seed=1, truth=TRUTH).data
     twice = data.take(np.repeat(np.arange(60), 2))
     twice = twice.with_y(twice.y + 17.5e-6 * np.random.default_rng(0).normal(size=twice.y.shape))
@@ -315,7 +315,7 @@ def reseated(sim: Simulation, data: Measurements, row: int, target: int, by: Arr
 
 
 @pytest.mark.parametrize("targets", [2, 3])
-def test_a_reseat_shows_in_a_file_that_tells_no_visits(robot: mc.Robot, targets: int) -> None:
+def test_a_reseat_shows_in_a_file_that_tells_no_visits(robot, targets):
     """From the fifth row on at the earliest; which of two it was no distance tells."""
     for seed, row in enumerate((4, 9, 30, 51, 56)):
         sim = simulate(robot, 60, targets, seed=seed, truth=TRUTH)
@@ -329,7 +329,7 @@ def test_a_reseat_shows_in_a_file_that_tells_no_visits(robot: mc.Robot, targets:
             assert_allclose(fault.parameters[0].value, 5e-3, rtol=0.03)
 
 
-def test_a_reseat_between_sessions_whose_rows_are_mixed(robot: mc.Robot) -> None:
+def test_a_reseat_between_sessions_whose_rows_are_mixed(robot):
     sim = simulate(robot, 60, 3, seed=1, truth=TRUTH)
     bad = reseated(sim, untimed(sim.data), 30, 0, np.array([1e-3, 0.0, 0.0]))
     mixed = halves(bad).take(np.random.default_rng(0).permutation(60))
@@ -338,7 +338,7 @@ def test_a_reseat_between_sessions_whose_rows_are_mixed(robot: mc.Robot) -> None
     assert len(set(mixed.columns["session"][fault.rows])) == 1
 
 
-def test_outliers_at_an_end_of_the_file_are_no_reseat(robot: mc.Robot) -> None:
+def test_outliers_at_an_end_of_the_file_are_no_reseat(robot):
     data = untimed(simulate(robot, 60, 3, seed=1, truth=TRUTH).data)
     rng = np.random.default_rng(0)
     for row in (0, 2, 4):
@@ -346,7 +346,7 @@ def test_outliers_at_an_end_of_the_file_are_no_reseat(robot: mc.Robot) -> None:
     assert {fault.effect for fault in find_faults(data)} == {"outliers"}
 
 
-def test_the_longest_part_of_a_reseated_target_stays(robot: mc.Robot) -> None:
+def test_the_longest_part_of_a_reseated_target_stays(robot):
     sim = simulate(robot, 60, 3, seed=1, truth=TRUTH)
     data = reseated(sim, untimed(sim.data), 12, 1, np.array([3e-3, 4e-3, 0.0]))
     data = reseated(sim, data, 48, 1, np.array([-2e-3, 1e-3, 0.0]))
@@ -354,7 +354,7 @@ def test_the_longest_part_of_a_reseated_target_stays(robot: mc.Robot) -> None:
     assert_array_equal(np.argwhere(gone), [[row, 1] for row in (*range(12), *range(48, 60))])
 
 
-def test_distances_tell_the_noise_beside_a_reseat(robot: mc.Robot) -> None:
+def test_distances_tell_the_noise_beside_a_reseat(robot):
     sim = simulate(robot, 400, 3, seed=1, truth=TRUTH)
     data = reseated(sim, untimed(sim.data), 200, 1, np.array([3e-3, 4e-3, 0.0]))
     for some in (sim.data, data):

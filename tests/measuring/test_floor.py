@@ -31,7 +31,7 @@ def visited(
 
 
 @pytest.mark.parametrize("times", [2, 3, 5])
-def test_visits_tell_the_noise_whatever_the_model(rng: np.random.Generator, times: int) -> None:
+def test_visits_tell_the_noise_whatever_the_model(rng, times):
     data, error = visited(rng, times)
     found = floor_of(data, error, np.nan, 10.0)
     assert found.source == REPEATS
@@ -40,7 +40,7 @@ def test_visits_tell_the_noise_whatever_the_model(rng: np.random.Generator, time
     assert found.low < 1e3 * np.sqrt(3.0) * SIGMA < found.high
 
 
-def test_a_few_wrong_visits_do_not_set_the_floor(rng: np.random.Generator) -> None:
+def test_a_few_wrong_visits_do_not_set_the_floor(rng):
     data, error = visited(rng, 2)
     error[:, :20] += 2e-3 * rng.normal(size=(3, 20, 3))
     found = floor_of(data, error, np.nan, 10.0)
@@ -48,7 +48,7 @@ def test_a_few_wrong_visits_do_not_set_the_floor(rng: np.random.Generator) -> No
     assert_allclose(found.value, 1e3 * np.sqrt(3.0) * SIGMA, rtol=0.12)
 
 
-def test_without_visits_or_promises_the_fit_tells_at_most(rng: np.random.Generator) -> None:
+def test_without_visits_or_promises_the_fit_tells_at_most(rng):
     q = rng.uniform(-2.0, 2.0, (30, 6))
     data = mc.measurements(q, rng.normal(size=(30, 1, 3)))
     error = SIGMA * rng.normal(size=(1, 30, 3))
@@ -62,18 +62,18 @@ def test_without_visits_or_promises_the_fit_tells_at_most(rng: np.random.Generat
     assert told.low < told.value
 
 
-def test_no_floor_is_above_what_a_model_leaves() -> None:
+def test_no_floor_is_above_what_a_model_leaves():
     assert Floor(1.79, 0.0, 1.79, AT_MOST).beneath(0.273) == Floor(0.273, 0.0, 0.273, AT_MOST)
     assert Floor(0.1, 0.05, 0.4, REPEATS).beneath(0.3) == Floor(0.1, 0.05, 0.3, REPEATS)
 
 
-def test_repeatability_is_mean_and_three_deviations(rng: np.random.Generator) -> None:
+def test_repeatability_is_mean_and_three_deviations(rng):
     distance = np.linalg.norm(rng.normal(size=(400_000, 3)), axis=1)
     promise = distance.mean() + 3.0 * distance.std()
     assert_allclose(np.sqrt((distance**2).mean()) / promise, RMS_OF_REPEATABILITY, rtol=3e-3)
 
 
-def test_a_floor_is_drawn_between_its_ends(rng: np.random.Generator) -> None:
+def test_a_floor_is_drawn_between_its_ends(rng):
     known = Floor(0.02, 0.018, 0.023, REPEATS).drawn(20_000, rng)
     assert_allclose(np.quantile(known, [0.025, 0.5, 0.975]), [0.018, 0.02, 0.023], rtol=0.01)
     loose = Floor(0.1, 0.0, 0.1, AT_MOST)
@@ -85,18 +85,18 @@ def test_a_floor_is_drawn_between_its_ends(rng: np.random.Generator) -> None:
     ("text", "base", "more"),
     [("10um+2.5um/m", 1e-5, 2.5e-6), ("0.05mm", 5e-5, 0.0), (" 15 um + 6 um/m", 1.5e-5, 6e-6)],
 )
-def test_an_instrument_in_words(text: str, base: float, more: float) -> None:
+def test_an_instrument_in_words(text, base, more):
     told = instrument_of(text)
     assert_allclose([told.base, told.per_metre], [base, more], rtol=1e-12)
 
 
 @pytest.mark.parametrize("text", ["", "10", "10 parsec", "1.2.3um", "0um", "5um+3um", "2 m"])
-def test_an_instrument_that_is_none(text: str) -> None:
+def test_an_instrument_that_is_none(text):
     with pytest.raises(mc.OptionError, match=r"10um\+2.5um/m"):
         instrument_of(text)
 
 
-def test_a_column_counts_more_than_the_option(rng: np.random.Generator) -> None:
+def test_a_column_counts_more_than_the_option(rng):
     y = rng.normal(size=(5, 2, 3))
     bare = mc.measurements(rng.normal(size=(5, 6)), y)
     filled = with_instrument(bare, "10um+2um/m")

@@ -33,13 +33,13 @@ def spread(rng: np.random.Generator, places: int, each: int, size: float) -> Arr
 
 
 @pytest.mark.parametrize("m", [7, 40, 400])
-def test_regions_are_those_of_scipy(m: int, rng: np.random.Generator) -> None:
+def test_regions_are_those_of_scipy(m, rng):
     q = rng.normal(size=(m, 6))
     found = scipy.cluster.vq.kmeans2(q, 5, minit="++", seed=np.random.default_rng(0))[1]
     assert_array_equal(nearest_means(q, 5, np.random.default_rng(0)), found)
 
 
-def test_groups_are_asked_again_where_labels_differ(rng: np.random.Generator) -> None:
+def test_groups_are_asked_again_where_labels_differ(rng):
     """Poses whose joints are the same array, with labels and without."""
     q = rng.uniform(-2.0, 2.0, (20, 6))
     plain = made(q)
@@ -47,9 +47,7 @@ def test_groups_are_asked_again_where_labels_differ(rng: np.random.Generator) ->
     assert [len(np.unique(groups(data))) for data in (plain, named, plain)] == [20, 10, 20]
 
 
-def test_visits_that_differ_by_less_than_the_arm_repeats_are_one_pose(
-    rng: np.random.Generator,
-) -> None:
+def test_visits_that_differ_by_less_than_the_arm_repeats_are_one_pose(rng):
     q = rng.uniform(-2.0, 2.0, (60, 6))
     twice = np.concatenate([q, q[:40] + 0.2 * REPEAT * rng.uniform(-1, 1, (40, 6))])
     group = groups(made(twice))
@@ -60,7 +58,7 @@ def test_visits_that_differ_by_less_than_the_arm_repeats_are_one_pose(
     assert nearest > 2.0 * REPEAT
 
 
-def test_a_slow_path_is_not_one_pose() -> None:
+def test_a_slow_path_is_not_one_pose():
     path = np.outer(np.arange(200) * 0.5 * REPEAT, np.eye(6)[0])
     group = groups(made(path))
     assert len(np.unique(group)) > 30
@@ -68,14 +66,14 @@ def test_a_slow_path_is_not_one_pose() -> None:
         assert np.ptp(path[group == number], axis=0).max() <= 2.0 * REPEAT
 
 
-def test_groups_do_not_depend_on_the_order_of_rows(rng: np.random.Generator) -> None:
+def test_groups_do_not_depend_on_the_order_of_rows(rng):
     q = spread(rng, 20, 3, 1e-5)
     shuffled = rng.permutation(60)
     held = [split(made(one), 0.3, 4)[1].q for one in (q, q[shuffled])]
     assert {tuple(row) for row in held[0]} == {tuple(row) for row in held[1]}
 
 
-def test_clusters_are_found_and_held_out_whole(rng: np.random.Generator) -> None:
+def test_clusters_are_found_and_held_out_whole(rng):
     data = made(spread(rng, 16, 5, 0.01))
     assert_array_equal(np.ptp(clusters(data).reshape(16, 5), axis=1), 0)
     assert len(np.unique(clusters(data))) == 16
@@ -86,14 +84,14 @@ def test_clusters_are_found_and_held_out_whole(rng: np.random.Generator) -> None
 
 
 @pytest.mark.parametrize("poses", [12, 30, 100, 400])
-def test_scattered_poses_stand_alone(poses: int, rng: np.random.Generator) -> None:
+def test_scattered_poses_stand_alone(poses, rng):
     for _ in range(5):
         data = made(rng.uniform(-2.0, 2.0, (poses, 6)))
         assert len(np.unique(clusters(data))) == poses
         assert "group" not in with_groups(data).columns
 
 
-def test_columns_force_groups(rng: np.random.Generator) -> None:
+def test_columns_force_groups(rng):
     q = rng.uniform(-2.0, 2.0, (30, 6))
     label = np.repeat(list("abcdef"), 5)
     assert len(np.unique(grouped(made(q, group=label)))) == 6
@@ -105,7 +103,7 @@ def test_columns_force_groups(rng: np.random.Generator) -> None:
     assert not set(train.columns["session"]) & set(held.columns["session"])
 
 
-def test_parts_keep_repeats_together(rng: np.random.Generator) -> None:
+def test_parts_keep_repeats_together(rng):
     q = rng.uniform(-2.0, 2.0, (50, 3))
     q = np.concatenate([q, q + 1e-5])
     found = parts(made(q, order=np.arange(100.0), session=np.repeat(["a", "b"], 50)))
@@ -121,7 +119,7 @@ def test_parts_keep_repeats_together(rng: np.random.Generator) -> None:
     assert q[low, 1].max() < q[~low, 1].min() + 2e-5
 
 
-def test_sessions_and_the_last_poses_are_parts(rng: np.random.Generator) -> None:
+def test_sessions_and_the_last_poses_are_parts(rng):
     q = rng.uniform(-2.0, 2.0, (60, 3))
     day = np.repeat(["mon", "tue", "wed"], 20)
     names = [part.name for part in parts(made(q, order=np.arange(60.0), session=day))]
@@ -133,12 +131,12 @@ def test_sessions_and_the_last_poses_are_parts(rng: np.random.Generator) -> None
 
 
 @pytest.mark.parametrize(("places", "each", "groups"), [(8, 2, 8), (8, 5, 8), (7, 5, 35)])
-def test_fewer_than_eight_clusters_are_regions(places: int, each: int, groups: int) -> None:
+def test_fewer_than_eight_clusters_are_regions(places, each, groups):
     data = made(spread(np.random.default_rng(4), places, each, 0.01))
     assert len(np.unique(clusters(data))) == groups
 
 
-def test_a_short_path_is_one_pose_and_a_longer_one_is_not() -> None:
+def test_a_short_path_is_one_pose_and_a_longer_one_is_not():
     """All within two steps of each other, or not."""
     step = 0.8 * REPEAT * np.eye(6)[0]
     counts = [len(np.unique(groups(made(np.outer(np.arange(n), step))))) for n in (2, 3, 5)]
@@ -146,7 +144,7 @@ def test_a_short_path_is_one_pose_and_a_longer_one_is_not() -> None:
     assert counts[2] > 1
 
 
-def test_groups_are_numbered_by_their_joints() -> None:
+def test_groups_are_numbered_by_their_joints():
     q = np.array([[0.3, 0.0], [-0.2, 1.0], [0.3, 0.0], [-0.2, -1.0]])
     assert_array_equal(groups(made(q)), [2, 1, 2, 0])
     told = made(q, pose=np.array(["a", "b", "c", "b"]))
@@ -155,12 +153,12 @@ def test_groups_are_numbered_by_their_joints() -> None:
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.0, 1.5])
-def test_a_share_is_a_share(share: float, rng: np.random.Generator) -> None:
+def test_a_share_is_a_share(share, rng):
     with pytest.raises(mc.OptionError, match="is not a fraction"):
         split(made(rng.normal(size=(9, 6))), share, 0)
 
 
-def test_a_column_splits_as_it_says(rng: np.random.Generator) -> None:
+def test_a_column_splits_as_it_says(rng):
     q = rng.uniform(-2.0, 2.0, (6, 6))
     label = np.array(["train", "HOLDOUT", "train", "Train", "holdout", "train"])
     train, held, notices = split(made(q, split=label), 0.9, 0)
@@ -177,7 +175,7 @@ def test_a_column_splits_as_it_says(rng: np.random.Generator) -> None:
     assert "stand both in training" in split(made(q, split=label), 0.2, 0)[2][1]
 
 
-def test_regions_are_named_by_where_they_stand() -> None:
+def test_regions_are_named_by_where_they_stand():
     rng = np.random.default_rng(2)
     q = 1e-3 * rng.normal(size=(35, 3))
     q[:, 1] += np.repeat(np.radians([-80.0, -40.0, 0.0, 40.0, 80.0]), 7)
@@ -191,7 +189,7 @@ def test_regions_are_named_by_where_they_stand() -> None:
     assert f"region about joint 2 = {1e3 * middle:.0f} mm" in {part.name for part in parts(slides)}
 
 
-def test_parts_are_neither_few_poses_nor_most() -> None:
+def test_parts_are_neither_few_poses_nor_most():
     q = np.linspace(-1.0, 1.0, 40)[:, None] * [1.0, 0.004, 0.0]  # joint 2 hardly moves
     q[:, 2] = np.random.default_rng(3).permutation(q[:, 0])
     named = {part.name: part.rows for part in parts(made(q, order=np.arange(40.0)))}
@@ -204,7 +202,7 @@ def test_parts_are_neither_few_poses_nor_most() -> None:
     assert [name for name in names if "session" in name] == ["session some"]
 
 
-def test_rows_of_a_group_column_are_told(rng: np.random.Generator) -> None:
+def test_rows_of_a_group_column_are_told(rng):
     """Nine poses that stand in six groups are worth a notice, eight in six are not."""
     for poses, told in ((10, True), (9, False)):
         label = [str(min(i, 5)) for i in range(poses)]
@@ -212,14 +210,14 @@ def test_rows_of_a_group_column_are_told(rng: np.random.Generator) -> None:
         assert bool(notices) == told
 
 
-def test_groups_are_numbered_alike_in_any_order_of_the_rows(rng: np.random.Generator) -> None:
+def test_groups_are_numbered_alike_in_any_order_of_the_rows(rng):
     q = rng.integers(0, 3, (40, 2)) * 0.5  # groups at the same joints, too
     group, order = rng.integers(0, 6, 40), rng.permutation(40)
     found = numbered_by_joints(group[order], q[order])
     assert_array_equal(found, numbered_by_joints(group, q)[order])
 
 
-def test_one_label_at_two_poses_is_told(rng: np.random.Generator) -> None:
+def test_one_label_at_two_poses_is_told(rng):
     q = np.repeat(rng.uniform(-2.0, 2.0, (4, 6)), 2, axis=0)
     q[1, 5] += 2.0 * np.pi + 1e-3  # the same pose, the wrist a turn on
     label = np.array(["a", "a", "b", "b", "", "", "d", "d"])
@@ -230,7 +228,7 @@ def test_one_label_at_two_poses_is_told(rng: np.random.Generator) -> None:
     assert ":4: pose 'b' is also that of line 3, where joint 2 differs by 0.5 rad" in said
 
 
-def test_visits_are_of_one_load(rng: np.random.Generator) -> None:
+def test_visits_are_of_one_load(rng):
     q = np.repeat(rng.uniform(-2.0, 2.0, (4, 6)), 3, axis=0)
     load = np.tile([0.0, np.nan, 5.0], 4)
     assert_array_equal(visits(made(q)), groups(made(q)))

@@ -14,7 +14,7 @@ def walk(q: list[float], **columns: object) -> Measurements:
     return measurements(joint, y, **{name: np.asarray(v) for name, v in columns.items()})
 
 
-def test_a_joint_that_stands_still_keeps_its_approach() -> None:
+def test_a_joint_that_stands_still_keeps_its_approach():
     columns = with_history(walk([0.0, 1.0, 1.0, 1.0 + 5e-8, 0.5, 0.5]).in_visit_order()).columns
     assert_array_equal(columns["approach1"], [0, 1, 1, 1, -1, -1])
     assert_allclose(columns["move1"], [0, 1, 0, 5e-8, -0.5, 0], atol=1e-15)
@@ -22,7 +22,7 @@ def test_a_joint_that_stands_still_keeps_its_approach() -> None:
     assert_allclose(columns["clock"], np.linspace(0, 1, 6))
 
 
-def test_moves_follow_the_visit_order_not_the_rows(rng: np.random.Generator) -> None:
+def test_moves_follow_the_visit_order_not_the_rows(rng):
     q = rng.normal(size=20)
     shuffled = rng.permutation(20)
     straight = with_history(walk(list(q), order=np.arange(20.0))).columns
@@ -31,7 +31,7 @@ def test_moves_follow_the_visit_order_not_the_rows(rng: np.random.Generator) -> 
         assert_array_equal(mixed[name], straight[name][shuffled])
 
 
-def test_a_gap_hides_the_pose_before() -> None:
+def test_a_gap_hides_the_pose_before():
     columns = with_history(walk([0.0, 1.0, 3.0, 3.0, 2.0], order=[0, 1, 4, 5, 6])).columns
     assert_array_equal(columns["followed"], [0, 1, 0, 1, 1])
     assert_array_equal(columns["approach1"], [0, 1, 0, 0, -1])  # nothing carries over the gap
@@ -39,7 +39,7 @@ def test_a_gap_hides_the_pose_before() -> None:
     assert_allclose(columns["clock"], np.array([0, 1, 4, 5, 6]) / 6)
 
 
-def test_orders_that_count_in_tens_or_squeeze_a_pose_in_have_no_gaps() -> None:
+def test_orders_that_count_in_tens_or_squeeze_a_pose_in_have_no_gaps():
     tens = with_history(walk([0.0, 1.0, 2.0], order=[10, 20, 30])).columns
     assert_array_equal(tens["followed"], [0, 1, 1])
     halves = with_history(walk([0.0, 2.0, 1.0, 5.0], order=[1, 2, 1.5, 4])).columns
@@ -47,7 +47,7 @@ def test_orders_that_count_in_tens_or_squeeze_a_pose_in_have_no_gaps() -> None:
     assert_array_equal(halves["move1"], [0, 1, 1, 0])
 
 
-def test_a_session_breaks_the_chain_and_may_count_anew() -> None:
+def test_a_session_breaks_the_chain_and_may_count_anew():
     data = walk([0.0, 1.0, 5.0, 4.0], order=[0, 1, 0, 1], session=["b", "b", "a", "a"])
     columns = with_history(data).columns
     assert_array_equal(visits(data), [0, 1, 2, 3])
@@ -56,32 +56,32 @@ def test_a_session_breaks_the_chain_and_may_count_anew() -> None:
     assert_allclose(columns["clock"], [0, 1 / 3, 2 / 3, 1])
 
 
-def test_repeated_numbers_side_by_side_are_sorted_stably() -> None:
+def test_repeated_numbers_side_by_side_are_sorted_stably():
     columns = with_history(walk([0.0, 1.0, 3.0, 2.0], order=[0, 1, 1, 2])).columns
     assert_array_equal(columns["followed"], [0, 1, 1, 1])
     assert_array_equal(columns["move1"], [0, 1, 2, -1])
 
 
-def test_numbers_that_begin_again_without_a_session_say_nothing_of_the_pose_before() -> None:
+def test_numbers_that_begin_again_without_a_session_say_nothing_of_the_pose_before():
     data = walk([0.0, 1.0, 2.0, 7.0, 8.0, 9.0], order=[0, 1, 2, 0, 1, 2])
     columns = with_history(data).columns
     assert not columns["followed"].any()
     assert not columns["approach1"].any()
 
 
-def test_rows_without_a_number_come_last_and_follow_nothing() -> None:
+def test_rows_without_a_number_come_last_and_follow_nothing():
     data = walk([0.0, 9.0, 1.0], order=[0.0, np.nan, 1.0])
     columns = with_history(data).columns
     assert_array_equal(visits(data), [0, 2, 1])
     assert_array_equal(columns["followed"], [0, 0, 1])
 
 
-def test_time_sets_the_clock() -> None:
+def test_time_sets_the_clock():
     columns = with_history(walk([0.0, 1.0, 2.0], time=[100.0, np.nan, 500.0])).columns
     assert_allclose(columns["clock"], [0, 0.5, 1])
 
 
-def test_columns_of_the_file_are_kept() -> None:
+def test_columns_of_the_file_are_kept():
     data = walk([0.0, 1.0, 2.0], approach1=[-1.0, -1.0, -1.0]).in_visit_order()
     columns = with_history(data).columns
     assert_array_equal(columns["approach1"], [-1, -1, -1])
@@ -91,13 +91,13 @@ def test_columns_of_the_file_are_kept() -> None:
     assert_array_equal(moves(part), [[0], [1]])
 
 
-def test_one_row() -> None:
+def test_one_row():
     columns = with_history(walk([1.0], order=[5])).columns
     assert_array_equal(columns["clock"], [0])
     assert_array_equal(columns["followed"], [0])
 
 
-def test_irb120_keeps_the_moves_whose_start_is_in_the_file() -> None:
+def test_irb120_keeps_the_moves_whose_start_is_in_the_file():
     data = mc.read_measurements(shared("irb120")[1])
     columns = with_history(data).columns
     linked = columns["followed"] > 0
@@ -110,7 +110,7 @@ def test_irb120_keeps_the_moves_whose_start_is_in_the_file() -> None:
     assert not columns["approach3"][~linked].any()
 
 
-def test_a_clock_against_the_order_is_told() -> None:
+def test_a_clock_against_the_order_is_told():
     order, time = np.arange(4.0), np.array([0.0, 2.0, 1.0, np.nan])
     q = [0.0, 1.0, 2.0, 3.0]
     (said,) = time_notices(walk(q, order=order, time=time))

@@ -92,9 +92,7 @@ def joint_rows(truth: mc.Measurements, header: str = "J1,J2,J3,J4,J5,J6") -> str
     return table(truth.q * DEG, header)
 
 
-def test_leica_points_by_target_name(
-    truth: mc.Measurements, write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_leica_points_by_target_name(truth, write, tmp_path, capsys):
     points = write("leica.csv", table(leica_rows(truth), LEICA).encode("latin-1"))
     joints = write("joints.csv", joint_rows(truth))
     found = import_files([points], joints)
@@ -115,9 +113,7 @@ def test_leica_points_by_target_name(
     assert mc.read_measurements(tmp_path / "cli.csv").poses == POSES
 
 
-def test_leica_one_reflector_in_turns_is_told_by_the_rigid_body(
-    truth: mc.Measurements, write: Write
-) -> None:
+def test_leica_one_reflector_in_turns_is_told_by_the_rigid_body(truth, write):
     joints = write("joints.csv", joint_rows(truth))
     rows = leica_rows(truth, ("A", "A", "A"))
     same(import_files([write("a.csv", table(rows, LEICA))], joints), truth)
@@ -130,7 +126,7 @@ def test_leica_one_reflector_in_turns_is_told_by_the_rigid_body(
     refused("add layout='pose' if", shuffled, joints=joints)
 
 
-def test_leica_matched_by_key(truth: mc.Measurements, write: Write) -> None:
+def test_leica_matched_by_key(truth, write):
     rows = [[f"p{i // 3}", *row] for i, row in enumerate(leica_rows(truth))]
     order = np.random.default_rng(2).permutation(len(rows))
     points = write("leica.csv", table([rows[i] for i in order], "Point," + LEICA))
@@ -149,7 +145,7 @@ def test_leica_matched_by_key(truth: mc.Measurements, write: Write) -> None:
     refused(f"{twice}:62: 'p0' stands twice", points, joints=twice)
 
 
-def test_leica_deleted_points_are_left_out(truth: mc.Measurements, write: Write) -> None:
+def test_leica_deleted_points_are_left_out(truth, write):
     rows = leica_rows(truth)
     bad = [*rows[0]]
     bad[-1] = "TRUE"
@@ -160,9 +156,7 @@ def test_leica_deleted_points_are_left_out(truth: mc.Measurements, write: Write)
         f"{points}: points that are marked deleted are left out: line 2",)  # fmt: skip
 
 
-def test_leica_points_deleted_and_not_measured_again_are_set_aside(
-    truth: mc.Measurements, write: Write, tmp_path: Path
-) -> None:
+def test_leica_points_deleted_and_not_measured_again_are_set_aside(truth, write, tmp_path):
     """By the targets' names, and where there is one: what follows stays with its joints."""
     joints = write("joints.csv", joint_rows(truth))
     for targets in (3, 1):
@@ -192,7 +186,7 @@ def test_leica_points_deleted_and_not_measured_again_are_set_aside(
     assert refused(f"{joints}:59: joint row 58 has no point", gone, joints=joints).endswith(words)
 
 
-def test_leica_broken(truth: mc.Measurements, write: Write) -> None:
+def test_leica_broken(truth, write):
     joints = write("joints.csv", joint_rows(truth))
     rows = leica_rows(truth)
     rows[7][1] = "12,5.3"
@@ -212,9 +206,7 @@ def test_leica_broken(truth: mc.Measurements, write: Write) -> None:
 # --- header-less columns ---------------------------------------------------------------------
 
 
-def test_columns_in_order_and_by_place(
-    truth: mc.Measurements, write: Write, tmp_path: Path
-) -> None:
+def test_columns_in_order_and_by_place(truth, write, tmp_path):
     rows = np.column_stack([truth.y.reshape(POSES, 9) * 1e3, truth.q * DEG])
     path = write("plain.txt", table(rows))
     text = refused("has 15 columns and no header", path)
@@ -235,7 +227,7 @@ def test_columns_in_order_and_by_place(
     assert found.files().rows[0][2:4] == ("tab", "comma")
 
 
-def test_columns_broken(truth: mc.Measurements, write: Write) -> None:
+def test_columns_broken(truth, write):
     rows = np.column_stack([truth.y[:, 0] * 1e3, truth.q * DEG])
     path = write("plain.txt", table(rows).replace("\n", "\nabc", 3).replace("\nabc", "\n", 2))
     refused(f"{path}:4: column column 1: 'abc", path, columns="smr1_mm,q_deg")
@@ -267,7 +259,7 @@ def tracker6d_text(truth: mc.Measurements, stamp: str = "2,02011E+13") -> str:
     return table(rows, TRACKER, ";").replace(".", ",")
 
 
-def test_tracker6d(truth: mc.Measurements, write: Write, tmp_path: Path) -> None:
+def test_tracker6d(truth, write, tmp_path):
     found = import_files([write("log.csv", tracker6d_text(truth))])
     same(found, truth, targets=1)
     assert found.files().rows[0][1:4] == ("6D tracker log", "semicolon", "comma")
@@ -280,7 +272,7 @@ def test_tracker6d(truth: mc.Measurements, write: Write, tmp_path: Path) -> None
     assert_allclose(data.columns["temperature"], 21.5)
 
 
-def test_tracker6d_joints_in_alphabetical_order(truth: mc.Measurements, write: Write) -> None:
+def test_tracker6d_joints_in_alphabetical_order(truth, write):
     names = ("elbow_joint", "shoulder_lift_joint", "shoulder_pan_joint", "wrist_1_joint",
              "wrist_2_joint", "wrist_3_joint")  # fmt: skip
     rows = [[*q[[2, 1, 0, 3, 4, 5]], *y] for q, y in zip(truth.q, truth.y[:, 0] * 1e3, strict=True)]
@@ -289,7 +281,7 @@ def test_tracker6d_joints_in_alphabetical_order(truth: mc.Measurements, write: W
     same(import_files([path]), truth, targets=1)
 
 
-def test_tracker6d_broken(truth: mc.Measurements, write: Write) -> None:
+def test_tracker6d_broken(truth, write):
     text = tracker6d_text(truth).splitlines()
     text[5] = text[5].replace("21,500000000", "21.5")
     path = write("log.csv", "\n".join(text))
@@ -325,7 +317,7 @@ def robodk_rows(truth: mc.Measurements, targets: int) -> list[list[object]]:
     ]
 
 
-def test_robodk(truth: mc.Measurements, write: Write, tmp_path: Path) -> None:
+def test_robodk(truth, write, tmp_path):
     found = import_files([write("val.csv", table(robodk_rows(truth, 1), ROBODK))])
     same(found, truth, targets=1)
     assert "taken as measured points" in found.data.notices[0]
@@ -336,7 +328,7 @@ def test_robodk(truth: mc.Measurements, write: Write, tmp_path: Path) -> None:
     calibrates(three, tmp_path)
 
 
-def test_robodk_broken(truth: mc.Measurements, write: Write) -> None:
+def test_robodk_broken(truth, write):
     rows = robodk_rows(truth, 1)
     rows[3][4] = ""
     path = write("val.csv", table(rows, ROBODK))
@@ -348,7 +340,7 @@ def test_robodk_broken(truth: mc.Measurements, write: Write) -> None:
 # --- one file per target, and a joints file ----------------------------------------------------
 
 
-def test_one_file_per_target(truth: mc.Measurements, write: Write, tmp_path: Path) -> None:
+def test_one_file_per_target(truth, write, tmp_path):
     paths = [
         write(f"position_SMR_{t + 1}.txt", table(truth.y[:, t] * 1e3, delimiter=" "))
         for t in range(3)
@@ -367,7 +359,7 @@ def test_one_file_per_target(truth: mc.Measurements, write: Write, tmp_path: Pat
     assert "though header says m" in found.columns()[0].rows[0][3]
 
 
-def test_one_file_per_target_broken(truth: mc.Measurements, write: Write) -> None:
+def test_one_file_per_target_broken(truth, write):
     joints = write("joints.txt", table(truth.q * DEG, delimiter=" "))
     points = write("smr_1.txt", table(truth.y[:50, 0] * 1e3, delimiter=" "))
     refused(f"{joints}:51: joint row 51 has no point", points, joints=joints)
@@ -397,7 +389,7 @@ def rapid_text(truth: mc.Measurements, odd: bool = False) -> str:
 
 
 @pytest.mark.parametrize("odd", [False, True])
-def test_rapid(truth: mc.Measurements, write: Write, tmp_path: Path, odd: bool) -> None:
+def test_rapid(truth, write, tmp_path, odd):
     points = write("points.csv", table(truth.y[:, 0] * 1e3, "x,y,z"))
     found = import_files([points], write("poses.mod", rapid_text(truth, odd)))
     same(found, truth, targets=1)
@@ -406,7 +398,7 @@ def test_rapid(truth: mc.Measurements, write: Write, tmp_path: Path, odd: bool) 
         calibrates(found, tmp_path)
 
 
-def test_rapid_broken(truth: mc.Measurements, write: Write) -> None:
+def test_rapid_broken(truth, write):
     points = write("points.csv", table(truth.y[:, 0] * 1e3, "x,y,z"))
     text = rapid_text(truth)
     joints = write("poses.mod", text.replace("p7:=[[", "p7:=[[x"))
@@ -424,7 +416,7 @@ def test_rapid_broken(truth: mc.Measurements, write: Write) -> None:
 FIGAROH = "x1,y1,z1,phix1,phiy1,phiz1,arm_1,arm_2,arm_3,arm_4,arm_5,arm_6"
 
 
-def test_figaroh(truth: mc.Measurements, write: Write, tmp_path: Path) -> None:
+def test_figaroh(truth, write, tmp_path):
     rows = [[*y, "0", "0", "0", *q] for q, y in zip(truth.q, truth.y[:, 0], strict=True)]
     found = import_files([write("fig.csv", table(rows, FIGAROH))])
     same(found, truth, targets=1)
@@ -434,7 +426,7 @@ def test_figaroh(truth: mc.Measurements, write: Write, tmp_path: Path) -> None:
     same(import_files([write("two.csv", wide)]), truth, targets=2)
 
 
-def test_figaroh_broken(truth: mc.Measurements, write: Write) -> None:
+def test_figaroh_broken(truth, write):
     header = "x1,y1,z1,a,b,c,d,e,f"
     degrees = table(np.column_stack([truth.y[:, 0], truth.q * DEG]), header)
     path = write("fig.csv", degrees)
@@ -449,7 +441,7 @@ def test_figaroh_broken(truth: mc.Measurements, write: Write) -> None:
 # --- the contract's own CSV in other units -------------------------------------------------------
 
 
-def test_contract_in_other_units(truth: mc.Measurements, write: Write, tmp_path: Path) -> None:
+def test_contract_in_other_units(truth, write, tmp_path):
     header = ";".join(
         [f"q{i + 1}_deg" for i in range(6)]
         + ["smr1_x_in", "smr1_y_in", "smr1_z_in", "u95_um", "temperature_F", "time_min", "operator"]
@@ -467,9 +459,7 @@ def test_contract_in_other_units(truth: mc.Measurements, write: Write, tmp_path:
     assert set(data.unknown["operator"]) == {"ann"}
 
 
-def test_contract_itself_and_with_gaps(
-    truth: mc.Measurements, tmp_path: Path, noisy: Simulation
-) -> None:
+def test_contract_itself_and_with_gaps(truth, tmp_path, noisy):
     mc.write_measurements(tmp_path / "m.csv", truth)
     same(import_files([tmp_path / "m.csv"]), truth)
     y = truth.y.copy()
@@ -480,7 +470,7 @@ def test_contract_itself_and_with_gaps(
     assert calibrates(found, tmp_path).seen.sum() == 3 * POSES - 1
 
 
-def test_contract_broken(truth: mc.Measurements, write: Write) -> None:
+def test_contract_broken(truth, write):
     head = "q1_rad;q2_rad;smr1_x_mm;smr1_y_mm;smr1_z_mm"
     refused("mix units of angle", write("m.csv", head.replace("q2_rad", "q2_deg") + "\n0;0;1;2;3"))
     refused("no column for joint 2", write("m.csv", head.replace("q2", "q3") + "\n0;0;1;2;3"))
@@ -495,14 +485,12 @@ def test_contract_broken(truth: mc.Measurements, write: Write) -> None:
 
 @pytest.mark.parametrize("angle", [1.0, DEG])
 @pytest.mark.parametrize("length", [1.0, 1e3])
-def test_units_are_proven_by_the_arm(
-    truth: mc.Measurements, write: Write, angle: float, length: float
-) -> None:
+def test_units_are_proven_by_the_arm(truth, write, angle, length):
     rows = np.column_stack([truth.y[:, 0] * length, truth.q * angle])
     same(import_files([write("m.txt", table(rows))], columns="smr1,q"), truth, targets=1)
 
 
-def test_units_that_cannot_be_proven_are_asked_for(truth: mc.Measurements, write: Write) -> None:
+def test_units_that_cannot_be_proven_are_asked_for(truth, write):
     still = np.column_stack([truth.y[:1, 0], truth.q[:1]])
     path = write("m.txt", table(still))
     text = refused("joints (up to", path, columns="smr1,q")
@@ -513,7 +501,7 @@ def test_units_that_cannot_be_proven_are_asked_for(truth: mc.Measurements, write
     refused("write q=deg, smr=mm or", path, columns="smr1,q", units="furlong")
 
 
-def test_small_ways_in_millimetres_are_not_taken_for_metres(write: Write) -> None:
+def test_small_ways_in_millimetres_are_not_taken_for_metres(write):
     rng = np.random.default_rng(3)
     q = 0.5 + rng.normal(size=(40, 6)) * 1e-3
     y = np.array([3000.0, 10.0, 20.0]) + rng.normal(size=(40, 3)) * 2.0
@@ -524,7 +512,7 @@ def test_small_ways_in_millimetres_are_not_taken_for_metres(write: Write) -> Non
     refused("units='smr=m'", path, columns="smr1,q_rad")
 
 
-def test_days_and_months_are_asked_for(truth: mc.Measurements, write: Write) -> None:
+def test_days_and_months_are_asked_for(truth, write):
     def stamped(stamp: str) -> Path:
         rows = [
             [*q, *y, stamp.format(j % 60 if j else 0, 3 + j // 30)]
@@ -543,7 +531,7 @@ def test_days_and_months_are_asked_for(truth: mc.Measurements, write: Write) -> 
     assert import_files([same_day]).data.columns["time"][5] == pytest.approx(5)
 
 
-def test_thousands_or_decimals_are_asked_for(write: Write) -> None:
+def test_thousands_or_decimals_are_asked_for(write):
     path = write("m.csv", "q1_rad;smr1_x_mm;smr1_y_mm;smr1_z_mm\n1;1,234;5,678;9,012\n2;1,2;3;4\n")
     assert_allclose(import_files([path]).data.y[0, 0], [1.234e-3, 5.678e-3, 9.012e-3])
     path = write("m.csv", "q1_rad;smr1_x_mm;smr1_y_mm;smr1_z_mm\n1;1,234;5,678;9,012\n2;2;3;4\n")
@@ -552,7 +540,7 @@ def test_thousands_or_decimals_are_asked_for(write: Write) -> None:
     assert_allclose(found.data.y[0, 0], [1.234e-3, 5.678e-3, 9.012e-3])
 
 
-def test_what_is_no_table(write: Write) -> None:
+def test_what_is_no_table(write):
     refused("is a spreadsheet", write("a.csv", b"PK\x03\x04abc"))
     refused("workbook", write("a.xlsx", b"PK\x03\x04abc"))
     refused("is not a text file", write("a.bin", b"abc\0def"))
@@ -564,7 +552,7 @@ def test_what_is_no_table(write: Write) -> None:
         import_files([])
 
 
-def test_utf16_and_byte_order_marks(truth: mc.Measurements, write: Write) -> None:
+def test_utf16_and_byte_order_marks(truth, write):
     header = "q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,smr1_x_m,smr1_y_m,smr1_z_m"
     text = table(np.column_stack([truth.q, truth.y[:, 0]]), header)
     same(import_files([write("a.csv", text.encode("utf-16"))]), truth, targets=1)
@@ -575,9 +563,7 @@ def test_utf16_and_byte_order_marks(truth: mc.Measurements, write: Write) -> Non
 # --- command -----------------------------------------------------------------------------------
 
 
-def test_command_json_errors_and_dry_run(
-    truth: mc.Measurements, write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_json_errors_and_dry_run(truth, write, tmp_path, capsys):
     path = write("log.csv", tracker6d_text(truth))
     assert run("import", path) == 0
     assert "nothing written; add -o FILE" in capsys.readouterr().out
@@ -616,19 +602,17 @@ def clocked(truth: mc.Measurements, write: Write, stamps: Sequence[str]) -> Path
         (["00:00:01", "23:59:59"], [0, 86398]),
     ],
 )  # fmt: skip
-def test_a_clock_runs_on_over_midnight(
-    truth: mc.Measurements, write: Write, stamps: list[str], seconds: list[float]
-) -> None:
+def test_a_clock_runs_on_over_midnight(truth, write, stamps, seconds):
     found = import_files([clocked(truth, write, stamps)])
     assert_allclose(found.data.columns["time"], seconds)
 
 
-def test_a_clock_of_twelve_hours_is_asked_about(truth: mc.Measurements, write: Write) -> None:
+def test_a_clock_of_twelve_hours_is_asked_about(truth, write):
     path = clocked(truth, write, ["12:59:59", "01:00:00", "01:00:01"])
     refused(f"{path}:3: column time: 01:00:00 follows 12:59:59: a clock of twelve hours?", path)
 
 
-def test_joint_names_are_put_along_the_arm(truth: mc.Measurements, write: Write) -> None:
+def test_joint_names_are_put_along_the_arm(truth, write):
     ways = [2, 1, 0, 3, 4, 5]
     for front in ("", "left_"):
         names = [f"{front}{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow",
@@ -638,7 +622,7 @@ def test_joint_names_are_put_along_the_arm(truth: mc.Measurements, write: Write)
         same(import_files([points], joints, units="q=rad"), truth, targets=1)
 
 
-def test_rapid_comments_are_no_poses(truth: mc.Measurements, write: Write) -> None:
+def test_rapid_comments_are_no_poses(truth, write):
     text = rapid_text(truth).replace("  CONST jointtarget p6:", "! CONST jointtarget p6:")
     points = write("points.csv", table(np.delete(truth.y[:, 0], 5, axis=0) * 1e3, "x,y,z"))
     found = import_files([points], write("poses.mod", text))
@@ -648,9 +632,7 @@ def test_rapid_comments_are_no_poses(truth: mc.Measurements, write: Write) -> No
 @pytest.mark.parametrize(
     ("header", "word"), [("Delete", "deleted"), ("Delete", "WAHR"), ("Deleted", "TRUE")]
 )
-def test_words_for_deleted_points(
-    truth: mc.Measurements, write: Write, header: str, word: str
-) -> None:
+def test_words_for_deleted_points(truth, write, header, word):
     rows = leica_rows(truth)
     bad = [*rows[0]]
     bad[-1] = word
@@ -662,7 +644,7 @@ def test_words_for_deleted_points(
     refused("leica.csv:2: column " + header + ": 'perhaps' does not say", points, joints=joints)
 
 
-def test_what_is_told_twice_is_refused(truth: mc.Measurements, write: Write) -> None:
+def test_what_is_told_twice_is_refused(truth, write):
     for units, words in (
         ("zz=mm,q=deg", "units='zz=mm': write q=deg, smr=mm or time=dmy"),
         ("q=deg,q=rad", "units='q=rad': q is in deg already"),

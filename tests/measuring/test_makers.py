@@ -1,22 +1,19 @@
 """Exports of ten set-ups as makers' programs write them: each is read at the first try, whole."""
 
-import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from xml.sax.saxutils import escape
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from test_exports import workbook  # stands beside this
 
 import minimax_cal as mc
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.importers import import_files
 
 POSES, TARGETS = 48, 3
-MAIN = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
-RELATED = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
 
 
 @dataclass(frozen=True)
@@ -69,65 +66,9 @@ def put(path: Path, lines: list[str], encoding: str = "utf-8", end: str = "\n") 
     return path.name
 
 
-def column_name(number: int) -> str:
-    return chr(65 + number) if number < 26 else "A" + chr(65 + number - 26)
-
-
 def put_workbook(path: Path, sheets: dict[str, list[list[object]]]) -> str:
-    """A workbook with nothing but cells.  Skips without a reader."""
-    pytest.importorskip("python_calamine", reason="python-calamine is not installed")
-    names = "".join(
-        f'<sheet name="{name}" sheetId="{i}" r:id="rId{i}"/>' for i, name in enumerate(sheets, 1)
-    )
-    parts = "".join(
-        f'<Relationship Id="rId{i}" Type="{RELATED}/worksheet" Target="worksheets/sheet{i}.xml"/>'
-        for i in range(1, len(sheets) + 1)
-    )
-    package = "http://schemas.openxmlformats.org/package/2006"
-    kind = "application/vnd.openxmlformats-officedocument.spreadsheetml"
-    types = "".join(
-        f'<Override PartName="/xl/worksheets/sheet{i}.xml" ContentType="{kind}.worksheet+xml"/>'
-        for i in range(1, len(sheets) + 1)
-    )
-    with zipfile.ZipFile(path, "w") as file:
-        file.writestr(
-            "[Content_Types].xml",
-            f'<Types xmlns="{package}/content-types"><Default Extension="rels" ContentType='
-            '"application/vnd.openxmlformats-package.relationships+xml"/><Default Extension="xml" '
-            f'ContentType="application/xml"/><Override PartName="/xl/workbook.xml" ContentType='
-            f'"{kind}.sheet.main+xml"/>{types}</Types>',
-        )
-        file.writestr(
-            "_rels/.rels",
-            f'<Relationships xmlns="{package}/relationships"><Relationship Id="rId1" '
-            f'Type="{RELATED}/officeDocument" Target="xl/workbook.xml"/></Relationships>',
-        )
-        file.writestr(
-            "xl/workbook.xml",
-            f'<workbook xmlns="{MAIN}" xmlns:r="{RELATED}"><sheets>{names}</sheets></workbook>',
-        )
-        file.writestr(
-            "xl/_rels/workbook.xml.rels",
-            f'<Relationships xmlns="{package}/relationships">{parts}</Relationships>',
-        )
-        for i, rows in enumerate(sheets.values(), 1):
-            data = "".join(row_of_workbook(r, row) for r, row in enumerate(rows, 1))
-            file.writestr(
-                f"xl/worksheets/sheet{i}.xml",
-                f'<worksheet xmlns="{MAIN}"><sheetData>{data}</sheetData></worksheet>',
-            )
+    path.write_bytes(workbook(sheets))
     return path.name
-
-
-def row_of_workbook(number: int, row: list[object]) -> str:
-    cells = ""
-    for i, value in enumerate(row):
-        at = f"{column_name(i)}{number}"
-        if isinstance(value, str) and value:
-            cells += f'<c r="{at}" t="inlineStr"><is><t>{escape(value)}</t></is></c>'
-        elif isinstance(value, float):
-            cells += f'<c r="{at}"><v>{value!r}</v></c>'
-    return f'<row r="{number}">{cells}</row>'
 
 
 def leica_kuka(folder: Path, q: Array, y: Array, rng: np.random.Generator) -> Export:
@@ -364,7 +305,7 @@ MAKERS: tuple[Maker, ...] = (
 
 
 @pytest.mark.parametrize("make", MAKERS)
-def test_an_export_is_read_as_it_is(make: Maker, tmp_path: Path, rng: np.random.Generator) -> None:
+def test_an_export_is_read_as_it_is(make, tmp_path, rng):
     """No option: every joint, every point, the gap left empty, and all that is left out listed."""
     truth = mc.simulate("irb2600", POSES, TARGETS, 5).data
     export = make(tmp_path, np.degrees(truth.q), 1e3 * truth.y, rng)
@@ -390,9 +331,7 @@ def test_an_export_is_read_as_it_is(make: Maker, tmp_path: Path, rng: np.random.
         (leica_kuka, "kalib.dat", "DECL E6AXIS", "set twice"),
     ],
 )
-def test_a_line_that_is_there_twice_is_named(
-    make: Maker, name: str, line: str, words: str, tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_a_line_that_is_there_twice_is_named(make, name, line, words, tmp_path, rng):
     truth = mc.simulate("irb2600", POSES, TARGETS, 5).data
     export = make(tmp_path, np.degrees(truth.q), 1e3 * truth.y, rng)
     lines = (tmp_path / name).read_text().splitlines()

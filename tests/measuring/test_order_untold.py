@@ -1,7 +1,6 @@
 """A file that tells no order yields nothing of time or move, unless its rows are said to be it."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,7 +40,7 @@ def needs(data: mc.Measurements) -> dict[str, str]:
     return {name: effect.needs(scene) for name, effect in EFFECTS.items()}
 
 
-def test_nothing_of_the_order_is_made_up(shifted: mc.Measurements) -> None:
+def test_nothing_of_the_order_is_made_up(shifted):
     data = untold(shifted)
     assert ordered(shifted)
     assert not ordered(data)
@@ -51,7 +50,7 @@ def test_nothing_of_the_order_is_made_up(shifted: mc.Measurements) -> None:
     assert with_history(data.in_visit_order()).columns["clock"][-1] == 1.0
 
 
-def test_what_needs_an_order_is_not_testable(shifted: mc.Measurements) -> None:
+def test_what_needs_an_order_is_not_testable(shifted):
     lacking, known = needs(untold(shifted)), needs(shifted)
     for name in OF_ORDER:
         assert "the file tells no order" in lacking[name]
@@ -62,7 +61,7 @@ def test_what_needs_an_order_is_not_testable(shifted: mc.Measurements) -> None:
     assert not needs(measured)["thermal_growth"]  # a thermometer needs no order
 
 
-def test_faults_of_the_session_need_an_order(shifted: mc.Measurements) -> None:
+def test_faults_of_the_session_need_an_order(shifted):
     def found(data: mc.Measurements) -> list[str]:
         return [fault.effect for fault in find_faults(with_history(data))]
 
@@ -70,9 +69,7 @@ def test_faults_of_the_session_need_an_order(shifted: mc.Measurements) -> None:
     assert "target_shift" not in found(untold(shifted))
 
 
-def test_rows_may_be_said_to_be_the_order(
-    shifted: mc.Measurements, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_may_be_said_to_be_the_order(shifted, tmp_path, capsys):
     mc.write_measurements(tmp_path / "poses.csv", untold(shifted))
     command = ("effects", "irb2600", tmp_path / "poses.csv", "--json")
     places: list[Array | str] = []

@@ -11,7 +11,7 @@ from minimax_cal.measuring.measurements import measurements
 from minimax_cal.measuring.pose_rows import pose_rows, read_poses
 
 
-def test_poses_come_back(rng: np.random.Generator) -> None:
+def test_poses_come_back(rng):
     y = rng.normal(size=(7, 2, 3))
     y[3, 1] = np.nan
     labels = np.array(list("abcabca"))
@@ -35,7 +35,7 @@ def test_poses_come_back(rng: np.random.Generator) -> None:
     ("key", "value"),
     [("q", [[0.0, 1.0]]), ("split", []), ("line", "x"), ("columns", None), ("measured_mm", [])],
 )
-def test_broken_poses_are_named(key: str, value: object, rng: np.random.Generator) -> None:
+def test_broken_poses_are_named(key, value, rng):
     data = measurements(rng.normal(size=(4, 2)), rng.normal(size=(4, 3)))
     block = pose_rows(data, np.zeros(4, dtype=bool), {}) | {key: value}
     with pytest.raises(DataError, match=r"fit\.json: .*"):

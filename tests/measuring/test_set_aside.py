@@ -1,7 +1,6 @@
 """Points that are set aside: every other number stays, and nobody forgets them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ def measured(noisy: Simulation) -> Measurements:
     return replace(noisy.data, simulated=False, line=np.arange(noisy.data.poses) + 2)
 
 
-def test_only_the_named_points_are_gone(measured: Measurements) -> None:
+def test_only_the_named_points_are_gone(measured):
     data, line = measured, measured.line
     found = left_out(data, [f"{line[0]}:smr2=knocked", str(line[3])])
     assert [(p.row, p.pose, p.target, p.why, p.by) for p in found.set_aside] == [
@@ -40,12 +39,12 @@ def test_only_the_named_points_are_gone(measured: Measurements) -> None:
     assert_array_equal(whole(found).y, data.y)
 
 
-def test_nothing_named_changes_nothing(measured: Measurements) -> None:
+def test_nothing_named_changes_nothing(measured):
     assert left_out(measured, []) is measured
     assert whole(measured) is measured
 
 
-def test_what_is_set_aside_twice_comes_once(measured: Measurements) -> None:
+def test_what_is_set_aside_twice_comes_once(measured):
     data = left_out(measured, ["2:smr1", "2:smr1=twice", "3"])
     assert [(p.row, p.target) for p in data.set_aside] == [
         (2, "smr1"), (3, "smr1"), (3, "smr2"), (3, "smr3")]  # fmt: skip
@@ -57,9 +56,7 @@ def test_what_is_set_aside_twice_comes_once(measured: Measurements) -> None:
     assert_array_equal(whole(more).y, measured.y)
 
 
-def test_a_file_keeps_them_with_the_reason_and_who_it_was(
-    measured: Measurements, tmp_path: Path
-) -> None:
+def test_a_file_keeps_them_with_the_reason_and_who_it_was(measured, tmp_path):
     first, second = tmp_path / "poses.csv", tmp_path / "used.csv"
     mc.write_measurements(first, measured)
     assert run("import", first, "--leave-out", "2:smr1,5=nest, knocked; twice", "-o", second) == 0
@@ -88,11 +85,11 @@ def test_a_file_keeps_them_with_the_reason_and_who_it_was(
         ("a: b [x]", [("", "a: b [x]", USER)]),
     ],
 )
-def test_cells_of_the_column(cell: str, said: list[tuple[str, str, str]]) -> None:
+def test_cells_of_the_column(cell, said):
     assert entries(cell) == said
 
 
-def test_the_column_names_targets_that_are_there(measured: Measurements, tmp_path: Path) -> None:
+def test_the_column_names_targets_that_are_there(measured, tmp_path):
     path = tmp_path / "poses.csv"
     cells = np.array(["", "smr9: x", *[""] * (measured.poses - 2)])
     mc.write_measurements(path, replace(measured, columns={"set_aside": cells}))
@@ -108,7 +105,7 @@ def test_the_column_names_targets_that_are_there(measured: Measurements, tmp_pat
         mc.read_measurements(path)
 
 
-def test_poses_set_aside_were_visited(measured: Measurements) -> None:
+def test_poses_set_aside_were_visited(measured):
     """The moves of the other poses, and the clock, are those of the whole file."""
     every = with_history(measured)
     found = with_history(left_out(measured, ["9", "10:smr1", "20"]))
@@ -120,7 +117,7 @@ def test_poses_set_aside_were_visited(measured: Measurements) -> None:
         assert_array_equal(column, every.columns[name][np.isin(every.line, [9, 10, 20])])
 
 
-def test_how_many_in_words(measured: Measurements) -> None:
+def test_how_many_in_words(measured):
     data = left_out(measured, ["3:smr1"])
     assert counted(data.set_aside) == "1 point set aside by the user"
     mask = np.zeros(data.seen.shape, dtype=bool)
@@ -133,13 +130,7 @@ def test_how_many_in_words(measured: Measurements) -> None:
     ("points", "said"),
     [("x", "write LINE:TARGET"), ("900000", "no pose stands in line"), ("2:smr9", "smr1, smr2")],
 )
-def test_a_point_that_is_not_there(
-    points: str,
-    said: str,
-    measured: Measurements,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_point_that_is_not_there(points, said, measured, tmp_path, capsys):
     path = tmp_path / "poses.csv"
     mc.write_measurements(path, measured)
     assert run("import", path, "--leave-out", points, "-o", tmp_path / "out.csv") == 2

@@ -21,14 +21,12 @@ def free(robot: mc.Robot) -> mc.Robot:
 
 
 @pytest.mark.parametrize(("size", "count"), [(9.0, 6), (11.0, 0), (0.0, 6)])
-def test_a_joint_that_spans_less_than_ten_degrees_is_narrow(
-    free: mc.Robot, size: float, count: int
-) -> None:
+def test_a_joint_that_spans_less_than_ten_degrees_is_narrow(free, size, count):
     q = np.radians(size) * np.linspace(0.0, 1.0, 400)[:, None] + np.zeros(6)
     assert len(narrow(spans_of(free, data_of(q)))) == count
 
 
-def test_a_slide_needs_twenty_millimetres(free: mc.Robot) -> None:
+def test_a_slide_needs_twenty_millimetres(free):
     slides = replace(free, prismatic=np.arange(6) == 0)
     q = np.linspace(0.0, 1.0, 400)[:, None] * [0.019, 1.0, 1.0, 1.0, 1.0, 1.0]
     (few,) = narrow(spans_of(slides, data_of(q)))
@@ -46,19 +44,19 @@ def test_a_slide_needs_twenty_millimetres(free: mc.Robot) -> None:
         (12.0, 6.0),
     ],  # 5 %, or half of a short one
 )
-def test_the_range_of_a_joint_counts(free: mc.Robot, size: float, least: float) -> None:
+def test_the_range_of_a_joint_counts(free, size, least):
     half = np.full(6, np.radians(size) / 2.0)
     limited = replace(free, lower=-half, upper=half)
     assert np.degrees(least_span(limited, 0)) == pytest.approx(least)
 
 
-def test_one_or_two_poses_elsewhere_make_no_span() -> None:
+def test_one_or_two_poses_elsewhere_make_no_span():
     assert inner_size(np.array([0.0, 0.0, 0.0, 0.0, 2.0, 3.0])) == 0.0
     assert inner_size(np.array([0.0, 0.0, 0.0, 3.0, 3.0, 3.0])) == 3.0
     assert inner_size(np.zeros(2)) == inner_size(np.zeros(0)) == 0.0
 
 
-def test_poses_that_nothing_measured_do_not_count(free: mc.Robot) -> None:
+def test_poses_that_nothing_measured_do_not_count(free):
     q = np.zeros((40, 6))
     q[:20, 0] = np.linspace(0.0, 2.0, 20)
     whole = data_of(q)
@@ -68,7 +66,7 @@ def test_poses_that_nothing_measured_do_not_count(free: mc.Robot) -> None:
     assert "J1" in [span.joint for span in narrow(spans_of(free, whole.with_y(y)))]
 
 
-def test_outside_is_where_a_narrow_joint_was_not(free: mc.Robot, rng: np.random.Generator) -> None:
+def test_outside_is_where_a_narrow_joint_was_not(free, rng):
     q = rng.uniform(-1.0, 1.0, (50, 6))
     q[:, 2] = 0.3
     spans = spans_of(free, data_of(q))

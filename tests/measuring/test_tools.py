@@ -36,7 +36,7 @@ def two_tools(robot: mc.Robot, tmp_path: Path) -> tuple[Path, mc.Measurements]:
     return path, data
 
 
-def test_each_tool_has_reflectors_of_its_own(robot: mc.Robot, tmp_path: Path) -> None:
+def test_each_tool_has_reflectors_of_its_own(robot, tmp_path):
     path, _ = two_tools(robot, tmp_path)
     assert "tool" in path.read_text().splitlines()[0].split(",")
     data = mc.read_measurements(path)
@@ -61,7 +61,7 @@ def test_each_tool_has_reflectors_of_its_own(robot: mc.Robot, tmp_path: Path) ->
     assert mc.read_measurements(one).target_names == ("smr1", "smr2")
 
 
-def test_a_point_of_a_tool_is_set_aside_by_its_reflector(robot: mc.Robot, tmp_path: Path) -> None:
+def test_a_point_of_a_tool_is_set_aside_by_its_reflector(robot, tmp_path):
     path, _ = two_tools(robot, tmp_path)
     out = tmp_path / "out.csv"
     assert run("import", path, "--leave-out", "12:smr1=knocked", "-o", out, "--quiet") == 0
@@ -71,14 +71,14 @@ def test_a_point_of_a_tool_is_set_aside_by_its_reflector(robot: mc.Robot, tmp_pa
     assert (point.row, point.why) == (12, "knocked")
 
 
-def test_a_pose_without_its_tool_is_refused(robot: mc.Robot, tmp_path: Path) -> None:
+def test_a_pose_without_its_tool_is_refused(robot, tmp_path):
     path, _ = two_tools(robot, tmp_path)
     path.write_text(path.read_text().replace("gripper", "", 1))
     with pytest.raises(mc.DataError, match="column tool is empty; name the tool of each pose"):
         mc.read_measurements(path)
 
 
-def test_torque_of_a_payload_is_that_of_a_mass_at_its_centre() -> None:
+def test_torque_of_a_payload_is_that_of_a_mass_at_its_centre():
     robot = robot_from_dict({
         "name": "bar", "units": {"length": "m", "angle": "rad"}, "up": [0, 1, 0],
         "joints": [dict(a=0.5, d=0, theta=0, alpha=0), dict(a=0.4, d=0, theta=0, alpha=0)],
@@ -100,7 +100,7 @@ def test_torque_of_a_payload_is_that_of_a_mass_at_its_centre() -> None:
     assert_allclose(scene.payload_place.T, place, rtol=0, atol=1e-12)
 
 
-def test_a_centre_without_its_mass_is_told(tmp_path: Path, robot: mc.Robot) -> None:
+def test_a_centre_without_its_mass_is_told(tmp_path, robot):
     path = tmp_path / "data.csv"
     data = simulate(robot, 20, 1, seed=1).data
     columns = {**data.columns, **{f"payload_{a}": np.full(20, 0.1) for a in "xyz"}}
@@ -110,7 +110,7 @@ def test_a_centre_without_its_mass_is_told(tmp_path: Path, robot: mc.Robot) -> N
     assert any("payload_x_mm is not used: the file has no column payload_kg" in n for n in notices)
 
 
-def test_compliance_counts_where_the_payload_hangs(robot: mc.Robot) -> None:
+def test_compliance_counts_where_the_payload_hangs(robot):
     """A heavy load that hangs now here, now there: told where, the fit reaches the noise."""
     made = simulate(robot, 90, 3, seed=8)
     rng = np.random.default_rng(1)

@@ -89,19 +89,19 @@ def columns(name: str, place: str, scene: Scene = SCENE, **choice: float) -> Col
     return Term(name, place, choice).columns(scene)
 
 
-def test_the_scene_shows_every_effect() -> None:
+def test_the_scene_shows_every_effect():
     assert {term.effect for term in all_terms(SCENE)} == set(EFFECTS)
     assert all(effect.needs(SCENE) == "" for effect in EFFECTS.values())
 
 
-def test_every_effect_is_in_the_guide() -> None:
+def test_every_effect_is_in_the_guide():
     text = DOCS.read_text()
     for effect in EFFECTS.values():
         assert f"`{effect.name}`" in text
 
 
 @pytest.mark.parametrize("which", SCENES)
-def test_columns_have_names_units_and_finite_fields(which: str) -> None:
+def test_columns_have_names_units_and_finite_fields(which):
     scene = SCENES[which]
     for term in all_terms(scene):
         found = term.columns(scene)
@@ -118,7 +118,7 @@ def test_columns_have_names_units_and_finite_fields(which: str) -> None:
 
 
 @pytest.mark.parametrize("which", SCENES)
-def test_the_text_of_a_variant_means_that_variant(which: str) -> None:
+def test_the_text_of_a_variant_means_that_variant(which):
     """And leaves nothing to be picked, unless the law's plain form has nothing to write."""
     scene = SCENES[which]
 
@@ -131,7 +131,7 @@ def test_the_text_of_a_variant_means_that_variant(which: str) -> None:
             assert found.text == term.text or dict(found.choice) == dict(term.choice), term
 
 
-def test_what_one_variant_has_does_not_go_with_another() -> None:
+def test_what_one_variant_has_does_not_go_with_another():
     scene = SCENES["no masses"]
     plain, *_, last = EFFECTS["joint_compliance"].choices(scene, "J2")
     assert "assumed" in last
@@ -140,7 +140,7 @@ def test_what_one_variant_has_does_not_go_with_another() -> None:
 
 
 @pytest.mark.parametrize("which", SCENES)
-def test_columns_are_the_derivative_of_the_points(which: str) -> None:
+def test_columns_are_the_derivative_of_the_points(which):
     """Central difference of the exact points; its own error is of second order in the step."""
     scene = SCENES[which]
     for term in all_terms(scene):
@@ -155,7 +155,7 @@ def test_columns_are_the_derivative_of_the_points(which: str) -> None:
 
 
 @pytest.mark.parametrize("which", SCENES)
-def test_a_part_of_the_data_sees_the_same_law(which: str) -> None:
+def test_a_part_of_the_data_sees_the_same_law(which):
     """With the history kept, a pose's displacement does not depend on which others are there."""
     scene = SCENES[which]
     for rows in (np.arange(5, 25), np.array([7])):
@@ -170,7 +170,7 @@ def test_a_part_of_the_data_sees_the_same_law(which: str) -> None:
             assert_allclose(found, expected, rtol=0, atol=1e-9 * size, err_msg=term)
 
 
-def test_effects_are_read_back_from_their_json() -> None:
+def test_effects_are_read_back_from_their_json():
     terms = tuple(all_terms(SCENE))
     values = tuple(1e-6 * np.ones(len(term.columns(SCENE).names)) for term in terms)
     told = Fitted(terms, values)
@@ -178,7 +178,7 @@ def test_effects_are_read_back_from_their_json() -> None:
     assert_allclose(again.points(SCENE), told.points(SCENE), rtol=0, atol=0)
 
 
-def test_every_term_is_read_back_from_its_text() -> None:
+def test_every_term_is_read_back_from_its_text():
     for term in all_terms(SCENE):
         (again,) = terms(SCENE, [term.text])
         assert (again.label, dict(again.choice)) == (term.label, dict(term.choice))
@@ -209,7 +209,7 @@ def potential(scene: Scene, q: Array) -> Array:
 
 
 @pytest.mark.parametrize("which", ["masses", "no masses", "coupled"])
-def test_torque_is_minus_the_slope_of_the_potential_energy(which: str) -> None:
+def test_torque_is_minus_the_slope_of_the_potential_energy(which):
     """Of a drive that moves several joints, by its own value."""
     scene = SCENES[which]
     for j in range(6):
@@ -219,7 +219,7 @@ def test_torque_is_minus_the_slope_of_the_potential_energy(which: str) -> None:
 
 
 @pytest.mark.dev
-def test_torque_is_the_one_of_pinocchio() -> None:
+def test_torque_is_the_one_of_pinocchio():
     pin = pytest.importorskip("pinocchio")
     data = replace(DATA, columns={k: v for k, v in DATA.columns.items() if k != "payload"})
     scene = scene_of(ROBOT, data)
@@ -241,7 +241,7 @@ def test_torque_is_the_one_of_pinocchio() -> None:
         assert_allclose(scene.gravity[:, m], expected, rtol=0, atol=EXACT * 1e4)
 
 
-def test_compliant_joints_turn_with_their_torque() -> None:
+def test_compliant_joints_turn_with_their_torque():
     for j in range(1, 6):
         choice, *_ = EFFECTS["joint_compliance"].choices(SCENE, f"J{j + 1}")
         found = columns("joint_compliance", f"J{j + 1}", **choice)
@@ -250,7 +250,7 @@ def test_compliant_joints_turn_with_their_torque() -> None:
         assert not np.delete(found.turn[0], j, axis=0).any()
 
 
-def test_gears_act_at_drives_and_bearings_at_joints() -> None:
+def test_gears_act_at_drives_and_bearings_at_joints():
     """A gear's error moves the arm as an error of its drive's value; bearings as if uncoupled."""
     scene = SCENES["coupled"]
     alike = scene_of(ROBOT, replace(DATA, q=COUPLED.turned(DATA.q) * ROBOT.sign))
@@ -275,7 +275,7 @@ def test_gears_act_at_drives_and_bearings_at_joints() -> None:
     assert_allclose(turn * ROBOT.sign[2], wanted, rtol=0, atol=EXACT)
 
 
-def test_a_joint_that_stiffens_gives_way_to_the_first_of_its_torque() -> None:
+def test_a_joint_that_stiffens_gives_way_to_the_first_of_its_torque():
     """As its compliance tells where the torque is small; never by more than at the torque told."""
     effect, tau = EFFECTS["joint_compliance"], SCENE.gravity[1]
     _, *stiffening = effect.choices(SCENE, "J2")
@@ -294,14 +294,14 @@ def test_a_joint_that_stiffens_gives_way_to_the_first_of_its_torque() -> None:
     assert effect.finer(SCENE, plain) == ()
 
 
-def test_the_doubts_of_a_joint_that_stiffens_are_those_of_its_torque_there() -> None:
+def test_the_doubts_of_a_joint_that_stiffens_are_those_of_its_torque_there():
     """Against a central difference, whose error is of second order in the step."""
     torque, other = np.linspace(-40.0, 60.0, 25), np.linspace(5.0, -3.0, 25)
     up, down = (taken_up(torque + sign * 1e-4 * other, 12.0)[0] for sign in (1.0, -1.0))
     assert_allclose(taken_up(torque, 12.0)[1] * other, (up - down) / 2e-4, rtol=0, atol=1e-8)
 
 
-def test_payload_adds_its_torque_even_where_it_never_changes() -> None:
+def test_payload_adds_its_torque_even_where_it_never_changes():
     loaded = replace(DATA, columns={**DATA.columns, "payload": np.full(40, 7.0)})
     empty = replace(DATA, columns={**DATA.columns, "payload": np.zeros(40)})
     with_load, without = scene_of(ROBOT, loaded), scene_of(ROBOT, empty)
@@ -314,7 +314,7 @@ def test_payload_adds_its_torque_even_where_it_never_changes() -> None:
         assert_allclose(found, torque, rtol=0, atol=EXACT * 1e4)
 
 
-def test_measured_torques_replace_computed_ones() -> None:
+def test_measured_torques_replace_computed_ones():
     scene = SCENES["torques"]
     for j in range(6):
         expected = TAU[f"tau{j + 1}"] * ROBOT.sign[j]
@@ -323,7 +323,7 @@ def test_measured_torques_replace_computed_ones() -> None:
 
 
 @pytest.mark.parametrize("lacks", ["a joint", "a pose", "any change"])
-def test_torques_that_tell_too_little_are_not_used(lacks: str) -> None:
+def test_torques_that_tell_too_little_are_not_used(lacks):
     """They would take gravity off the joints that they say nothing of: a notice tells."""
     torques = {name: values.copy() for name, values in TAU.items()}
     if lacks == "a joint":
@@ -338,7 +338,7 @@ def test_torques_that_tell_too_little_are_not_used(lacks: str) -> None:
     assert SCENES["torques"].unused_torques == SCENE.unused_torques == ""
 
 
-def test_torques_of_guessed_masses_stay_so_where_torques_are_measured() -> None:
+def test_torques_of_guessed_masses_stay_so_where_torques_are_measured():
     guessed, measured = (
         scene_of(NO_MASSES, data) for data in (DATA, replace(DATA, columns={**DATA.columns, **TAU}))
     )
@@ -350,7 +350,7 @@ def test_torques_of_guessed_masses_stay_so_where_torques_are_measured() -> None:
     assert not any("assumed" in c for c in EFFECTS["joint_compliance"].choices(measured, "J2"))
 
 
-def test_unknown_masses_give_torques_of_parts() -> None:
+def test_unknown_masses_give_torques_of_parts():
     scene = SCENES["no masses"]
     choice, *_ = EFFECTS["joint_compliance"].choices(scene, "J2")
     found = columns("joint_compliance", "J2", scene, **choice)
@@ -362,7 +362,7 @@ def test_unknown_masses_give_torques_of_parts() -> None:
     assert len(columns("joint_compliance", "J2", **choice).names) == 1
 
 
-def test_a_tool_beside_the_flange_weighs_on_the_joints() -> None:
+def test_a_tool_beside_the_flange_weighs_on_the_joints():
     """Its torque is that of its weight on the axis and of two levers, whatever it weighs."""
     scene = SCENES["no masses"]
     plain, choice = EFFECTS["joint_compliance"].choices(scene, "all")
@@ -383,7 +383,7 @@ def test_a_tool_beside_the_flange_weighs_on_the_joints() -> None:
     assert len(EFFECTS["joint_compliance"].choices(SCENE, "all")) == 1  # masses are told
 
 
-def test_doubt_is_the_change_of_torque_for_other_masses() -> None:
+def test_doubt_is_the_change_of_torque_for_other_masses():
     """The doubts kept span the most of what one sigma of every mass and centre adds up to."""
     parts = SCENE.gravity_parts[:, 1]
     heavier = ROBOT.mass.copy()
@@ -416,7 +416,7 @@ def beam(load: float) -> Scene:
     return Scene.of(robot, data, (np.eye(3), np.zeros(3)), spot, data.q)
 
 
-def test_a_level_link_bends_as_the_cantilever_of_the_textbook() -> None:
+def test_a_level_link_bends_as_the_cantilever_of_the_textbook():
     """Tip force F and moment F e: FL^3/3 + (F e) L^2/2 down, slope FL^2/2 + F e L, per 1/EI."""
     load, length, beyond = 4.0, 2.0, 0.5
     force = load * G
@@ -431,7 +431,7 @@ def test_a_level_link_bends_as_the_cantilever_of_the_textbook() -> None:
 
 
 @pytest.mark.parametrize(("effect", "place"), [("link_bending", "L2"), ("base_flex", "frame")])
-def test_a_tool_that_nobody_told_bends_as_a_payload_of_a_kilogram(effect: str, place: str) -> None:
+def test_a_tool_that_nobody_told_bends_as_a_payload_of_a_kilogram(effect, place):
     empty, one = (
         scene_of(NO_MASSES, replace(DATA, columns={**DATA.columns, "payload": np.full(40, mass)}))
         for mass in (0.0, 1.0)
@@ -455,12 +455,12 @@ def test_a_tool_that_nobody_told_bends_as_a_payload_of_a_kilogram(effect: str, p
     assert owners == [0]  # of the links' masses; the tool's is free
 
 
-def test_links_that_carry_nothing_do_not_bend() -> None:
+def test_links_that_carry_nothing_do_not_bend():
     assert EFFECTS["link_bending"].places(beam(0.0)) == ()
     assert EFFECTS["link_bending"].places(beam(1.0)) == ("L1",)
 
 
-def test_base_tilts_by_the_moment_of_all_weight() -> None:
+def test_base_tilts_by_the_moment_of_all_weight():
     """omega = C M with M = -sum of m (centre of gravity) x g up, payload at the targets."""
     found = columns("base_flex", "frame").displacement(SCENE)[0]
     for m in (0, 17, 39):
@@ -477,7 +477,7 @@ def test_base_tilts_by_the_moment_of_all_weight() -> None:
         assert_allclose(found[:, :, m], expected, rtol=0, atol=EXACT * np.abs(expected).max())
 
 
-def test_bracket_sags_to_gravity_and_not_along_it() -> None:
+def test_bracket_sags_to_gravity_and_not_along_it():
     """A bracket along the flange's axis turns by s x g: not at all where it hangs or stands."""
     pose = ROBOT.pose(DATA.q)
     axis = pose[:, :3, 2]
@@ -490,7 +490,7 @@ def test_bracket_sags_to_gravity_and_not_along_it() -> None:
     assert_allclose(found[1], np.broadcast_to(drawn.T, found[1].shape), rtol=0, atol=EXACT)
 
 
-def test_any_turn_of_the_bracket_contains_the_others() -> None:
+def test_any_turn_of_the_bracket_contains_the_others():
     free = columns("tool_flex", "all", lever=2.0).displacement(SCENE)
     basis = free.reshape(len(free), -1).T
     for lever in (0.0, 1.0):
@@ -499,7 +499,7 @@ def test_any_turn_of_the_bracket_contains_the_others() -> None:
             assert rest < 1e-20 * (one**2).sum()
 
 
-def test_spring_pulls_as_the_length_of_a_real_spring_has_it() -> None:
+def test_spring_pulls_as_the_length_of_a_real_spring_has_it():
     """Torque is the slope of (s - s0)^2 / 2 by the lean, up to the factor a that k holds."""
     zero, eye, rest = 0.2, 0.5, 0.4
     lean = ROBOT.mdh[1, 2] + SCENE.q[1] + np.pi / 2  # from the base's own vertical
@@ -514,7 +514,7 @@ def test_spring_pulls_as_the_length_of_a_real_spring_has_it() -> None:
 # ---------------------------------------------------------------- gears
 
 
-def test_waves_repeat_so_many_times_a_turn() -> None:
+def test_waves_repeat_so_many_times_a_turn():
     found = columns("gear_error", "J3", turns=2.0)
     assert_allclose(found.turn[0, 2] + 1j * found.turn[1, 2], np.exp(2j * SCENE.q[2]), rtol=EXACT)
     assert found.fixed == {"waves_per_turn": 2.0}
@@ -529,9 +529,7 @@ def test_waves_repeat_so_many_times_a_turn() -> None:
     ("found", "orders"),
     [([{"turns": 1.0}], 2.0), ([{"turns": 2.0}, {"turns": 3.0}], 3.0), ([{"orders": 2.0}], 2.0)],
 )
-def test_a_gear_error_has_all_orders_up_to_the_highest_found(
-    found: list[dict[str, float]], orders: float
-) -> None:
+def test_a_gear_error_has_all_orders_up_to_the_highest_found(found, orders):
     assert EFFECTS["gear_error"].entire(found, ()) == [{"orders": orders}]
     alike = [{**choice, "joints": 6.0} for choice in found]  # of several joints at once
     assert EFFECTS["gear_error"].entire(alike, ()) is alike
@@ -540,21 +538,21 @@ def test_a_gear_error_has_all_orders_up_to_the_highest_found(
     assert list(EFFECTS["gear_error"].entire(found, beside)) == rest
 
 
-def test_the_whole_of_a_law_can_be_asked_for() -> None:
+def test_the_whole_of_a_law_can_be_asked_for():
     (term,) = terms(SCENE, ["gear_error:J2:orders=3"])
     assert term.choice == {"orders": 3.0}
     with pytest.raises(mc.CalibrationError, match="no orders 4; choose 2, 3"):
         terms(SCENE, ["gear_error:J2:orders=4"])
 
 
-def test_gain_and_coupling_turn_in_proportion() -> None:
+def test_gain_and_coupling_turn_in_proportion():
     assert_allclose(columns("encoder_gain", "J3").turn[0, 2], -DATA.q[:, 2], rtol=0, atol=0)
     turn = columns("joint_coupling", "J5", source=4.0).turn
     assert_allclose(turn[0, 4], DATA.q[:, 3], rtol=0, atol=0)
     assert np.count_nonzero(turn.any(axis=2)) == 1
 
 
-def test_play_is_half_the_backlash_towards_the_last_move() -> None:
+def test_play_is_half_the_backlash_towards_the_last_move():
     joint, sign = 2, ROBOT.sign[2]
     turn = columns("backlash", "J3").turn[0, joint]
     moves = np.sign(np.diff(DATA.q[:, joint])) * sign
@@ -565,12 +563,12 @@ def test_play_is_half_the_backlash_towards_the_last_move() -> None:
     assert_allclose(found, 0.5 * side * sign, rtol=0, atol=0)
 
 
-def test_settling_is_a_share_of_the_last_move() -> None:
+def test_settling_is_a_share_of_the_last_move():
     turn = columns("settling", "J2").turn[0, 1]
     assert_allclose(turn, [0.0, *np.diff(DATA.q[:, 1])], rtol=0, atol=0)
 
 
-def test_slides_settle_too() -> None:
+def test_slides_settle_too():
     slide = SCENES["a slide"]
     assert "J3" in EFFECTS["settling"].places(slide)
     assert "J3" not in EFFECTS["backlash"].places(slide)  # whose play is told in radians
@@ -581,7 +579,7 @@ def test_slides_settle_too() -> None:
 # ---------------------------------------------------------------- time
 
 
-def test_warm_arm_is_the_arm_with_longer_links() -> None:
+def test_warm_arm_is_the_arm_with_longer_links():
     """A strain of 1e-5 a kelvin against forward kinematics with lengths scaled."""
     strain = 1e-5
     term = Term("thermal_growth", "all", {"temperature": 1.0})
@@ -595,14 +593,14 @@ def test_warm_arm_is_the_arm_with_longer_links() -> None:
         assert_allclose(moved[:, :, m], SPOTS @ pose[:3, :3].T + pose[:3, 3], rtol=0, atol=1e-12)
 
 
-def test_strains_apart_add_up_to_the_common_one() -> None:
+def test_strains_apart_add_up_to_the_common_one():
     apart = columns("thermal_growth", "all", constant=0.5, apart=1.0)
     assert apart.names == ("strain d1", "strain a2", "strain d4")
     common = columns("thermal_growth", "all", constant=0.5).displacement(SCENE)
     assert_allclose(apart.displacement(SCENE).sum(axis=0), common[0], rtol=0, atol=EXACT)
 
 
-def test_growth_slows_down_with_its_time_constant() -> None:
+def test_growth_slows_down_with_its_time_constant():
     clock = SCENE.column("clock")
     straight = columns("thermal_growth", "all", constant=np.inf).shift[0, 0]
     curved = columns("thermal_growth", "all", constant=0.3).shift[0, 0]
@@ -613,7 +611,7 @@ def test_growth_slows_down_with_its_time_constant() -> None:
                     / np.ptp(DATA.columns["time"]), rtol=0, atol=EXACT)  # fmt: skip
 
 
-def test_a_temperature_that_was_not_read_is_not_zero_degrees() -> None:
+def test_a_temperature_that_was_not_read_is_not_zero_degrees():
     term = Term("thermal_growth", "all", {"temperature": 1.0})
     gone = DATA.columns["temperature"].copy()
     gone[3] = np.nan
@@ -626,7 +624,7 @@ def test_a_temperature_that_was_not_read_is_not_zero_degrees() -> None:
     assert not term.columns(scene).shift.any()
 
 
-def test_the_base_drifts_as_one_body() -> None:
+def test_the_base_drifts_as_one_body():
     found = columns("frame_drift", "frame", constant=np.inf)
     clock, p = SCENE.column("clock"), SCENE.points
     assert_allclose(found.shift[1, :, 1], np.broadcast_to(clock, (3, 40)), rtol=0, atol=EXACT)
@@ -635,7 +633,7 @@ def test_the_base_drifts_as_one_body() -> None:
     assert_allclose(found.shift[5], expected, rtol=0, atol=EXACT)
 
 
-def test_a_jump_is_the_base_elsewhere_in_each_further_session() -> None:
+def test_a_jump_is_the_base_elsewhere_in_each_further_session():
     session = np.array(["a", "b", "c", "b"])[np.arange(40) % 4]
     frames = {name: np.eye(4) for name in "abc"}
     scene = scene_of(ROBOT, replace(DATA, frames=frames, columns={**DATA.columns,
@@ -650,7 +648,7 @@ def test_a_jump_is_the_base_elsewhere_in_each_further_session() -> None:
     assert_allclose(after.shift[0, :, 0], np.broadcast_to(SCENE.column("clock") >= 0.4, (3, 40)))
 
 
-def test_a_zero_is_otherwise_before_the_last_rows() -> None:
+def test_a_zero_is_otherwise_before_the_last_rows():
     """The geometry is that of the last session; rows of no known session are as the last ones."""
     session = np.array(["a", "b", "c", "x"])[np.arange(40) % 4]
     frames = {name: np.eye(4) for name in "abc"}
@@ -667,7 +665,7 @@ def test_a_zero_is_otherwise_before_the_last_rows() -> None:
     assert not columns("encoder_zero", "J3", later, session=2.0).turn.any()
 
 
-def test_a_nest_moves_in_the_flange_after_its_moment() -> None:
+def test_a_nest_moves_in_the_flange_after_its_moment():
     since = float(SCENE.column("clock")[15])
     move = np.array([1e-3, -2e-3, 5e-4])
     term = Term("target_shift", "smr2", {"since": since})
@@ -679,7 +677,7 @@ def test_a_nest_moves_in_the_flange_after_its_moment() -> None:
     assert_allclose(moved[..., :15], SCENE.points[..., :15], rtol=0, atol=0)
 
 
-def test_an_offset_lies_on_the_line_of_sight() -> None:
+def test_an_offset_lies_on_the_line_of_sight():
     """The instrument is the origin of the measurement frame; one target, and all of them."""
     rotation, origin = BASE
     seen = np.einsum("ij,kjm->kim", rotation, SCENE.points) + origin[:, None]
@@ -692,7 +690,7 @@ def test_an_offset_lies_on_the_line_of_sight() -> None:
 
 
 @pytest.mark.parametrize("name", ["irb2600", "ur10", "scara_600", "meca500"])
-def test_the_simulator_has_the_gravity_of_the_laws(name: str, rng: np.random.Generator) -> None:
+def test_the_simulator_has_the_gravity_of_the_laws(name, rng):
     """Whether masses are told or those of tubes, each of which hangs midway between its ends."""
     robot = mc.load_robot(name)
     n, signs = robot.joints, rng.choice([-1.0, 1.0], robot.joints)
@@ -714,7 +712,7 @@ def test_the_simulator_has_the_gravity_of_the_laws(name: str, rng: np.random.Gen
         assert_allclose(found, -slope.imag / 1e-30, rtol=0, atol=EXACT * 1e4)
 
 
-def test_a_law_of_the_wrong_shape_is_an_error_in_words() -> None:
+def test_a_law_of_the_wrong_shape_is_an_error_in_words():
     from minimax_cal.ground.errors import OptionError
     from minimax_cal.modelling.effects.scene import Columns
     from minimax_cal.modelling.effects.table import check_columns

@@ -4,7 +4,6 @@ import json
 import runpy
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -130,12 +129,12 @@ CASES: dict[str, list[float]] = {
 }
 
 
-def test_every_effect_is_put_in() -> None:
+def test_every_effect_is_put_in():
     assert {text.partition(":")[0] for text in CASES} == set(EFFECTS)
 
 
 @pytest.mark.parametrize("text", CASES)
-def test_an_effect_that_is_put_in_is_found(text: str) -> None:
+def test_an_effect_that_is_put_in_is_found(text):
     put = {text: CASES[text]}
     data = visited()
     data = measured(with_effects(true_cell(), data, put), data)
@@ -149,7 +148,7 @@ def test_an_effect_that_is_put_in_is_found(text: str) -> None:
 
 
 @pytest.mark.parametrize("objective", ["sum", "minimax", "point", "pose", "smr:1"])
-def test_effects_are_found_with_every_objective(objective: str) -> None:
+def test_effects_are_found_with_every_objective(objective):
     put = {"joint_compliance:all": [1e-6, 8e-7, 2e-6, 1e-5], "encoder_gain:J1": [3e-4]}
     data = visited()
     cell = with_effects(true_cell(), data, put)
@@ -163,7 +162,7 @@ def test_effects_are_found_with_every_objective(objective: str) -> None:
     assert fit.accuracy["holdout"].rms_mm < most * FLOOR_MM
 
 
-def test_finite_turns_are_taken_in_the_second_pass() -> None:
+def test_finite_turns_are_taken_in_the_second_pass():
     """4 mrad at a lever of 2 m: to first order alone the points would miss by 16 um."""
     put = {"joint_compliance:J2": [2.5e-6], "joint_compliance:J3": [5e-6]}
     data = visited()
@@ -177,7 +176,7 @@ def test_finite_turns_are_taken_in_the_second_pass() -> None:
         assert_allclose(values(fit, text)[0][0], true, rtol=2e-4)  # `up` as the nominal base has it
 
 
-def test_priors_are_weighed_against_the_noise_that_effects_leave() -> None:
+def test_priors_are_weighed_against_the_noise_that_effects_leave():
     """The effect would pass for noise of a millimetre, and the priors then win over the data."""
     put = {"joint_compliance:J2": [2e-6]}
     data = visited()
@@ -191,7 +190,7 @@ def test_priors_are_weighed_against_the_noise_that_effects_leave() -> None:
 # ---------------------------------------------------------------- what cannot be told
 
 
-def test_an_effect_that_is_geometry_is_not_identified() -> None:
+def test_an_effect_that_is_geometry_is_not_identified():
     """A wave that never turns is a constant: theta3, and nothing."""
     data = measured(true_cell(), visited())
     text = "gear_ripple:J3:turns=0"
@@ -208,7 +207,7 @@ def test_an_effect_that_is_geometry_is_not_identified() -> None:
     assert_allclose(fit.predict(data.q), plain.predict(data.q), rtol=0, atol=1e-9)
 
 
-def test_the_same_effect_twice_is_told_once() -> None:
+def test_the_same_effect_twice_is_told_once():
     put = {"encoder_gain:J1": [4e-4]}
     data = visited()
     data = measured(with_effects(true_cell(), data, put), data)
@@ -244,11 +243,11 @@ def many() -> tuple[mc.Cell, mc.Measurements, mc.Fit]:
 Many = tuple[mc.Cell, mc.Measurements, mc.Fit]
 
 
-def test_several_effects_are_found_at_once(many: Many) -> None:
+def test_several_effects_are_found_at_once(many):
     check_found(many[2], MANY)
 
 
-def test_a_saved_fit_predicts_the_same(many: Many, tmp_path: Path) -> None:
+def test_a_saved_fit_predicts_the_same(many, tmp_path):
     _, data, fit = many
     fit.save(tmp_path / "fit.json")
     cell = mc.load_cell(tmp_path / "fit.json")
@@ -268,9 +267,7 @@ def test_a_saved_fit_predicts_the_same(many: Many, tmp_path: Path) -> None:
         ({"values": [1.0, 2.0]}, "joint_compliance:J2: 2 values for c2"),
     ],
 )
-def test_a_spoilt_file_is_refused(
-    many: Many, tmp_path: Path, change: dict[str, object], message: str
-) -> None:
+def test_a_spoilt_file_is_refused(many, tmp_path, change, message):
     content = json.loads(many[2].json())
     content["cell"]["effects"][0] |= change
     path = tmp_path / "fit.json"
@@ -279,7 +276,7 @@ def test_a_spoilt_file_is_refused(
         mc.load_cell(path)
 
 
-def test_predictions_hold_what_is_there_at_rest(many: Many) -> None:
+def test_predictions_hold_what_is_there_at_rest(many):
     """Compliance without payload turns joint 2; nothing else acts before the session begins."""
     _, data, fit = many
     cell = replace(fit.cell, effects=Fitted((), ()))
@@ -301,7 +298,7 @@ def axes_of(links: kinematics.Chain) -> Array:
     return np.stack([kinematics.cross(links.y, z), links.y, z], axis=1)
 
 
-def test_new_data_bring_their_own_columns(many: Many) -> None:
+def test_new_data_bring_their_own_columns(many):
     cell, _, fit = many
     cell = replace(cell, sessions=fit.cell.sessions)  # the clock runs on
     new = visited(40, seed=11)
@@ -340,13 +337,13 @@ def test_new_data_bring_their_own_columns(many: Many) -> None:
         ("outliers", "no effect 'outliers'"),
     ],
 )
-def test_a_wrong_wish_is_explained(text: str, message: str) -> None:
+def test_a_wrong_wish_is_explained(text, message):
     data = measured(true_cell(), visited(60))
     with pytest.raises(mc.OptionError, match=message.replace("(", r"\(")):
         mc.calibrate(ROBOT, data, objective="sum", effects=[text])
 
 
-def test_missing_columns_are_named() -> None:
+def test_missing_columns_are_named():
     data = measured(true_cell(), visited(60))
     rest = np.zeros(60)
     still = {f"{stem}{j + 1}": rest for stem in ("approach", "move") for j in range(6)}
@@ -364,7 +361,7 @@ def test_missing_columns_are_named() -> None:
         mc.calibrate(ROBOT, one, objective="sum", effects=["target_shift:smr1"])
 
 
-def test_few_poses_suggest_no_moment() -> None:
+def test_few_poses_suggest_no_moment():
     """A session too short to look for the moment of a shift: one can still tell it."""
     cell, data = true_cell(), visited(10)
     scene = cell.scene(with_history(data))
@@ -374,19 +371,19 @@ def test_few_poses_suggest_no_moment() -> None:
     assert term.choice == {"since": 0.5}
 
 
-def test_a_text_picks_the_variant_that_has_what_it_tells() -> None:
+def test_a_text_picks_the_variant_that_has_what_it_tells():
     scene = true_cell().scene(with_history(visited()))
     (term,) = terms(scene, ["thermal_growth:all:constant=0.37:apart=1"])
     assert dict(term.choice) == {"constant": 0.37, "apart": 1.0}
 
 
-def test_effects_are_taken_from_one_text() -> None:
+def test_effects_are_taken_from_one_text():
     data = measured(true_cell(), visited(60))
     fit = mc.calibrate(ROBOT, data, objective="sum", effects="encoder_gain:J1, base_flex:frame")
     assert [term.label for term in fit.cell.effects.terms] == ["encoder_gain:J1", "base_flex:frame"]
 
 
-def test_effects_may_be_terms_too() -> None:
+def test_effects_may_be_terms_too():
     data = measured(true_cell(), visited(60))
     term = Term("gear_error", "J2", {"turns": 2.0})
     fit = mc.calibrate(ROBOT, data, objective="sum", effects=[term])
@@ -394,7 +391,7 @@ def test_effects_may_be_terms_too() -> None:
     assert json.loads(fit.json())["provenance"]["settings"]["effects"] == [term.text]
 
 
-def test_all_poses_can_be_fitted() -> None:
+def test_all_poses_can_be_fitted():
     put = {"joint_compliance:J2": [6e-7]}
     data = visited(60)
     data = measured(with_effects(true_cell(), data, put), data)
@@ -404,7 +401,7 @@ def test_all_poses_can_be_fitted() -> None:
     check_found(fit, put)
 
 
-def test_targets_may_be_missing_at_some_poses() -> None:
+def test_targets_may_be_missing_at_some_poses():
     put = {"joint_compliance:J2": [6e-7], "target_offset:smr1": [3e-4]}
     data = visited()
     data = measured(with_effects(true_cell(), data, put), data)
@@ -439,7 +436,7 @@ LARGE = {
 }
 
 
-def test_the_model_at_its_values_is_the_cell() -> None:
+def test_the_model_at_its_values_is_the_cell():
     """Columns, and what finite turns add to them, give the exact points again."""
     data, chosen, state, model = joined(LARGE)
     effects = fitted(chosen, scene_of(ROBOT, data, model, state), state.effects)
@@ -448,7 +445,7 @@ def test_the_model_at_its_values_is_the_cell() -> None:
     assert_allclose(model.error(state), expected, rtol=0, atol=1e-12)
 
 
-def test_columns_are_the_derivative_of_the_error() -> None:
+def test_columns_are_the_derivative_of_the_error():
     """Central differences of every parameter, where the error is zero (paper S, eq. 12 ff.)."""
     _, _, state, model = joined(LARGE)
     off = np.einsum("ij,kmj->kim", state.rotation, model.error(state))
@@ -463,7 +460,7 @@ def test_columns_are_the_derivative_of_the_error() -> None:
                         err_msg=model.names.all[i])  # fmt: skip
 
 
-def test_slope_is_the_gradient_of_the_cost() -> None:
+def test_slope_is_the_gradient_of_the_cost():
     """Also where errors are large, and by the base's turn, which takes the effects along."""
     _, _, state, model = joined(LARGE)
     model = replace(model, y=model.y + np.random.default_rng(0).normal(size=model.y.shape))
@@ -478,7 +475,7 @@ def test_slope_is_the_gradient_of_the_cost() -> None:
         assert abs((up - down) / (2.0 * step[i]) - gradient[i]) < 1e-5 * scale[i]
 
 
-def test_full_golub_pereyra_matrix_holds_the_effects() -> None:
+def test_full_golub_pereyra_matrix_holds_the_effects():
     """As in test_model: J'J of the projected residual, effects among what is eliminated."""
     _, _, state, model = joined(LARGE)
     model = replace(model, y=model.y + np.random.default_rng(0).normal(size=model.y.shape))
@@ -524,7 +521,7 @@ def library() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("library")
-def test_an_own_effect_is_fitted_saved_and_loaded(tmp_path: Path) -> None:
+def test_an_own_effect_is_fitted_saved_and_loaded(tmp_path):
     register(
         Effect(
             "squint",
@@ -550,7 +547,7 @@ def test_an_own_effect_is_fitted_saved_and_loaded(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("library")
-def test_the_example_finds_its_effect(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_example_finds_its_effect(capsys):
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     first, second = capsys.readouterr().out.splitlines()
     value, sigma = float(first.split()[2]), float(first.split()[4])
@@ -559,5 +556,5 @@ def test_the_example_finds_its_effect(capsys: pytest.CaptureFixture[str]) -> Non
     assert after < 0.5 * before
 
 
-def test_the_library_is_as_it_was() -> None:
+def test_the_library_is_as_it_was():
     assert not {"squint", "hose_pull"} & set(EFFECTS)

@@ -26,9 +26,7 @@ def somewhere(robot: mc.Robot, rng: np.random.Generator) -> State:
     )
 
 
-def test_normal_equations_are_those_of_the_explicit_jacobian(
-    robot: mc.Robot, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_normal_equations_are_those_of_the_explicit_jacobian(robot, rng, monkeypatch):
     monkeypatch.setattr(model, "BLOCK", 32)  # several blocks
     this = model_of(robot, gappy(rng))
     x = somewhere(robot, rng)
@@ -45,7 +43,7 @@ def test_normal_equations_are_those_of_the_explicit_jacobian(
     assert_allclose(found.gram, gram, rtol=0, atol=1e-12 * np.abs(gram).max())
 
 
-def test_weights_come_from_u95(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_weights_come_from_u95(robot, rng):
     data = gappy(rng)
     this = model_of(robot, data)
     u95 = data.columns["u95"]
@@ -53,9 +51,7 @@ def test_weights_come_from_u95(robot: mc.Robot, rng: np.random.Generator) -> Non
     assert np.all(this.weight[1][~data.seen[:, 1]] == 0.0)
 
 
-def test_projected_lengths_are_the_linear_least_squares_ones(
-    robot: mc.Robot, rng: np.random.Generator
-) -> None:
+def test_projected_lengths_are_the_linear_least_squares_ones(robot, rng):
     this = model_of(robot, gappy(rng))
     linear = this.names.linear
     chosen = np.zeros(this.names.count, dtype=bool)
@@ -75,9 +71,7 @@ def test_projected_lengths_are_the_linear_least_squares_ones(
 
 
 @pytest.mark.parametrize("kind", ["even", "weighted", "poses"])
-def test_full_golub_pereyra_matrix_is_the_square_of_the_projected_jacobian(
-    kind: str, robot: mc.Robot, rng: np.random.Generator
-) -> None:
+def test_full_golub_pereyra_matrix_is_the_square_of_the_projected_jacobian(kind, robot, rng):
     """J'J from Schur complement and coupling against finite differences of the projected residual.
 
     The residual is P y with lengths eliminated by dense linear algebra, in measurement axes: an
@@ -134,7 +128,7 @@ def test_full_golub_pereyra_matrix_is_the_square_of_the_projected_jacobian(
             assert off > 1e-3  # Kaufman's really is another matrix
 
 
-def test_prior_rows_count_like_measurements(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_prior_rows_count_like_measurements(robot, rng):
     this = model_of(robot, gappy(rng))
     weight = np.where(this.names.links, 2.0, 0.0)
     with_prior = this.with_prior(Prior(this.prior.mean, weight))
@@ -148,9 +142,7 @@ def test_prior_rows_count_like_measurements(robot: mc.Robot, rng: np.random.Gene
     assert_allclose(gram - bare, np.diag(weight), rtol=0, atol=1e-10)
 
 
-def test_pose_weights_are_position_and_orientation_errors(
-    robot: mc.Robot, rng: np.random.Generator
-) -> None:
+def test_pose_weights_are_position_and_orientation_errors(robot, rng):
     """A rigid motion of the measured triangle by (shift, small turn) has the cost it should."""
     from minimax_cal.modelling.model import pose_weights
 
@@ -173,7 +165,7 @@ def test_pose_weights_are_position_and_orientation_errors(
     assert cost[0] >= (bent[0] ** 2).sum() * (1 - 1e-9)
 
 
-def test_a_pose_without_all_targets_weighs_nothing(rng: np.random.Generator) -> None:
+def test_a_pose_without_all_targets_weighs_nothing(rng):
     from minimax_cal.modelling.model import pose_weights
 
     y = rng.normal(size=(30, 3, 3))
@@ -183,9 +175,7 @@ def test_a_pose_without_all_targets_weighs_nothing(rng: np.random.Generator) -> 
     assert np.all(np.delete(weight, 4, axis=0).any(axis=(1, 2)))
 
 
-def test_mixed_normal_equations_are_explicit_ones(
-    robot: mc.Robot, rng: np.random.Generator
-) -> None:
+def test_mixed_normal_equations_are_explicit_ones(robot, rng):
     from minimax_cal.modelling.model import pose_weights, with_poses
 
     data = mc.measurements(rng.uniform(-2, 2, (30, 6)), rng.normal(size=(30, 3, 3)))

@@ -7,12 +7,11 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import minimax_cal as mc
-from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.planning.candidates import limits_of
 from minimax_cal.planning.setting import check_same
 
 
-def test_a_fit_of_another_arm_is_refused(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_fit_of_another_arm_is_refused(robot, noisy):
     fit = mc.calibrate(robot, noisy.data, "sum")
     with pytest.raises(mc.OptionError, match=r"the fit is of ABB IRB 2600.*, which is not .*UR10"):
         mc.plan("ur10", 10, fit=fit, candidates=100)
@@ -26,9 +25,7 @@ def test_a_fit_of_another_arm_is_refused(robot: mc.Robot, noisy: Simulation) -> 
         mc.plan(robot, 10, data=noisy.data.with_y(turned), candidates=100)
 
 
-def test_a_joint_without_limits_goes_where_the_poses_at_hand_went(
-    robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_a_joint_without_limits_goes_where_the_poses_at_hand_went(robot, noisy):
     free = replace(
         robot,
         lower=np.where(np.arange(6) < 4, -np.inf, robot.lower),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,7 +35,7 @@ def short() -> Iterator[None]:
         yield
 
 
-def test_a_series_is_its_own_derivative_and_rests_at_its_ends() -> None:
+def test_a_series_is_its_own_derivative_and_rests_at_its_ends():
     rng = np.random.default_rng(1)
     series = Series(rng.normal(size=3), *at_rest(*rng.normal(size=(2, 5, 3))), 7.0)
     t = np.linspace(0.0, 7.0, 701)
@@ -49,7 +48,7 @@ def test_a_series_is_its_own_derivative_and_rests_at_its_ends() -> None:
     assert_allclose((ahead.qd - back.qd) / (2.0 * step), moved.qdd, atol=1e-6)
 
 
-def test_the_motion_stays_within_its_limits(loaded: module.MotionPlan) -> None:
+def test_the_motion_stays_within_its_limits(loaded):
     robot = mc.load_robot(ARM)
     assert [part.name for part in loaded.parts] == ["fast", "slow", "loaded"]
     for part in loaded.parts:
@@ -69,7 +68,7 @@ def test_the_motion_stays_within_its_limits(loaded: module.MotionPlan) -> None:
     assert np.median(peaks) > 0.1
 
 
-def test_the_search_finds_more_than_it_drew(loaded: module.MotionPlan) -> None:
+def test_the_search_finds_more_than_it_drew(loaded):
     robot = mc.load_robot(ARM)
     options = module.MotionOptions(10.0, SPEED, ACCELERATION)
     bounds, _ = module.bounds_of(robot, options, module.PlanOptions(volume=BOX))
@@ -80,7 +79,7 @@ def test_the_search_finds_more_than_it_drew(loaded: module.MotionPlan) -> None:
     assert module.information(model, loaded.parts[0].series) > max(worth)
 
 
-def test_a_payload_tells_drive_gains(loaded: module.MotionPlan, short: None) -> None:
+def test_a_payload_tells_drive_gains(loaded, short):
     alone = mc.plan_motion(ARM, duration=10.0)
     assert any("without a known payload" in text for text in alone.notices)
     gains = [t.sigma for t in alone.told if t.parameter == "drive gain"]
@@ -91,7 +90,7 @@ def test_a_payload_tells_drive_gains(loaded: module.MotionPlan, short: None) -> 
     assert "not separable" in {cell for row in alone.told_table().rows for cell in row}
 
 
-def test_couplings_and_joints_without_a_drive(short: None) -> None:
+def test_couplings_and_joints_without_a_drive(short):
     plain = mc.load_robot(ARM).to_dict()
     plain["coupling"] = {"J3": {"J2": -1.0}, "J4": {"J2": 0.5, "J4": 0.0}}
     robot = robot_from_dict(plain)
@@ -103,7 +102,7 @@ def test_couplings_and_joints_without_a_drive(short: None) -> None:
     assert np.isfinite([t.sigma for t in found.told if t.parameter == "Coulomb"]).sum() == 5
 
 
-def test_what_is_told_is_what_a_fit_finds(loaded: module.MotionPlan) -> None:
+def test_what_is_told_is_what_a_fit_finds(loaded):
     """Repeated fits of friction to torques with the noise that was assumed."""
     robot = mc.load_robot(ARM)
     model = module.model_of(robot, [part.series for part in loaded.parts])
@@ -120,9 +119,7 @@ def test_what_is_told_is_what_a_fit_finds(loaded: module.MotionPlan) -> None:
     assert_allclose(found, module.sigmas(white), rtol=0.2)
 
 
-def test_the_file_is_read_again_once_torques_are_in_it(
-    loaded: module.MotionPlan, tmp_path: Path
-) -> None:
+def test_the_file_is_read_again_once_torques_are_in_it(loaded, tmp_path):
     path = tmp_path / "motion.csv"
     path.write_text(loaded.csv("rad"))
     with pytest.raises(mc.DataError, match="no column of torque or current; drive this motion"):
@@ -139,7 +136,7 @@ def test_the_file_is_read_again_once_torques_are_in_it(
     assert [one.notices for one in runs] == [()] * 3
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], short: None) -> None:
+def test_the_command(tmp_path, capsys, short):
     motion, points = tmp_path / "m.csv", tmp_path / "w.csv"
     words = ("plan", ARM, "--motion", "--duration", 6, "--payload", 1)
     assert run(*words, "-o", motion, "--waypoints", points) == 0
@@ -168,8 +165,6 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], short: 
         (("--motion", "--unit", "grad"), "no unit 'grad'"),
     ],
 )
-def test_mistakes(
-    capsys: pytest.CaptureFixture[str], words: tuple[object, ...], message: str
-) -> None:
+def test_mistakes(capsys, words, message):
     assert run("plan", ARM, *words) == 2
     assert message in capsys.readouterr().err

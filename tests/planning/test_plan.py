@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 import json
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -86,7 +85,7 @@ NAMES = tuple(criteria(2))
 # ---- criteria ----------------------------------------------------------------------------------
 
 
-def test_sizes_are_what_they_say() -> None:
+def test_sizes_are_what_they_say():
     f = 4
     info = random_menu(1, 6, 3, f).of(np.arange(6))
     cov = np.linalg.inv(info)
@@ -104,14 +103,14 @@ def test_sizes_are_what_they_say() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_tells_not_everything_has_no_size(name: str) -> None:
+def test_what_tells_not_everything_has_no_size(name):
     info = random_menu(0, 1, 2, 3).of(np.array([0]))
     assert size_of(criteria(3)[name], info) == np.inf
 
 
 @pytest.mark.parametrize("name", ["D", "A", "I"])
 @pytest.mark.parametrize("r", [1, 3])
-def test_updates_are_those_of_a_new_inverse(name: str, r: int) -> None:
+def test_updates_are_those_of_a_new_inverse(name, r):
     menu, criterion = random_menu(3, 12, r, 5), criteria(5)[name]
     info = menu.of(np.arange(12))
     found = criterion.after(np.linalg.inv(info), menu.rows)
@@ -120,7 +119,7 @@ def test_updates_are_those_of_a_new_inverse(name: str, r: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["E", "G"])
-def test_updates_of_the_worst_are_bounds(name: str) -> None:
+def test_updates_of_the_worst_are_bounds(name):
     menu, criterion = random_menu(3, 12, 2, 5), criteria(5)[name]
     info = menu.of(np.arange(12))
     cov = np.linalg.inv(info)
@@ -131,7 +130,7 @@ def test_updates_of_the_worst_are_bounds(name: str) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10_000), name=st.sampled_from(NAMES))
-def test_no_information_has_a_size_below_the_polar(seed: int, name: str) -> None:
+def test_no_information_has_a_size_below_the_polar(seed, name):
     f = 4
     criterion = criteria(f, seed)[name]
     here, there = (random_menu(seed + i, 6, 2, f).of(np.arange(6)) for i in (1, 2))
@@ -140,7 +139,7 @@ def test_no_information_has_a_size_below_the_polar(seed: int, name: str) -> None
     assert size_of(criterion, there) >= 1.0 / np.trace(pull @ there) * (1 - ROUNDING)
 
 
-def test_scores_are_the_polars_product() -> None:
+def test_scores_are_the_polars_product():
     menu = random_menu(5)
     pull = menu.of(np.arange(3))
     direct = [np.trace(pull @ a.T @ a) for a in menu.rows]
@@ -152,7 +151,7 @@ def test_scores_are_the_polars_product() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000), name=st.sampled_from(NAMES))
-def test_an_exchange_never_worsens(seed: int, name: str) -> None:
+def test_an_exchange_never_worsens(seed, name):
     menu, criterion = random_menu(seed, 14, 1, 4), criteria(4, seed)[name]
     start = np.random.default_rng(seed).choice(14, 6, replace=False)
     before = size_of(criterion, menu.of(start))
@@ -170,7 +169,7 @@ def test_an_exchange_never_worsens(seed: int, name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("at_hand", [False, True])
-def test_small_menus_by_brute_force(name: str, seed: int, at_hand: bool) -> None:
+def test_small_menus_by_brute_force(name, seed, at_hand):
     menu, criterion = random_menu(seed, 11, 1, 3), criteria(3, seed)[name]
     if at_hand:
         menu = Menu(menu.rows, random_menu(seed + 9, 2, 1, 3).of(np.arange(2)))
@@ -190,7 +189,7 @@ def polynomial(points: Array, degree: int, copies: int) -> Menu:
     ("degree", "support"),
     [(2, [-1.0, 0.0, 1.0]), (3, [-1.0, -1 / np.sqrt(5), 1 / np.sqrt(5), 1.0])],
 )
-def test_d_optimal_polynomials_are_the_known_ones(degree: int, support: list[float]) -> None:
+def test_d_optimal_polynomials_are_the_known_ones(degree, support):
     """Equal weights on the zeros of (1 - x^2) P_n'(x) [Guest 1958; Hoel 1958]."""
     points = np.union1d(np.linspace(-1.0, 1.0, 21), support)
     each = 3
@@ -211,7 +210,7 @@ def test_d_optimal_polynomials_are_the_known_ones(degree: int, support: list[flo
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_bound_is_near_the_best_weights(name: str) -> None:
+def test_the_bound_is_near_the_best_weights(name):
     """Below the convex problem's optimum, written down plainly for cvxpy, and near it."""
     cp = pytest.importorskip("cvxpy")
     menu, f, count = random_menu(2, 30, 2, 3), 3, 8
@@ -239,7 +238,7 @@ def test_the_bound_is_near_the_best_weights(name: str) -> None:
     assert found >= expected * (1 - NEAR[name])
 
 
-def test_greedy_takes_the_best_one_by_one() -> None:
+def test_greedy_takes_the_best_one_by_one():
     menu, criterion = random_menu(6, 20, 3, 3), Trace(np.eye(3))
     chosen = greedy(menu, criterion, 5)
     for step in range(2, 5):
@@ -252,7 +251,7 @@ def test_greedy_takes_the_best_one_by_one() -> None:
         assert int(np.argmin(sizes)) == chosen[step]
 
 
-def test_too_few_experiments_are_told_with_how_many_it_takes() -> None:
+def test_too_few_experiments_are_told_with_how_many_it_takes():
     with pytest.raises(mc.OptionError, match=r"2 poses do not tell the 7 parameters .* at least 4"):
         first_design(random_menu(0, 30, 2, 7), Determinant(), 2, 0)
     flat = Menu(np.ones((20, 1, 2)), np.zeros((2, 2)))
@@ -260,7 +259,7 @@ def test_too_few_experiments_are_told_with_how_many_it_takes() -> None:
         first_design(flat, Determinant(), 3, 0)
 
 
-def test_worth_is_the_number_of_random_ones_that_tell_as_much() -> None:
+def test_worth_is_the_number_of_random_ones_that_tell_as_much():
     menu, criterion = random_menu(8, 4000, 3, 3), Trace(np.eye(3))
     rng = np.random.default_rng(1)
     sizes = [size_of(criterion, menu.of(rng.choice(4000, 75, replace=False))) for _ in range(200)]
@@ -271,7 +270,7 @@ def test_worth_is_the_number_of_random_ones_that_tell_as_much() -> None:
 # ---- indices and tours -------------------------------------------------------------------------
 
 
-def test_observability_by_hand() -> None:
+def test_observability_by_hand():
     found = observability(np.array([4.0, 2.0, 1.0]), 4)
     assert found == pytest.approx(
         {"O1": 2.0 / 2.0, "O2": 1 / 4, "O3": 1.0, "O4": 1 / 4, "O5": 1 / (1 / 4 + 1 / 2 + 1)}
@@ -280,7 +279,7 @@ def test_observability_by_hand() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_short_way_is_near_the_shortest(seed: int) -> None:
+def test_a_short_way_is_near_the_shortest(seed):
     rng = np.random.default_rng(seed)
     q, sliding = rng.uniform(-2.0, 2.0, (6, 3)), np.array([False, True, False])
     begin = np.zeros(3)
@@ -299,14 +298,14 @@ def test_a_short_way_is_near_the_shortest(seed: int) -> None:
         assert travel(np.concatenate([begin[None], q[other]]), sliding) >= found - ROUNDING
 
 
-def test_travel_counts_the_joint_that_goes_farthest() -> None:
+def test_travel_counts_the_joint_that_goes_farthest():
     q = np.array([[0.0, 0.0], [0.3, -0.1], [0.3, 0.4]])
     assert travel(q, np.array([False, False])) == pytest.approx(0.3 + 0.5)
     assert travel(q, np.array([False, True])) == pytest.approx(0.3 + 1.0)  # a slide of 0.5 m
     assert travel(q[:1], np.array([False, False])) == 0.0
 
 
-def test_revisits_come_from_the_other_side() -> None:
+def test_revisits_come_from_the_other_side():
     rng = np.random.default_rng(0)
     q, sliding = rng.uniform(-1.0, 1.0, (9, 3)), np.zeros(3, dtype=bool)
     far = np.full(3, 2.0)
@@ -336,7 +335,7 @@ def ahead_of(robot: mc.Robot, k: int, q: Array, seen: Array, noise: Instrument) 
     return prospect(cell, noise, q, seen)
 
 
-def test_information_is_that_of_dense_covariances(robot: mc.Robot) -> None:
+def test_information_is_that_of_dense_covariances(robot):
     rng = np.random.default_rng(0)
     q = random_poses(robot, 40, rng)
     seen = rng.uniform(size=(40, 2)) < 0.7
@@ -365,9 +364,7 @@ def test_information_is_that_of_dense_covariances(robot: mc.Robot) -> None:
     # a plain fit does not know that joints jitter and noise grows with range, the prediction does
     [(Instrument(12e-6, 0.0, 0.0), 1.09), (NOISE, 1.2)],
 )
-def test_predicted_variance_is_that_of_refits(
-    robot: mc.Robot, noise: Instrument, most: float
-) -> None:
+def test_predicted_variance_is_that_of_refits(robot, noise, most):
     rng = np.random.default_rng(3)
     q, work = random_poses(robot, 25, rng), random_poses(robot, 60, rng)
     ahead = ahead_of(robot, 1, q, np.ones((25, 1), dtype=bool), noise)
@@ -389,7 +386,7 @@ def test_predicted_variance_is_that_of_refits(
     assert 0.91 < found / predicted[0] < most
 
 
-def test_effects_are_unknowns_too(robot: mc.Robot) -> None:
+def test_effects_are_unknowns_too(robot):
     q = random_poses(robot, 60, np.random.default_rng(0))
     seen = np.ones((60, 3), dtype=bool)
     plain = ahead_of(robot, 3, q, seen, NOISE)
@@ -422,7 +419,7 @@ def planned(robot: mc.Robot) -> Plan:
     return plan(robot, 12, targets=1, candidates=150, revisit=3, approach="both", seed=2)
 
 
-def test_a_plan_is_better_than_random_poses(planned: Plan) -> None:
+def test_a_plan_is_better_than_random_poses(planned):
     assert planned.bound <= planned.size < planned.random
     assert 0.6 < planned.efficiency <= 1.0  # 36 coordinates for 27 unknowns: whole poses cost
     assert planned.equal > 12
@@ -438,7 +435,7 @@ def test_a_plan_is_better_than_random_poses(planned: Plan) -> None:
         assert other > 0.0
 
 
-def test_a_plan_is_better_at_poses_that_it_does_not_know(planned: Plan) -> None:
+def test_a_plan_is_better_at_poses_that_it_does_not_know(planned):
     room, _, _ = surroundings(planned.cell, PlanOptions(targets=1))
     fresh = free_poses(room, 1000, 1_000_003)
     every = planned.candidates
@@ -457,7 +454,7 @@ def test_a_plan_is_better_at_poses_that_it_does_not_know(planned: Plan) -> None:
     assert ours < told(every.q, every.seen, drawn).min()
 
 
-def test_predicted_sigmas_are_those_of_the_information(planned: Plan, robot: mc.Robot) -> None:
+def test_predicted_sigmas_are_those_of_the_information(planned, robot):
     ahead = prospect(planned.cell, planned.instrument, planned.candidates.q,
                      planned.candidates.seen)  # fmt: skip
     rows = ahead.ahead(planned.q, planned.seen).reshape(-1, len(ahead.scale))
@@ -466,7 +463,7 @@ def test_predicted_sigmas_are_those_of_the_information(planned: Plan, robot: mc.
     assert_allclose(planned.sigma, sigma, rtol=1e-6)
 
 
-def test_a_plan_of_as_few_poses_as_can_be(robot: mc.Robot) -> None:
+def test_a_plan_of_as_few_poses_as_can_be(robot):
     """Nine poses of one target are 27 coordinates for 27 unknowns."""
     found = plan(robot, 9, targets=1, candidates=9, acceptance=np.pi, seed=1)
     assert len(found.names) == 27
@@ -478,7 +475,7 @@ def test_a_plan_of_as_few_poses_as_can_be(robot: mc.Robot) -> None:
         plan(robot, 8, targets=1, candidates=100, acceptance=np.pi)
 
 
-def test_a_plan_tells_itself(planned: Plan, tmp_path: Path) -> None:
+def test_a_plan_tells_itself(planned, tmp_path):
     content = json.loads(planned.json())
     assert content["schema"] == 1
     assert content["kind"] == "plan"
@@ -492,7 +489,7 @@ def test_a_plan_tells_itself(planned: Plan, tmp_path: Path) -> None:
         assert words in text
 
 
-def test_poses_at_hand_count(robot: mc.Robot) -> None:
+def test_poses_at_hand_count(robot):
     rng = np.random.default_rng(5)
     cell = cell_ahead(mc.Cell(robot, np.eye(4), ("smr1",), ring(1)), np.array([3.0, 0.0, 1.0]))
     q = random_poses(robot, 15, rng)
@@ -510,7 +507,7 @@ def test_poses_at_hand_count(robot: mc.Robot) -> None:
     assert any("tells no poses" in notice for notice in alone.notices)
 
 
-def test_noise_is_as_the_data_show_it(robot: mc.Robot) -> None:
+def test_noise_is_as_the_data_show_it(robot):
     rng = np.random.default_rng(6)
     cell = cell_ahead(mc.Cell(robot, np.eye(4), ("smr1", "smr2", "smr3"), ring(3)),
                       np.array([3.0, 0.0, 1.0]))  # fmt: skip
@@ -552,9 +549,7 @@ def asked(robot: mc.Robot, narrow: mc.Measurements) -> Callable[..., separating.
 
 
 @pytest.mark.parametrize("pair", [GAIN, ("joint_compliance:J2", "base_flex:frame")])
-def test_power_is_what_separate_says(
-    asked: Callable[..., separating.Question], pair: tuple[str, str]
-) -> None:
+def test_power_is_what_separate_says(asked, pair):
     """Its own proposal of more poses, given to us as candidates that are all measured."""
     one = asked(*pair)
     told = next_measurement.powers(one.site, one.pair)
@@ -569,7 +564,7 @@ def test_power_is_what_separate_says(
         assert_allclose(ours.now, told["old", 50], rtol=near)
 
 
-def test_planned_poses_tell_effects_apart_sooner(robot: mc.Robot, narrow: mc.Measurements) -> None:
+def test_planned_poses_tell_effects_apart_sooner(robot, narrow):
     found = plan(robot, 8, data=narrow, separate=GAIN, candidates=150, acceptance=np.pi)
     (separation,) = found.separation
     assert found.criterion == POWER
@@ -582,9 +577,7 @@ def test_planned_poses_tell_effects_apart_sooner(robot: mc.Robot, narrow: mc.Mea
     assert json.loads(found.json())["separation"][0]["rival"] == "gear_error:J3"
 
 
-def test_effects_that_are_alike_everywhere_are_said_to_be(
-    robot: mc.Robot, narrow: mc.Measurements
-) -> None:
+def test_effects_that_are_alike_everywhere_are_said_to_be(robot, narrow):
     pair = ("encoder_gain:J3", "encoder_gain:all")
     found = plan(robot, 6, data=narrow, separate=pair, candidates=60, acceptance=np.pi)
     (separation,) = found.separation
@@ -593,9 +586,7 @@ def test_effects_that_are_alike_everywhere_are_said_to_be(
     assert separation.else_
 
 
-def test_effects_that_a_fit_holds_as_a_whole_are_not_asked_for_in_part(
-    robot: mc.Robot, narrow: mc.Measurements
-) -> None:
+def test_effects_that_a_fit_holds_as_a_whole_are_not_asked_for_in_part(robot, narrow):
     fit = mc.calibrate(robot, narrow, "sum", holdout=0.0, effects=("joint_compliance:all",))
     with pytest.raises(mc.OptionError, match="the fit holds joint_compliance:all, and"):
         plan(robot, 6, fit=fit, separate=("joint_compliance:J2", "link_bending:L2"), candidates=60)
@@ -607,9 +598,7 @@ def test_effects_that_a_fit_holds_as_a_whole_are_not_asked_for_in_part(
     assert [term.label for term, _ in asked.pair.known] == ["joint_compliance:all"]
 
 
-def test_revisits_from_the_other_side_show_play(
-    asked: Callable[..., separating.Question], robot: mc.Robot
-) -> None:
+def test_revisits_from_the_other_side_show_play(asked, robot):
     rng = np.random.default_rng(1)
     one = asked(*GAIN)
     pair = next_measurement.Pair(Term("backlash", "J2"), np.array([3e-5]), one.pair.other)
@@ -649,13 +638,13 @@ def test_revisits_from_the_other_side_show_play(
         ({"effects": ("nonsense",)}, "no effect 'nonsense'"),
     ],
 )
-def test_wishes_that_make_no_sense(robot: mc.Robot, wishes: dict, message: str) -> None:
+def test_wishes_that_make_no_sense(robot, wishes, message):
     given = {"poses": 10, "candidates": 60, **wishes}
     with pytest.raises(mc.OptionError, match=message):
         plan(robot, given.pop("poses"), **given)
 
 
-def test_a_fit_tells_where_things_are(robot: mc.Robot, noisy: object) -> None:
+def test_a_fit_tells_where_things_are(robot, noisy):
     cell = cell_ahead(mc.Cell(robot, np.eye(4), ("smr1",), ring(1)), np.array([3.0, 0.0, 1.0]))
     with pytest.raises(mc.OptionError, match="leave tracker= and spots= out"):
         plan(robot, 10, fit=cell, tracker=(3.0, 0.0, 1.0))

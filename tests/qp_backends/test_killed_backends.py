@@ -1,14 +1,12 @@
 """However a QP backend dies, the calibration goes on with another and says so."""
 
 import time
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 import minimax_cal as mc
 import qp_backends
-from minimax_cal.modelling.simulate import Simulation
 from qp_backends import Problem, Solution, Status
 
 
@@ -33,9 +31,7 @@ def out_of_time(problem: Problem, time_limit: float = np.inf) -> Solution:
 
 
 @pytest.mark.parametrize("killed", [raising, not_numbers, lying, out_of_time])
-def test_another_backend_takes_over(
-    killed: Callable[..., Solution], robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_another_backend_takes_over(killed, robot, noisy):
     name = f"killed-{killed.__name__}"
     qp_backends.register(name, killed)
     fit = mc.calibrate(robot, noisy.data, "minimax", qp=name)
@@ -49,7 +45,7 @@ def test_another_backend_takes_over(
     )
 
 
-def test_a_backend_that_is_not_installed(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_backend_that_is_not_installed(robot, noisy):
     missing = [name for name in qp_backends.names() if name not in qp_backends.available()]
     if not missing:
         pytest.skip("every known backend is installed here")
@@ -61,6 +57,6 @@ def test_a_backend_that_is_not_installed(robot: mc.Robot, noisy: Simulation) -> 
     assert fit.provenance.settings["qp"] == missing[0]
 
 
-def test_a_name_that_does_not_exist_is_a_mistake(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_name_that_does_not_exist_is_a_mistake(robot, noisy):
     with pytest.raises(mc.OptionError, match="did you mean"):
         mc.calibrate(robot, noisy.data, qp="clarabell")

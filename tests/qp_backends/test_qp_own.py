@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -54,7 +53,7 @@ def no_status(given: Problem) -> Any:
     return Solution(*ANSWER, "solved", 0.0)  # type: ignore[arg-type]
 
 
-def test_a_solver_that_changes_the_problem_changes_its_own_copy() -> None:
+def test_a_solver_that_changes_the_problem_changes_its_own_copy():
     """Were it the caller's, x = 0 would solve what is left of it."""
     registry.register("mine", spoiling)
     asked = problem()
@@ -64,7 +63,7 @@ def test_a_solver_that_changes_the_problem_changes_its_own_copy() -> None:
     assert asked.q.tolist() == [1.0, 1.0]
 
 
-def test_a_process_of_its_own_gives_the_same_answer() -> None:
+def test_a_process_of_its_own_gives_the_same_answer():
     registry.register("mine", right, seconds=60.0)
     found = solve(problem(), "mine", fallback=False)
     assert found.status is Status.SOLVED
@@ -79,9 +78,7 @@ def test_a_process_of_its_own_gives_the_same_answer() -> None:
         (leaving, 120.0, "raised"),
     ],
 )
-def test_what_never_ends_or_dies_is_replaced(
-    solver: Callable[..., Any], seconds: float, says: str
-) -> None:
+def test_what_never_ends_or_dies_is_replaced(solver, seconds, says):
     """The two that die get time to start: a busy machine may need seconds for that."""
     registry.register("mine", solver, seconds=seconds)
     found = solve(problem(), "mine")
@@ -90,14 +87,14 @@ def test_what_never_ends_or_dies_is_replaced(
     assert says in found.notes[0]
 
 
-def test_a_status_of_its_own_making_is_no_answer() -> None:
+def test_a_status_of_its_own_making_is_no_answer():
     registry.register("mine", no_status)
     found = solve(problem(), "mine")
     assert found.status is Status.SOLVED
     assert "no qp_backends.Status" in found.notes[0]
 
 
-def test_a_process_needs_what_can_be_imported() -> None:
+def test_a_process_needs_what_can_be_imported():
     with pytest.raises(BackendError, match="top of a module"):
         registry.register("mine", lambda given: ANSWER, seconds=1.0)
     with pytest.raises(BackendError, match="positive"):

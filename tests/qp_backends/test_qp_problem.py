@@ -52,7 +52,7 @@ def test_row_norm_is_the_same_dense_and_sparse():
     assert not dense.has_sparse
 
 
-def test_one_sided_rows_say_the_same() -> None:
+def test_one_sided_rows_say_the_same():
     A = np.array([[1.0, 2.0], [3.0, -1.0], [0.5, 0.5]])
     problem = Problem(np.eye(2), np.zeros(2), A, [-1.0, -np.inf, 0.0], [1.0, 2.0, 4.0])
     rows, bound, low = problem.above

@@ -1,7 +1,5 @@
 """Texts as rows and numbers: whole tables at once as cell by cell."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
@@ -12,7 +10,7 @@ from minimax_cal.reading.words import in_own_words
 
 
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
-def test_a_table_read_at_once_is_that_of_its_cells(delimiter: str) -> None:
+def test_a_table_read_at_once_is_that_of_its_cells(delimiter):
     rng = np.random.default_rng(0)
     values = rng.normal(size=(20_000, 4)) * 10.0 ** rng.integers(-30, 30, (20_000, 4))
     rows = [delimiter.join(map(repr, row)) for row in values.tolist()]
@@ -26,13 +24,13 @@ def test_a_table_read_at_once_is_that_of_its_cells(delimiter: str) -> None:
 @pytest.mark.parametrize(
     "row", ["1,,3", "1,x,3", "1,null,3", "1,[2],3", "1,1_0,3", '1,"2",3', "1,1e999,3", "01,2,3"]
 )
-def test_what_is_no_plain_number_is_left_to_the_cells(row: str) -> None:
+def test_what_is_no_plain_number_is_left_to_the_cells(row):
     table = cut(sheet_of("x.csv", f"a,b,c\n1,2,3\n{row}\n4,5,6\n"))
     assert table.block is None
     assert table.cells[1] == tuple(row.replace('"', "").split(","))
 
 
-def test_words_that_mean_a_column_of_this_project() -> None:
+def test_words_that_mean_a_column_of_this_project():
     german = ["Pose", "Achse 1 [°]", "Achse 2 [°]", "Zeit [s]", "Werkzeug", "Prüfer"]
     assert in_own_words(german) == ("pose", "q1_deg", "q2_deg", "time_s", "tool", "Prüfer")
     own = ["q1_deg", "name", "id", "outil"]
@@ -40,7 +38,7 @@ def test_words_that_mean_a_column_of_this_project() -> None:
     assert in_own_words(["Ziel", "X [mm]", "y_mm"]) == ("target", "x_mm", "y_mm")
 
 
-def test_a_file_without_columns_or_text(tmp_path: Path) -> None:
+def test_a_file_without_columns_or_text(tmp_path):
     for content, said in ((b"word\n", "no columns"), (b"\0\1\2", "not a text"), (b" ", "empty")):
         (tmp_path / "x").write_bytes(content)
         with pytest.raises(mc.DataError, match=said):

@@ -1,7 +1,5 @@
 """The page to sign judges a requirement by what leaves the house, and not by a model of no file."""
 
-from pathlib import Path
-
 import pytest
 
 import minimax_cal as mc
@@ -33,7 +31,7 @@ def judged(fit: mc.Fit, limits: str, *deliver: str) -> Signed:
     return signed(read_sources([fit]), limits_of(limits), "inside", None, deliver)
 
 
-def test_a_file_is_judged_by_what_it_reaches(fit: mc.Fit, between: str) -> None:
+def test_a_file_is_judged_by_what_it_reaches(fit, between):
     """The same fit passes for corrected targets and not for a URDF."""
     for names, verdict, of in (
         ((), PASSED, "compensate"),
@@ -55,7 +53,7 @@ def test_a_file_is_judged_by_what_it_reaches(fit: mc.Fit, between: str) -> None:
     assert "frame_drift:frame" in rows[0].delivered.not_carried
 
 
-def test_geometry_alone_is_its_own_deliverable(between: str) -> None:
+def test_geometry_alone_is_its_own_deliverable(between):
     made = simulate("irb2600", 120, 3, seed=4)
     plain = mc.calibrate("irb2600", made.data, "sum")
     alone = judged(plain, between)
@@ -66,16 +64,14 @@ def test_geometry_alone_is_its_own_deliverable(between: str) -> None:
     assert named.verdict == alone.verdict
 
 
-def test_without_measurements_nothing_is_stated(fit: mc.Fit, between: str, tmp_path: Path) -> None:
+def test_without_measurements_nothing_is_stated(fit, between, tmp_path):
     fit.save(tmp_path / "fit.json", poses=False)
     found = judged(mc.load_fit(tmp_path / "fit.json"), between, "urdf")
     assert found.verdict == NOT_STATED
     assert "holds no measurements" in found.judged[0].why
 
 
-def test_the_page_and_the_command_say_for_which_file(
-    fit: mc.Fit, between: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_page_and_the_command_say_for_which_file(fit, between, tmp_path, capsys):
     fit.save(tmp_path / "fit.json")
     asked = ("report", tmp_path / "fit.json", "--tolerance", between, "-o", tmp_path / "page.html")
     assert run(*asked) == 0

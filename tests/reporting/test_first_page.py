@@ -42,9 +42,7 @@ def rows(seen: Seen) -> dict[str, list[str]]:
     }
 
 
-def test_requirement_result_and_verdict(
-    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_requirement_result_and_verdict(whole, tmp_path, capsys):
     fit, out = mc.load_fit(whole), tmp_path / "report.html"
     high = 1e3 * fit.within.rms.high
     for size, verdict in ((1.1 * high, "passed"), (0.5 * fit.within.after.rms_mm, "not passed")):
@@ -62,9 +60,7 @@ def test_requirement_result_and_verdict(
         assert verdict.capitalize() in seen.text["verdict"]
 
 
-def test_beyond_is_asked_of_the_worst_part(
-    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_beyond_is_asked_of_the_worst_part(whole, tmp_path, capsys):
     fit = mc.load_fit(whole)
     out = tmp_path / "report.html"
     size = 0.5 * (fit.within.rms.high * 1e3 + fit.beyond.rms_high_mm)
@@ -79,9 +75,7 @@ def test_beyond_is_asked_of_the_worst_part(
     assert "choose inside or outside" in capsys.readouterr().err
 
 
-def test_an_arm_of_half_its_lengths_is_not_signed_unseen(
-    robot: mc.Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_arm_of_half_its_lengths_is_not_signed_unseen(robot, tmp_path, capsys):
     """Points that are scaled by half give links of half their length: told on the sheet itself."""
     made = mc.simulate(robot, 60, seed=4)
     for factor, told in ((0.5, True), (1.0, False)):
@@ -95,7 +89,7 @@ def test_an_arm_of_half_its_lengths_is_not_signed_unseen(
         assert ("another arm's" in Seen(page.read_text()).text["verdict"]) == told
 
 
-def test_the_page_says_which_model_is_signed(results: Path, whole: Path) -> None:
+def test_the_page_says_which_model_is_signed(results, whole):
     plain = rendered(WORDING, results / "fit.json", results / "gap.json")
     assert any(title == "Model: geometry alone" for title in plain.tables)
     text = plain.text["verdict"]
@@ -112,7 +106,7 @@ def test_the_page_says_which_model_is_signed(results: Path, whole: Path) -> None
     assert "effects beyond geometry" in both.tables
 
 
-def test_only_what_a_diagnosis_establishes_is_told_for_established(results: Path) -> None:
+def test_only_what_a_diagnosis_establishes_is_told_for_established(results):
     fit, gap = mc.load_fit(results / "fit.json"), load_diagnosis(results / "gap.json")
 
     def limiting(verdict: str, share: float) -> str:
@@ -131,7 +125,7 @@ def test_only_what_a_diagnosis_establishes_is_told_for_established(results: Path
     assert cause not in limiting("named", -0.001)  # a cause that closes nothing limits nothing
 
 
-def test_a_floor_that_is_an_upper_bound_is_no_cause(results: Path) -> None:
+def test_a_floor_that_is_an_upper_bound_is_no_cause(results):
     gap = load_diagnosis(results / "gap.json")
     assert gap.remainder is not None
     rest = replace(gap.remainder, predictable_mm=0.026)
@@ -148,7 +142,7 @@ def test_a_floor_that_is_an_upper_bound_is_no_cause(results: Path) -> None:
     assert "no pose was measured twice" in told
 
 
-def test_rungs_of_a_diagnosis(results: Path, tmp_path: Path) -> None:
+def test_rungs_of_a_diagnosis(results, tmp_path):
     gap = load_diagnosis(results / "gap.json")
     for number, step in ((0, gap.ladder[0]), (1, gap.ladder[1]), (None, gap.ladder[-1])):
         wording = Wording("2026-11-21", rung=number)
@@ -161,7 +155,7 @@ def test_rungs_of_a_diagnosis(results: Path, tmp_path: Path) -> None:
         mc.report(results / "fit.json", tmp_path / "a.html", rung=1)
 
 
-def test_too_few_poses_leave_a_maximum_open(robot: mc.Robot, tmp_path: Path) -> None:
+def test_too_few_poses_leave_a_maximum_open(robot, tmp_path):
     """Nine held-out poses, and none in turn: the file of an earlier version."""
     fit = mc.calibrate(robot, mc.simulate(robot, 45, 3, seed=2).data, "sum")
     content = fit.to_dict()
@@ -173,9 +167,7 @@ def test_too_few_poses_leave_a_maximum_open(robot: mc.Robot, tmp_path: Path) -> 
     assert "9 poses are too few for a maximum: at least 19 are needed" in text
 
 
-def test_facts_are_of_the_file_or_to_be_filled_in(
-    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_facts_are_of_the_file_or_to_be_filled_in(results, tmp_path, capsys):
     toml, out = tmp_path / "cell.toml", tmp_path / "report.html"
     toml.write_text('serial_number = "26-104711"\npayload = 12\ncustomer = "<b>Example</b>"\n')
     assert run("report", results / "fit.json", "--facts", toml, "-o", out) == 0
@@ -195,9 +187,7 @@ def test_facts_are_of_the_file_or_to_be_filled_in(
 
 
 @pytest.mark.usefixtures("browser")
-def test_paper_and_picture_by_the_ending(
-    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_paper_and_picture_by_the_ending(results, tmp_path, monkeypatch):
     assert run("report", results / "fit.json", "-o", tmp_path / "page.png") == 0
     assert (tmp_path / "page.png").read_bytes().startswith(b"\x89PNG")
     printed: list[tuple[str, Path]] = []  # by a browser in `test_pdf_holds_the_whole_report`

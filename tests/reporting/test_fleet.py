@@ -48,7 +48,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_ten_cells(folder: Path, tmp_path: Path) -> None:
+def test_ten_cells(folder, tmp_path):
     found = mc.fleet(
         folder / "cells.toml", out=tmp_path / "fits", page=tmp_path / "page.html", processes=1
     )
@@ -73,15 +73,13 @@ def test_ten_cells(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_processes_say_what_one_says(folder: Path) -> None:
+def test_processes_say_what_one_says(folder):
     pytest.importorskip("joblib", reason="needs pip install minimax-cal[fleet]")
     one, two = (mc.fleet(folder / "cells.toml", processes=count).to_dict() for count in (1, 2))
     assert one == two
 
 
-def test_the_command_goes_on_after_a_failed_cell(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_goes_on_after_a_failed_cell(folder, tmp_path, capsys):
     text = (folder / "cells.toml").read_text().split("[[cells]]")
     short = folder / "short.toml"
     short.write_text("\n[[cells]]".join([text[0], text[-1], text[3]]))
@@ -93,7 +91,7 @@ def test_the_command_goes_on_after_a_failed_cell(
     assert both.err.splitlines()[-1] == "error: 1 cells failed: broken"
 
 
-def test_what_cells_say_is_escaped() -> None:
+def test_what_cells_say_is_escaped():
     row = Row("a", "<b>&", "calibrated", "converged", "", 1.0, 1.0, 1.0, (), "", "<img src=x>")
     page = Fleet((row,), "<i>").html()
     for bad in ("<b>", "<img", "<i>"):
@@ -117,9 +115,7 @@ def test_what_cells_say_is_escaped() -> None:
         ("[[cells]", "is not TOML"),
     ],
 )  # fmt: skip
-def test_a_wrong_file_is_one_line(
-    text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_file_is_one_line(text, said, tmp_path, capsys):
     (tmp_path / "cells.toml").write_text(text)
     assert run("fleet", tmp_path / "cells.toml") == 2
     err = capsys.readouterr().err
@@ -127,7 +123,7 @@ def test_a_wrong_file_is_one_line(
     assert len(err.splitlines()) == 1
 
 
-def test_a_wrong_place_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_place_is_one_line(folder, capsys):
     cells = folder / "cells.toml"
     assert run("fleet", cells, "--jobs", "0") == 2
     assert run("fleet", cells, "--page", folder / "page.png") == 2
@@ -135,9 +131,7 @@ def test_a_wrong_place_is_one_line(folder: Path, capsys: pytest.CaptureFixture[s
     assert len(capsys.readouterr().err.splitlines()) == 3
 
 
-def test_what_a_calibration_says_is_in_its_row(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_calibration_says_is_in_its_row(folder, tmp_path, capsys):
     """A fleet of the wrong robot looked like any other."""
     other = simulate("ur10", 24, 3, 1, Truth(compliance=0.0)).data
     mc.write_measurements(tmp_path / "other.csv", other)

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from minimax_cal.fitting.several import RelativeCalibration, relative
 from minimax_cal.instruments import flange_poses
 from minimax_cal.judging.bootstrap import bootstrap
 from minimax_cal.modelling.frames import frames_of, tables_of
-from minimax_cal.modelling.simulate import Simulation, simulate
+from minimax_cal.modelling.simulate import simulate
 from minimax_cal.robots.frames import Frame
 from minimax_cal.robots.transforms import transform
 
@@ -25,12 +24,7 @@ TOOL = ("tool", "tool_nominal", "tool_correction")
 KEYS = {"xyz_mm", "abc_deg", "quaternion_wxyz", "rotation_vector_rad"}
 
 
-@pytest.fixture(scope="module")
-def fit(robot: mc.Robot, noisy: Simulation) -> mc.Fit:
-    return mc.calibrate(robot, noisy.data, "sum")
-
-
-def test_the_base_is_where_it_stands(fit: mc.Fit) -> None:
+def test_the_base_is_where_it_stands(fit):
     frames = fit.to_dict()["frames"]
     assert list(frames) == [*BASE, *TOOL]
     assert all(set(frame) == KEYS for frame in frames.values())
@@ -42,7 +36,7 @@ def test_the_base_is_where_it_stands(fit: mc.Fit) -> None:
     assert abs(fit.parameters["base_x"].value) != pytest.approx(1e-3 * abs(base["xyz_mm"][0]))
 
 
-def test_corrections_are_the_changes_of_the_parameters(fit: mc.Fit) -> None:
+def test_corrections_are_the_changes_of_the_parameters(fit):
     correction = fit.frames["base_correction"]
     one = {p.name: p for p in fit.parameters}
     moved = [1e3 * (one[f"base_{a}"].value - one[f"base_{a}"].nominal) for a in "xyz"]
@@ -54,7 +48,7 @@ def test_corrections_are_the_changes_of_the_parameters(fit: mc.Fit) -> None:
         assert_allclose(drawn @ fit.frames[f"{name}_correction"].pose, found, rtol=0, atol=1e-12)
 
 
-def test_the_tool_is_the_reflectors_as_one_body(fit: mc.Fit) -> None:
+def test_the_tool_is_the_reflectors_as_one_body(fit):
     known = (
         np.array([0.01, -0.02, 0.03]),
         Rotation.from_euler("ZYX", [3.0, -2.0, 1.0], degrees=True),
@@ -69,7 +63,7 @@ def test_the_tool_is_the_reflectors_as_one_body(fit: mc.Fit) -> None:
     assert frames["tool_nominal"].abc_deg == (0.0, 0.0, 0.0)
 
 
-def test_reflectors_that_tell_no_turn_make_no_tool(fit: mc.Fit) -> None:
+def test_reflectors_that_tell_no_turn_make_no_tool(fit):
     line = np.arange(3.0)[:, None] * [0.05, 0.02, 0.0]
     for spots in (line, line[:2]):
         cells = [replace(cell, target_positions=spots) for cell in (fit.cell, fit.nominal)]
@@ -77,7 +71,7 @@ def test_reflectors_that_tell_no_turn_make_no_tool(fit: mc.Fit) -> None:
     assert list(frames_of(fit.cell, None)) == ["base"]
 
 
-def test_a_further_session_has_its_instrument(fit: mc.Fit) -> None:
+def test_a_further_session_has_its_instrument(fit):
     away = transform(np.eye(3), np.array([0.5, 0.0, 0.0]))
     sessions = replace(fit.cell.sessions, frames={"monday": np.eye(4), "tuesday": away})
     frames = frames_of(replace(fit.cell, sessions=sessions), fit.nominal)
@@ -85,9 +79,7 @@ def test_a_further_session_has_its_instrument(fit: mc.Fit) -> None:
     assert "instrument of session tuesday" in [row[0] for row in tables_of(frames)[0].rows]
 
 
-def test_people_read_a_distance_that_is_the_norm_in_json(
-    tmp_path: Path, noisy: Simulation, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_people_read_a_distance_that_is_the_norm_in_json(tmp_path, noisy, capsys):
     mc.write_measurements(tmp_path / "poses.csv", noisy.data)
     out, page = tmp_path / "fit.json", tmp_path / "report.html"
     assert run("calibrate", "irb2600", tmp_path / "poses.csv", "-o", out, "--details") == 0
@@ -109,7 +101,7 @@ def test_people_read_a_distance_that_is_the_norm_in_json(
         assert f"{frames['base']['rotation_vector_rad'][1]:.6f}" in text
 
 
-def test_a_correction_is_never_told_as_a_value(fit: mc.Fit) -> None:
+def test_a_correction_is_never_told_as_a_value(fit):
     rows = {row[0]: row[1:] for row in fit.parameter_table().rows}
     assert "base_x" not in rows
     nominal, calibrated, _, change, _, unit, _ = rows["base_x (correction)"]
@@ -125,7 +117,7 @@ def test_a_correction_is_never_told_as_a_value(fit: mc.Fit) -> None:
     assert low < change < high
 
 
-def test_angles_are_in_degrees_and_their_changes_in_milliradians(fit: mc.Fit) -> None:
+def test_angles_are_in_degrees_and_their_changes_in_milliradians(fit):
     rows = {row[0]: row[1:] for row in fit.parameter_table().rows}
     one = fit.parameters["alpha2"]
     assert rows["alpha2"][:6] == (
@@ -135,7 +127,7 @@ def test_angles_are_in_degrees_and_their_changes_in_milliradians(fit: mc.Fit) ->
     assert rows["a2"][2:6:3] == ("mm", "mm")
 
 
-def test_whole_poses_have_base_and_tool(robot: mc.Robot) -> None:
+def test_whole_poses_have_base_and_tool(robot):
     made = simulate(robot, 60, 3, seed=2)
     base, tool = (
         made.cell.base,
@@ -155,9 +147,7 @@ def test_whole_poses_have_base_and_tool(robot: mc.Robot) -> None:
     assert again.to_dict()["frames"] == found.to_dict()["frames"]
 
 
-def test_frames_with_effects_stand_beside_those_of_geometry(
-    robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_frames_with_effects_stand_beside_those_of_geometry(robot, noisy):
     fit = mc.calibrate(robot, noisy.data, "sum", effects="joint_compliance:all")
     frames = fit.to_dict()["frames"]
     plain, whole = (1e3 * cell.base[:3, 3] for cell in (fit.geometric, fit.cell))
@@ -171,14 +161,14 @@ def test_frames_with_effects_stand_beside_those_of_geometry(
     assert "base correction, with effects" in fit.summary(200)
 
 
-def test_a_diagnosis_writes_its_frames(results: Path) -> None:
+def test_a_diagnosis_writes_its_frames(results):
     found = json.loads((results / "gap.json").read_text())["frames"]
     base = mc.Diagnosis.from_dict(json.loads((results / "gap.json").read_text())).cells[-1].base
     for key, value in Frame.of(base).to_dict().items():
         assert_allclose(found["base"][key], value, rtol=0, atol=1e-9)
 
 
-def test_links_of_a_robot_are_in_degrees(capsys: pytest.CaptureFixture[str]) -> None:
+def test_links_of_a_robot_are_in_degrees(capsys):
     assert run("robots", "irb2600") == 0
     told = capsys.readouterr().out
     assert "alpha deg" in told

@@ -1,7 +1,6 @@
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ CASES: dict[str, tuple[str, str, dict[str, float], list[float]]] = {
 }
 
 
-def test_a_long_name_stays_in_its_picture() -> None:
+def test_a_long_name_stays_in_its_picture():
     pytest.importorskip("matplotlib")
     robot = replace(ROBOT, name="A robot of a make and of a type with a name that goes on " * 3)
     fit = mc.calibrate(robot, simulate(ROBOT, 40).data, "sum")
@@ -54,7 +53,7 @@ def diagnosed(case: str, targets: int = 3) -> Diagnosis:
     return mc.diagnose(ROBOT, data, quick=True)
 
 
-def test_a_picture_of_each_kind_and_the_same_file_again(tmp_path: Path) -> None:
+def test_a_picture_of_each_kind_and_the_same_file_again(tmp_path):
     made = []
     for name in ("gap.png", "gap.pdf", "gap.svg", "again.svg"):
         diagnosis.save_diagnosis(diagnosed("backlash"), tmp_path / name)
@@ -65,7 +64,7 @@ def test_a_picture_of_each_kind_and_the_same_file_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("targets", [1, 3])
-def test_nothing_found_no_order_and_one_target(targets: int, tmp_path: Path) -> None:
+def test_nothing_found_no_order_and_one_target(targets, tmp_path):
     found = replace(diagnosed("none", targets), robot="arm $x_{$")  # a name may hold a dollar
     assert not found.effects
     diagnosis.save_diagnosis(found, tmp_path / "gap.svg")
@@ -77,7 +76,7 @@ def test_nothing_found_no_order_and_one_target(targets: int, tmp_path: Path) -> 
     assert diagnosis.verdict_of(found) == "no cause beyond geometry and noise"
 
 
-def test_backlash_is_drawn_against_the_last_move_and_is_gone_after() -> None:
+def test_backlash_is_drawn_against_the_last_move_and_is_gone_after():
     left = diagnosed("backlash").leftover()
     curve = curves.residual_curve(left)
     assert "joint 3" in curve.title
@@ -98,9 +97,7 @@ def test_backlash_is_drawn_against_the_last_move_and_is_gone_after() -> None:
         ("offset", "distance from the instrument (m)", 0.3),
     ],
 )
-def test_effects_on_targets_are_drawn_along_their_motion(
-    case: str, label: str, late: float, tmp_path: Path
-) -> None:
+def test_effects_on_targets_are_drawn_along_their_motion(case, label, late, tmp_path):
     left = diagnosed(case).leftover()
     curve = curves.residual_curve(left)
     assert curve.xlabel.startswith(label)
@@ -114,7 +111,7 @@ def test_effects_on_targets_are_drawn_along_their_motion(
 
 
 @pytest.mark.parametrize("rungs", [2, 12, 30])
-def test_no_rung_touches_another(rungs: int) -> None:
+def test_no_rung_touches_another(rungs):
     """In a quarter of the picture that `save_diagnosis` draws, four ninths of its height."""
     found = diagnosed("backlash")
     more = [replace(found.ladder[-1], name=f"+ gear_ripple J{i}") for i in range(rungs)]
@@ -128,7 +125,7 @@ def test_no_rung_touches_another(rungs: int) -> None:
     assert boxes[0].height > 5.0  # and can be read
 
 
-def test_errors_are_those_of_the_ladder() -> None:
+def test_errors_are_those_of_the_ladder():
     found = diagnosed("backlash")
     left = found.leftover()
     for distance, step in zip(left.distances(), (found.ladder[1], found.ladder[-1]), strict=True):
@@ -137,7 +134,7 @@ def test_errors_are_those_of_the_ladder() -> None:
     assert_allclose(np.sqrt(np.mean(rms[found.held] ** 2)), found.ladder[-1].holdout.rms_mm)
 
 
-def test_visits_are_in_their_order() -> None:
+def test_visits_are_in_their_order():
     found = diagnosed("backlash")
     order = found.data.columns["order"][::-1].copy()
     turned = replace(found, data=replace(found.data, columns={
@@ -147,7 +144,7 @@ def test_visits_are_in_their_order() -> None:
 
 
 @pytest.mark.parametrize("name", list(EFFECTS))
-def test_every_effect_has_something_to_be_drawn_against(name: str) -> None:
+def test_every_effect_has_something_to_be_drawn_against(name):
     """With its unit, one number for each pose."""
     scene, effect = diagnosed("backlash").leftover().scene, EFFECTS[name]
     if name == "cross_compliance":  # asks for masses, which this robot does not tell
@@ -163,7 +160,7 @@ def test_every_effect_has_something_to_be_drawn_against(name: str) -> None:
         assert label.endswith(")")
 
 
-def test_powers_on_a_logarithmic_axis_are_set_as_mathematics(tmp_path: Path) -> None:
+def test_powers_on_a_logarithmic_axis_are_set_as_mathematics(tmp_path):
     figure = new_figure(4, 3)
     axes = figure.subplots()
     axes.plot([1.0, 1e4], [1.0, 1e4])
@@ -174,7 +171,7 @@ def test_powers_on_a_logarithmic_axis_are_set_as_mathematics(tmp_path: Path) -> 
     assert all(label.get_parse_math() for label in labels)
 
 
-def test_workspaces_are_shown_in_millimetres() -> None:
+def test_workspaces_are_shown_in_millimetres():
     axes = figures.new_figure(4, 4).subplots()
     axes.set(xlim=(-1.0, 1.0), ylim=(0.0, 0.5))
     figures.in_millimetres(axes)

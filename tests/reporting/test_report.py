@@ -19,7 +19,7 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 from click.testing import CliRunner, Result
-from conftest import SHARED, run, spots
+from conftest import SHARED, run, slipped
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
@@ -156,7 +156,7 @@ def rendered(tmp_path: Path, *contents: object) -> Seen:
 # ---- what it says ------------------------------------------------------------------------------
 
 
-def test_every_section_is_there_in_order(seen: Seen) -> None:
+def test_every_section_is_there_in_order(seen):
     assert [name for name in seen.text if name != "signatures"] == SECTIONS
     assert seen.tags.count("h1") == 1
     assert seen.tags.count("h2") == len(SECTIONS) + 2  # signatures, contents
@@ -167,7 +167,7 @@ def table_of(seen: Seen, words: str) -> list[list[str]]:
     return next(rows for title, rows in seen.tables.items() if words in title)
 
 
-def test_accuracy_is_that_of_the_calibration(results: Path, seen: Seen) -> None:
+def test_accuracy_is_that_of_the_calibration(results, seen):
     own = mc.calibrate("ur10", mc.read_measurements(results / "poses.csv")).accuracy_table()
     found = table_of(seen, "position accuracy")
     assert found == [list(own.header), *own.cells()]
@@ -176,7 +176,7 @@ def test_accuracy_is_that_of_the_calibration(results: Path, seen: Seen) -> None:
     assert [row[0] for row in found[1:4]] == [*crossed, "held out, nominal"]
 
 
-def test_parameters_are_those_of_the_file(fit: dict[str, Any], seen: Seen) -> None:
+def test_parameters_are_those_of_the_file(fit, seen):
     rows = {row[0]: row for row in seen.tables["parameters"][1:]}
     titles = {p["name"]: f"{p['name']} (correction)" if "corrects" in p else p["name"]
               for p in fit["parameters"]}  # fmt: skip
@@ -197,7 +197,7 @@ def test_parameters_are_those_of_the_file(fit: dict[str, Any], seen: Seen) -> No
         assert reason == ("" if p["identifiable"] else p["reason"])
 
 
-def test_diagnosis_is_that_of_the_file(gap: dict[str, Any], seen: Seen) -> None:
+def test_diagnosis_is_that_of_the_file(gap, seen):
     for reason in gap["reasons"]:
         assert reason in seen.text["diagnosis"]
     ladder = table_of(seen, "error budget, step by step")[1:]
@@ -219,7 +219,7 @@ def test_diagnosis_is_that_of_the_file(gap: dict[str, Any], seen: Seen) -> None:
     ]
 
 
-def test_solution_names_the_backend_of_every_step(fit: dict[str, Any], seen: Seen) -> None:
+def test_solution_names_the_backend_of_every_step(fit, seen):
     steps = seen.tables["Steps of the minimax"][1:]
     assert [(row[0], row[-1]) for row in steps] == [
         (str(s["iteration"]), s["backend"]) for s in fit["minimax"]["trace"]
@@ -229,7 +229,7 @@ def test_solution_names_the_backend_of_every_step(fit: dict[str, Any], seen: See
     assert [row[0] for row in multipliers] == fit["minimax"]["functions"]
 
 
-def test_accuracy_states_the_held_out_numbers(fit: dict[str, Any], seen: Seen) -> None:
+def test_accuracy_states_the_held_out_numbers(fit, seen):
     text = seen.text["accuracy"].replace("\N{NO-BREAK SPACE}", " ")
     for key in ("nominal", "holdout"):
         for kind in ("rms_mm", "max_mm"):
@@ -241,7 +241,7 @@ def test_accuracy_states_the_held_out_numbers(fit: dict[str, Any], seen: Seen) -
     assert float(change) == pytest.approx(100 * (float(other) / float(one) - 1), abs=0.6)
 
 
-def test_provenance_has_the_digests_of_the_files(results: Path, seen: Seen) -> None:
+def test_provenance_has_the_digests_of_the_files(results, seen):
     files = {row[0]: row[1:] for row in seen.tables["Files"][1:]}
     for kind, name in (("calibration", "fit.json"), ("diagnosis", "gap.json"),
                        ("measurements", "poses.csv")):  # fmt: skip
@@ -252,14 +252,12 @@ def test_provenance_has_the_digests_of_the_files(results: Path, seen: Seen) -> N
     assert chosen["holdout"] == "0.2"
 
 
-def test_iso_values_are_there_with_their_caveat(seen: Seen) -> None:
+def test_iso_values_are_there_with_their_caveat(seen):
     assert "not a test by the standard" in seen.text["iso9283"]
     assert any("AP" in title and "7.2" in title for title in seen.tables)
 
 
-def test_what_later_files_tell_is_shown(
-    tmp_path: Path, fit: dict[str, Any], gap: dict[str, Any]
-) -> None:
+def test_what_later_files_tell_is_shown(tmp_path, fit, gap):
     for part in ("nominal", "nominal_train"):
         fit["accuracy"][part].pop("rms_ci95_mm", None)
     fit["accuracy"]["holdout"] |= {"rms_ci95_mm": [0.111, 0.222], "max_ci95_mm": [0.222, None]}
@@ -281,7 +279,7 @@ def test_what_later_files_tell_is_shown(
 
 
 @pytest.mark.parametrize(("given", "lacking"), [("fit.json", "gap"), ("gap.json", "parameters")])
-def test_no_chapter_is_empty(results: Path, given: str, lacking: str) -> None:
+def test_no_chapter_is_empty(results, given, lacking):
     seen = Seen(page.render(compose(read_sources([results / given]), WORDING)))
     told = [name for name in seen.text if name != "signatures"]
     assert told == [name for name in SECTIONS if name in told]
@@ -289,9 +287,7 @@ def test_no_chapter_is_empty(results: Path, given: str, lacking: str) -> None:
     assert {"accuracy", "workspace"} < set(told)
 
 
-def test_files_without_poses_give_their_tables(
-    tmp_path: Path, fit: dict[str, Any], gap: dict[str, Any]
-) -> None:
+def test_files_without_poses_give_their_tables(tmp_path, fit, gap):
     for key in ("poses", "minimax"):
         del fit[key]
     for key in ("poses", "curves"):
@@ -303,7 +299,7 @@ def test_files_without_poses_give_their_tables(
     assert len(seen.tables["parameters"]) > 30
 
 
-def test_a_fit_that_did_not_converge_warns(tmp_path: Path, fit: dict[str, Any]) -> None:
+def test_a_fit_that_did_not_converge_warns(tmp_path, fit):
     fit |= {"status": "iteration_limit"}
     fit["accuracy"]["holdout"] = fit["accuracy"]["nominal"]
     text = rendered(tmp_path, fit).text["verdict"]
@@ -311,7 +307,7 @@ def test_a_fit_that_did_not_converge_warns(tmp_path: Path, fit: dict[str, Any]) 
     assert "the calibration is no improvement" in text
 
 
-def test_nothing_held_out_is_said(tmp_path: Path, results: Path) -> None:
+def test_nothing_held_out_is_said(tmp_path, results):
     data = mc.read_measurements(results / "poses.csv")
     mc.calibrate("ur10", data, holdout=0.0).save(tmp_path / "all.json")
     seen = Seen(page.render(compose(read_sources([tmp_path / "all.json"]), WORDING)))
@@ -336,7 +332,7 @@ def painted(value: Any, key: str = "") -> Any:
     return "#123456" if is_colour and value in PALETTE else value
 
 
-def test_figures_are_what_plotly_understands(sections: dict[str, Section]) -> None:
+def test_figures_are_what_plotly_understands(sections):
     found = figures(sections)
     assert len(found) >= 9
     assert len({figure.name for figure in found}) == len(found)
@@ -346,7 +342,7 @@ def test_figures_are_what_plotly_understands(sections: dict[str, Section]) -> No
         assert all(len(t["x"]) == len(t["y"]) for t in figure.traces if t["type"] == "scatter")
 
 
-def test_distributions_are_those_of_the_points(sources: Sources) -> None:
+def test_distributions_are_those_of_the_points(sources):
     poses = sources.poses
     held = np.linalg.norm(poses.after, axis=-1)[:, poses.held]
     shown = histogram(poses, ("nominal", "calibrated")).traces[1]
@@ -361,7 +357,7 @@ def test_distributions_are_those_of_the_points(sources: Sources) -> None:
     assert curve["x"][-1] == pytest.approx(held.max(), rel=1e-5)
 
 
-def test_boxes_are_quartiles(rng: np.random.Generator) -> None:
+def test_boxes_are_quartiles(rng):
     values = rng.exponential(size=(2, 40))
     values[0, 3] = np.nan
     values = np.vstack([values, np.full(40, np.nan)])  # a target that was never seen
@@ -371,7 +367,7 @@ def test_boxes_are_quartiles(rng: np.random.Generator) -> None:
     assert_allclose(parts, np.nanpercentile(values[:2], [0, 25, 50, 75, 100], axis=1), rtol=1e-5)
 
 
-def test_trend_is_a_running_median() -> None:
+def test_trend_is_a_running_median():
     x = np.arange(60.0)[::-1]
     at, middle = trend(x, 3.0 * x)
     assert len(at) == 12
@@ -379,7 +375,7 @@ def test_trend_is_a_running_median() -> None:
     assert np.all(np.diff(at) > 0)
 
 
-def test_correlations_of_a_known_covariance() -> None:
+def test_correlations_of_a_known_covariance():
     names = Names(1, (), ())
     covariance = np.full((names.count,) * 2, np.nan)
     covariance[:3, :3] = [[4, 3, 0], [3, 9, 0], [0, 0, 0]]
@@ -392,7 +388,7 @@ def test_correlations_of_a_known_covariance() -> None:
 
 
 @given(st.lists(st.floats(0, 1e3), max_size=60), st.integers(4, 20))
-def test_some_keeps_the_largest(size: list[float], most: int) -> None:
+def test_some_keeps_the_largest(size, most):
     chosen = some(np.array(size), most)
     assert len(chosen) == min(most, len(size))
     assert np.all(np.diff(chosen) > 0)
@@ -404,7 +400,7 @@ def test_some_keeps_the_largest(size: list[float], most: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["irb2600", "ur10", "irb120"])
-def test_the_arm_ends_at_the_flange(name: str, rng: np.random.Generator) -> None:
+def test_the_arm_ends_at_the_flange(name, rng):
     robot = mc.load_robot(name)
     q = rng.uniform(-2, 2, size=(7, robot.joints))
     arm, corners = skeleton(robot, q)
@@ -418,7 +414,7 @@ def test_the_arm_ends_at_the_flange(name: str, rng: np.random.Generator) -> None
     assert corners[-1]
 
 
-def test_arrows_lead_from_prediction_to_measurement(sources: Sources) -> None:
+def test_arrows_lead_from_prediction_to_measurement(sources):
     poses, cell = sources.poses, sources.cell
     space = space_of(poses, cell)
     predicted = space.points - space.after
@@ -437,7 +433,7 @@ def test_arrows_lead_from_prediction_to_measurement(sources: Sources) -> None:
     assert 0.03 < np.percentile(sizes, 90) / space.radius < 0.13
 
 
-def test_still_is_a_parallel_projection() -> None:
+def test_still_is_a_parallel_projection():
     right, up, depth = flat(np.eye(3)).T[0], -flat(np.eye(3)).T[1], np.zeros(3)
     depth = np.cross(right, up)
     assert_allclose(np.stack([right, up, depth]) @ np.stack([right, up, depth]).T, np.eye(3),
@@ -445,7 +441,7 @@ def test_still_is_a_parallel_projection() -> None:
     assert up[2] > 0.5  # z stays upright
 
 
-def test_view_holds_every_arrow_once(sections: dict[str, Section], fit: dict[str, Any]) -> None:
+def test_view_holds_every_arrow_once(sections, fit):
     view = next(b for b in sections["workspace"].blocks if isinstance(b, View))
     rows = fit["poses"]["measured_mm"]
     count = sum(spot[0] is not None for pose in rows for spot in pose)
@@ -459,7 +455,7 @@ def test_view_holds_every_arrow_once(sections: dict[str, Section], fit: dict[str
     assert f"magnified {view.arms['start'][1]} times" in view.still
 
 
-def test_many_poses_are_capped_and_that_is_said(tmp_path: Path) -> None:
+def test_many_poses_are_capped_and_that_is_said(tmp_path):
     made = simulate(mc.load_robot("ur10"), 700, 1, seed=2)
     mc.calibrate("ur10", made.data).save(tmp_path / "many.json")
     report = compose(read_sources([tmp_path / "many.json"]), WORDING)
@@ -502,7 +498,7 @@ def hostile(content: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def test_hostile_names_are_text(tmp_path: Path, fit: dict[str, Any], gap: dict[str, Any]) -> None:
+def test_hostile_names_are_text(tmp_path, fit, gap):
     fit, gap = hostile(fit), hostile(gap)
     for curve in gap["curves"].values():
         curve["title"] = curve["x"]["label"] = curve["views"][0]["name"] = NASTY
@@ -525,9 +521,7 @@ def test_hostile_names_are_text(tmp_path: Path, fit: dict[str, Any], gap: dict[s
     assert seen.tables["Files"][2][1] == text
 
 
-def test_labels_of_figures_hold_no_marks(
-    tmp_path: Path, fit: dict[str, Any], gap: dict[str, Any]
-) -> None:
+def test_labels_of_figures_hold_no_marks(tmp_path, fit, gap):
     paths = [write(tmp_path / "0.json", hostile(fit)), write(tmp_path / "1.json", hostile(gap))]
     report = compose(read_sources(paths), WORDING)
 
@@ -546,7 +540,7 @@ def test_labels_of_figures_hold_no_marks(
 
 @given(st.text(max_size=60))
 @settings(max_examples=50)
-def test_label_comes_back_from_its_marks(text: str) -> None:
+def test_label_comes_back_from_its_marks(text):
     assert html.unescape(label(text)) == html.unescape(html.escape(text, quote=False))
     assert not {"<", ">"} & set(label(text))
     assert len(html.unescape(label(text * 50))) <= 70
@@ -561,7 +555,7 @@ JSON = st.recursive(
 
 
 @given(JSON)
-def test_json_in_a_script_cannot_end_it(content: Any) -> None:
+def test_json_in_a_script_cannot_end_it(content):
     text = script_json(content)
     assert json.loads(text) == content
     assert not set("<>&\u2028\u2029") & set(text)
@@ -569,7 +563,7 @@ def test_json_in_a_script_cannot_end_it(content: Any) -> None:
 
 @given(st.text())
 @settings(max_examples=200)
-def test_what_is_shown_can_be_written_and_hides_nothing(text: str) -> None:
+def test_what_is_shown_can_be_written_and_hides_nothing(text):
     shown = visible(text)
     shown.encode()  # no lone surrogates
     assert len(shown) == len(text)
@@ -577,7 +571,7 @@ def test_what_is_shown_can_be_written_and_hides_nothing(text: str) -> None:
     assert not set("\u202e\u2066\x00\x1b\n") & set(shown)
 
 
-def test_nothing_leads_outside(seen: Seen, sources: Sources) -> None:
+def test_nothing_leads_outside(seen, sources):
     text = page.render(compose(sources, WORDING))
     clear = re.sub(r'(id="plotly">)[A-Za-z0-9+/=]+', r"\1", text)
     assert len(clear) < 0.4 * len(text)
@@ -594,7 +588,7 @@ def test_nothing_leads_outside(seen: Seen, sources: Sources) -> None:
     assert links >= set(SECTIONS) - {"verdict"}
 
 
-def test_policy_allows_two_scripts_and_no_request(seen: Seen) -> None:
+def test_policy_allows_two_scripts_and_no_request(seen):
     equivalents = [v for tag, name, v in seen.attributes if (tag, name) == ("meta", "content")]
     policy = next(v for v in equivalents if v.startswith("default-src 'none'"))
     parts = dict(part.strip().split(" ", 1) for part in policy.split(";"))
@@ -610,7 +604,7 @@ def test_policy_allows_two_scripts_and_no_request(seen: Seen) -> None:
         assert f"'sha256-{digest}'" in parts["script-src"]
 
 
-def test_tables_and_figures_have_words_for_everyone(seen: Seen) -> None:
+def test_tables_and_figures_have_words_for_everyone(seen):
     assert ("html", "lang", "en") in seen.attributes
     assert seen.tags.count("caption") == seen.tags.count("table")
     scopes = [value for tag, name, value in seen.attributes if (tag, name) == ("th", "scope")]
@@ -624,9 +618,7 @@ def test_tables_and_figures_have_words_for_everyone(seen: Seen) -> None:
 # ---- the command -------------------------------------------------------------------------------
 
 
-def test_the_same_files_give_the_same_page(
-    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_same_files_give_the_same_page(results, tmp_path, monkeypatch):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
     files = (results / "fit.json", results / "gap.json")
     for name in ("a.html", "b.html"):
@@ -644,9 +636,7 @@ def test_the_same_files_give_the_same_page(
     assert not (tmp_path / "c.html").exists()
 
 
-def test_files_must_belong_together(
-    results: Path, tmp_path: Path, fit: dict[str, Any], gap: dict[str, Any]
-) -> None:
+def test_files_must_belong_together(results, tmp_path, fit, gap):
     one, other = results / "fit.json", results / "gap.json"
     with pytest.raises(CalibrationError, match="second calibration"):
         read_sources([one, one])
@@ -687,9 +677,7 @@ BROKEN: dict[str, Callable[[dict[str, Any]], object]] = {
 
 
 @pytest.mark.parametrize("how", BROKEN)
-def test_a_broken_file_is_one_line(
-    how: str, tmp_path: Path, fit: dict[str, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_broken_file_is_one_line(how, tmp_path, fit, capsys):
     BROKEN[how](fit)
     path = write(tmp_path / "fit.json", fit)
     assert run("report", path, "-o", tmp_path / "report.html") == 2
@@ -703,9 +691,7 @@ def test_a_broken_file_is_one_line(
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", "NaN", '{"a": NaN}', "[" * 100_000, "\xff", "7" * 5000]
 )
-def test_what_is_no_json_is_said(
-    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_no_json_is_said(text, tmp_path, capsys):
     path = tmp_path / "fit.json"
     path.write_bytes(text.encode("latin-1"))
     assert run("report", path, "-o", tmp_path / "report.html") == 2
@@ -714,28 +700,17 @@ def test_what_is_no_json_is_said(
 
 @pytest.mark.parametrize("slips", [20, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["fit.json", "gap.json"])
-def test_no_slip_in_a_file_is_a_traceback(
-    name: str, slips: int, results: Path, tmp_path: Path
-) -> None:
+def test_no_slip_in_a_file_is_a_traceback(name, slips, results, tmp_path):
     rng = np.random.default_rng(1)
     whole = json.loads((results / name).read_text())
-    every = spots(whole)
     odd = [None, "x", -1, 1e30, [], {}, [None], True]
     for _ in range(slips):
-        content = copy.deepcopy(whole)
-        *way, last = every[rng.integers(len(every))]
-        part = content
-        for key in way:
-            part = part[key]
-        part[last] = odd[rng.integers(len(odd))]
-        path = write(tmp_path / "slip.json", content)
+        path = write(tmp_path / "slip.json", slipped(whole, rng, odd, 0.0))
         with suppress(CalibrationError):
             compose(read_sources([path]), WORDING)
 
 
-def test_what_is_not_installed_is_said(
-    sources: Sources, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, results: Path
-) -> None:
+def test_what_is_not_installed_is_said(sources, monkeypatch, tmp_path, results):
     monkeypatch.setattr("shutil.which", lambda name: None)
     with pytest.raises(OptionError, match=r"none was found; .* print it"):
         command(results / "fit.json", "-o", tmp_path / "a.html", "--pdf", tmp_path / "a.pdf")
@@ -745,20 +720,20 @@ def test_what_is_not_installed_is_said(
         page.render(compose(sources, WORDING))
 
 
-def test_a_browser_that_fails_leaves_no_pdf(tmp_path: Path) -> None:
+def test_a_browser_that_fails_leaves_no_pdf(tmp_path):
     with pytest.raises(CalibrationError, match="could not print it"):
         pdf.print_pdf("<p>", tmp_path / "a.pdf", "/bin/false")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_paths_are_checked_first(results: Path, tmp_path: Path) -> None:
+def test_paths_are_checked_first(results, tmp_path):
     for options in (("-o", "a.txt"), ("-o", tmp_path / "none" / "a.html"), ("--pdf", "a.html")):
         with pytest.raises(CalibrationError):
             command(results / "fit.json", *options)
 
 
 @pytest.mark.slow
-def test_real_arm_in_three_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_real_arm_in_three_commands(tmp_path, capsys):
     folder = SHARED / "irb120"
     if not folder.is_dir():
         pytest.skip(f"real measurements {folder} are not on this machine")

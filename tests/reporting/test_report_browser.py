@@ -75,7 +75,7 @@ def sent(driver: Any) -> list[str]:
 
 
 @pytest.mark.dev
-def test_opens_without_a_complaint_and_asks_for_nothing(opened: Any, folder: Path) -> None:
+def test_opens_without_a_complaint_and_asks_for_nothing(opened, folder):
     assert opened.execute_script("return document.body.dataset.drawn") == "yes"
     assert [e for e in opened.get_log("browser") if e["level"] == "SEVERE"] == []
     asked = sent(opened)
@@ -84,7 +84,7 @@ def test_opens_without_a_complaint_and_asks_for_nothing(opened: Any, folder: Pat
 
 
 @pytest.mark.dev
-def test_every_section_shows_the_numbers_of_the_files(opened: Any, results: Path) -> None:
+def test_every_section_shows_the_numbers_of_the_files(opened, results):
     files = [results / name for name in ("fit.json", "gap.json")]
     for section in compose(read_sources(files), WORDING).sections:
         rows = opened.execute_script(
@@ -97,7 +97,7 @@ def test_every_section_shows_the_numbers_of_the_files(opened: Any, results: Path
 
 
 @pytest.mark.dev
-def test_every_chart_is_drawn(opened: Any, results: Path) -> None:
+def test_every_chart_is_drawn(opened, results):
     files = [results / name for name in ("fit.json", "gap.json")]
     report = compose(read_sources(files), WORDING)
     names = [b.name for s in report.sections for b in s.blocks if isinstance(b, Figure)]
@@ -114,7 +114,7 @@ def test_every_chart_is_drawn(opened: Any, results: Path) -> None:
 
 
 @pytest.mark.dev
-def test_the_view_in_space_is_not_empty(opened: Any) -> None:
+def test_the_view_in_space_is_not_empty(opened):
     image = pytest.importorskip("PIL.Image", reason="pillow reads the screenshot")
     chart = opened.find_element("id", "chart-workspace")
     scheme(opened, "light")
@@ -132,7 +132,7 @@ def test_the_view_in_space_is_not_empty(opened: Any) -> None:
 
 
 @pytest.mark.dev
-def test_controls_work_by_keyboard(opened: Any) -> None:
+def test_controls_work_by_keyboard(opened):
     keys = pytest.importorskip("selenium.webdriver.common.keys").Keys
     for name in ("times", "pose"):
         told = opened.find_element("id", f"{name}-told")
@@ -152,7 +152,7 @@ def test_controls_work_by_keyboard(opened: Any) -> None:
 
 
 @pytest.mark.dev
-def test_dark_and_light_follow_system_and_button(opened: Any) -> None:
+def test_dark_and_light_follow_system_and_button(opened):
     keys = pytest.importorskip("selenium.webdriver.common.keys").Keys
 
     def state() -> tuple[bool, bool]:
@@ -176,7 +176,7 @@ def test_dark_and_light_follow_system_and_button(opened: Any) -> None:
 
 
 @pytest.mark.dev
-def test_paper_is_light_and_shows_the_still_view(opened: Any) -> None:
+def test_paper_is_light_and_shows_the_still_view(opened):
     shown = "return getComputedStyle(document.querySelector(arguments[0])).display"
     scheme(opened, "dark", "print")
     opened.execute_script("window.dispatchEvent(new Event('beforeprint'))")
@@ -196,7 +196,7 @@ def test_paper_is_light_and_shows_the_still_view(opened: Any) -> None:
 
 
 @pytest.mark.dev
-def test_narrow_pages_scroll_in_their_tables_alone(opened: Any) -> None:
+def test_narrow_pages_scroll_in_their_tables_alone(opened):
     """As wide as a phone, light and dark: nothing stands out of the page."""
     size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
     opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
@@ -212,7 +212,7 @@ def test_narrow_pages_scroll_in_their_tables_alone(opened: Any) -> None:
 
 
 @pytest.mark.dev
-def test_the_page_itself_forbids_scripts_and_requests(opened: Any) -> None:
+def test_the_page_itself_forbids_scripts_and_requests(opened):
     found = opened.execute_async_script(
         """
         const done = arguments[arguments.length - 1], broken = [];
@@ -232,9 +232,7 @@ def test_the_page_itself_forbids_scripts_and_requests(opened: Any) -> None:
 
 
 @pytest.mark.dev
-def test_the_first_page_is_one_sheet_with_all_that_is_signed(
-    driver: Any, results: Path, tmp_path: Path
-) -> None:
+def test_the_first_page_is_one_sheet_with_all_that_is_signed(driver, results, tmp_path):
     """On A4: robot, requirement, result, verdict and signatures, and nothing else."""
     limits = limits_of("rms 0.2, max 0.5")
     facts = {"serial_number": "26-104711", "tool": "three-ball nest, " * 4}
@@ -262,7 +260,7 @@ def test_the_first_page_is_one_sheet_with_all_that_is_signed(
 
 
 @pytest.mark.dev
-def test_a_phone_shows_the_verdict_and_charts_whole(driver: Any, folder: Path) -> None:
+def test_a_phone_shows_the_verdict_and_charts_whole(driver, folder):
     """The table that is signed needs no scrolling, no button lies on a legend, maps have room."""
     size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
@@ -279,7 +277,7 @@ def test_a_phone_shows_the_verdict_and_charts_whole(driver: Any, folder: Path) -
 
 
 @pytest.mark.dev
-def test_hostile_names_are_shown_and_do_nothing(driver: Any, folder: Path) -> None:
+def test_hostile_names_are_shown_and_do_nothing(driver, folder):
     open_page(driver, folder / "bad.html")
     with pytest.raises(Exception, match="alert"):
         assert driver.switch_to.alert
@@ -296,7 +294,7 @@ def test_hostile_names_are_shown_and_do_nothing(driver: Any, folder: Path) -> No
 
 
 @pytest.mark.dev
-def test_without_depth_the_still_view_stands(driver: Any, folder: Path) -> None:
+def test_without_depth_the_still_view_stands(driver, folder):
     blind = "HTMLCanvasElement.prototype.getContext = ((old) => function (kind, ...rest) {" \
         "return /webgl/.test(kind) ? null : old.call(this, kind, ...rest); })(" \
         "HTMLCanvasElement.prototype.getContext);"  # fmt: skip
@@ -311,7 +309,7 @@ def test_without_depth_the_still_view_stands(driver: Any, folder: Path) -> None:
 
 
 @pytest.mark.dev
-def test_without_scripts_the_tables_and_the_still_view_stand(driver: Any, folder: Path) -> None:
+def test_without_scripts_the_tables_and_the_still_view_stand(driver, folder):
     driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     try:
         driver.get((folder / "good.html").as_uri())
@@ -322,7 +320,7 @@ def test_without_scripts_the_tables_and_the_still_view_stand(driver: Any, folder
 
 
 @pytest.mark.usefixtures("browser")
-def test_pdf_holds_the_whole_report(results: Path, tmp_path: Path) -> None:
+def test_pdf_holds_the_whole_report(results, tmp_path):
     out, printed = tmp_path / "a.html", tmp_path / "a.pdf"
     assert run("report", results / "fit.json", "-o", out, "--pdf", printed) == 0
     raw = printed.read_bytes()
@@ -333,7 +331,7 @@ def test_pdf_holds_the_whole_report(results: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.dev
-def test_a_diagnosis_of_several_instruments_is_shown(driver: Any, tmp_path: Path) -> None:
+def test_a_diagnosis_of_several_instruments_is_shown(driver, tmp_path):
     job = Job("irb2600", ("wires_3", "tracker"), "compliance", 1, 80)
     arm, rng = arm_of(job), np.random.default_rng(4)
     found = diagnose_relative(arm.robot, [seen(arm, k, 80, rng) for k in job.instruments])

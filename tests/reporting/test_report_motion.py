@@ -31,7 +31,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_sections_hold_the_budget_the_curves_and_the_run_left_out(saved: Path) -> None:
+def test_sections_hold_the_budget_the_curves_and_the_run_left_out(saved):
     source = motion_of([saved])
     assert source
     page = compose_motion(source, WORDING)
@@ -50,7 +50,7 @@ def test_sections_hold_the_budget_the_curves_and_the_run_left_out(saved: Path) -
     assert blocks["provenance"][0].rows[0][2] == source.file.digest  # type: ignore[union-attr]
 
 
-def test_the_command_writes_one_page(saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_one_page(saved, capsys):
     page = saved.with_name("report.html")
     assert run("report", saved, "-o", page, "--author", "A. Smith", "--date", "2026-11-25") == 0
     said = capsys.readouterr().out
@@ -61,9 +61,7 @@ def test_the_command_writes_one_page(saved: Path, capsys: pytest.CaptureFixture[
     assert html.count('id="figure-joint-') == 3
 
 
-def test_what_is_of_positions_is_refused_and_it_stands_alone(
-    saved: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_of_positions_is_refused_and_it_stands_alone(saved, capsys):
     assert run("report", saved, "--tolerance", "rms 0.2", "-o", saved.with_name("a.html")) == 2
     assert "is of positions" in capsys.readouterr().err
     assert run("report", saved, saved, "-o", saved.with_name("a.html")) == 2

@@ -37,9 +37,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_passed_only_without_them_is_said_in_the_verdict_line(
-    files: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_passed_only_without_them_is_said_in_the_verdict_line(files, capsys):
     fit, out = mc.load_fit(files / "used.json"), files / "report.html"
     counted = fit.accuracy["holdout_with_them"].rms_mm
     assert run("report", files / "used.json", "--tolerance", "rms 0.1", "-o", out) == 0
@@ -53,19 +51,19 @@ def test_passed_only_without_them_is_said_in_the_verdict_line(
     assert "Why: looks odd (10)" in verdict
 
 
-def test_with_room_enough_it_is_passed_with_them_too(files: Path) -> None:
+def test_with_room_enough_it_is_passed_with_them_too(files):
     found = signed(read_sources([files / "used.json"]), limits_of("rms 2"), "inside", None)
     assert found.sentence == found.verdict == PASSED
     assert found.lines()[2].startswith(f"{2 * BAD} points set aside by the user; with them RMS")
 
 
-def test_a_diagnosis_alone_says_it_as_well(files: Path) -> None:
+def test_a_diagnosis_alone_says_it_as_well(files):
     found = signed(read_sources([files / "gap.json"]), limits_of("rms 0.1"), "inside", None)
     assert found.verdict == PASSED
     assert found.sentence.startswith(f"{PASSED} without {2 * BAD} points set aside by the user")
 
 
-def test_without_any_the_page_says_so(files: Path) -> None:
+def test_without_any_the_page_says_so(files):
     sources = read_sources([files / "poses.json"])
     found = signed(sources, limits_of("rms 2"), "inside", None)
     assert (found.set_aside, found.judged_with) == ((), ())

@@ -1,7 +1,6 @@
 """Degrees called radians in a robot file, and the reverse: refused by the file alone."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ def content(name: str, unit: str = "rad", factor: float = 1.0, keys: Any = ANGLE
 
 
 @pytest.mark.parametrize("name", mc.builtin_robots())
-def test_each_unit_is_told_from_the_other(name: str) -> None:
+def test_each_unit_is_told_from_the_other(name):
     given = mc.load_robot(name)
     right = robot_from_dict(content(name, "deg", 180.0 / np.pi))
     np.testing.assert_allclose(right.mdh, given.mdh, rtol=1e-14)
@@ -36,7 +35,7 @@ def test_each_unit_is_told_from_the_other(name: str) -> None:
         robot_from_dict(content(name, "rad", 180.0 / np.pi))
 
 
-def test_calibrated_angles_are_told_too(robot: mc.Robot) -> None:
+def test_calibrated_angles_are_told_too(robot):
     off = robot.mdh + np.random.default_rng(0).normal(scale=2e-3, size=robot.mdh.shape)
     whole = robot.with_mdh(off).to_dict()
     robot_from_dict(whole)
@@ -56,11 +55,11 @@ def test_calibrated_angles_are_told_too(robot: mc.Robot) -> None:
         ("rad", [1.5708, 1.4, 6.9]),
     ],
 )
-def test_angles_that_may_be_are_taken(unit: str, angles: list[float]) -> None:
+def test_angles_that_may_be_are_taken(unit, angles):
     check_angles(np.array([angles]), unit, "robot")
 
 
-def test_limits_in_degrees_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_limits_in_degrees_are_named(tmp_path, capsys):
     path = tmp_path / "robot.json"
     path.write_text(json.dumps(content("irb2600", "rad", 180.0 / np.pi, ("lower", "upper"))))
     assert run("plan", path, "--poses", 10) == 2
@@ -72,7 +71,7 @@ def test_limits_in_degrees_are_named(tmp_path: Path, capsys: pytest.CaptureFixtu
         robot_from_dict(slip)
 
 
-def test_one_joint_may_turn_far_and_a_placeholder_is_no_slip() -> None:
+def test_one_joint_may_turn_far_and_a_placeholder_is_no_slip():
     far = content("irb2600")
     far["joints"][5] |= {"lower": -200.0 * np.pi, "upper": 200.0 * np.pi}
     assert robot_from_dict(far).upper[5] == 200.0 * np.pi
@@ -81,7 +80,7 @@ def test_one_joint_may_turn_far_and_a_placeholder_is_no_slip() -> None:
     robot_from_dict(far)
 
 
-def test_limits_of_a_urdf_are_radians(tmp_path: Path) -> None:
+def test_limits_of_a_urdf_are_radians(tmp_path):
     path = tmp_path / "arm.urdf"
     mc.export("irb2600", "urdf", path, notify=list)
     mc.load_robot(path)

@@ -17,7 +17,7 @@ SPECIAL = Rotation.from_euler(
 
 
 @pytest.mark.parametrize("turn", [*TURNS, *SPECIAL])
-def test_a_frame_is_what_scipy_says(turn: np.ndarray) -> None:
+def test_a_frame_is_what_scipy_says(turn):
     frame = Frame.of(transform(turn, np.array([0.1, -2.0, 3.0])))
     assert_allclose(frame.xyz_mm, [100.0, -2000.0, 3000.0], rtol=1e-15)
     back = Rotation.from_euler("ZYX", frame.abc_deg, degrees=True).as_matrix()
@@ -32,18 +32,18 @@ def test_a_frame_is_what_scipy_says(turn: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("turn", TURNS[:20])
-def test_angles_are_those_of_scipy(turn: np.ndarray) -> None:
+def test_angles_are_those_of_scipy(turn):
     expected = Rotation.from_matrix(turn).as_euler("ZYX", degrees=True)
     assert_allclose(Frame.of(transform(turn, np.zeros(3))).abc_deg, expected, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("turn", [*TURNS[:20], *SPECIAL])
-def test_there_and_back(turn: np.ndarray) -> None:
+def test_there_and_back(turn):
     pose = transform(turn, np.array([0.1, -2.0, 3.0]))
     assert_allclose(Frame.of(pose).pose, pose, rtol=0, atol=1e-14)
 
 
-def test_a_turns_about_z_b_about_y_c_about_x() -> None:
+def test_a_turns_about_z_b_about_y_c_about_x():
     """Each angle alone, by hand: what KUKA calls A, B, C."""
     quarter = {"A": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "C": [[1, 0, 0], [0, 0, -1], [0, 1, 0]]}
     for name, turn in quarter.items():
@@ -54,7 +54,7 @@ def test_a_turns_about_z_b_about_y_c_about_x() -> None:
     assert "Rz(A) Ry(B) Rx(C)" in CONVENTION
 
 
-def test_tables_hold_every_digit_and_say_the_order() -> None:
+def test_tables_hold_every_digit_and_say_the_order():
     frame = Frame.of(transform(TURNS[0], np.array([0.1, -2.0, 3.0])))
     places, turns = frames_tables({"base": frame}, "frames")
     assert places.rows == (("base", *frame.xyz_mm, *frame.abc_deg),)

@@ -10,13 +10,12 @@ import minimax_cal as mc
 from minimax_cal.modelling.cell import still
 from minimax_cal.modelling.effects.table import Fitted, Term
 from minimax_cal.modelling.reach import arm_of, bent
-from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.robots.sampling import random_poses
 
 THERE = 1e-7  # of a pose [m, and what turns a point at the lever so far]
 
 
-def test_every_robot_comes_back_to_its_pose(rng: np.random.Generator) -> None:
+def test_every_robot_comes_back_to_its_pose(rng):
     for name in mc.builtin_robots():
         robot = mc.load_robot(name)
         q = random_poses(robot, 20, rng, 0.9 * np.pi)
@@ -27,12 +26,12 @@ def test_every_robot_comes_back_to_its_pose(rng: np.random.Generator) -> None:
         assert_allclose(robot.pose(robot.inverse(pose, near=near)), pose, rtol=0, atol=THERE)
 
 
-def test_a_regular_pose_gives_the_joints_near_by(robot: mc.Robot) -> None:
+def test_a_regular_pose_gives_the_joints_near_by(robot):
     q = np.array([0.3, 0.2, 0.1, 0.5, 0.8, -0.4])
     assert_allclose(robot.inverse(robot.pose(q), near=q + 0.05), q, rtol=0, atol=1e-9)
 
 
-def test_batches_have_the_shape_of_their_poses(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_batches_have_the_shape_of_their_poses(robot, rng):
     q = np.array([0.3, 0.2, 0.1, 0.5, 0.8, -0.4]) + 0.1 * rng.normal(size=(2, 3, 6))
     pose = robot.pose(q)
     assert robot.inverse(pose, near=q).shape == (2, 3, 6)
@@ -41,7 +40,7 @@ def test_batches_have_the_shape_of_their_poses(robot: mc.Robot, rng: np.random.G
     assert robot.inverse(pose[:0], near=q[0, 0]).shape == (0, 3, 6)
 
 
-def test_without_a_start_any_way_is_found(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_without_a_start_any_way_is_found(robot, rng):
     pose = robot.pose(random_poses(robot, 30, rng))
     q = robot.inverse(pose)
     assert_allclose(robot.pose(q), pose, rtol=0, atol=1e-6)
@@ -49,7 +48,7 @@ def test_without_a_start_any_way_is_found(robot: mc.Robot, rng: np.random.Genera
     assert (q <= robot.upper).all()
 
 
-def test_what_is_out_of_reach_is_said(robot: mc.Robot) -> None:
+def test_what_is_out_of_reach_is_said(robot):
     pose = np.eye(4)
     pose[0, 3] = 9.0
     with pytest.warns(mc.CalibrationWarning, match="1 of 1 poses are not reached"):
@@ -68,12 +67,12 @@ def test_what_is_out_of_reach_is_said(robot: mc.Robot) -> None:
         ("here", None, "numbers"),
     ],
 )
-def test_no_pose_is_one_line(robot: mc.Robot, pose: object, near: object, said: str) -> None:
+def test_no_pose_is_one_line(robot, pose, near, said):
     with pytest.raises(mc.RobotError, match=said):
         robot.inverse(pose, near=near)  # type: ignore[arg-type]
 
 
-def test_a_fit_counts_its_effects(noisy: Simulation, rng: np.random.Generator) -> None:
+def test_a_fit_counts_its_effects(noisy, rng):
     """The flange with its compliance, by the law itself, is at the pose."""
     fit = mc.calibrate("irb2600", noisy.data, "sum", effects="joint_compliance:all")
     arm, robot = arm_of(fit.cell), fit.cell.robot
@@ -88,7 +87,7 @@ def test_a_fit_counts_its_effects(noisy: Simulation, rng: np.random.Generator) -
     assert np.abs(found - robot.inverse(pose, near=found)).max() > 1e-5  # the effects' share
 
 
-def test_what_only_the_tracker_sees_moves_no_flange(clean: Simulation) -> None:
+def test_what_only_the_tracker_sees_moves_no_flange(clean):
     cell, q = clean.cell, np.array([0.3, 0.2, 0.1, 0.5, 0.8, -0.4])
     drift = Fitted((Term("target_offset", "smr1", {}),), (np.array([1e-3]),))
     pose = cell.robot.pose(q)

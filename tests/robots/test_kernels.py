@@ -56,9 +56,7 @@ def near(found: Arrays, wanted: Arrays, alike: float = ALIKE) -> None:
 
 
 @pytest.mark.parametrize(("name", "robots", "effects"), CELLS)
-def test_pairs(
-    name: str, robots: int, effects: int, fast: ModuleType, rng: np.random.Generator
-) -> None:
+def test_pairs(name, robots, effects, fast, rng):
     model, state = cell(name, robots, effects, rng)
     at, seen = arrays_of(state), model.sight
     (mdh, *place), (q, prismatic, *_) = at, seen
@@ -77,7 +75,7 @@ def test_pairs(
         near(fast.stepped(*one, which, step), plain.stepped(*one, which, step))
 
 
-def test_a_system_that_is_not_definite_is_told(fast: ModuleType, rng: np.random.Generator) -> None:
+def test_a_system_that_is_not_definite_is_told(fast, rng):
     """And one that is has its solution; the last row repeats the first."""
     rows = rng.normal(size=(1, 3, 20, 6))
     right, off, hold = rng.normal(size=(1, 3, 6)), rng.normal(size=6), np.zeros(6)
@@ -98,9 +96,7 @@ def test_a_system_that_is_not_definite_is_told(fast: ModuleType, rng: np.random.
 
 
 @pytest.mark.parametrize(("name", "robots", "effects"), CELLS)
-def test_rows_make_the_normal_equations(
-    name: str, robots: int, effects: int, rng: np.random.Generator
-) -> None:
+def test_rows_make_the_normal_equations(name, robots, effects, rng):
     model, state = cell(name, 1, effects, rng)
     which = np.flatnonzero(rng.random(model.names.count) < 0.8)
     given = plain, arrays_of(state), model.sight, which
@@ -117,9 +113,7 @@ def test_rows_make_the_normal_equations(
 
 
 @pytest.mark.parametrize(("name", "robots", "effects"), CELLS)
-def test_normal_equations_are_those_of_the_jacobian(
-    name: str, robots: int, effects: int, rng: np.random.Generator
-) -> None:
+def test_normal_equations_are_those_of_the_jacobian(name, robots, effects, rng):
     model, state = cell(name, robots, effects, rng)
     which = np.flatnonzero(rng.random(model.names.count) < 0.8)
     cost, gradient, gram = sums.normal(plain, arrays_of(state), model.sight, which)
@@ -137,9 +131,7 @@ def test_normal_equations_are_those_of_the_jacobian(
 
 
 @pytest.mark.parametrize(("name", "effects"), [("irb120", 0), ("irb2600", 2)])
-def test_plain_steps_end_alike(
-    name: str, effects: int, fast: ModuleType, rng: np.random.Generator
-) -> None:
+def test_plain_steps_end_alike(name, effects, fast, rng):
     model, state = cell(name, 1, effects, rng)
     names = ("a1", "a2", "a3", "theta2", "theta3", "theta4", "theta5")
     told = [model.names.index(one) for one in names]  # by any poses
@@ -155,7 +147,7 @@ def test_plain_steps_end_alike(
     near(ends[0][1:2], ends[1][1:2], alike=1e-10)
 
 
-def test_polish(fast: ModuleType, rng: np.random.Generator) -> None:
+def test_polish(fast, rng):
     truth = Rotation.random(rng=rng).as_matrix()
     matrix = rng.normal(size=(10, 9))
     right = matrix @ truth.reshape(9) + 1e-3 * rng.normal(size=10)
@@ -168,7 +160,7 @@ def test_polish(fast: ModuleType, rng: np.random.Generator) -> None:
     assert_allclose(best, truth, rtol=0, atol=5e-3)
 
 
-def test_choice(monkeypatch: pytest.MonkeyPatch, fast: ModuleType) -> None:
+def test_choice(monkeypatch, fast):
     choice.best.cache_clear()
     monkeypatch.setenv(choice.SWITCH, "plain")
     assert choice.kernels() is plain
@@ -182,7 +174,7 @@ def test_choice(monkeypatch: pytest.MonkeyPatch, fast: ModuleType) -> None:
     assert choice.kernels() is fast
 
 
-def test_without_numba_numpy_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_numba_numpy_answers(monkeypatch):
     choice.best.cache_clear()
     monkeypatch.delenv(choice.SWITCH, raising=False)
     monkeypatch.setattr(choice.util, "find_spec", lambda name: None)
@@ -191,9 +183,7 @@ def test_without_numba_numpy_answers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", ["plain", "fast"])
-def test_targets_alone_may_be_free(
-    name: str, request: pytest.FixtureRequest, rng: np.random.Generator
-) -> None:
+def test_targets_alone_may_be_free(name, request, rng):
     own = plain if name == "plain" else request.getfixturevalue(name)
     model, state = cell("irb120", 1, 0, rng)
     given = plain, arrays_of(state), model.sight

@@ -17,7 +17,7 @@ def bent(robot: mc.Robot, rng: np.random.Generator) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["irb2600", "ur10", "scara_600"])
-def test_jacobian_is_the_complex_step_derivative(name: str, rng: np.random.Generator) -> None:
+def test_jacobian_is_the_complex_step_derivative(name, rng):
     robot = mc.load_robot(name)
     n = robot.joints
     q = rng.uniform(-2, 2, (20, n))
@@ -60,7 +60,7 @@ def pinocchio_model(robot: mc.Robot):  # type: ignore[no-untyped-def]
 
 @pytest.mark.dev
 @pytest.mark.parametrize("name", ["irb2600", "irb120", "ur5e", "scara_600", "fanuc_r2000ic_165f"])
-def test_forward_agrees_with_pinocchio(name: str, rng: np.random.Generator) -> None:
+def test_forward_agrees_with_pinocchio(name, rng):
     robot = mc.load_robot(name)
     robot = robot.with_mdh(bent(robot, rng))
     pin, model, flange = pinocchio_model(robot)
@@ -70,7 +70,7 @@ def test_forward_agrees_with_pinocchio(name: str, rng: np.random.Generator) -> N
         assert_allclose(robot.pose(q), data.oMf[flange].homogeneous, rtol=0, atol=1e-13)
 
 
-def test_batched_chain_equals_each_alone(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_batched_chain_equals_each_alone(robot, rng):
     mdh = np.stack([bent(robot, rng) for _ in range(4)])
     q = rng.uniform(-3, 3, (7, 6))
     together = kinematics.forward(mdh, q, robot.prismatic)
@@ -79,7 +79,7 @@ def test_batched_chain_equals_each_alone(robot: mc.Robot, rng: np.random.Generat
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-5, 1.0, 3.1])
-def test_rotation_is_scipys(size: float, rng: np.random.Generator) -> None:
+def test_rotation_is_scipys(size, rng):
     from scipy.spatial.transform import Rotation
 
     w = rng.normal(size=3)
@@ -88,7 +88,7 @@ def test_rotation_is_scipys(size: float, rng: np.random.Generator) -> None:
     assert_allclose(kinematics.rotation(w), expected, rtol=0, atol=1e-15)
 
 
-def test_gravity_torque_is_the_slope_of_potential_energy(rng: np.random.Generator) -> None:
+def test_gravity_torque_is_the_slope_of_potential_energy(rng):
     robot = mc.load_robot("irb2600")
     mass, com = rng.uniform(1, 50, 6), rng.normal(size=(6, 3)) * 0.2
     up = rng.normal(size=3)

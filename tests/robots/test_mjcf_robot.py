@@ -93,7 +93,7 @@ def pose_in(model: Any, q: Array, tip: str) -> Array:
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_mujoco_has_the_same_poses_and_torques(name: str, tmp_path: Path) -> None:
+def test_mujoco_has_the_same_poses_and_torques(name, tmp_path):
     text, tip, n = ARMS[name]
     (tmp_path / "arm.xml").write_text(text)
     model = mujoco.MjModel.from_xml_string(text)
@@ -143,7 +143,7 @@ def two_arms(passive: tuple[str, ...] = ()) -> str:
     return GRIPPER.format(arms=arms, motors=motors)
 
 
-def test_a_chain_between_two_bodies_and_behind_a_floating_base(tmp_path: Path) -> None:
+def test_a_chain_between_two_bodies_and_behind_a_floating_base(tmp_path):
     file = tmp_path / "two.xml"
     file.write_text(two_arms())
     with pytest.raises(mc.RobotError, match=r"end in left_hand, right_hand; .*two.xml#left_hand"):
@@ -176,7 +176,7 @@ def test_a_chain_between_two_bodies_and_behind_a_floating_base(tmp_path: Path) -
         mc.load_robot(f"{file}#torso:nose")
 
 
-def test_joints_without_a_drive_follow_or_stay(tmp_path: Path) -> None:
+def test_joints_without_a_drive_follow_or_stay(tmp_path):
     file, text = tmp_path / "two.xml", two_arms(passive=("left_2", "left_3"))
     file.write_text(text)
     seen = load_urdf(f"{file}#left_hand")
@@ -191,7 +191,7 @@ def test_joints_without_a_drive_follow_or_stay(tmp_path: Path) -> None:
     assert_allclose(seen.base @ robot.pose(np.array([0.4])) @ seen.tool, judge, atol=1e-9)
 
 
-def test_one_line_says_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_line_says_what_is_wrong(tmp_path, monkeypatch):
     ball = '<body name="b"><joint type="ball"/>{0}<body name="c"><joint/>{0}</body></body>'
     ball = ball.format('<geom size="1"/>')
     wrong = {
@@ -230,8 +230,8 @@ def six_of(side: str, y: float) -> str:
 
 
 def test_an_arm_of_a_cell_is_corrected_by_the_command_that_is_printed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     motors = "".join(
         f'<position joint="{side}_j{i}" kp="2000" kv="100"/>'

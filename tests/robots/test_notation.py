@@ -119,9 +119,7 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_the_flange_is_where_the_files_own_convention_puts_it(
-    name: str, rng: np.random.Generator
-) -> None:
+def test_the_flange_is_where_the_files_own_convention_puts_it(name, rng):
     robot = robot_from_dict(FILES[name])
     q = driven(robot, rng, 30)
     assert_allclose(robot.pose(q), flange(FILES[name], q), rtol=0, atol=1e-12)
@@ -129,7 +127,7 @@ def test_the_flange_is_where_the_files_own_convention_puts_it(
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_written_again_is_the_same_file(name: str, tmp_path: Path) -> None:
+def test_a_file_written_again_is_the_same_file(name, tmp_path):
     robot = robot_from_dict(FILES[name])
     robot.save(tmp_path / "arm.json")
     again = mc.load_robot(tmp_path / "arm.json")
@@ -143,7 +141,7 @@ def test_a_file_written_again_is_the_same_file(name: str, tmp_path: Path) -> Non
             assert np.degrees(new[key]) == pytest.approx(old[key], abs=1e-9), key
 
 
-def test_masses_of_craigs_links_are_in_the_frames_of_his_joints(tmp_path: Path) -> None:
+def test_masses_of_craigs_links_are_in_the_frames_of_his_joints(tmp_path):
     content = copy.deepcopy(CRAIG)
     inertia = [0.5, 0.01, -0.02, 0.6, 0.03, 0.7]
     content["joints"][2] |= {"mass_kg": 10, "com_mm": [200, 10, 20], "inertia": inertia}
@@ -164,7 +162,7 @@ def test_masses_of_craigs_links_are_in_the_frames_of_his_joints(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_simulated_arm_is_calibrated_to_its_noise(name: str, rng: np.random.Generator) -> None:
+def test_a_simulated_arm_is_calibrated_to_its_noise(name, rng):
     truth, robot = bent(FILES[name], rng), robot_from_dict(FILES[name])
     data = measured(truth, robot, rng)
     fit = mc.calibrate(robot, data, "sum", holdout=0.2)
@@ -189,7 +187,7 @@ def test_a_simulated_arm_is_calibrated_to_its_noise(name: str, rng: np.random.Ge
     assert_allclose(fit.robot.pose(q), flange(content, q), rtol=0, atol=1e-12)
 
 
-def test_options_and_tables_speak_of_the_files_rows(rng: np.random.Generator) -> None:
+def test_options_and_tables_speak_of_the_files_rows(rng):
     robot = robot_from_dict(CRAIG)
     data = measured(bent(CRAIG, rng), robot, rng)
     fit = mc.calibrate(robot, data, "sum", fix="a3", holdout=0.2)
@@ -204,13 +202,13 @@ def test_options_and_tables_speak_of_the_files_rows(rng: np.random.Generator) ->
     assert rows[2][1:4] == pytest.approx((432.0, 149.0, 0.0))
 
 
-def test_craigs_table_read_as_standard_is_another_arm(rng: np.random.Generator) -> None:
+def test_craigs_table_read_as_standard_is_another_arm(rng):
     standard = robot_from_dict({**CRAIG, "convention": "standard"})
     q = driven(standard, rng, 5)
     assert np.abs(standard.pose(q) - robot_from_dict(CRAIG).pose(q)).max() > 0.1
 
 
-def test_joints_that_bring_a_linked_arm_to_a_pose(rng: np.random.Generator) -> None:
+def test_joints_that_bring_a_linked_arm_to_a_pose(rng):
     for content in (LINKED, PALLETISER, CRAIG):
         robot = robot_from_dict(content)
         q = 0.5 * driven(robot, rng, 10)
@@ -220,7 +218,7 @@ def test_joints_that_bring_a_linked_arm_to_a_pose(rng: np.random.Generator) -> N
 
 
 @pytest.mark.dev
-def test_a_urdf_of_a_linked_arm_follows_by_mimic(rng: np.random.Generator, tmp_path: Path) -> None:
+def test_a_urdf_of_a_linked_arm_follows_by_mimic(rng, tmp_path):
     pinocchio = pytest.importorskip("pinocchio")
     for content in (LINKED, PALLETISER, TURNED):
         robot = robot_from_dict(content)
@@ -262,7 +260,7 @@ MIMIC = """<robot name="linked">
 
 
 @pytest.mark.dev
-def test_mimic_of_a_urdf_is_read_and_corrected(rng: np.random.Generator, tmp_path: Path) -> None:
+def test_mimic_of_a_urdf_is_read_and_corrected(rng, tmp_path):
     pinocchio = pytest.importorskip("pinocchio")
     path = tmp_path / "linked.urdf"
     path.write_text(MIMIC)
@@ -308,7 +306,7 @@ joint;a_i-1 [mm];alpha_i-1 [deg];d_i [mm];offset [deg];theta [deg];lower_deg;upp
 """
 
 
-def test_a_data_sheet_as_csv(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_a_data_sheet_as_csv(tmp_path, rng):
     path = tmp_path / "puma.csv"
     path.write_text(SHEET)
     robot = mc.load_robot(path)
@@ -344,14 +342,14 @@ def test_a_data_sheet_as_csv(tmp_path: Path, rng: np.random.Generator) -> None:
         (("3;432;0;149;0;0;-135;135", "3;432;0"), ":5: 3 cells, but the header has 8"),
     ],
 )
-def test_what_a_data_sheet_cannot_say(change: tuple[str, str], said: str, tmp_path: Path) -> None:
+def test_what_a_data_sheet_cannot_say(change, said, tmp_path):
     path = tmp_path / "sheet.csv"
     path.write_text(SHEET.replace(*change))
     with pytest.raises(mc.RobotError, match=said):
         mc.load_robot(path)
 
 
-def test_a_data_sheet_must_say_its_convention(tmp_path: Path) -> None:
+def test_a_data_sheet_must_say_its_convention(tmp_path):
     path = tmp_path / "sheet.csv"
     path.write_text("a_mm,alpha_deg,d_mm,theta_deg\n0,90,300,0\n200,0,0,0\n")
     with pytest.raises(mc.RobotError, match="standard or modified"):
@@ -371,13 +369,13 @@ def test_a_data_sheet_must_say_its_convention(tmp_path: Path) -> None:
         ({**LINKED, "couplings": {}}, "unknown key 'couplings'; did you mean 'coupling'"),
     ],
 )
-def test_what_a_robot_file_cannot_say(content: Content, said: str) -> None:
+def test_what_a_robot_file_cannot_say(content, said):
     with pytest.raises(mc.RobotError, match=said):
         robot_from_dict(content)
 
 
 @pytest.mark.parametrize("to", sorted(EXPORTERS))
-def test_formats_without_couplings_refuse_a_linked_arm(to: str, tmp_path: Path) -> None:
+def test_formats_without_couplings_refuse_a_linked_arm(to, tmp_path):
     linked = robot_from_dict(LINKED)
     if EXPORTERS[to].couples:
         assert export(linked, to, tmp_path / "arm.x", notify=lambda said: None)

@@ -1,5 +1,4 @@
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,7 +57,7 @@ joints:
 """
 
 
-def test_json_toml_and_yaml_are_the_same_robot(tmp_path: Path) -> None:
+def test_json_toml_and_yaml_are_the_same_robot(tmp_path):
     robots = []
     for name, text in (("r.json", json.dumps(ROBOT)), ("r.toml", TOML), ("r.yaml", YAML)):
         (tmp_path / name).write_text(text)
@@ -71,7 +70,7 @@ def test_json_toml_and_yaml_are_the_same_robot(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", mc.builtin_robots())
-def test_saved_robot_comes_back(name: str, tmp_path: Path) -> None:
+def test_saved_robot_comes_back(name, tmp_path):
     robot = mc.load_robot(name)
     robot.save(tmp_path / "r.json")
     again = mc.load_robot(tmp_path / "r.json")
@@ -108,7 +107,7 @@ def joint(**fields: object) -> str:
         (joint(a=float("nan")), "joints[0].a"),
     ],
 )
-def test_broken_robot_files_say_what_is_wrong(text: str, say: str, tmp_path: Path) -> None:
+def test_broken_robot_files_say_what_is_wrong(text, say, tmp_path):
     path = tmp_path / "r.json"
     path.write_text(text)
     with pytest.raises(mc.RobotError) as caught:
@@ -119,7 +118,7 @@ def test_broken_robot_files_say_what_is_wrong(text: str, say: str, tmp_path: Pat
     assert "\n" not in message
 
 
-def test_unknown_names_get_a_hint(tmp_path: Path) -> None:
+def test_unknown_names_get_a_hint(tmp_path):
     with pytest.raises(mc.RobotError, match="did you mean 'irb2600'"):
         mc.load_robot("irb260")
     with pytest.raises(mc.RobotError, match="cannot be read"):
@@ -129,7 +128,7 @@ def test_unknown_names_get_a_hint(tmp_path: Path) -> None:
         mc.load_robot(tmp_path / "robot.txt")
 
 
-def test_yaml_cannot_run_code(tmp_path: Path) -> None:
+def test_yaml_cannot_run_code(tmp_path):
     path = tmp_path / "r.yaml"
     path.write_text("!!python/object/apply:os.system ['echo hacked']")
     with pytest.raises(mc.RobotError, match="cannot be parsed"):
@@ -148,19 +147,19 @@ def test_yaml_cannot_run_code(tmp_path: Path) -> None:
         ("joints: [{d: 1:30.5}]", "line 1: 1:30.5 is no decimal number"),
     ],
 )
-def test_yaml_means_what_it_reads_as(text: str, says: str, tmp_path: Path) -> None:
+def test_yaml_means_what_it_reads_as(text, says, tmp_path):
     path = tmp_path / "robot.yaml"
     path.write_text(text)
     with pytest.raises(mc.RobotError, match=says):
         mc.load_robot(path)
 
 
-def test_a_huge_vertical_keeps_its_direction() -> None:
+def test_a_huge_vertical_keeps_its_direction():
     robot = robot_from_dict(ROBOT | {"up": [0.0, 3e300, 4e300]})
     np.testing.assert_allclose(robot.up, [0.0, 0.6, 0.8])
 
 
-def test_yaml_that_grows_is_refused(tmp_path: Path) -> None:
+def test_yaml_that_grows_is_refused(tmp_path):
     """Nine levels of nine aliases each would be 387 million entries."""
     lines = ["a0: &a0 {x: 1}"]
     lines += [f"a{i}: &a{i}\n  <<: [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10)]
@@ -177,9 +176,7 @@ def test_yaml_that_grows_is_refused(tmp_path: Path) -> None:
         ('"sign": 1', '"sign": 1, "ratio": 0', "gear ratio of zero"),
     ],
 )
-def test_json_that_could_mean_two_things_is_refused(
-    tmp_path: Path, old: str, new: str, says: str
-) -> None:
+def test_json_that_could_mean_two_things_is_refused(tmp_path, old, new, says):
     path = tmp_path / "robot.json"
     mc.load_robot("irb2600").save(path)
     path.write_text(path.read_text().replace(old, new, 1))

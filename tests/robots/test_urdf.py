@@ -1,7 +1,6 @@
 """URDF as robot: any chain, the same poses, and clear words for what is not one."""
 
 import itertools
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,7 +51,7 @@ def same_poses(text: str, tip: str = "") -> mc.Robot:
     return robot
 
 
-def test_a_chain_of_every_joint() -> None:
+def test_a_chain_of_every_joint():
     robot = same_poses(urdf_of(ARM))
     assert robot.joints == 5
     assert list(robot.sign) == [-1, 1, -1, 1, 1]  # z of the base stays upright
@@ -63,7 +62,7 @@ def test_a_chain_of_every_joint() -> None:
 
 
 @pytest.mark.dev
-def test_pinocchio_reads_the_same_poses() -> None:
+def test_pinocchio_reads_the_same_poses():
     pinocchio = pytest.importorskip("pinocchio")
     text = urdf_of([row for row in ARM if row[0] != "continuous"])
     model = to_robot(parse_urdf(text.encode()))
@@ -76,7 +75,7 @@ def test_pinocchio_reads_the_same_poses() -> None:
         assert_allclose(ours, data.oMf[frame].homogeneous, **EXACT)
 
 
-def test_masses_of_fixed_links_are_lumped() -> None:
+def test_masses_of_fixed_links_are_lumped():
     text = urdf_of(ARM, masses=True)
     model = to_robot(parse_urdf(text.encode()))
     robot = robot_from_dict(model.content)
@@ -101,7 +100,7 @@ kinds = st.sampled_from(["revolute", "prismatic", "continuous", "fixed"])
 
 @settings(max_examples=80, deadline=None, derandomize=True)
 @given(st.lists(st.tuples(kinds, vectors, turns, axes), min_size=1, max_size=7))
-def test_any_chain(rows: list[tuple[str, tuple[float, ...], tuple[float, ...], str]]) -> None:
+def test_any_chain(rows):
     text = urdf_of(
         tuple(
             (kind, " ".join(map(repr, xyz)), " ".join(map(repr, rpy)), axis, "")
@@ -111,7 +110,7 @@ def test_any_chain(rows: list[tuple[str, tuple[float, ...], tuple[float, ...], s
     same_poses(text)
 
 
-def test_rpy_comes_back_near_what_stood_there(rng: np.random.Generator) -> None:
+def test_rpy_comes_back_near_what_stood_there(rng):
     steep = np.array(list(itertools.product((0.3, np.pi / 2, -np.pi / 2, np.pi), repeat=3)))
     for rpy in (*rng.uniform(-4, 4, (200, 3)), *steep):
         pose = from_rpy(np.zeros(3), rpy)
@@ -122,7 +121,7 @@ def test_rpy_comes_back_near_what_stood_there(rng: np.random.Generator) -> None:
             assert_allclose(again, rpy, rtol=0, atol=1e-9)
 
 
-def test_a_link_reaches_any_line(rng: np.random.Generator) -> None:
+def test_a_link_reaches_any_line(rng):
     for size in (1.0, 0.05, 1e-3, 1e-9, 0.0):
         axis = np.array([*(size * rng.normal(size=2)), 1.0])
         axis /= np.linalg.norm(axis)
@@ -133,7 +132,7 @@ def test_a_link_reaches_any_line(rng: np.random.Generator) -> None:
         assert_allclose(off - (off @ axis) * axis, 0, rtol=0, atol=1e-12)
 
 
-def test_load_robot_takes_a_urdf_and_a_tip(tmp_path: Path) -> None:
+def test_load_robot_takes_a_urdf_and_a_tip(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(urdf_of(ARM))
     assert mc.load_robot(path).joints == 5
@@ -149,7 +148,7 @@ TWO_HANDS = """<robot name="r"><link name="a"/><link name="b"/><link name="left"
 <child link="plate"/></joint></robot>"""
 
 
-def test_the_chain_is_named_where_there_are_several() -> None:
+def test_the_chain_is_named_where_there_are_several():
     urdf = parse_urdf(TWO_HANDS.encode(), "hands.urdf")
     with pytest.raises(mc.RobotError, match=r"several chains: they end in left, right; name .*tip"):
         to_robot(urdf)
@@ -162,7 +161,7 @@ def test_the_chain_is_named_where_there_are_several() -> None:
         to_robot(urdf, "plate")
 
 
-def test_of_frames_on_one_body_tool0_is_meant() -> None:
+def test_of_frames_on_one_body_tool0_is_meant():
     text = TWO_HANDS.replace('"jr" type="continuous"', '"jr" type="fixed"').replace(
         '"jl" type="continuous"', '"jl" type="fixed"'
     )
@@ -171,7 +170,7 @@ def test_of_frames_on_one_body_tool0_is_meant() -> None:
     assert to_robot(parse_urdf(text.encode())).chain[-1].child == "tool0"
 
 
-def test_a_chain_between_two_links_and_grippers_left_out() -> None:
+def test_a_chain_between_two_links_and_grippers_left_out():
     """A lifting torso with two arms, each with a flange, a camera and two fingers."""
     pinocchio = pytest.importorskip("pinocchio")
     lines = ['<robot name="cell"><link name="world"/><link name="torso"/>']
@@ -225,7 +224,7 @@ def test_a_chain_between_two_links_and_grippers_left_out() -> None:
 
 
 @pytest.mark.dev
-def test_a_joint_whose_limits_are_one_number_is_fixed_there() -> None:
+def test_a_joint_whose_limits_are_one_number_is_fixed_there():
     pinocchio = pytest.importorskip("pinocchio")
     rows = [row for row in ARM if row[0] != "continuous"]
     rows[1] = (*rows[1][:4], 'lower="0.3" upper="0.3"')
@@ -286,7 +285,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("text", BROKEN, ids=range(len(BROKEN)))
-def test_a_broken_file_is_one_clear_line(text: str, tmp_path: Path) -> None:
+def test_a_broken_file_is_one_clear_line(text, tmp_path):
     path = tmp_path / "broken.urdf"
     path.write_text(text)
     with pytest.raises(mc.RobotError, match=BROKEN[text]) as caught:
@@ -295,7 +294,7 @@ def test_a_broken_file_is_one_clear_line(text: str, tmp_path: Path) -> None:
     assert str(path) in str(caught.value)
 
 
-def test_origins_change_and_no_other_byte() -> None:
+def test_origins_change_and_no_other_byte():
     raw = """\ufeff<?xml version='1.0'?>
 <robot name="é > '"><!-- <origin xyz="1 2 3"/> -->
   <link name="a"><visual><origin xyz="9 9 9"/></visual></link><link name="b"/><link name="c"/>
@@ -323,14 +322,14 @@ HOSTILE = (
 
 
 @pytest.mark.parametrize("text", HOSTILE)
-def test_hostile_xml_is_refused(text: str) -> None:
+def test_hostile_xml_is_refused(text):
     with pytest.raises(mc.RobotError, match="DOCTYPE or entities"):
         parse_urdf(text.encode(), "x.urdf")
     with pytest.raises(mc.RobotError, match="undefined entity"):
         parse_urdf(b'<robot name="&x;"/>', "x.urdf")
 
 
-def test_not_text_and_not_there(tmp_path: Path) -> None:
+def test_not_text_and_not_there(tmp_path):
     path = tmp_path / "a.urdf"
     with pytest.raises(mc.RobotError, match="cannot be read"):
         mc.load_robot(path)

@@ -9,12 +9,12 @@ import time
 from pathlib import Path
 
 import pytest
-from served import PATIENCE, Served
+from served import PATIENCE
 
 pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[app]")
 
 
-def test_the_token_opens_and_leaves_the_address(server: Served) -> None:
+def test_the_token_opens_and_leaves_the_address(server):
     answer = server.ask("GET", f"/?token={server.token}", cookie="")
     assert answer.status == 303
     assert answer.headers["location"] == "/"  # the token is in no history and no referrer
@@ -26,7 +26,7 @@ def test_the_token_opens_and_leaves_the_address(server: Served) -> None:
 
 
 @pytest.mark.parametrize("query", ["", "?token=", "?token=the-right-toke", "?token=%00"])
-def test_without_the_token_nothing_is_told(server: Served, query: str) -> None:
+def test_without_the_token_nothing_is_told(server, query):
     for path in ("/", "/s/cell/state", "/static/serve.js", "/s/cell/file/fit.json"):
         answer = server.ask("GET", path + query, cookie="")
         assert answer.status == 403
@@ -34,12 +34,12 @@ def test_without_the_token_nothing_is_told(server: Served, query: str) -> None:
     assert server.ask("POST", f"/sessions{query}", "{}", cookie="").status == 403
 
 
-def test_an_old_cookie_is_a_wrong_token(server: Served) -> None:
+def test_an_old_cookie_is_a_wrong_token(server):
     cookie = f"minimax-cal-{server.port}=of-the-last-server"
     assert server.ask("GET", "/", cookie=cookie).text.startswith("wrong token")
 
 
-def test_the_token_leads_to_no_other_place(server: Served) -> None:
+def test_the_token_leads_to_no_other_place(server):
     answer = server.ask("GET", f"//elsewhere.example/?token={server.token}", cookie="")
     assert not answer.headers.get("location", "/").startswith("//")
 
@@ -47,7 +47,7 @@ def test_the_token_leads_to_no_other_place(server: Served) -> None:
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:PORT", "127.0.0.1:1", "127.0.0.1.evil.example:PORT", ""]
 )
-def test_a_name_that_leads_here_is_refused(server: Served, host: str) -> None:
+def test_a_name_that_leads_here_is_refused(server, host):
     """DNS rebinding: the browser tells the name in Host."""
     answer = server.ask("GET", "/", headers={"host": host.replace("PORT", str(server.port))})
     assert answer.status == 403
@@ -66,7 +66,7 @@ def test_a_name_that_leads_here_is_refused(server: Served, host: str) -> None:
         {"sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"},
     ],
 )
-def test_another_page_is_refused(server: Served, headers: dict[str, str]) -> None:
+def test_another_page_is_refused(server, headers):
     told = {name: value.replace("PORT", str(server.port)) for name, value in headers.items()}
     before = list(server.folder.iterdir())
     answer = server.ask("POST", "/sessions", "{}", headers=told)
@@ -75,14 +75,14 @@ def test_another_page_is_refused(server: Served, headers: dict[str, str]) -> Non
     assert list(server.folder.iterdir()) == before
 
 
-def test_the_page_itself_may_ask(server: Served) -> None:
+def test_the_page_itself_may_ask(server):
     headers = {"origin": f"http://127.0.0.1:{server.port}", "sec-fetch-site": "same-origin"}
     assert server.ask("POST", "/sessions", "{}", headers=headers).status == 200
     followed = {"sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"}
     assert server.ask("GET", "/", headers=followed).status == 200  # a link to it
 
 
-def test_every_answer_is_sealed(server: Served) -> None:
+def test_every_answer_is_sealed(server):
     for path in ("/", "/static/serve.js", "/s/none/state", "/nowhere", "/?token=wrong"):
         headers = server.ask("GET", path).headers
         policy = headers["content-security-policy"]
@@ -93,7 +93,7 @@ def test_every_answer_is_sealed(server: Served) -> None:
         assert "access-control-allow-origin" not in headers
 
 
-def test_it_listens_on_this_machine_alone(server: Served) -> None:
+def test_it_listens_on_this_machine_alone(server):
     """No address of this machine but loopback has the port."""
     listening = Path("/proc/net/tcp")
     if not listening.exists():
@@ -103,7 +103,7 @@ def test_it_listens_on_this_machine_alone(server: Served) -> None:
     assert {row.partition(":")[0] for row in ours} == {"0100007F"}  # 127.0.0.1
 
 
-def test_the_pages_name_nothing_outside() -> None:
+def test_the_pages_name_nothing_outside():
     import minimax_cal.serving as serving
 
     folder = Path(str(serving.__file__)).parent
@@ -114,7 +114,7 @@ def test_the_pages_name_nothing_outside() -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the browser is a script of a shell")
-def test_the_token_is_not_in_the_command_line_of_the_browser(tmp_path: Path) -> None:
+def test_the_token_is_not_in_the_command_line_of_the_browser(tmp_path):
     """Whoever shares the machine may read command lines, but not a private file."""
     browser, heard = tmp_path / "browser", tmp_path / "heard"
     browser.write_text(f'#!/bin/sh\nprintf %s "$*" > {heard}.part && mv {heard}.part {heard}\n')

@@ -141,9 +141,7 @@ def fitted(driver: Any, server: Served, poses: Path) -> Any:
     return driver
 
 
-def test_from_dropped_files_to_a_passed_report(
-    fitted: Any, server: Served, downloads: Path, tmp_path: Path
-) -> None:
+def test_from_dropped_files_to_a_passed_report(fitted, server, downloads, tmp_path):
     driver = fitted
     folder = session_of(driver, server)
     same_as_the_command_line(folder, "irb120", tmp_path)
@@ -178,7 +176,7 @@ def test_from_dropped_files_to_a_passed_report(
     assert asked(driver) == {f"http://127.0.0.1:{server.port}"}
 
 
-def test_a_dh_table_can_be_typed(driver: Any, server: Served, poses: Path) -> None:
+def test_a_dh_table_can_be_typed(driver, server, poses):
     """The table of the nominal arm, typed in, is the arm of the fit."""
     begin(driver, server, "Typed")
     drop(driver, "measured", poses)
@@ -216,7 +214,7 @@ def unticked(driver: Any) -> tuple[str, str]:
     return line, target
 
 
-def test_a_point_can_be_unticked_and_taken_back(fitted: Any) -> None:
+def test_a_point_can_be_unticked_and_taken_back(fitted):
     driver = fitted
     line, target = unticked(driver)
     assert f"--leave-out={line}:{target} -o used.csv" in one(driver, "[data-said=fit]").text
@@ -230,7 +228,7 @@ def test_a_point_can_be_unticked_and_taken_back(fitted: Any) -> None:
     assert severe(driver) == []
 
 
-def test_what_is_too_large_is_refused_by_the_page(fitted: Any, server: Served) -> None:
+def test_what_is_too_large_is_refused_by_the_page(fitted, server):
     driver = fitted
     driver.execute_script(HUGE)
     problem = one(driver, "#problem")
@@ -239,7 +237,7 @@ def test_what_is_too_large_is_refused_by_the_page(fitted: Any, server: Served) -
     assert not (session_of(driver, server) / "given" / "huge.csv").exists()
 
 
-def test_a_phone_shows_all_of_it(fitted: Any) -> None:
+def test_a_phone_shows_all_of_it(fitted):
     driver = fitted
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", PHONE)
     time.sleep(0.5)
@@ -248,7 +246,7 @@ def test_a_phone_shows_all_of_it(fitted: Any) -> None:
     assert wide[0] <= wide[1]
 
 
-def test_a_wrong_token_is_told(driver: Any, server: Served) -> None:
+def test_a_wrong_token_is_told(driver, server):
     driver.delete_all_cookies()
     driver.get(f"http://127.0.0.1:{server.port}/?token=wrong")
     assert one(driver, "body").text.startswith("wrong token: open the address that minimax-cal")
@@ -259,9 +257,7 @@ def test_a_wrong_token_is_told(driver: Any, server: Served) -> None:
 
 
 @pytest.mark.slow
-def test_the_whole_work_in_two_browsers(
-    server: Served, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_the_whole_work_in_two_browsers(server, tmp_path, tmp_path_factory):
     """One drops and fits, the other sees it, and both go on at once in two sessions."""
     data, targets = tmp_path / "tracker.csv", tmp_path / "targets.csv"
     truth = mc.Truth(compliance=1.5e-6)
@@ -324,7 +320,7 @@ def test_the_whole_work_in_two_browsers(
 
 
 @pytest.mark.slow
-def test_a_real_arm(driver: Any, server: Served, tmp_path: Path) -> None:
+def test_a_real_arm(driver, server, tmp_path):
     robot, data = map(Path, shared("irb120"))
     begin(driver, server, "irb120")
     drop(driver, "measured", data)

@@ -32,24 +32,24 @@ def at(tmp_path: Path) -> Session:
     ["../x.csv", "a/b.csv", "a\\b.csv", "/etc/passwd", "..", ".", "", ".hidden", "-o", "con",
      "NUL.csv", "a\0b", "a\nb", "a.csv ", "a.", "x" * 121, "C:poses.csv", "a\u202egpj.csv"],
 )  # fmt: skip
-def test_names_that_are_refused(at: Session, name: str) -> None:
+def test_names_that_are_refused(at, name):
     with pytest.raises(OptionError, match=r"^file name "):
         at.file(GIVEN, name)
 
 
 @pytest.mark.parametrize("name", ["poses.csv", "Meßwerte (2).txt", "smr_1.txt", "T_ROB1.mod"])
-def test_names_that_serve(name: str) -> None:
+def test_names_that_serve(name):
     assert plain_name(name) == name
 
 
-def test_a_link_leads_nowhere_else(at: Session, tmp_path: Path) -> None:
+def test_a_link_leads_nowhere_else(at, tmp_path):
     (tmp_path / "secret").write_text("x")
     os.symlink(tmp_path / "secret", at.folder / "fit.json")
     with pytest.raises(OptionError, match="leads out"):
         at.file("fit.json")
 
 
-def test_sessions_have_names_of_their_own(at: Session, tmp_path: Path) -> None:
+def test_sessions_have_names_of_their_own(at, tmp_path):
     other = new_session(tmp_path, "Cell 7: the blue one")
     assert (at.name, other.name) == ("cell-7-the-blue-one", "cell-7-the-blue-one-2")
     assert new_session(tmp_path, "../..").folder.parent == tmp_path
@@ -59,7 +59,7 @@ def test_sessions_have_names_of_their_own(at: Session, tmp_path: Path) -> None:
             session(tmp_path, name)
 
 
-def test_choices_are_kept_as_they_were_made(at: Session) -> None:
+def test_choices_are_kept_as_they_were_made(at):
     at.choose({"measured": ["poses.csv"], "robot": "irb120", "left_out": ["12:smr2"], "rms": 0.2})
     again = Session(at.folder).choices
     assert again.measured == ("poses.csv",)
@@ -74,21 +74,21 @@ def test_choices_are_kept_as_they_were_made(at: Session) -> None:
      {"unknown": 1}, {"measured": "poses.csv"}, {"units": "x" * 3000},
      {"units": "a\0b"}, {"columns": "a\nb"}, {"units": "\ud800"}],
 )  # fmt: skip
-def test_choices_that_are_refused_change_nothing(at: Session, changes: dict[str, object]) -> None:
+def test_choices_that_are_refused_change_nothing(at, changes):
     before = at.choose({"measured": ["poses.csv"]})
     with pytest.raises(OptionError):
         at.choose(changes)
     assert at.choices == before
 
 
-def test_a_removed_file_is_chosen_no_more(at: Session) -> None:
+def test_a_removed_file_is_chosen_no_more(at):
     at.choose({"measured": ["poses.csv"], "joints": "poses.csv"})
     left = at.remove("poses.csv")
     assert (left.measured, left.joints) == ((), "")
     assert at.given() == []
 
 
-def test_a_session_is_full_at_last(at: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_session_is_full_at_last(at, monkeypatch):
     assert at.room("new.csv") == 256 << 20
     monkeypatch.setattr("minimax_cal.serving.sessions.MOST_TOGETHER", 10)
     assert at.room("new.csv") == 3  # beside the seven bytes of the one that is there
@@ -98,22 +98,20 @@ def test_a_session_is_full_at_last(at: Session, monkeypatch: pytest.MonkeyPatch)
         at.room("new.csv")
 
 
-def test_choices_that_somebody_broke_are_told(at: Session) -> None:
+def test_choices_that_somebody_broke_are_told(at):
     (at.folder / CHOICES).write_text("{")
     with pytest.raises(OptionError, match=r"session\.json"):
         at.choices  # noqa: B018
 
 
-def test_the_stamp_changes_with_every_file(at: Session) -> None:
+def test_the_stamp_changes_with_every_file(at):
     before = at.stamp()
     assert at.stamp() == before
     (at.folder / "fit.json").write_text("{}")
     assert at.stamp() != before
 
 
-def test_files_that_are_being_written_take_their_room(
-    at: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_that_are_being_written_take_their_room(at, monkeypatch):
     """Two that are sent at once must not fill a session beyond its limit."""
     monkeypatch.setattr("minimax_cal.serving.sessions.MOST_TOGETHER", 1000)
     part = at.part("large.csv", 900)
@@ -125,7 +123,7 @@ def test_files_that_are_being_written_take_their_room(
         at.room("new.csv")
 
 
-def test_parts_that_a_killed_server_left_are_removed(at: Session) -> None:
+def test_parts_that_a_killed_server_left_are_removed(at):
     old, new = at.part("old.csv", 10), at.part("new.csv", 10)
     os.utime(old, (time.time() - 7200.0,) * 2)
     remove_parts(at.folder.parent)
@@ -134,13 +132,13 @@ def test_parts_that_a_killed_server_left_are_removed(at: Session) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="permissions are those of POSIX")
-def test_sessions_are_private(at: Session) -> None:
+def test_sessions_are_private(at):
     folders = (at.folder, at.folder / GIVEN, at.folder / "log")
     assert {stat.S_IMODE(path.stat().st_mode) for path in folders} == {0o700}
     assert stat.S_IMODE(at.part("x.csv", 3).stat().st_mode) == 0o600
 
 
-def test_choices_nested_too_deep_are_refused(at: Session) -> None:
+def test_choices_nested_too_deep_are_refused(at):
     (at.folder / CHOICES).write_text("[" * 100_000)
     with pytest.raises(OptionError, match=r"session\.json"):
         at.choices  # noqa: B018

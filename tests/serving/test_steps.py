@@ -37,7 +37,7 @@ def everything(at: Session) -> None:
     )  # fmt: skip
 
 
-def test_points_are_set_aside_with_their_reasons(at: Session) -> None:
+def test_points_are_set_aside_with_their_reasons(at):
     everything(at)
     at.choose({"left_out": ["3:smr1", "12:smr2", "40"],
                "reasons": {"12:smr2": "nest, knocked", "40": "nest, knocked"}})  # fmt: skip
@@ -47,7 +47,7 @@ def test_points_are_set_aside_with_their_reasons(at: Session) -> None:
     )
 
 
-def test_the_lines_are_what_people_would_type(at: Session) -> None:
+def test_the_lines_are_what_people_would_type(at):
     everything(at)
     left = "minimax-cal import poses.csv --leave-out=12:smr2,40 -o used.csv"
     assert lines(at, "read") == [
@@ -69,14 +69,14 @@ def test_the_lines_are_what_people_would_type(at: Session) -> None:
     ]
 
 
-def test_a_diagnosis_of_other_measurements_joins_no_report(at: Session) -> None:
+def test_a_diagnosis_of_other_measurements_joins_no_report(at):
     everything(at)
     (at.folder / DIAGNOSIS).write_text(RESULT.replace("abc", "def"))
     assert "diagnosis.json" not in lines(at, "judge")[0]
 
 
 @pytest.mark.parametrize("step", STEPS)
-def test_the_command_line_takes_every_line(at: Session, step: str) -> None:
+def test_the_command_line_takes_every_line(at, step):
     """Each option is one that its command has, and every value is that of its option."""
     everything(at)
     for line in lines(at, step):
@@ -92,6 +92,6 @@ def test_the_command_line_takes_every_line(at: Session, step: str) -> None:
     [("read", "drop the files"), ("fit", "not been read"), ("judge", "calibrate first"),
      ("plan", "not been read"), ("urdf", "calibrate first"), ("correct", "joint targets first")],
 )  # fmt: skip
-def test_what_a_step_waits_for_is_told(at: Session, step: str, said: str) -> None:
+def test_what_a_step_waits_for_is_told(at, step, said):
     with pytest.raises(OptionError, match=said):
         lines(at, step)

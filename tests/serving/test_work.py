@@ -70,9 +70,7 @@ def at_work(folder: Path) -> list[int]:
 # ---- the same as the command line ----------------------------------------------------------------
 
 
-def test_the_numbers_are_those_of_the_command_line(
-    server: Served, fitted: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_numbers_are_those_of_the_command_line(server, fitted, tmp_path, monkeypatch):
     monkeypatch.chdir(folder_of(server, fitted))
     (line,) = server.state(fitted)["steps"]["fit"]["lines"]
     words = line.removeprefix("minimax-cal ").removesuffix("fit.json").split()
@@ -80,7 +78,7 @@ def test_the_numbers_are_those_of_the_command_line(
     assert result(tmp_path / "fit.json") == result(Path("fit.json"))
 
 
-def test_the_script_of_the_session_does_it_all_again(server: Served, fitted: str) -> None:
+def test_the_script_of_the_session_does_it_all_again(server, fitted):
     state = server.state(fitted)
     script = (folder_of(server, fitted) / "commands.sh").read_text()
     for step in ("read", "fit"):
@@ -89,7 +87,7 @@ def test_the_script_of_the_session_does_it_all_again(server: Served, fitted: str
 
 
 @pytest.mark.slow
-def test_a_point_that_is_unticked_is_out_of_the_next_fit(server: Served, fitted: str) -> None:
+def test_a_point_that_is_unticked_is_out_of_the_next_fit(server, fitted):
     worst = folder_of(server, fitted) / "fit.json"
     before = result(worst)
     server.choose(fitted, left_out=["2:smr1", "5:smr2"], reasons={"5:smr2": "knocked"})
@@ -110,7 +108,7 @@ def test_a_point_that_is_unticked_is_out_of_the_next_fit(server: Served, fitted:
     assert server.state(fitted)["steps"]["fit"]["state"] == "old"
 
 
-def test_an_error_is_the_line_of_the_command(server: Served) -> None:
+def test_an_error_is_the_line_of_the_command(server):
     home = server.begin(robot="irb120")
     server.put(home, "points.csv", b"a,b\n1,2\n")
     server.choose(home, measured=["points.csv"])
@@ -121,7 +119,7 @@ def test_an_error_is_the_line_of_the_command(server: Served) -> None:
     assert not (folder_of(server, home) / "understood.json").exists()
 
 
-def test_files_of_tracker_and_controller_are_one(server: Served, poses: bytes) -> None:
+def test_files_of_tracker_and_controller_are_one(server, poses):
     """Without headers: what they do not tell is chosen, and goes to the command as it is."""
     home = server.begin(robot="irb120")
     rows = [line.split(",") for line in poses.decode().splitlines()[1:]]
@@ -136,7 +134,7 @@ def test_files_of_tracker_and_controller_are_one(server: Served, poses: bytes) -
     assert found.q.shape == (POSES, 6)
 
 
-def test_names_from_files_are_only_text(server: Served, poses: bytes) -> None:
+def test_names_from_files_are_only_text(server, poses):
     """Of a file and of its columns, wherever they are shown."""
     home = server.begin(robot="irb120")
     header, _, rows = poses.partition(b"\n")
@@ -151,7 +149,7 @@ def test_names_from_files_are_only_text(server: Served, poses: bytes) -> None:
 
 
 @pytest.mark.slow
-def test_a_requirement_is_judged_by_the_report(server: Served, fitted: str) -> None:
+def test_a_requirement_is_judged_by_the_report(server, fitted):
     server.choose(fitted, rms=50.0)
     state = server.run(fitted, "judge")
     assert ">Passed</p>" in state["panels"]["verdict"]
@@ -163,7 +161,7 @@ def test_a_requirement_is_judged_by_the_report(server: Served, fitted: str) -> N
     assert "allow-same-origin" not in look.headers["content-security-policy"]
 
 
-def test_files_are_given_to_keep_and_never_shown(server: Served, fitted: str) -> None:
+def test_files_are_given_to_keep_and_never_shown(server, fitted):
     answer = server.ask("GET", f"{fitted}/file/fit.json")
     assert answer.body == (folder_of(server, fitted) / "fit.json").read_bytes()
     assert answer.headers["content-type"] == "application/octet-stream"
@@ -176,7 +174,7 @@ def test_files_are_given_to_keep_and_never_shown(server: Served, fitted: str) ->
 @pytest.mark.parametrize(
     "name", ["../fit.json", "..%2Ffit.json", "%2Fetc%2Fpasswd", "a%5Cb.csv", "..", "", ".x", "%00"]
 )
-def test_a_path_in_a_file_name_is_refused(server: Served, fitted: str, name: str) -> None:
+def test_a_path_in_a_file_name_is_refused(server, fitted, name):
     before = sorted(server.folder.rglob("*"))
     answer = server.put(fitted, name, b"x")
     assert answer.status == 400
@@ -186,13 +184,13 @@ def test_a_path_in_a_file_name_is_refused(server: Served, fitted: str, name: str
     assert server.ask("GET", f"{fitted}/file/{name}").status in (400, 404)
 
 
-def test_a_path_to_a_session_is_refused(server: Served) -> None:
+def test_a_path_to_a_session_is_refused(server):
     for name in ("..", "%2e%2e", "none", "..%2f.."):
         assert server.ask("GET", f"/s/{name}/state").status in (400, 404)
         assert server.ask("POST", f"/s/{name}/run/read").status in (400, 404, 405)
 
 
-def test_two_gigabytes_are_refused_before_they_come(server: Served, fitted: str) -> None:
+def test_two_gigabytes_are_refused_before_they_come(server, fitted):
     headers = {"content-length": TOO_LARGE}
     answer = server.ask("PUT", f"{fitted}/given?name=huge.csv", None, headers)
     assert answer.status == 413
@@ -201,7 +199,7 @@ def test_two_gigabytes_are_refused_before_they_come(server: Served, fitted: str)
     )
 
 
-def test_what_does_not_tell_its_length_is_counted(server: Served, fitted: str) -> None:
+def test_what_does_not_tell_its_length_is_counted(server, fitted):
     """Sent in chunks, as much as it likes: an end is put to it, and nothing is kept."""
     request = (
         f"PUT {fitted}/given?name=huge.csv HTTP/1.1\r\nhost: 127.0.0.1:{server.port}\r\n"
@@ -225,7 +223,7 @@ def test_what_does_not_tell_its_length_is_counted(server: Served, fitted: str) -
     assert names == {"tracker.csv"}
 
 
-def test_a_file_without_its_length_is_refused(server: Served, fitted: str) -> None:
+def test_a_file_without_its_length_is_refused(server, fitted):
     line = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
     line.putrequest("PUT", f"{fitted}/given?name=x.csv")
     line.putheader("cookie", f"minimax-cal-{server.port}={server.token}")
@@ -238,7 +236,7 @@ def test_a_file_without_its_length_is_refused(server: Served, fitted: str) -> No
 DEEP = "[" * 100_000
 
 
-def test_json_nested_too_deep_is_refused(server: Served) -> None:
+def test_json_nested_too_deep_is_refused(server):
     home = server.begin()
     for method, path in (("PATCH", f"{home}/choices"), ("POST", "/sessions")):
         answer = server.ask(method, path, DEEP)
@@ -248,7 +246,7 @@ def test_json_nested_too_deep_is_refused(server: Served) -> None:
 @pytest.mark.parametrize(
     "name", ["fit.json", "diagnosis.json", "understood.json", "log/fit.json", "given/robot.json"]
 )
-def test_deep_json_in_a_session_leaves_its_page(server: Served, name: str) -> None:
+def test_deep_json_in_a_session_leaves_its_page(server, name):
     home = server.begin()
     (folder_of(server, home) / name).write_text('{"a":' * 100_000)
     if name.startswith("given"):
@@ -260,7 +258,7 @@ def test_deep_json_in_a_session_leaves_its_page(server: Served, name: str) -> No
 
 
 @pytest.mark.skipif(os.name == "nt", reason="permissions are those of POSIX")
-def test_what_a_session_holds_is_private(server: Served, fitted: str) -> None:
+def test_what_a_session_holds_is_private(server, fitted):
     folder = folder_of(server, fitted)
     found = {path: stat.S_IMODE(path.stat().st_mode) for path in [folder, *folder.rglob("*")]}
     assert len(found) > 6
@@ -269,13 +267,13 @@ def test_what_a_session_holds_is_private(server: Served, fitted: str) -> None:
 
 
 @pytest.mark.parametrize("body", ["", "[]", "{", '{"robot": 1}', '{"x": 1}', "x" * (2 << 20)])
-def test_choices_that_are_none(server: Served, fitted: str, body: str) -> None:
+def test_choices_that_are_none(server, fitted, body):
     answer = server.ask("PATCH", f"{fitted}/choices", body)
     assert answer.status == 400
     assert "\n" not in answer.json["error"]
 
 
-def test_steps_that_are_none_or_cannot_be_done(server: Served) -> None:
+def test_steps_that_are_none_or_cannot_be_done(server):
     home = server.begin()
     assert server.ask("POST", f"{home}/run/rm").json["error"] == "there is no such step"
     assert server.ask("POST", f"{home}/run/fit").json["error"].endswith("have not been read yet")
@@ -285,9 +283,7 @@ def test_steps_that_are_none_or_cannot_be_done(server: Served) -> None:
 
 
 @pytest.mark.slow
-def test_two_sessions_work_at_once_and_one_waits_for_itself(
-    server: Served, fitted: str, poses: bytes
-) -> None:
+def test_two_sessions_work_at_once_and_one_waits_for_itself(server, fitted, poses):
     other = server.begin("other", robot="irb120", objective="sum")
     server.put(other, "t.csv", poses)
     server.choose(other, measured=["t.csv"])
@@ -313,7 +309,7 @@ def waited_for(server: Served, home: str) -> Any:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells whose folder is where")
-def test_work_that_is_cancelled_leaves_nothing(server: Served, fitted: str) -> None:
+def test_work_that_is_cancelled_leaves_nothing(server, fitted):
     folder = folder_of(server, fitted)
     before = sorted(folder.rglob("*"))
     waited_for(server, fitted)
@@ -325,7 +321,7 @@ def test_work_that_is_cancelled_leaves_nothing(server: Served, fitted: str) -> N
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells whose folder is where")
-def test_a_killed_server_loses_no_finished_result(tmp_path: Path, poses: bytes) -> None:
+def test_a_killed_server_loses_no_finished_result(tmp_path, poses):
     with serving(tmp_path) as first:
         home = first.begin(robot="irb120", objective="sum")
         first.put(home, "t.csv", poses)

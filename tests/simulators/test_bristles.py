@@ -36,7 +36,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_model_keeps_its_bristles_and_takes_their_torque_along_a_motion(robot: Path) -> None:
+def test_a_model_keeps_its_bristles_and_takes_their_torque_along_a_motion(robot):
     opened = open_model(robot, 3)
     chain, document = opened.chain, opened.given.document
     bare = given_numbers(chain, Bodies.of(chain))
@@ -58,9 +58,7 @@ def test_a_model_keeps_its_bristles_and_takes_their_torque_along_a_motion(robot:
     assert b"dcmotor" not in opened.again(document).content(None)
 
 
-def test_a_file_with_bristles_holds_rest_better_and_holds_still(
-    robot: Path, tmp_path: Path
-) -> None:
+def test_a_file_with_bristles_holds_rest_better_and_holds_still(robot, tmp_path):
     runs, out = [stopping(seed) for seed in range(4)], tmp_path / "arm.xml"
     plain = mc.motion_gap(robot, runs, driven=False)
     found = mc.motion_gap(robot, runs, driven=False, friction="dcmotor", write=out)
@@ -82,7 +80,7 @@ def test_a_file_with_bristles_holds_rest_better_and_holds_still(
     assert reached.speed < 2e-3
 
 
-def test_file_and_module_together_do_what_the_last_step_says(robot: Path, tmp_path: Path) -> None:
+def test_file_and_module_together_do_what_the_last_step_says(robot, tmp_path):
     runs, out = [stopping(seed, 0.1) for seed in range(4)], tmp_path / "arm.xml"
     found = mc.motion_gap(robot, runs, driven=False, friction="dcmotor", write=out)
     opened, logs = open_model(out, 3), prepare(runs[-1:])
@@ -92,6 +90,6 @@ def test_file_and_module_together_do_what_the_last_step_says(robot: Path, tmp_pa
     assert_allclose(np.sqrt((off**2).mean(axis=0)), found.rungs[-1].torque_rms, rtol=1e-3)
 
 
-def test_another_element_is_refused(robot: Path) -> None:
+def test_another_element_is_refused(robot):
     with pytest.raises(OptionError, match="give dcmotor"):
         mc.motion_gap(robot, [stopping(0)], friction="bristles")

@@ -48,7 +48,7 @@ def check_held(
 
 
 @pytest.mark.parametrize("name", ["ur10", "irb2600", "seven_axes", "scara_600"])
-def test_a_new_file_holds_still_and_moves(name: str) -> None:
+def test_a_new_file_holds_still_and_moves(name):
     robot = with_masses(robot_called(name))
     cell = cell_with(robot, "joint_compliance:all", "encoder_gain:all", "base_flex:frame",
                      size=3e-6, base_flex=[2e-7],
@@ -61,7 +61,7 @@ def test_a_new_file_holds_still_and_moves(name: str) -> None:
     assert not any(model.joint(j).name.startswith("flex") for j in range(model.njnt))
 
 
-def test_one_compliant_joint_among_stiff_ones_has_a_spring() -> None:
+def test_one_compliant_joint_among_stiff_ones_has_a_spring():
     robot = with_masses(robot_called("irb2600"))
     cell = cell_with(robot, "joint_compliance:J2", "link_bending:L1", size=3e-6,
                      link_bending=[1e-6])  # fmt: skip
@@ -82,7 +82,7 @@ def in_default_scene(text: str) -> Any:
 
 @pytest.mark.filterwarnings("ignore:Attach conflict")
 @pytest.mark.parametrize("name", ["ur10", "irb2600", "meca500", "scara_600", "seven_axes"])
-def test_a_new_file_stands_and_moves_in_a_default_scene(name: str) -> None:
+def test_a_new_file_stands_and_moves_in_a_default_scene(name):
     robot = robot_called(name)
     effects = [] if name == "ur10" else ["joint_compliance:J2", "encoder_gain:J1"]
     cell = cell_with(robot, *effects, size=1e-7)
@@ -98,7 +98,7 @@ def test_a_new_file_stands_and_moves_in_a_default_scene(name: str) -> None:
     np.testing.assert_allclose(attached.sites, alone.sites, rtol=0, atol=1e-6)
 
 
-def test_a_file_corrected_again_stays_braked_in_its_joints(tmp_path: Path) -> None:
+def test_a_file_corrected_again_stays_braked_in_its_joints(tmp_path):
     robot = with_masses(robot_called("ur10"))
     cell = cell_with(robot, "joint_compliance:all", size=3e-6)
     path = tmp_path / "arm.xml"
@@ -111,7 +111,7 @@ def test_a_file_corrected_again_stays_braked_in_its_joints(tmp_path: Path) -> No
     check_held(text, cell, poses(robot, 3))
 
 
-def test_what_is_delivered_is_what_the_file_reaches() -> None:
+def test_what_is_delivered_is_what_the_file_reaches():
     """One set of masses and springs stands for the torques that a fit takes apart, as it can."""
     name, effects = (
         "fanuc_r2000ic_165f",
@@ -169,9 +169,7 @@ def case(
     return folder, fit, gap
 
 
-def test_a_corrected_file_under_its_force_limits_does_what_the_gap_says(
-    case: tuple[Path, mc.Fit, SimulatorGap],
-) -> None:
+def test_a_corrected_file_under_its_force_limits_does_what_the_gap_says(case):
     folder, fit, gap = case
     assert all(rung.at_limit < SELDOM and not rung.moving_poses for rung in gap.rungs[1:])
     for rung in gap.rungs[2:]:
@@ -186,9 +184,7 @@ def test_a_corrected_file_under_its_force_limits_does_what_the_gap_says(
     assert model.actuator_gainprm[:, 0].max() < 20 * 5000.0
 
 
-def test_gravity_still_counts_against_the_force_limits(
-    case: tuple[Path, mc.Fit, SimulatorGap],
-) -> None:
+def test_gravity_still_counts_against_the_force_limits(case):
     folder, fit, _ = case
     model = mujoco.MjModel.from_xml_path(str(folder / "corrected.xml"))
     data = mujoco.MjData(model)
@@ -198,7 +194,7 @@ def test_gravity_still_counts_against_the_force_limits(
     np.testing.assert_allclose(data.qfrc_actuator[dofs], data.qfrc_bias[dofs], rtol=0, atol=0.01)
 
 
-def test_the_text_stays_but_for_what_changed(case: tuple[Path, mc.Fit, SimulatorGap]) -> None:
+def test_the_text_stays_but_for_what_changed(case):
     folder, fit, _ = case
     before = (folder / "ur10.xml").read_text().splitlines()
     after = (folder / "corrected.xml").read_text().splitlines()
@@ -216,7 +212,7 @@ def test_the_text_stays_but_for_what_changed(case: tuple[Path, mc.Fit, Simulator
         assert any(f"<!-- joint {joint} -->" in line for line in after)
 
 
-def test_a_file_is_written_byte_for_byte(tmp_path: Path) -> None:
+def test_a_file_is_written_byte_for_byte(tmp_path):
     path = published_like(tmp_path, mc.load_robot("ur10"))
     odd = (
         b"<?xml version='1.0'?>\r\n<!-- > -->\r\n<mujoco   model = 'a &gt; b' >\t<option\r\n"
@@ -238,7 +234,7 @@ def test_a_file_is_written_byte_for_byte(tmp_path: Path) -> None:
     assert document.raw() == changed
 
 
-def test_an_include_is_written_out_only_where_it_changed(tmp_path: Path) -> None:
+def test_an_include_is_written_out_only_where_it_changed(tmp_path):
     (tmp_path / "arm.xml").write_text(
         "<mujoco>\n  <include file='a.xml'/>\n  <include file='b.xml'/>\n</mujoco>\n"
     )
@@ -253,7 +249,7 @@ def test_an_include_is_written_out_only_where_it_changed(tmp_path: Path) -> None
     )
 
 
-def test_a_keyframe_grows_with_the_springs(tmp_path: Path) -> None:
+def test_a_keyframe_grows_with_the_springs(tmp_path):
     model = ur10_like(tmp_path)
     text = model.read_text().replace("qpos='0 0 0 0 0 0 '", "qpos='1 2 3 4 5 6'")
     model.write_text(text)
@@ -273,7 +269,7 @@ def test_a_keyframe_grows_with_the_springs(tmp_path: Path) -> None:
     assert out.key_qpos[0].sum() == 21.0
 
 
-def test_a_command_map_reaches_what_the_fit_says(tmp_path: Path) -> None:
+def test_a_command_map_reaches_what_the_fit_says(tmp_path):
     model = ur10_like(tmp_path)
     weighs = chain_of(read_model(model).compiled(), 6, str(model)).robot
     cell = cell_with(weighs, "joint_compliance:all", "gear_error:J3:turns=1", size=8e-6,
@@ -291,9 +287,7 @@ def test_a_command_map_reaches_what_the_fit_says(tmp_path: Path) -> None:
 UNSTABLE = "integrator='Euler' timestep='0.005'"
 
 
-def test_an_unstable_model_is_an_error_of_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unstable_model_is_an_error_of_one_line(tmp_path, capsys):
     model = ur10_like(tmp_path, (1e4,) * 6, UNSTABLE, (1e6,) * 6, damping=0.0)
     text = model.read_text().replace('armature="0.1"', "").replace("armature='0.1'", "")
     model.write_text(text.replace("damping='1'", ""))
@@ -304,9 +298,7 @@ def test_an_unstable_model_is_an_error_of_one_line(
     assert "kv" in said
 
 
-def test_a_force_limit_below_the_weight_is_an_error_of_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_force_limit_below_the_weight_is_an_error_of_one_line(tmp_path, capsys):
     model = ur10_like(tmp_path, limits=(330.0, 60.0, 150.0, 56.0, 56.0, 56.0))
     data = mc.simulate("ur10", 30, 3, seed=3).data
     mc.write_measurements(tmp_path / "poses.csv", data)
@@ -322,7 +314,7 @@ def test_a_force_limit_below_the_weight_is_an_error_of_one_line(
     assert not (tmp_path / "out.xml").exists()
 
 
-def test_a_limit_that_binds_is_counted(tmp_path: Path) -> None:
+def test_a_limit_that_binds_is_counted(tmp_path):
     """A limit above the weight, below what the move asks for."""
     q = np.array([[0.0, -1.5, 0.0, 0.0, 0.0, 0.0], [0.0, -0.4, 0.0, 0.0, 0.0, 0.0]] * 2)
     free = ur10_like(tmp_path)
@@ -340,7 +332,7 @@ def test_a_limit_that_binds_is_counted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["ur10", "irb2600", "seven_axes"])
 @pytest.mark.slow
-def test_the_study_s_corrected_files_hold_still_and_move(name: str, tmp_path: Path) -> None:
+def test_the_study_s_corrected_files_hold_still_and_move(name, tmp_path):
     result = study.run(study.Trial(name, 48, 0))
     assert abs(result.alone_mm - result.gap.rungs[-1].holdout_rms_mm) < HOLDS_MM
     assert result.speed < STILL

@@ -64,7 +64,7 @@ def gap(arm: Path, few_moves: None) -> SimulatorGap:
     )
 
 
-def test_the_ladder_falls_to_what_the_fit_says(arm: Path, gap: SimulatorGap) -> None:
+def test_the_ladder_falls_to_what_the_fit_says(arm, gap):
     names = [rung.name for rung in gap.rungs]
     assert names == ["as given", "servo sag removed", "calibrated geometry",
                      "+ joint_compliance all"]  # fmt: skip
@@ -79,12 +79,12 @@ def test_the_ladder_falls_to_what_the_fit_says(arm: Path, gap: SimulatorGap) -> 
     assert abs(held[-1] - fit.accuracy["holdout"].rms_mm) < AGREES
 
 
-def test_the_corrected_file_reproduces_the_last_rung(arm: Path, gap: SimulatorGap) -> None:
+def test_the_corrected_file_reproduces_the_last_rung(arm, gap):
     again = mc.simulator_gap(arm / "corrected.xml", arm / "poses.csv", fit=arm / "fit.json")
     assert abs(again.rungs[0].holdout_rms_mm - gap.rungs[-1].holdout_rms_mm) < 1e-3
 
 
-def test_a_report_tells_that_the_simulator_met_another_arm(arm: Path, gap: SimulatorGap) -> None:
+def test_a_report_tells_that_the_simulator_met_another_arm(arm, gap):
     pytest.importorskip("plotly")
     fit = mc.load_fit(arm / "fit.json")
     assert read_sources([fit, gap]).notices == ()
@@ -96,9 +96,7 @@ def test_a_report_tells_that_the_simulator_met_another_arm(arm: Path, gap: Simul
     assert f"of another, not of {fit.robot.name}: is it the same arm?" in told
 
 
-def test_the_command_and_the_report(
-    arm: Path, gap: SimulatorGap, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_and_the_report(arm, gap, tmp_path, capsys):
     pytest.importorskip("plotly")
     pytest.importorskip("matplotlib")
     mc.export("ur10", "urdf", tmp_path / "arm.urdf", notify=lambda notice: None)
@@ -119,9 +117,7 @@ def test_the_command_and_the_report(
     assert run("report", tmp_path / "gap.json", "-o", page) == 2
 
 
-def test_models_that_do_not_fit_are_refused(
-    arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_models_that_do_not_fit_are_refused(arm, tmp_path, capsys):
     other = tmp_path / "other.xml"
     mc.export("scara_600", "mjcf", other, notify=lambda notice: None)
     broken, empty = tmp_path / "broken.xml", tmp_path / "empty.xml"
@@ -142,7 +138,7 @@ def test_models_that_do_not_fit_are_refused(
 
 
 @pytest.mark.slow  # the quick studies run it besides
-def test_the_study_in_its_quick_form() -> None:
+def test_the_study_in_its_quick_form():
     result = study.run(study.Trial("ur10", 48, 0))
     for rung in result.gap.rungs[2:]:
         assert abs(rung.holdout_rms_mm - rung.predicted_rms_mm) < AGREES
@@ -174,8 +170,8 @@ def stiffening(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_an_effect_without_an_element_is_no_rung_and_what_was_fitted_beside_it_is_not_used(
-    stiffening: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    stiffening, monkeypatch
+):
     monkeypatch.setattr(ladder, "TRAINING", 100)  # what is left is much more than noise
     written = stiffening / "corrected.xml"
     ways = {"data": stiffening / "poses.csv", "fit": stiffening / "fit.json"}
@@ -215,9 +211,7 @@ def driven(path: Path, fit: mc.Fit, asked: Callable[[np.ndarray], np.ndarray]) -
     return float(1e3 * off / np.sqrt(len(real)))
 
 
-def test_what_makes_the_simulator_worse_is_not_written(
-    stiffening: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_makes_the_simulator_worse_is_not_written(stiffening, tmp_path, monkeypatch):
     monkeypatch.setattr(ladder, "TRAINING", 12)
     monkeypatch.setattr(ladder, "WORSE", -0.9)  # no rung is so much better
     monkeypatch.setattr(ladder, "AGREES_MM", -1.0)
@@ -235,7 +229,7 @@ def test_what_makes_the_simulator_worse_is_not_written(
     assert "base_flex_x" not in [model.joint(i).name for i in range(model.njnt)]
 
 
-def test_a_simulator_that_does_other_than_the_fit_says_so() -> None:
+def test_a_simulator_that_does_other_than_the_fit_says_so():
     rung = Rung("+ base_flex frame", 0.0950, 0.3, 0.0950, 0.3, 0.0, predicted_rms_mm=0.0800)
     (said,) = ladder.disagreement([rung, replace(rung, predicted_rms_mm=0.0900)])
     assert said == (
@@ -246,7 +240,7 @@ def test_a_simulator_that_does_other_than_the_fit_says_so() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["irb120", "ur10_b"])
-def test_real_arms_end_where_effects_with_an_element_end(name: str, tmp_path: Path) -> None:
+def test_real_arms_end_where_effects_with_an_element_end(name, tmp_path):
     robot, data = shared(name)
     mc.export(robot, "mjcf", tmp_path / "arm.xml", notify=lambda notice: None)
     mc.diagnose(robot, data).save(tmp_path / "diagnosis.json")
@@ -256,7 +250,7 @@ def test_real_arms_end_where_effects_with_an_element_end(name: str, tmp_path: Pa
     assert np.isclose(gap.rungs[2].predicted_rms_mm, ladder[1].holdout.rms_mm, rtol=0.02)
 
 
-def test_laws_chosen_for_guessed_masses_are_chosen_anew_for_told_ones() -> None:
+def test_laws_chosen_for_guessed_masses_are_chosen_anew_for_told_ones():
     told = mc.load_robot("irb2600")
     mass, com = tubes(told.mdh)
     told = replace(told, mass=np.maximum(mass, 1.0), com=com)
@@ -321,9 +315,7 @@ def turned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, mc.Measureme
     return folder, replace(rows, y=y, source="poses.csv")
 
 
-def test_a_pillar_between_poses_is_nothing_that_an_arm_rests_on(
-    turned: tuple[Path, mc.Measurements],
-) -> None:
+def test_a_pillar_between_poses_is_nothing_that_an_arm_rests_on(turned):
     folder, data = turned
     (folder / "post.xml").write_text(beside_a_pillar())
     (folder / "free.xml").write_text(beside_a_pillar(""))
@@ -345,7 +337,7 @@ def test_a_pillar_between_poses_is_nothing_that_an_arm_rests_on(
     assert whole.rungs[-1].holdout_rms_mm < NOISE_MM
 
 
-def test_motors_named_as_their_joints(turned: tuple[Path, mc.Measurements]) -> None:
+def test_motors_named_as_their_joints(turned):
     folder, data = turned
     (folder / "named.xml").write_text(beside_a_pillar("", "motor"))
     fit = mc.calibrate(robot_of(folder / "named.xml"), data, "sum")
@@ -357,7 +349,7 @@ def test_motors_named_as_their_joints(turned: tuple[Path, mc.Measurements]) -> N
     ]
 
 
-def test_poses_of_another_arm_are_refused(arm: Path) -> None:
+def test_poses_of_another_arm_are_refused(arm):
     data = mc.simulate("irb2600", 30, 3, seed=1).data
     with pytest.raises(mc.DataError, match="of the calibrated arm"):
         mc.simulator_gap(arm / "arm.xml", data, fit=arm / "fit.json")

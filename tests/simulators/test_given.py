@@ -79,7 +79,7 @@ def sites(model: Any, chain: Chain, q: np.ndarray, names: tuple[str, ...]) -> np
     return np.asarray(points @ chain.base[:3, :3])
 
 
-def test_the_robot_of_a_model_moves_as_the_model_does(given: tuple[Path, Chain]) -> None:
+def test_the_robot_of_a_model_moves_as_the_model_does(given):
     _, chain = given
     model, data = chain.model, mujoco.MjData(chain.model)
     assert chain.names == tuple(f"axis{i}" for i in range(6))
@@ -97,9 +97,7 @@ def test_the_robot_of_a_model_moves_as_the_model_does(given: tuple[Path, Chain])
 
 
 @pytest.mark.parametrize("step", ["1e-6", "1e-9"])
-def test_a_timestep_that_takes_forever_is_refused(
-    given: tuple[Path, Chain], tmp_path: Path, step: str
-) -> None:
+def test_a_timestep_that_takes_forever_is_refused(given, tmp_path, step):
     tree = ET.parse(given[0])
     for option in [*tree.getroot().iter("option")] or [ET.SubElement(tree.getroot(), "option")]:
         option.set("timestep", step)
@@ -108,7 +106,7 @@ def test_a_timestep_that_takes_forever_is_refused(
         chain_of(read_model(tmp_path / "slow.xml").compiled(), 6, str(tmp_path / "slow.xml"))
 
 
-def test_everything_stays_but_what_was_corrected(given: tuple[Path, Chain], tmp_path: Path) -> None:
+def test_everything_stays_but_what_was_corrected(given, tmp_path):
     path, chain = given
     cell = bent_cell(chain.robot, {"joint_compliance:all": [2e-6] * 5, "encoder_gain:J4": [1e-3]})
     corrected(path, chain, cell, tmp_path / "out.xml")
@@ -137,9 +135,7 @@ def test_everything_stays_but_what_was_corrected(given: tuple[Path, Chain], tmp_
     assert "<include file='parts.xml'/>" in text  # nothing in it changed
 
 
-def test_a_corrected_model_in_another_folder_finds_its_meshes(
-    given: tuple[Path, Chain], tmp_path: Path
-) -> None:
+def test_a_corrected_model_in_another_folder_finds_its_meshes(given, tmp_path):
     path, chain = given
     (tmp_path / "elsewhere").mkdir()
     model = corrected(path, chain, bent_cell(chain.robot, {}), tmp_path / "elsewhere" / "arm.xml")
@@ -157,9 +153,7 @@ EFFECTS = {
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-def test_a_corrected_model_rests_where_the_fit_says(
-    given: tuple[Path, Chain], tmp_path: Path, name: str
-) -> None:
+def test_a_corrected_model_rests_where_the_fit_says(given, tmp_path, name):
     path, chain = given
     cell = bent_cell(chain.robot, EFFECTS[name])
     model = corrected(path, chain, cell, tmp_path / "out.xml")
@@ -168,7 +162,7 @@ def test_a_corrected_model_rests_where_the_fit_says(
     assert np.linalg.norm(off, axis=-1).max() < FIRST_ORDER
 
 
-def test_published_gains_sag(given: tuple[Path, Chain]) -> None:
+def test_published_gains_sag(given):
     _, chain = given
     q = joints(chain.robot, 6)
     rested = drive(chain, q, str(given[0]))
@@ -192,7 +186,7 @@ def still_torque(chain: Chain, q: np.ndarray) -> np.ndarray:
     return np.array(out)
 
 
-def test_base_and_targets_are_found_from_poses() -> None:
+def test_base_and_targets_are_found_from_poses():
     robot = mc.load_robot("irb120")
     simulation = mc.simulate(
         robot, 30, truth=mc.Truth(noise=0.0, noise_per_metre=0.0, compliance=0.0)
@@ -221,9 +215,7 @@ def test_base_and_targets_are_found_from_poses() -> None:
         ("", '<body pos="0 0 1"><geom size="1"/></body>' * 1200, "bodies: 1.2e+03, at most 1000"),
     ],
 )  # fmt: skip
-def test_models_that_no_memory_holds_are_refused(
-    tmp_path: Path, before: str, within: str, says: str
-) -> None:
+def test_models_that_no_memory_holds_are_refused(tmp_path, before, within, says):
     file = tmp_path / "bad.xml"
     file.write_text(f"<mujoco>{before}<worldbody>{within}</worldbody></mujoco>")
     with pytest.raises(mc.CalibrationError) as caught:

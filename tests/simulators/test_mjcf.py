@@ -2,7 +2,6 @@
 
 import io
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -104,7 +103,7 @@ ROBOTS = (*mc.builtin_robots(), "seven_axes")
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_an_arm_without_effects_moves_and_rests_as_its_robot(name: str) -> None:
+def test_an_arm_without_effects_moves_and_rests_as_its_robot(name):
     robot = robot_called(name)
     model, q = model_of(cell_with(robot)), poses(robot, 4)
     assert [model.joint(f"joint{i + 1}").id for i in range(robot.joints)] == [*range(robot.joints)]
@@ -139,7 +138,7 @@ ONE = {
 
 
 @pytest.mark.parametrize("text", ONE)
-def test_each_element_does_what_its_law_says(text: str) -> None:
+def test_each_element_does_what_its_law_says(text):
     robot = with_masses(robot_called("irb2600"))
     robot = replace(robot, sign=np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0]))
     name = text.split(":")[0]
@@ -171,7 +170,7 @@ def test_each_element_does_what_its_law_says(text: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["ur10", "irb2600", "seven_axes"])
-def test_all_effects_at_once_on_arms_of_unknown_masses(name: str) -> None:
+def test_all_effects_at_once_on_arms_of_unknown_masses(name):
     robot = robot_called(name)
     cell = cell_with(
         robot, "joint_compliance:all", "base_flex:frame", "encoder_gain:all", size=1.5e-6,
@@ -183,7 +182,7 @@ def test_all_effects_at_once_on_arms_of_unknown_masses(name: str) -> None:
     assert np.sqrt((off**2).sum(axis=-1).mean()) < IMITATED
 
 
-def test_a_gain_that_carries_a_deflection_says_so() -> None:
+def test_a_gain_that_carries_a_deflection_says_so():
     """The compliance that is said is the law's: that of the gain under its share of gravity."""
     cell = cell_with(with_masses(robot_called("irb2600")), "joint_compliance:all")
     model, ((_, compliance),) = model_of(cell), cell.effects.pairs
@@ -195,7 +194,7 @@ def test_a_gain_that_carries_a_deflection_says_so() -> None:
         assert share / model.actuator(f"joint{j}").gainprm[0] == pytest.approx(value, rel=1e-9)
 
 
-def test_turns_without_an_element_go_into_the_commands(tmp_path: Path) -> None:
+def test_turns_without_an_element_go_into_the_commands(tmp_path):
     robot = with_masses(robot_called("irb2600"))
     cell = cell_with(robot, "gear_error:J3:turns=2", "joint_compliance:J2",
                      gear_error=[3e-4, -2e-4], joint_compliance=[3e-6])  # fmt: skip
@@ -224,7 +223,7 @@ def test_turns_without_an_element_go_into_the_commands(tmp_path: Path) -> None:
         written(made.file, None)
 
 
-def test_a_joint_that_stiffens_goes_into_the_commands_and_not_into_springs() -> None:
+def test_a_joint_that_stiffens_goes_into_the_commands_and_not_into_springs():
     robot = with_masses(robot_called("irb2600"))
     cell = cell_with(robot, "joint_compliance:J2:within=20", joint_compliance=[3e-6])
     arm = arm_of(cell)
@@ -235,7 +234,7 @@ def test_a_joint_that_stiffens_goes_into_the_commands_and_not_into_springs() -> 
     assert compliance_of(plain)[1] == 3e-6
 
 
-def test_links_that_bend_under_a_tool_nobody_told_have_one_spring() -> None:
+def test_links_that_bend_under_a_tool_nobody_told_have_one_spring():
     robot = robot_called("irb2600")
     cell = cell_with(robot, "link_bending:L2:tool=1", link_bending=[1e-6, 2e-6])
     arm = arm_of(cell)
@@ -243,7 +242,7 @@ def test_links_that_bend_under_a_tool_nobody_told_have_one_spring() -> None:
     assert arm.remainder < IMITATED
 
 
-def test_what_changes_with_time_is_named() -> None:
+def test_what_changes_with_time_is_named():
     robot = with_masses(mc.load_robot("irb120"))
     cell = cell_with(robot)
     data = still(poses(robot), cell.target_names, robot)
@@ -255,7 +254,7 @@ def test_what_changes_with_time_is_named() -> None:
     assert not made.beside
 
 
-def test_a_basis_across_itself_is_found() -> None:
+def test_a_basis_across_itself_is_found():
     matrix = np.random.default_rng(3).normal(size=(3, 3))
     matrix -= np.trace(matrix) / 3.0 * np.eye(3)
     basis = across_themselves(matrix)
@@ -265,7 +264,7 @@ def test_a_basis_across_itself_is_found() -> None:
 
 @pytest.mark.dev
 @pytest.mark.parametrize("name", ROBOTS)
-def test_simulators_load_every_urdf(name: str) -> None:
+def test_simulators_load_every_urdf(name):
     robot = robot_called(name)
     text = mc.export(robot, "urdf", notify=lambda notice: None)
     model, q = mujoco.MjModel.from_xml_string(text), poses(robot, 4)
@@ -298,13 +297,13 @@ def fixed_tip(robot: mc.Robot) -> np.ndarray:
     return np.asarray(origins(robot)[-1])
 
 
-def test_assumed_masses_do_not_come_back_as_known(tmp_path: Path) -> None:
+def test_assumed_masses_do_not_come_back_as_known(tmp_path):
     path = tmp_path / "arm.urdf"
     mc.export("irb120", "urdf", path, notify=lambda notice: None)
     assert np.isnan(mc.load_robot(path).mass).all()
 
 
-def test_the_command_exports_mjcf(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_exports_mjcf(tmp_path, capsys):
     assert run("export", "ur10", "--to", "mjcf", "-o", tmp_path / "arm.xml") == 0
     assert "inertias are assumed" in capsys.readouterr().err
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml")).nu == 6

@@ -81,7 +81,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
                            figure=figure)  # fmt: skip
 
 
-def test_the_file_has_the_numbers_of_the_real_arm(made: SimpleNamespace) -> None:
+def test_the_file_has_the_numbers_of_the_real_arm(made):
     found, real = mujoco.MjModel.from_xml_path(str(made.out)), made.arm.real()
     assert_allclose(found.dof_frictionloss[[0, 2]], LACKS.friction[[0, 2]], rtol=0.05)
     assert_allclose(found.dof_damping[[0, 2]], LACKS.damping[[0, 2]], rtol=0.1)
@@ -91,7 +91,7 @@ def test_the_file_has_the_numbers_of_the_real_arm(made: SimpleNamespace) -> None
     assert np.linalg.norm(across) < 0.03 * LACKS.payload * np.linalg.norm(real.body_ipos[-1])
 
 
-def test_it_moves_as_the_arm_does(made: SimpleNamespace) -> None:
+def test_it_moves_as_the_arm_does(made):
     """On a run that no log holds, under a controller that knows the first file."""
     arm, before = made.arm, made.arm.known
     real = drive_along(arm, arm.real(), commands(arm, 77, 1.1), 5.0, LACKS)
@@ -110,7 +110,7 @@ def test_it_moves_as_the_arm_does(made: SimpleNamespace) -> None:
     assert (full[1] < FULL[1] * first[1]).all()
 
 
-def test_the_ladder_says_so(made: SimpleNamespace) -> None:
+def test_the_ladder_says_so(made):
     content = json.loads(made.text.read_text())
     assert content["kind"] == "simulator_gap"
     first, *_, last = content["rungs"]
@@ -134,8 +134,8 @@ def test_the_ladder_says_so(made: SimpleNamespace) -> None:
     assert any(text.startswith("not in the file") for text in gap.sentences())
 
 
-def test_a_plain_file_has_nothing_that_others_leave_out(made: SimpleNamespace,
-                                                       tmp_path: Path) -> None:  # fmt: skip
+def test_a_plain_file_has_nothing_that_others_leave_out(made,
+                                                       tmp_path):  # fmt: skip
     out = tmp_path / "plain.xml"
     gap = mc.motion_gap(made.model, made.logs, write=out, plain=True, driven=False)
     assert not gap.module
@@ -152,7 +152,7 @@ def test_a_plain_file_has_nothing_that_others_leave_out(made: SimpleNamespace,
         mc.motion_gap(made.model, made.logs, plain=True, friction="dcmotor")
 
 
-def test_a_plain_file_moves_alike_in_every_simulator(made: SimpleNamespace, tmp_path: Path) -> None:
+def test_a_plain_file_moves_alike_in_every_simulator(made, tmp_path):
     """MuJoCo in C, in JAX and in Warp: 50 steps from a start at speed, in single precision."""
     mjx = pytest.importorskip("mujoco.mjx", reason="needs pip install minimax-cal[rl]")
     jax = pytest.importorskip("jax", reason="needs pip install minimax-cal[rl]")
@@ -180,16 +180,14 @@ def reached(path: Path, module: str, runs: list[Run], payload: Payload | None = 
         return np.array(judge.torque(opened.chain).whole)
 
 
-def test_a_file_and_its_module_reach_the_last_rung(made: SimpleNamespace) -> None:
+def test_a_file_and_its_module_reach_the_last_rung(made):
     runs = read_logs(made.model, made.logs)
     assert made.gap.module
     last = made.gap.rungs[-1].torque_rms
     assert_allclose(reached(made.out, made.gap.module, runs), last, rtol=1e-4)
 
 
-def test_a_drive_gain_that_no_file_holds_is_in_no_figure(
-    made: SimpleNamespace, tmp_path: Path
-) -> None:
+def test_a_drive_gain_that_no_file_holds_is_in_no_figure(made, tmp_path):
     """Torques of joint 2 are logged 17 % too large; position servos hold no gain, motors do."""
     robot, out = tmp_path / "robot.json", tmp_path / "out.xml"
     robot.write_text(json.dumps(three_joints().to_dict()))
@@ -207,7 +205,7 @@ def test_a_drive_gain_that_no_file_holds_is_in_no_figure(
     assert not any("drive gain" in text for text in given.left_out)
 
 
-def test_a_report_has_it_beside_a_calibration(made: SimpleNamespace, tmp_path: Path) -> None:
+def test_a_report_has_it_beside_a_calibration(made, tmp_path):
     poses = mc.simulate(three_joints(), 30, seed=1).data
     mc.calibrate(three_joints(), poses, "sum").save(tmp_path / "fit.json")
     page = tmp_path / "report.html"
@@ -217,7 +215,7 @@ def test_a_report_has_it_beside_a_calibration(made: SimpleNamespace, tmp_path: P
     assert "friction in proportion to the load" in text
 
 
-def test_the_text_stays_but_for_what_changes(made: SimpleNamespace) -> None:
+def test_the_text_stays_but_for_what_changes(made):
     before, after = (path.read_text().splitlines() for path in (made.model, made.out))
     assert len(before) == len(after)
     changed = [old for old, new in zip(before, after, strict=True) if old != new]
@@ -225,7 +223,7 @@ def test_the_text_stays_but_for_what_changes(made: SimpleNamespace) -> None:
     assert all(line.lstrip().startswith(("<inertial", "<joint")) for line in changed)
 
 
-def test_an_arm_as_drawn_keeps_its_file(tmp_path: Path) -> None:
+def test_an_arm_as_drawn_keeps_its_file(tmp_path):
     nothing = Withheld(*np.zeros((4, 3)))
     arm = DrivenArm(three_joints(), with_motors(three_joints()), nothing, 5, STEP)
     gap = mc.motion_gap(save_model(arm, tmp_path), logged(arm, 2, 8.0), driven=False,
@@ -235,7 +233,7 @@ def test_an_arm_as_drawn_keeps_its_file(tmp_path: Path) -> None:
     assert (tmp_path / "same.xml").read_bytes() == arm.xml
 
 
-def test_torques_write_a_new_file_that_holds_still(made: SimpleNamespace, tmp_path: Path) -> None:
+def test_torques_write_a_new_file_that_holds_still(made, tmp_path):
     """Of a robot file: position servos, friction, and the drive test of every written model."""
     robot, out = tmp_path / "robot.json", tmp_path / "new.xml"
     robot.write_text(json.dumps(three_joints().to_dict()))
@@ -257,9 +255,7 @@ def test_torques_write_a_new_file_that_holds_still(made: SimpleNamespace, tmp_pa
 
 
 @pytest.mark.slow
-def test_a_static_calibration_goes_into_the_same_file(
-    made: SimpleNamespace, tmp_path: Path
-) -> None:
+def test_a_static_calibration_goes_into_the_same_file(made, tmp_path):
     """Compliance in springs of its own, so that friction of the servos does not hold it."""
     robot, runs = three_joints(), made.logs[-2:]
     truth = mc.Truth(compliance=3e-6)
@@ -283,7 +279,7 @@ def test_a_static_calibration_goes_into_the_same_file(
 
 
 @pytest.mark.slow
-def test_logged_commands_drive_the_servos_of_the_model(tmp_path: Path) -> None:
+def test_logged_commands_drive_the_servos_of_the_model(tmp_path):
     """A real arm with the servos of its model, friction and late commands, driven by its log."""
     robot = three_joints()
     xml = with_motors(robot).decode().replace("<motor ", '<position kp="2000" kv="200" ')
@@ -318,7 +314,7 @@ def test_logged_commands_drive_the_servos_of_the_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(mujoco, "mj_initCtrlHistory"), reason="no delays in this MuJoCo")
-def test_a_delayed_servo_at_its_command_stays_there(tmp_path: Path) -> None:
+def test_a_delayed_servo_at_its_command_stays_there(tmp_path):
     """MuJoCo fills the history of a delayed command with 0: the arm would jump towards it."""
     servo = '<position kp="2000" kv="200" delay="0.02" nsample="14" '
     path, q = tmp_path / "late.xml", np.array([0.4, -0.3, 0.5])
@@ -330,7 +326,7 @@ def test_a_delayed_servo_at_its_command_stays_there(tmp_path: Path) -> None:
     assert_allclose(follow_commands(chain, log, still, str(path)), still, atol=1e-9)
 
 
-def test_no_link_grows_in_place_of_a_rotor(tmp_path: Path) -> None:
+def test_no_link_grows_in_place_of_a_rotor(tmp_path):
     """Torques tell J1's rotor from no mass off its axis: what is nearer to the drawing counts."""
     rotors = replace(LACKS, armature=np.array([6.0, 5.0, 2.0]))
     arm, out = DrivenArm(three_joints(), with_motors(three_joints()), rotors, 3, STEP), "new.xml"
@@ -341,16 +337,16 @@ def test_no_link_grows_in_place_of_a_rotor(tmp_path: Path) -> None:
     assert_allclose(found.body_mass[1:], real.body_mass[1:], rtol=0.1)
 
 
-def test_currents_need_drive_gains(made: SimpleNamespace, tmp_path: Path,
-                                   capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+def test_currents_need_drive_gains(made, tmp_path,
+                                   capsys):  # fmt: skip
     log = tmp_path / "currents.csv"
     log.write_text(made.logs[0].read_text().replace("_Nm", "_A").replace("tau", "i"))
     assert run("gap", made.model, log) == 2
     assert "drive-gain" in capsys.readouterr().err
 
 
-def test_options_of_logs_are_none_of_poses(made: SimpleNamespace, tmp_path: Path,
-                                           capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+def test_options_of_logs_are_none_of_poses(made, tmp_path,
+                                           capsys):  # fmt: skip
     poses = tmp_path / "poses.csv"
     poses.write_text("q1_rad,q2_rad,q3_rad,x_mm,y_mm,z_mm\n0,0,0,1,2,3\n")
     assert run("gap", made.model, poses, "--payload", "1") == 2
@@ -360,7 +356,7 @@ def test_options_of_logs_are_none_of_poses(made: SimpleNamespace, tmp_path: Path
 # ---- bodies ------------------------------------------------------------------------------------
 
 
-def test_a_pseudo_inertia_holds_what_its_parameters_do() -> None:
+def test_a_pseudo_inertia_holds_what_its_parameters_do():
     parameters = link_parameters(2.0, np.array([0.1, -0.2, 0.3]),
                                  np.array([0.5, 0.01, 0.02, 0.6, -0.03, 0.4]))  # fmt: skip
     pseudo = bodies.pseudo_inertia(parameters)
@@ -379,7 +375,7 @@ def about_of(values: dict[str, np.ndarray]) -> np.ndarray:
     return turn @ np.diag(values["diaginertia"]) @ turn.T
 
 
-def test_a_body_as_thin_as_a_plate_is_one_that_mujoco_takes() -> None:
+def test_a_body_as_thin_as_a_plate_is_one_that_mujoco_takes():
     plate = bodies.of_body(2.0, np.zeros(3), np.diag([0.1, 0.2, 0.3]))  # no height at all
     values = bodies.inertial(plate)
     low, middle, high = np.sort(values["diaginertia"])
@@ -387,7 +383,7 @@ def test_a_body_as_thin_as_a_plate_is_one_that_mujoco_takes() -> None:
     assert_allclose(np.sort(values["diaginertia"]), [0.1, 0.2, 0.3], rtol=1e-5)
 
 
-def test_slopes_are_the_derivatives_of_the_links() -> None:
+def test_slopes_are_the_derivatives_of_the_links():
     rng = np.random.default_rng(0)
     factor = rng.normal(size=(2, 4, 4))
     drawn = factor @ np.swapaxes(factor, 1, 2)
@@ -403,7 +399,7 @@ def test_slopes_are_the_derivatives_of_the_links() -> None:
     assert np.linalg.eigvalsh(arm.at(at)).min() > 0.0
 
 
-def test_a_bounded_fit_stops_at_its_bound() -> None:
+def test_a_bounded_fit_stops_at_its_bound():
     matrix = np.array([[1.0, 0.5], [0.5, 1.0], [0.1, 0.1]])
     found = least_within(
         lambda x: matrix @ x - [1.0, -1.0, 0.0], lambda x: matrix, np.ones(2), np.zeros(2)
@@ -411,13 +407,13 @@ def test_a_bounded_fit_stops_at_its_bound() -> None:
     assert_allclose(found, [0.5 / 1.26, 0.0], atol=1e-6)
 
 
-def test_damping_that_levels_off_falls_nowhere() -> None:
+def test_damping_that_levels_off_falls_nowhere():
     v = np.linspace(0.0, 5.0, 200)
     for speed in (0.5, 2.0):
         assert (np.diff(speeds(v) @ levelling(speed)) >= -1e-12).all()
 
 
-def test_the_damper_of_a_servo_is_no_friction(tmp_path: Path) -> None:
+def test_the_damper_of_a_servo_is_no_friction(tmp_path):
     """Joints of an exported file hold the dampers of their servos: not along logs, nor in SDF."""
     path = tmp_path / "arm.xml"
     assert run("export", "ur10", "--to", "mjcf", "-o", path) == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -85,7 +84,7 @@ def chain_of(text: str) -> tuple[pin.Model, dict[str, ET.Element]]:
     return model, {str(joint.get("name")): joint for joint in arm.iter("joint")}
 
 
-def test_poses_and_torques_are_those_of_the_mjcf(tmp_path: Path) -> None:
+def test_poses_and_torques_are_those_of_the_mjcf(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text(GIVEN)
     said: list[str] = []
@@ -117,7 +116,7 @@ def test_poses_and_torques_are_those_of_the_mjcf(tmp_path: Path) -> None:
     assert "proportional to the speed, of j2" in told
 
 
-def test_a_calibration_as_sdf_has_its_targets_where_they_are(tmp_path: Path) -> None:
+def test_a_calibration_as_sdf_has_its_targets_where_they_are(tmp_path):
     made = mc.simulate("irb2600", 40, 3, seed=1)
     fit = mc.calibrate("irb2600", made.data)
     text = mc.export(fit, to="sdf", path=tmp_path / "arm.sdf", notify=lambda _: None)
@@ -131,9 +130,7 @@ def test_a_calibration_as_sdf_has_its_targets_where_they_are(tmp_path: Path) -> 
             assert_allclose(data.oMf[model.getFrameId(name)].translation, expected[:3], atol=1e-9)
 
 
-def test_a_body_of_several_joints_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_body_of_several_joints_is_refused(tmp_path, capsys):
     path = tmp_path / "arm.xml"
     path.write_text(GIVEN.replace('<joint name="j2"', '<joint name="play"/><joint name="j2"'))
     assert run("export", path, "--to", "sdf", "-o", tmp_path / "arm.sdf") == 2

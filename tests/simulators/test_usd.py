@@ -1,7 +1,5 @@
 """USD that mujoco-usd-converter makes of a written model: the page's table of what arrives."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -18,7 +16,7 @@ from minimax_cal.simulators.motion.opened import open_model  # noqa: E402
 from minimax_cal.simulators.motion.written import write_numbers  # noqa: E402
 
 
-def test_what_usd_holds_of_a_written_model(tmp_path: Path) -> None:
+def test_what_usd_holds_of_a_written_model(tmp_path):
     opened, rng = open_model("ur10", 6), np.random.default_rng(0)
     chain, model = opened.chain, opened.chain.model
     given, damping = given_numbers(chain, Bodies.of(chain)), np.zeros((6, 3))

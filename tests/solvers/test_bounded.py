@@ -2,14 +2,13 @@
 
 import cvxpy as cp
 import numpy as np
-import pytest
 import scipy
 from numpy.testing import assert_allclose
 
 from minimax_cal.solvers.bounded import bounded, nearest
 
 
-def test_a_bounded_step_is_the_optimum(rng: np.random.Generator) -> None:
+def test_a_bounded_step_is_the_optimum(rng):
     root = rng.normal(size=(12, 9))
     gram, pull = root.T @ root, 5.0 * rng.normal(size=9)
     low, high = np.full(9, -np.inf), np.full(9, np.inf)
@@ -22,7 +21,7 @@ def test_a_bounded_step_is_the_optimum(rng: np.random.Generator) -> None:
     assert_allclose(free, np.linalg.solve(gram, pull), rtol=1e-6)
 
 
-def test_columns_that_are_the_same_share_their_part(rng: np.random.Generator) -> None:
+def test_columns_that_are_the_same_share_their_part(rng):
     """Products of rank 3 in 5 parameters: any split of a sum is as good, and none is infinite."""
     matrix = rng.normal(size=(12, 3))[:, [0, 1, 2, 0, 1]]
     right = 3.0 * rng.normal(size=12)
@@ -35,9 +34,7 @@ def test_columns_that_are_the_same_share_their_part(rng: np.random.Generator) ->
     assert_allclose(np.sum((matrix @ x - right) ** 2), best.value, rtol=1e-5)
 
 
-def test_a_compiled_solver_that_gives_up_is_replaced(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_compiled_solver_that_gives_up_is_replaced(rng, monkeypatch):
     matrix, target = rng.normal(size=(5, 5)), rng.normal(size=5)
     low, high = np.full(5, -0.1), np.full(5, np.inf)
     fast = nearest(matrix, target, low, high)

@@ -48,7 +48,7 @@ def optimum(problem: Problem) -> tuple[float, Multipliers]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_right_multipliers_prove_the_optimum(seed: int) -> None:
+def test_the_right_multipliers_prove_the_optimum(seed):
     problem = made(seed)
     best, right = optimum(problem)
     bound = lower_bound(*problem, right)
@@ -59,7 +59,7 @@ def test_the_right_multipliers_prove_the_optimum(seed: int) -> None:
         assert_allclose(lower_bound(*problem, scaled), bound, rtol=1e-9)
 
 
-def test_the_bound_has_the_unit_of_the_norms() -> None:
+def test_the_bound_has_the_unit_of_the_norms():
     rows, lower, upper = made(0)
     _, right = optimum((rows, lower, upper))
     bound = lower_bound(rows, lower, upper, right)
@@ -69,7 +69,7 @@ def test_the_bound_has_the_unit_of_the_norms() -> None:
         assert_allclose(lower_bound(there, lower, upper, same), unit * bound, rtol=1e-9)
 
 
-def test_what_pulls_along_an_open_direction_proves_nothing() -> None:
+def test_what_pulls_along_an_open_direction_proves_nothing():
     """No vector moves with the last variable, and a constraint does: its multiplier is worthless.
 
     However little it pulls, as the sum then falls for ever along that direction.
@@ -86,7 +86,7 @@ def test_what_pulls_along_an_open_direction_proves_nothing() -> None:
     assert lower_bound(free, lower, upper, given) == 0.0
 
 
-def test_no_multipliers_prove_too_much() -> None:
+def test_no_multipliers_prove_too_much():
     rng = np.random.default_rng(5)
     problem = made(1)
     best, right = optimum(problem)
@@ -99,7 +99,7 @@ def test_no_multipliers_prove_too_much() -> None:
     assert lower_bound(*problem, nothing) == 0.0
 
 
-def test_what_is_not_balanced_is_charged_over_the_ball(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_balanced_is_charged_over_the_ball(monkeypatch):
     rows, lower, upper = made(2)
     rows = Rows(rows.r, 0.1 * rows.J, rows.c, 0.1 * rows.C)
     _, right = optimum((rows, lower, upper))
@@ -115,7 +115,7 @@ def test_what_is_not_balanced_is_charged_over_the_ball(monkeypatch: pytest.Monke
     assert reach * rest > 1e-4
 
 
-def test_the_dual_value_is_its_formula() -> None:
+def test_the_dual_value_is_its_formula():
     rows, lower, upper = made(3)
     y, lam = np.full((9, 3), 0.1 / np.sqrt(3.0)), np.array([-0.2, 0.3, 0.0])
     rest = np.linalg.norm(np.einsum("nw,nwp->p", y, rows.J) + rows.C.T @ lam)
@@ -128,7 +128,7 @@ def test_the_dual_value_is_its_formula() -> None:
     assert rest > 0.1
 
 
-def test_balance_is_the_least_weighted_change() -> None:
+def test_balance_is_the_least_weighted_change():
     """min sum |dy|^2 / w over J'(y + dy) + C'lam = 0, w the size and a part in 1e6 of the mean."""
     rows, _, _ = made(4)
     rng = np.random.default_rng(6)
@@ -145,7 +145,7 @@ def test_balance_is_the_least_weighted_change() -> None:
     assert_allclose(flat.T @ found.ravel() + rows.C.T @ lam, 0.0, atol=1e-12)
 
 
-def test_multipliers_lie_along_the_vectors() -> None:
+def test_multipliers_lie_along_the_vectors():
     rows, _, _ = made(0)
     rows = Rows(np.concatenate([np.zeros((1, 3)), rows.r[1:]]), rows.J, rows.c, rows.C)
     mu, lam = np.arange(9.0), np.array([1.0, -2.0, 0.0])

@@ -114,7 +114,7 @@ def expected(v: Array, method: Method, damping: float) -> tuple[Array, Array, Ar
     return e, J, np.linalg.lstsq(tall, np.concatenate([e, 0.0 * scale]), rcond=None)[0]
 
 
-def test_the_methods_are_those_of_the_paper() -> None:
+def test_the_methods_are_those_of_the_paper():
     """Two switches, and Kaufman's form of the two that eliminate the lengths."""
     assert {
         name: (m.separable, m.damped, m.full) for name, m in METHODS.items() if m.separable
@@ -128,7 +128,7 @@ def test_the_methods_are_those_of_the_paper() -> None:
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_a_step_is_that_of_dense_algebra(name: str) -> None:
+def test_a_step_is_that_of_dense_algebra(name):
     method, problem = METHODS[name], Decay(LINEAR)
     at = examine(problem, Points(BEGIN), method)
     trial, motion, gain = tried(problem, at, DAMPING * method.damped, 25.0, method)
@@ -146,7 +146,7 @@ def test_a_step_is_that_of_dense_algebra(name: str) -> None:
         assert_allclose(trial.cost[i], (residual(trial.x.value[i]) ** 2).sum(), rtol=1e-12)
 
 
-def test_lengths_follow_a_step_to_first_order() -> None:
+def test_lengths_follow_a_step_to_first_order():
     from minimax_cal.solvers.least_squares import lift
 
     method, problem = METHODS["snlgn"], Decay(LINEAR)
@@ -163,7 +163,7 @@ def test_lengths_follow_a_step_to_first_order() -> None:
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_all_end_at_the_least_cost_and_say_when(name: str) -> None:
+def test_all_end_at_the_least_cost_and_say_when(name):
     told: list[int] = []
     found = solve(Decay(LINEAR), Points(BEGIN[:2]), 2, 25.0, METHODS[name], progress=told.append)
     assert found.status == (Status.CONVERGED,) * 2
@@ -181,14 +181,14 @@ def test_all_end_at_the_least_cost_and_say_when(name: str) -> None:
     assert_array_equal(short.trace, found.trace[[0, -1]])
 
 
-def test_an_undamped_search_that_leaves_the_numbers_failed() -> None:
+def test_an_undamped_search_that_leaves_the_numbers_failed():
     far = BEGIN[:1] * [1.0, -500.0, 1.0, 1.0]  # exp(+350 t) overflows
     found = solve(Decay(LINEAR), Points(far), 1, 25.0, METHODS["nlgn"])
     assert found.status == (Status.FAILED,)
     assert_array_equal(found.x.value, far)
 
 
-def test_a_slope_that_lies_stalls_where_it_began() -> None:
+def test_a_slope_that_lies_stalls_where_it_began():
     lie = replace(Decay(LINEAR), sense=-1.0)
     limits = Limits(damping=1e-2)
     found = solve(lie, Points(BEGIN[:1]), 1, 25.0, METHODS["nllm"], limits)
@@ -200,7 +200,7 @@ def test_a_slope_that_lies_stalls_where_it_began() -> None:
 
 
 @pytest.mark.parametrize("most", [0, 3])
-def test_a_limit_is_the_number_of_steps(most: int) -> None:
+def test_a_limit_is_the_number_of_steps(most):
     limits = Limits(iterations=most)
     found = solve(Decay(LINEAR), Points(BEGIN[:1]), 1, 25.0, METHODS["nllm"], limits)
     assert found.status == (Status.ITERATION_LIMIT,)
@@ -208,7 +208,7 @@ def test_a_limit_is_the_number_of_steps(most: int) -> None:
     assert np.array_equal(found.x.value, BEGIN[:1]) == (most == 0)
 
 
-def test_what_is_singular_to_rounding_has_the_least_solution() -> None:
+def test_what_is_singular_to_rounding_has_the_least_solution():
     """Two columns that agree to fifteen digits, and a right side that does not."""
     near = np.array([[1.0, 1.0 - 2e-15], [1.0 - 2e-15, 1.0]])
     for scale in (np.ones(2), np.array([1e-6, 1e6])):
@@ -217,7 +217,7 @@ def test_what_is_singular_to_rounding_has_the_least_solution() -> None:
         assert_allclose(found * scale, 1.0, rtol=0, atol=1e-8)
 
 
-def test_damping_goes_by_nielsens_rule() -> None:
+def test_damping_goes_by_nielsens_rule():
     damping, growth = np.full(5, 8.0), np.array([2.0, 2.0, 2.0, 4.0, 16.0])
     accept = np.array([True, True, True, False, True])
     ratio = np.array([0.5, 1.0, 0.25, 0.0, 0.75])
@@ -226,7 +226,7 @@ def test_damping_goes_by_nielsens_rule() -> None:
     assert_array_equal(next_growth, [2.0, 2.0, 2.0, 8.0, 2.0])
 
 
-def test_a_trial_is_compared_with_what_was_predicted() -> None:
+def test_a_trial_is_compared_with_what_was_predicted():
     at = examine(Decay(LINEAR), Points(np.repeat(BEGIN[:1], 5, axis=0)), METHODS["nlgn"])
     at = replace(at, cost=np.full(5, 10.0))
     trial = replace(at, cost=np.array([9.0, 11.0, 6.0, 10.0 + 1e-12, np.nan]))

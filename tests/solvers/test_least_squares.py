@@ -5,12 +5,11 @@ from problems_fit import solve
 from scipy import optimize
 from scipy.spatial.transform import Rotation
 
-import minimax_cal as mc
 from experiments.speed import identified
 from minimax_cal.modelling import start
 from minimax_cal.modelling.model import SumOfSquares, model_of
 from minimax_cal.modelling.parameters import State
-from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.kinematics import rotation
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import METHODS
@@ -18,9 +17,7 @@ from minimax_cal.solvers.status import Status
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_reaches_the_same_minimum(
-    method: str, robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_every_method_reaches_the_same_minimum(method, robot, noisy):
     model, begin = identified(robot, noisy.data)
     found = solve(model, begin, method)
     best = solve(model, begin)
@@ -30,7 +27,7 @@ def test_every_method_reaches_the_same_minimum(
     assert found.trace[0] > found.trace[-1]
 
 
-def test_minimum_is_scipys(robot: mc.Robot, noisy: Simulation) -> None:
+def test_minimum_is_scipys(robot, noisy):
     model, begin = identified(robot, noisy.data)
     best = solve(model, begin)
 
@@ -43,7 +40,7 @@ def test_minimum_is_scipys(robot: mc.Robot, noisy: Simulation) -> None:
     assert_allclose(best.cost[0] * 1e6, 2 * peer.cost, rtol=1e-9)
 
 
-def test_gradient_is_zero_at_the_minimum(robot: mc.Robot, noisy: Simulation) -> None:
+def test_gradient_is_zero_at_the_minimum(robot, noisy):
     model, begin = identified(robot, noisy.data)
     found = solve(model, begin)
     cost, gradient, gram = SumOfSquares(model).normal(found.x.take(np.array(0)))
@@ -51,20 +48,20 @@ def test_gradient_is_zero_at_the_minimum(robot: mc.Robot, noisy: Simulation) -> 
     assert np.abs(gradient / np.sqrt(np.diag(gram) * cost)).max() < 1e-9
 
 
-def test_true_robot_is_found_without_noise(robot: mc.Robot, clean: Simulation) -> None:
+def test_true_robot_is_found_without_noise(robot, clean):
     model, begin = identified(robot, clean.data)
     found = solve(model, begin)
     assert np.sqrt(found.cost[0] / model.counts.sum()) < 1e-12  # metres
 
 
-def test_iteration_limit_is_said(robot: mc.Robot, noisy: Simulation) -> None:
+def test_iteration_limit_is_said(robot, noisy):
     model, begin = identified(robot, noisy.data)
     found = solve(model, begin, limits=least_squares.Limits(iterations=1))
     assert found.status[0] is Status.ITERATION_LIMIT
     assert "iteration limit" in found.status[0].advice
 
 
-def test_many_starts_at_once_equal_each_alone(robot: mc.Robot, noisy: Simulation) -> None:
+def test_many_starts_at_once_equal_each_alone(robot, noisy):
     model, begin = identified(robot, noisy.data)
     rng = np.random.default_rng(3)
     starts = begin.repeat(5)
@@ -82,7 +79,7 @@ def test_many_starts_at_once_equal_each_alone(robot: mc.Robot, noisy: Simulation
         assert_allclose(together.trace[:steps, i], way[:steps], rtol=1e-7)
 
 
-def test_closed_form_start_is_the_best_frame(robot: mc.Robot, rng: np.random.Generator) -> None:
+def test_closed_form_start_is_the_best_frame(robot, rng):
     """Base and targets of the nominal robot, against a local search from the truth."""
     for seed in range(5):
         made = simulate(robot, 30, 2, seed)
@@ -97,7 +94,7 @@ def test_closed_form_start_is_the_best_frame(robot: mc.Robot, rng: np.random.Gen
         assert_allclose(model.cost(frame.state).sum(), local.cost[0], rtol=1e-9)
 
 
-def test_100_random_bases_reach_the_global_minimum(robot: mc.Robot) -> None:
+def test_100_random_bases_reach_the_global_minimum(robot):
     for seed in range(100):
         truth = Truth(noise=0, noise_per_metre=0, compliance=0)
         made = simulate(robot, 25, 1 + 2 * (seed % 2), seed, truth)
@@ -107,7 +104,7 @@ def test_100_random_bases_reach_the_global_minimum(robot: mc.Robot) -> None:
         assert miss < 1e-10, f"seed {seed}: {miss} m"
 
 
-def test_search_finds_gross_angle_errors(robot: mc.Robot) -> None:
+def test_search_finds_gross_angle_errors(robot):
     """Nominal theta_2 and alpha_3 off by up to 3.1 rad, the tracker anywhere."""
     rng = np.random.default_rng(8)
     for seed in range(4):
@@ -120,7 +117,7 @@ def test_search_finds_gross_angle_errors(robot: mc.Robot) -> None:
         assert np.sqrt(found.cost[0] / model.counts.sum()) < 1e-9, f"seed {seed}"
 
 
-def test_turning_the_instrument_changes_no_error(robot: mc.Robot, noisy: Simulation) -> None:
+def test_turning_the_instrument_changes_no_error(robot, noisy):
     rng = np.random.default_rng(4)
     model, begin = identified(robot, noisy.data)
     error = model.error(solve(model, begin).x.take(np.array(0)))
@@ -132,9 +129,7 @@ def test_turning_the_instrument_changes_no_error(robot: mc.Robot, noisy: Simulat
         assert_allclose(again, error, rtol=0, atol=1e-9)  # 1e-6 mm
 
 
-def test_solve_normal_gives_the_least_solution_of_a_singular_system(
-    rng: np.random.Generator,
-) -> None:
+def test_solve_normal_gives_the_least_solution_of_a_singular_system(rng):
     rows = rng.normal(size=(5, 4))
     rows = np.concatenate([rows, rows[:, :1]], axis=1)  # the last column repeats the first
     gram, right = rows.T @ rows, rows.T @ rng.normal(size=(5, 1))
@@ -143,7 +138,7 @@ def test_solve_normal_gives_the_least_solution_of_a_singular_system(
     assert_allclose(found[0], found[4], rtol=1e-6)
 
 
-def test_rotation_steps_have_no_gimbal(robot: mc.Robot, clean: Simulation) -> None:
+def test_rotation_steps_have_no_gimbal(robot, clean):
     """A base pitched by 90 degrees, where Euler angles are singular."""
     cell = clean.cell
     pitch = rotation(np.array([0.0, np.pi / 2, 0.0]))

@@ -18,7 +18,6 @@ from minimax_cal.fitting.minimax_problem import (
 )
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
-from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.minimax import Linear, Sqp
 from minimax_cal.solvers.status import Status
@@ -67,7 +66,7 @@ class Plain:
         return x + d
 
 
-def test_known_minimax_with_bfgs() -> None:
+def test_known_minimax_with_bfgs():
     """Rosen-Suzuki as a minimax: -44 at (0, 1, 2, -1)."""
 
     def f(x):  # type: ignore[no-untyped-def]
@@ -92,7 +91,7 @@ def test_known_minimax_with_bfgs() -> None:
     assert_allclose(found.mu.sum(), 1.0, rtol=1e-12)
 
 
-def test_equality_and_inequality_constraints() -> None:
+def test_equality_and_inequality_constraints():
     """min max(x, y) on the unit circle with x - y >= 0.4: x = y + 0.4 is active."""
     problem = Plain(
         (lambda x: x[0], lambda x: x[1]),
@@ -107,7 +106,7 @@ def test_equality_and_inequality_constraints() -> None:
     assert found.lam[1] < 0  # active at its lower bound
 
 
-def test_contradicting_constraints_are_said() -> None:
+def test_contradicting_constraints_are_said():
     problem = Plain((lambda x: x[0],), (lambda x: x[0], lambda x: x[0]), np.array([2.0, -np.inf]),
                     np.array([np.inf, 1.0]))  # fmt: skip
     found = run(problem, np.array([0.0]), hessian="bfgs")
@@ -115,7 +114,7 @@ def test_contradicting_constraints_are_said() -> None:
     assert "contradict" in found.status.advice
 
 
-def test_the_maratos_problem_takes_full_steps() -> None:
+def test_the_maratos_problem_takes_full_steps():
     """Curved constraint x'x = 1, start on it: without correction every unit step is refused."""
     problem = Plain(
         (lambda x: 2 * (x @ x - 1) - x[0],), (lambda x: x @ x,), np.array([1.0]), np.array([1.0])
@@ -126,7 +125,7 @@ def test_the_maratos_problem_takes_full_steps() -> None:
     assert found.iterations < 15
 
 
-def test_derivatives_of_the_calibration_problem(robot: mc.Robot, noisy: Simulation) -> None:
+def test_derivatives_of_the_calibration_problem(robot, noisy):
     model, x = warm(robot, noisy.data)
     for form in ("two-sided", "squared", "off"):
         problem = worst_target(model, x, measured_distances(noisy.data), form)
@@ -153,7 +152,7 @@ def value_of(robot: mc.Robot, data: mc.Measurements, backend: str = "daqp") -> f
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_backends_end_at_the_same_value(backend: str, robot: mc.Robot, noisy: Simulation) -> None:
+def test_backends_end_at_the_same_value(backend, robot, noisy):
     if backend not in available():
         pytest.skip(f"{backend} is not installed")
     reference = value_of(robot, noisy.data)
@@ -177,7 +176,7 @@ def slsqp_value(problem: MinimaxProblem, x: State) -> float:
     return float(problem.evaluate(problem.step(x, found.x[:size]))[0].max())
 
 
-def test_value_is_slsqps(robot: mc.Robot, noisy: Simulation) -> None:
+def test_value_is_slsqps(robot, noisy):
     model, x = warm(robot, noisy.data)
     problem = worst_target(model, x, measured_distances(noisy.data), "two-sided")
     ours, theirs = run(problem, x).value, slsqp_value(problem, x)
@@ -187,9 +186,7 @@ def test_value_is_slsqps(robot: mc.Robot, noisy: Simulation) -> None:
 
 @pytest.mark.parametrize("form", ["two-sided", "squared", "off"])
 @pytest.mark.parametrize("hessian", ["gauss-newton", "bfgs"])
-def test_forms_and_hessians_agree(
-    form: str, hessian: str, robot: mc.Robot, noisy: Simulation
-) -> None:
+def test_forms_and_hessians_agree(form, hessian, robot, noisy):
     model, x = warm(robot, noisy.data)
     problem = worst_target(model, x, measured_distances(noisy.data), form)
     found = run(problem, x, hessian=hessian)
@@ -201,7 +198,7 @@ def test_forms_and_hessians_agree(
         assert_allclose(found.value, reference.value, rtol=1e-7)
 
 
-def test_tight_distances_are_kept(robot: mc.Robot, noisy: Simulation) -> None:
+def test_tight_distances_are_kept(robot, noisy):
     """Distances that disagree with the points by 50 um bind, and hold to their tolerance."""
     model, x = warm(robot, noisy.data)
     measured = measured_distances(noisy.data, 1e-6)
@@ -217,7 +214,7 @@ def test_tight_distances_are_kept(robot: mc.Robot, noisy: Simulation) -> None:
     assert found.value >= free.value * (1 - 1e-9)
 
 
-def test_kkt_conditions_hold(robot: mc.Robot, noisy: Simulation) -> None:
+def test_kkt_conditions_hold(robot, noisy):
     model, x = warm(robot, noisy.data)
     problem = worst_target(model, x, measured_distances(noisy.data), "two-sided")
     found = run(problem, x)
@@ -228,7 +225,7 @@ def test_kkt_conditions_hold(robot: mc.Robot, noisy: Simulation) -> None:
     assert here.f.max() <= problem.linearise(x).f.max()
 
 
-def test_moving_the_instrument_changes_nothing(robot: mc.Robot, noisy: Simulation) -> None:
+def test_moving_the_instrument_changes_nothing(robot, noisy):
     rng = np.random.default_rng(5)
     reference = value_of(robot, noisy.data)
     for _ in range(10):
@@ -237,7 +234,7 @@ def test_moving_the_instrument_changes_nothing(robot: mc.Robot, noisy: Simulatio
         assert_allclose(value_of(robot, moved), reference, rtol=1e-8)
 
 
-def test_a_qp_solver_that_fails_ends_in_a_status(robot: mc.Robot, noisy: Simulation) -> None:
+def test_a_qp_solver_that_fails_ends_in_a_status(robot, noisy):
     from qp_backends import Solution
     from qp_backends import Status as QpStatus
 
@@ -253,9 +250,7 @@ def test_a_qp_solver_that_fails_ends_in_a_status(robot: mc.Robot, noisy: Simulat
     assert found.x is x
 
 
-def test_qps_of_some_functions_are_those_of_all(
-    robot: mc.Robot, noisy: Simulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_qps_of_some_functions_are_those_of_all(robot, noisy, monkeypatch):
     """The worst of many points: the QPs that begin with a few take the same steps."""
     model, x = warm(robot, noisy.data)
     problem = minimax_problem(model, x, measured_distances(noisy.data), "two-sided", "point")

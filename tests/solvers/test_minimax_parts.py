@@ -108,7 +108,7 @@ BENT = linear(
 )
 
 
-def test_the_distance_from_optimal_is_its_formula() -> None:
+def test_the_distance_from_optimal_is_its_formula():
     mu, lam = np.array([0.5, 0.2, 0.3]), np.array([0.4, -0.3, 0.0])
     found = optimality(BENT, mu, lam, LOWER, UPPER)
     assert_allclose(found.stationarity, 0.6)  # of (0.5 - 0.3 + 0.4, 0.2 + 0.6 + 0.4 - 0.6)
@@ -120,11 +120,11 @@ def test_the_distance_from_optimal_is_its_formula() -> None:
 
 
 @pytest.mark.parametrize("three", [(3.0, 1.0, 2.0), (1.0, 3.0, 2.0), (2.0, 1.0, 3.0)])
-def test_the_residual_is_the_largest(three: tuple[float, float, float]) -> None:
+def test_the_residual_is_the_largest(three):
     assert Kkt(*three).residual == 3.0
 
 
-def test_a_violation_that_no_step_lessens_is_hopeless() -> None:
+def test_a_violation_that_no_step_lessens_is_hopeless():
     here = linear([0.0], [[1.0]], [2.0, 0.0], [[1.0], [1.0]])
     lower, upper = np.array([-INF, 1.0]), np.array([1.0, INF])
     assert_array_equal(excess(here.c, lower, upper), [1.0, 1.0])
@@ -138,7 +138,7 @@ def test_a_violation_that_no_step_lessens_is_hopeless() -> None:
 # ---- quadratic programs ------------------------------------------------------------------------
 
 
-def test_the_epigraph_problem_is_its_formula(rng: np.random.Generator) -> None:
+def test_the_epigraph_problem_is_its_formula(rng):
     hessian = np.array([[2.0, 0.5], [0.5, 1.0]])
     made = epigraph(BENT, 3.5, hessian, LOWER, UPPER)
     d, v = rng.normal(size=2), rng.normal()
@@ -155,9 +155,7 @@ def test_the_epigraph_problem_is_its_formula(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize(("price", "there"), [(0.5, 0.5), (1.9, 1.9), (5.0, 2.0)])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_a_relaxed_constraint_is_kept_if_its_price_is_high(
-    price: float, there: float, sign: float
-) -> None:
+def test_a_relaxed_constraint_is_kept_if_its_price_is_high(price, there, sign):
     """Least 1/2 d^2 with |d| 2 at least: the slope d is paid up to the price."""
     low, high = (2.0, INF) if sign > 0.0 else (-INF, -2.0)
     rows = np.array([[0.0, -1.0], [1.0, 0.0]])
@@ -168,7 +166,7 @@ def test_a_relaxed_constraint_is_kept_if_its_price_is_high(
     assert_allclose(found.x[2:].sum(), 2.0 - there, atol=1e-6)
 
 
-def test_multipliers_are_put_in_their_places() -> None:
+def test_multipliers_are_put_in_their_places():
     here = linear([0.0] * 5, [[1.0, 2.0]] * 5, [1.0], [[0.0, 1.0]])
     answer = Solution(np.array([7.0, 8.0, 9.0]), np.array([-1e-9, 0.5, 1.5, -0.25]),
                       QpStatus.SOLVED, 0.0, "daqp", notes=("slow",))  # fmt: skip
@@ -194,7 +192,7 @@ def test_multipliers_are_put_in_their_places() -> None:
         assert_array_equal(found.d, [21.0, 4.0] if lost.solved else [0.0, 0.0])
 
 
-def test_functions_that_were_forgotten_are_the_worst_beyond() -> None:
+def test_functions_that_were_forgotten_are_the_worst_beyond():
     """Six functions of two variables; the answer makes three of those unknown larger than v."""
     slopes = [[1.0, 0.0], [0.0, 1.0], [3.0, 0.0], [0.0, 0.0], [2.0, 0.0], [0.0, 4.0]]
     here = linear([1.0, 0.0, 1.0, 1.0, 0.0, 0.0], slopes)
@@ -209,7 +207,7 @@ def test_functions_that_were_forgotten_are_the_worst_beyond() -> None:
     assert_array_equal(forgotten(here, np.array([0, 2]), lost), [1, 3, 4, 5])
 
 
-def test_of_many_functions_the_largest_come_first() -> None:
+def test_of_many_functions_the_largest_come_first():
     values = [0.0, 9.0, 1.0, 8.0, 2.0, 7.0, 3.0]
     mu = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
     nothing = np.zeros(0)
@@ -220,7 +218,7 @@ def test_of_many_functions_the_largest_come_first() -> None:
     assert_array_equal(seven.likely(six), range(6))
 
 
-def test_contradicting_constraints_are_relaxed_at_a_price() -> None:
+def test_contradicting_constraints_are_relaxed_at_a_price():
     """x at least 2 and at most 1; a hundred times the slope by the way, or what was paid before."""
     here = linear([0.0], [[-3.0]], [0.0, 0.0], [[1.0], [1.0]])
     at = standing(here, np.ones(1), np.array([2.0, -INF]), np.array([INF, 1.0]))
@@ -242,7 +240,7 @@ def test_contradicting_constraints_are_relaxed_at_a_price() -> None:
 # ---- an iterate --------------------------------------------------------------------------------
 
 
-def test_it_begins_with_even_multipliers_or_those_given() -> None:
+def test_it_begins_with_even_multipliers_or_those_given():
     problem = Plane(np.array([1.0, 2.0, 4.0, 0.0]))
     at = Iterate.begin(problem, np.zeros(1), Sqp(), np.zeros(0))
     assert_array_equal(at.mu, 0.25)
@@ -283,14 +281,14 @@ class Plane:
         Plane(np.array([1.0, 2.0]), np.array([[1.0], [np.nan]])),
     ],
 )
-def test_what_is_no_number_ends_in_a_status(problem: Plane) -> None:
+def test_what_is_no_number_ends_in_a_status(problem):
     asked: list[Problem] = []
     found = solve(problem, np.zeros(1), from_nothing(asked.append))  # type: ignore[arg-type]
     assert found.status is Status.FAILED
     assert asked == []
 
 
-def test_the_notes_of_backends_are_told_once() -> None:
+def test_the_notes_of_backends_are_told_once():
     said = iter(["slow", "slow", "lost"])
 
     def qp(problem: Problem) -> Solution:
@@ -309,7 +307,7 @@ def test_the_notes_of_backends_are_told_once() -> None:
     assert replace(found, f=np.array([1.0, 3.0, 2.0])).value == 3.0
 
 
-def test_notes_that_differ_in_their_numbers_are_one() -> None:
+def test_notes_that_differ_in_their_numbers_are_one():
     notes = [f"daqp said infeasible, its relative residual is {r}" for r in ("1.2e-08", "4", "inf")]
     first, other = told_once([*notes[:2], "slow", notes[1]])
     assert first == f"{notes[0]} (the first of 3 alike)"
@@ -317,7 +315,7 @@ def test_notes_that_differ_in_their_numbers_are_one() -> None:
     assert told_once(notes[1:]) == tuple(notes[1:])
 
 
-def test_the_hessian_has_a_floor_and_is_damped() -> None:
+def test_the_hessian_has_a_floor_and_is_damped():
     here = replace(linear([1.0, 2.0], [[1.0, 0.0], [0.0, 1.0]]), curvature=np.diag)
     at = standing(here, np.array([1.0, 0.0]), np.zeros(0), np.zeros(0))
     assert_array_equal(at.hessian(0.1), np.diag([1.0, 0.05]))
@@ -326,7 +324,7 @@ def test_the_hessian_has_a_floor_and_is_damped() -> None:
     assert_allclose(replace(at, damping=3.0).hessian(0.0), np.diag([4.0, 1.5e-8]))
 
 
-def test_idle_is_who_falls_neither_in_value_nor_in_residual() -> None:
+def test_idle_is_who_falls_neither_in_value_nor_in_residual():
     """f is 1 with the slope 2, which is all of it over the length 1/2: the residual is 1."""
     at = replace(begun(parabola(), 1.0), best=10.0, lowest=5.0, idle=4)
     one, none = plan([0.0], [1.0]), np.zeros(0)
@@ -356,9 +354,7 @@ def judged(at: Iterate[Array], *kkt: float) -> Iterate[Array]:
         (1e-6, 1.1e-8, 99, None),
     ],
 )
-def test_patience_has_an_end(
-    residual: float, violation: float, idle: int, ended: Status | None
-) -> None:
+def test_patience_has_an_end(residual, violation, idle, ended):
     at = judged(replace(begun(parabola(), 1.0), idle=idle), residual, 0.0, violation)
     assert at.patience(1e-8) is ended
     rough = Status.STALLED if idle == 99 else ended  # such QPs may not get rid of a violation
@@ -374,16 +370,14 @@ def test_patience_has_an_end(
         (1.0, 1.1e-8, 1.1e8, Status.INFEASIBLE),
     ],
 )
-def test_damping_has_an_end(
-    residual: float, violation: float, damping: float, ended: Status | None
-) -> None:
+def test_damping_has_an_end(residual, violation, damping, ended):
     at = judged(replace(begun(parabola(), 1.0), damping=damping), residual, 0.0, violation)
     assert at.arrived(1e-8) is ended
     rough = Status.STALLED if ended is Status.INFEASIBLE else ended
     assert at.arrived(1e-8, exact=False) is rough
 
 
-def test_damping_grows_and_falls_tenfold() -> None:
+def test_damping_grows_and_falls_tenfold():
     at = begun(parabola(), 1.0)
     assert at.damped().damping == 1e-3
     assert replace(at, damping=2.0).damped().damping == 20.0
@@ -409,9 +403,7 @@ def test_damping_grows_and_falls_tenfold() -> None:
         (True, 0.0, 3.1e6, None),  # a million times the slope 3
     ],
 )
-def test_the_price_of_a_violation(
-    relaxed: bool, d: float, penalty: float, expected: float | None
-) -> None:
+def test_the_price_of_a_violation(relaxed, d, penalty, expected):
     here = linear([0.0], [[-3.0]], [2.0], [[1.0]])
     at = standing(here, np.ones(1), np.array([-INF]), np.array([1.0]))
     one = plan([d], [1.0], [-2.0], relaxed=np.array([5.0]) if relaxed else None)
@@ -426,7 +418,7 @@ def lost(f: Array, c: Array) -> Plan:
     return plan([0.0], [1.0], usable=False)
 
 
-def test_a_full_step_that_helps_is_taken() -> None:
+def test_a_full_step_that_helps_is_taken():
     length, move, end, there = search(begun(parabola(), 1.0), plan([-0.9], [1.0]), lost)
     assert (length, move[0], there.jacobian[0, 0]) == (1.0, -0.9, 2.0 * end[0])
     assert_allclose(end, 0.1)
@@ -441,14 +433,14 @@ def test_a_full_step_that_helps_is_taken() -> None:
         (-2.5, 0.4),
     ],
 )
-def test_a_step_too_long_is_shortened_to_the_vertex(d: float, length: float) -> None:
+def test_a_step_too_long_is_shortened_to_the_vertex(d, length):
     found, move, end, there = search(begun(parabola(), 1.0), plan([d], [1.0]), lost)
     assert_allclose(found, length, rtol=1e-12)
     assert_allclose(move, length * d, rtol=1e-12)
     assert_allclose([end[0], there.f[0]], 0.0, atol=1e-12)
 
 
-def test_a_step_is_never_shortened_to_more_than_half_nor_less_than_a_tenth() -> None:
+def test_a_step_is_never_shortened_to_more_than_half_nor_less_than_a_tenth():
     """Beyond a kink nothing is known (NaN); before it a wall leaves the vertex at the start."""
     wall = Curve(lambda x: -x if x < 0.3 else INF, lambda x: -1.0)
     assert search(begun(wall, 0.0), plan([1.0], [1.0]), lost)[0] == 0.1
@@ -458,13 +450,13 @@ def test_a_step_is_never_shortened_to_more_than_half_nor_less_than_a_tenth() -> 
     assert search(begun(flat, 0.0), plan([1.0], [1.0]), lost)[0] == 0.25  # half of a half
 
 
-def test_no_step_up_a_hill() -> None:
+def test_no_step_up_a_hill():
     uphill = Curve(lambda x: x, lambda x: -1.0)  # whose slope is told wrong
     length, move, end, _ = search(begun(uphill, 0.0), plan([1.0], [1.0]), lost)
     assert (length, move[0], end[0]) == (0.0, 0.0, 0.0)
 
 
-def test_a_violation_counts_at_its_price() -> None:
+def test_a_violation_counts_at_its_price():
     """From 1 to 0.5 x^2 falls by 0.75, and x is short of its bound 1 by 0.5."""
     at = begun(parabola(lower=1.0), 1.0)
     assert search(replace(at, price=np.array([1.0])), plan([-0.5], [1.0], [0.0]), lost)[0] == 1.0
@@ -472,7 +464,7 @@ def test_a_violation_counts_at_its_price() -> None:
     assert dear[0] == 0.0
 
 
-def test_the_second_order_correction_is_asked_what_the_step_missed() -> None:
+def test_the_second_order_correction_is_asked_what_the_step_missed():
     asked = []
 
     def bent(f: Array, c: Array, usable: bool = True, d: float = -1.0) -> Plan:
@@ -512,7 +504,7 @@ def updated(start: Bfgs, s: list[float], q: list[float]) -> Bfgs:
 GUESS = Bfgs(np.array([[2.0, 0.5], [0.5, 1.0]]), fresh=False)
 
 
-def test_the_hessian_explains_the_latest_step() -> None:
+def test_the_hessian_explains_the_latest_step():
     s, q = np.array([1.0, -2.0]), np.array([3.0, -1.0])
     found = updated(GUESS, s.tolist(), q.tolist())
     assert_allclose(found.matrix @ s, q, rtol=1e-12)
@@ -526,14 +518,14 @@ def test_the_hessian_explains_the_latest_step() -> None:
 
 
 @pytest.mark.parametrize("q", [[-3.0, 1.0], [0.1, 0.0], [0.0, 0.0]])
-def test_curvature_that_is_missing_is_damped_by_powell(q: list[float]) -> None:
+def test_curvature_that_is_missing_is_damped_by_powell(q):
     s = np.array([1.0, -2.0])
     found = updated(GUESS, s.tolist(), q)
     assert_allclose(s @ found.matrix @ s, 0.2 * (s @ GUESS.matrix @ s), rtol=1e-12)
     assert np.linalg.eigvalsh(found.matrix)[0] > 0.0
 
 
-def test_the_first_guess_takes_its_size_from_the_first_step() -> None:
+def test_the_first_guess_takes_its_size_from_the_first_step():
     fresh = Bfgs(np.eye(2), fresh=True)
     s, q = np.array([2.0, 0.0]), np.array([0.4, 0.2])
     size = (q @ q) / (q @ s)
@@ -546,14 +538,14 @@ def test_the_first_guess_takes_its_size_from_the_first_step() -> None:
                                          [-0.4, -0.2]).matrix)  # fmt: skip
 
 
-def test_steps_that_teach_nothing_leave_the_hessian() -> None:
+def test_steps_that_teach_nothing_leave_the_hessian():
     assert updated(GUESS, [0.0, 0.0], [1.0, 1.0]) is GUESS
     assert updated(GUESS, [1.0, 0.0], [np.nan, 1.0]) is GUESS
     hollow = Bfgs(np.diag([0.0, 1.0]), fresh=False)
     assert updated(hollow, [1.0, 0.0], [1.0, 1.0]) is hollow
 
 
-def test_the_hessian_begins_with_the_mean_curvature_where_there_is_one() -> None:
+def test_the_hessian_begins_with_the_mean_curvature_where_there_is_one():
     here = linear([0.0, 0.0], [[1.0, 0.0], [0.0, 1.0]])
     guess = np.array([1.0, 4.0])
     plain = Bfgs.start(here, guess)

@@ -22,7 +22,7 @@ from qp_backends import solve as solve_qp
 
 
 @pytest.mark.parametrize("name", CLASSICS)
-def test_complex_step_is_the_gradient(name: str) -> None:
+def test_complex_step_is_the_gradient(name):
     """Central differences in the complex plane against central differences on the line."""
     classic = CLASSICS[name]
     rng = np.random.default_rng(0)
@@ -52,7 +52,7 @@ def solve(classic: Classic, unit: object = 1.0, **more: object):  # type: ignore
 
 
 @pytest.mark.parametrize("name", CLASSICS)
-def test_classics_reach_their_published_optimum(name: str) -> None:
+def test_classics_reach_their_published_optimum(name):
     classic = CLASSICS[name]
     found = solve(classic)
     assert found.success, found.message
@@ -73,7 +73,7 @@ def test_classics_reach_their_published_optimum(name: str) -> None:
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6, "mixed"])
 @pytest.mark.parametrize("name", CLASSICS)
-def test_the_unit_of_the_variables_does_not_matter(name: str, unit: float | str) -> None:
+def test_the_unit_of_the_variables_does_not_matter(name, unit):
     classic = CLASSICS[name]
     if unit == "mixed":
         unit = 10.0 ** np.random.default_rng(7).choice([-6, 0, 6], len(classic.start))
@@ -104,7 +104,7 @@ def least_polynomial(powers: np.ndarray, f: np.ndarray) -> float:
     ("degree", "jac"),
     [*((degree, "given") for degree in range(2, 10)), (3, "2-point"), (6, "2-point")],
 )
-def test_polynomials_are_fitted_in_any_unit(degree: int, unit: float, jac: str) -> None:
+def test_polynomials_are_fitted_in_any_unit(degree, unit, jac):
     """Columns from 1 to 1e65; the value is linprog's, or it is no success."""
     h = np.linspace(0.0, 30.0, 61)
     powers = (unit * h[:, None]) ** np.arange(degree + 1)
@@ -123,7 +123,7 @@ def test_polynomials_are_fitted_in_any_unit(degree: int, unit: float, jac: str) 
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6, (1e6, 1e-6)])
-def test_constraints_scale_along(unit: object) -> None:
+def test_constraints_scale_along(unit):
     """min max(x, y) with x^2 + y^2 = 1, x - y >= 0.4, y >= -0.5, in any units: the same corner."""
     found = mc.minimize_max(
         lambda x: x / unit,
@@ -140,13 +140,13 @@ def test_constraints_scale_along(unit: object) -> None:
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
-def test_contradictions_are_said_in_any_unit(unit: float) -> None:
+def test_contradictions_are_said_in_any_unit(unit):
     both = [LinearConstraint([[1.0 / unit]], 2.0, np.inf), LinearConstraint([[1.0]], -np.inf, unit)]
     found = mc.minimize_max(lambda x: (x / unit) ** 2, [0.0], jac="cs", constraints=both)
     assert (found.success, found.status) == (False, "infeasible")
 
 
-def test_a_qp_that_is_solved_badly_is_no_success() -> None:
+def test_a_qp_that_is_solved_badly_is_no_success():
     """Answers a tenth off in every entry: the search goes on, and says how far it came."""
 
     def rough(problem: Problem) -> Solution:
@@ -160,14 +160,14 @@ def test_a_qp_that_is_solved_badly_is_no_success() -> None:
 
 
 @pytest.mark.parametrize("qp", ["clarabel", "osqp", "proxqp"])
-def test_other_backends_reach_it_too(qp: str) -> None:
+def test_other_backends_reach_it_too(qp):
     for name in ("Rosen-Suzuki", "MAD4", "Bard"):
         found = solve(CLASSICS[name], qp=qp)
         assert found.success
         assert_allclose(found.fun, CLASSICS[name].best, rtol=1e-6)
 
 
-def test_user_jacobian_arguments_and_callback() -> None:
+def test_user_jacobian_arguments_and_callback():
     seen = []
     found = mc.minimize_max(
         lambda x, c: np.array([(x[0] - c) ** 2, (x[0] + c) ** 2]),
@@ -182,12 +182,12 @@ def test_user_jacobian_arguments_and_callback() -> None:
     assert seen[0][1] == 25.0
 
 
-def test_finite_differences_are_the_default() -> None:
+def test_finite_differences_are_the_default():
     found = mc.minimize_max(CLASSICS["CB2"].fun, (2, 2), tol=1e-6)
     assert_allclose(found.fun, 1.9522245, rtol=1e-6)
 
 
-def test_linear_and_nonlinear_constraints_with_bounds() -> None:
+def test_linear_and_nonlinear_constraints_with_bounds():
     """min max(x, y) with x^2 + y^2 = 1, x - y >= 0.4, y >= -0.5: y = -0.5 is active at a corner."""
     found = mc.minimize_max(
         lambda x: x,
@@ -204,7 +204,7 @@ def test_linear_and_nonlinear_constraints_with_bounds() -> None:
     assert found.violation < 1e-8
 
 
-def test_start_outside_the_bounds_is_brought_in() -> None:
+def test_start_outside_the_bounds_is_brought_in():
     seen = []
 
     def fun(x: np.ndarray) -> np.ndarray:
@@ -217,7 +217,7 @@ def test_start_outside_the_bounds_is_brought_in() -> None:
     assert min(x[0] for x in seen) >= 0.25 - 1e-9
 
 
-def test_no_feasible_point_is_said() -> None:
+def test_no_feasible_point_is_said():
     found = mc.minimize_max(
         lambda x: x, [0.0], jac="cs", constraints=NonlinearConstraint(lambda x: x**2, -5, -1)
     )
@@ -226,7 +226,7 @@ def test_no_feasible_point_is_said() -> None:
     assert found.violation == pytest.approx(1.0, abs=1e-6)
 
 
-def test_unbounded_problem_does_not_claim_success() -> None:
+def test_unbounded_problem_does_not_claim_success():
     found = mc.minimize_max(lambda x: -x, [1.0], jac=lambda x: -np.eye(1), maxiter=30)
     assert not found.success
 
@@ -245,13 +245,13 @@ def test_unbounded_problem_does_not_claim_success() -> None:
         ({"bounds": Bounds([1.0], [0.0])}, "above"),
     ],
 )
-def test_wrong_arguments_are_refused(options: dict, say: str) -> None:  # type: ignore[type-arg]
+def test_wrong_arguments_are_refused(options, say):  # type: ignore[type-arg]
     arguments = {"fun": lambda x: x, "x0": [1.0], **options}
     with pytest.raises(mc.OptionError, match=say):
         mc.minimize_max(**arguments)
 
 
-def test_a_wrong_gradient_is_not_called_optimal() -> None:
+def test_a_wrong_gradient_is_not_called_optimal():
     """The KKT test trusts jac; with a wrong one the line search must stop, not claim success."""
     found = mc.minimize_max(
         lambda x: np.array([x @ x]), [1.0, 1.0], jac=lambda x: -np.array([2 * x])
@@ -261,7 +261,7 @@ def test_a_wrong_gradient_is_not_called_optimal() -> None:
 
 
 @pytest.mark.parametrize("factor", [1e-12, 1e-9, 1e-3, 1e6])
-def test_the_unit_of_the_functions_does_not_matter(factor: float) -> None:
+def test_the_unit_of_the_functions_does_not_matter(factor):
     """CB2 in another unit: the same point, to 1e-6."""
 
     def cb2(x: np.ndarray) -> np.ndarray:
@@ -274,7 +274,7 @@ def test_the_unit_of_the_functions_does_not_matter(factor: float) -> None:
     assert_allclose(found.x, mc.minimize_max(cb2, [2.0, 2.0], jac="cs").x, rtol=0, atol=1e-6)
 
 
-def test_a_hilltop_is_no_minimum() -> None:
+def test_a_hilltop_is_no_minimum():
     found = mc.minimize_max(
         lambda x: np.array([-x[0] ** 2]), [0.0], jac=lambda x: -2.0 * x[None],
         bounds=Bounds([-1.0], [2.0]),
@@ -283,14 +283,14 @@ def test_a_hilltop_is_no_minimum() -> None:
     assert found.fun < -0.99  # at one of the bounds
 
 
-def test_what_has_no_minimum_is_said() -> None:
+def test_what_has_no_minimum_is_said():
     found = mc.minimize_max(lambda x: np.array([x[0], 2.0 * x[0]]), [0.0], jac="cs")
     assert not found.success
     assert found.status == "unbounded"
     assert "falls without end" in found.message
 
 
-def test_a_jacobian_of_another_shape_is_said() -> None:
+def test_a_jacobian_of_another_shape_is_said():
     with pytest.raises(mc.OptionError, match=r"shape \(2, 2\); 2 functions of 1 variables"):
         mc.minimize_max(lambda x: np.array([x[0], -x[0]]), [0.0], jac=lambda x: np.eye(2))
 
@@ -298,14 +298,12 @@ def test_a_jacobian_of_another_shape_is_said() -> None:
 @pytest.mark.parametrize(
     ("sign", "bounds"), [(1.0, [(None, 5.0)]), (-1.0, [(-5.0, None)]), (1.0, None)]
 )
-def test_a_bound_on_the_other_side_does_not_end_a_fall(
-    sign: float, bounds: list[tuple[float | None, float | None]] | None
-) -> None:
+def test_a_bound_on_the_other_side_does_not_end_a_fall(sign, bounds):
     found = mc.minimize_max(lambda x: sign * x, [1.0], jac="cs", bounds=bounds)
     assert found.status == "unbounded"
 
 
-def test_evaluations_are_counted() -> None:
+def test_evaluations_are_counted():
     seen = {"fun": 0, "jac": 0}
 
     def fun(x: np.ndarray) -> np.ndarray:
@@ -322,7 +320,7 @@ def test_evaluations_are_counted() -> None:
 
 
 @pytest.mark.parametrize("jac", ["cs", lambda x: 2.0 * x])
-def test_a_constraint_has_the_derivative_that_it_names(jac: object) -> None:
+def test_a_constraint_has_the_derivative_that_it_names(jac):
     """The complex step shows complex numbers to the function; a function is asked itself."""
     kinds, asked = set(), []
 
@@ -341,7 +339,7 @@ def test_a_constraint_has_the_derivative_that_it_names(jac: object) -> None:
     assert bool(asked) == (jac != "cs")
 
 
-def test_central_differences_are_of_second_order() -> None:
+def test_central_differences_are_of_second_order():
     """On exp, whose third derivative is itself: h^2/6 with h = 6e-6, and rounding eps/h."""
     x, length = np.array([0.3, 40.0]), np.array([1.0, 40.0])
     slopes = np.diag([np.exp(0.3), 1.0 / 40.0])
@@ -356,7 +354,7 @@ def test_central_differences_are_of_second_order() -> None:
 
 
 @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
-def test_the_length_of_a_variable_is_found_from_zero(unit: float) -> None:
+def test_the_length_of_a_variable_is_found_from_zero(unit):
     """Where exp, a square, a line and a fourth power at 0 change by the size 1 of all."""
 
     def fun(x: np.ndarray) -> np.ndarray:
@@ -376,7 +374,7 @@ def scaled(fun: object, x: np.ndarray, rows: Rows | None = None) -> MaxOfFunctio
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
-def test_the_way_down_from_a_flat_point_is_the_steepest(unit: float) -> None:
+def test_the_way_down_from_a_flat_point_is_the_steepest(unit):
     """A thousandth of the length over which the functions change by their size."""
     nowhere = np.zeros(2)
 
@@ -398,7 +396,7 @@ def test_the_way_down_from_a_flat_point_is_the_steepest(unit: float) -> None:
 
 
 @pytest.mark.parametrize("most", [1, 3])
-def test_a_limit_is_the_number_of_programs(most: int) -> None:
+def test_a_limit_is_the_number_of_programs(most):
     found = mc.minimize_max(CLASSICS["CB2"].fun, (2, 2), jac="cs", maxiter=most)
     assert (found.status, found.nit) == ("iteration_limit", most)
 
@@ -417,14 +415,14 @@ def two(x):  # type: ignore[no-untyped-def]
     ],
     ids=["zero", "the other sign", "zero for one", "zero near the answer"],
 )
-def test_a_wrong_gradient_is_no_success(jac, function: int) -> None:  # type: ignore[no-untyped-def]
+def test_a_wrong_gradient_is_no_success(jac, function):  # type: ignore[no-untyped-def]
     found = mc.minimize_max(two, [3.0], jac=jac)
     assert not found.success
     assert found.status == "wrong_gradient"
     assert f"function {function}" in found.message
 
 
-def test_a_gradient_at_a_kink_is_not_called_wrong() -> None:
+def test_a_gradient_at_a_kink_is_not_called_wrong():
     found = mc.minimize_max(
         lambda x: np.array([abs(x[0]) + (x[1] - 1.0) ** 2]),
         [0.0, 3.0],
@@ -453,7 +451,7 @@ def powell_singular(x):  # type: ignore[no-untyped-def]
     [(powell_badly_scaled, (0.0, 1.0)), (powell_singular, (3.0, -1.0, 0.0, 1.0))],
 )
 @pytest.mark.parametrize("jac", ["cs", "2-point"])
-def test_an_optimum_of_zero_is_found_where_gradients_flatten(fun, start, jac: str) -> None:  # type: ignore[no-untyped-def]
+def test_an_optimum_of_zero_is_found_where_gradients_flatten(fun, start, jac):  # type: ignore[no-untyped-def]
     """Their least is 0; along a valley the gradient falls to the tolerance long before."""
     found = mc.minimize_max(fun, start, jac=jac)
     assert found.success
