@@ -356,8 +356,11 @@ def check_poses(data: Measurements) -> None:
         )
 
 
-def geometry(task: Task, progress: Progress) -> Stage:
-    """The least-squares fit of the geometry."""
+def geometry(task: Task, progress: Progress, *, wide: bool = True) -> Stage:
+    """The least-squares fit of the geometry.
+
+    wide: whether base rotations are searched where it misses grossly.
+    """
     progress("identifiable parameters")
     model = task.base.emphasise(task.share)
     identification = task.identified(model, task.frame.state)
@@ -365,9 +368,11 @@ def geometry(task: Task, progress: Progress) -> Stage:
     model, squares = task.squares(model.only(identification.active), task.frame.state)
     robust = task.robust(model, squares)
     # a few gross outliers are no reason to search: what counts is how the believed points are met
-    wide, notices = wider(task.robot, robust.model, robust.fit, progress)
-    if wide is not robust.fit:
-        robust = task.robust(robust.plain, wide)
+    notices: tuple[str, ...] = ()
+    if wide:
+        better, notices = wider(task.robot, robust.model, robust.fit, progress)
+        if better is not robust.fit:
+            robust = task.robust(robust.plain, better)
     for _ in range(MAX_GROWTHS):
         at = task.base.emphasise(task.share), robust.fit.x.take(np.array(0)), identification
         more = task.grown(*at, 0.0)
@@ -408,7 +413,7 @@ def by_drawing(task: Task, stage: Stage, progress: Progress) -> tuple[Task, Stag
     better = (times > usual) | np.isin(names.all, not_told)  # what the drawing knows better
     sigma = np.where(better, np.minimum(task.sigma, within), task.sigma)
     held = replace(task, sigma=sigma)
-    found = geometry(held, progress)
+    found = geometry(held, progress, wide=False)  # near the drawing its base is the best of all
     if stage.squares.cost[0] < MAX_REMAINING_COST * found.squares.cost[0]:
         return task, stage  # the drawing contradicts the data
     named = name_first([names.all[i] for i in np.flatnonzero(vague)], MAX_NAMED)
