@@ -129,6 +129,36 @@ class Problem:
         for name, value in (("P", P), ("q", q), ("A", A), ("l", l), ("u", u)):
             object.__setattr__(self, name, value)
 
+    @staticmethod
+    def from_qpsolvers(
+        P: Matrix,
+        q: Any,
+        G: Matrix | None = None,
+        h: Any = None,
+        A: Matrix | None = None,
+        b: Any = None,
+        lb: Any = None,
+        ub: Any = None,
+    ) -> Problem:
+        """From what `qpsolvers.solve_qp` takes: Gx ≤ h, Ax = b, lb ≤ x ≤ ub, each if given.
+
+        The rows are those of G, of A, and of the variables that have a bound given.  Raises
+        ProblemError.
+        """
+        n = len(q)
+        box = None if lb is None and ub is None else np.eye(n)
+        low = np.full(n, -np.inf) if lb is None else lb
+        high = np.full(n, np.inf) if ub is None else ub
+        sides = ((G, np.full(np.shape(h), -np.inf), h), (A, b, b), (box, low, high))
+        given: list[Any] = [side for side in sides if side[0] is not None]
+        if any(end is None for _, _, end in given):
+            raise ProblemError("G needs h, and A needs b")
+        thin = any(is_sparse(matrix) for matrix, _, _ in given)
+        stack: Any = scipy.sparse.vstack if thin else np.vstack
+        rows = stack([matrix for matrix, _, _ in given]) if given else np.zeros((0, n))
+        l, u = (np.concatenate([[], *(np.atleast_1d(side[i]) for side in given)]) for i in (1, 2))  # noqa: E741
+        return Problem(P, q, rows, l, u)
+
     @cached_property
     def row_norm(self) -> Array:
         """Euclidean norm of each row of A, 1 for an empty row.  Returns (m,)."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -24,6 +24,7 @@ from qp_backends import Problem, Solution
 from qp_backends import solve as solve_qp
 
 Constraint = LinearConstraint | NonlinearConstraint
+Given = Constraint | Mapping[str, Any]  # or as `scipy.optimize.minimize` takes it
 Function = Callable[[Array], Array]
 COMPLEX_STEP = 1e-30
 QP_TOLERANCE = 1e-9
@@ -51,14 +52,15 @@ MESSAGES = {
 def minimize_max(
     fun: Callable[..., Any],
     x0: Any,
-    jac: Callable[..., Any] | str = "2-point",
+    jac: Callable[..., Any] | str | bool = "2-point",
     bounds: Bounds | Sequence[tuple[float | None, float | None]] | None = None,
-    constraints: Constraint | Sequence[Constraint] = (),
+    constraints: Given | Sequence[Given] = (),
     qp: str | Callable[[Problem], Solution] = "daqp",
     *,
     args: tuple[Any, ...] = (),
     tol: float = 1e-8,
     maxiter: int = 500,
+    options: Mapping[str, Any] | None = None,
     callback: Callable[[OptimizeResult], None] | None = None,
 ) -> OptimizeResult:
     """Minimise over x the largest of several smooth functions.
@@ -72,10 +74,10 @@ def minimize_max(
     jac
         (n,) -> (m, n), or "cs" for the complex step (exact; fun must take complex numbers),
         or "3-point" or "2-point" for finite differences (least accurate; where they do not
-        suffice, "3-point" follows).
+        suffice, "3-point" follows), or True where fun returns both.
     bounds, constraints
-        scipy.optimize's Bounds, LinearConstraint, NonlinearConstraint; bounds also as n
-        pairs, None where open.
+        scipy.optimize's Bounds, LinearConstraint, NonlinearConstraint, or its dictionaries
+        of type, fun, jac and args; bounds also as n pairs, None where open.
     qp
         Name of a QP backend, or a function from Problem to a verified Solution.
     args
@@ -85,6 +87,8 @@ def minimize_max(
         gain, to first order; and on violations relative to that way.
     maxiter
         QPs at most.
+    options
+        The same by name, as scipy.optimize takes them: tol, maxiter.
     callback
         Called with fun, nit, kkt after each QP.
 
@@ -113,10 +117,18 @@ def minimize_max(
         raise OptionError("minimize_max: x0 is empty; give the variables to begin with")
     if not np.all(np.isfinite(x)):
         raise OptionError("minimize_max: x0 holds NaN or infinite entries")
+    asked = {"tol": tol, "maxiter": maxiter, **(options or {})}
+    if unknown := asked.keys() - {"tol", "maxiter"}:
+        raise OptionError(f"minimize_max: options: no {min(unknown)}; they are tol and maxiter")
+    tol, maxiter = float(asked["tol"]), int(asked["maxiter"])
+    if jac is True:
+        fun, jac = apart(fun)
     if not (0.0 < tol < 1.0 and maxiter >= 1):
         raise OptionError(f"minimize_max: tol {tol:g}, maxiter {maxiter}: give tol between 0 and 1 "
                           "and maxiter of 1 or more")  # fmt: skip
-    listed = [constraints] if isinstance(constraints, Constraint) else list(constraints)
+    alone = isinstance(constraints, Constraint | Mapping)
+    several: Any = [constraints] if alone else constraints
+    listed = [as_scipys(one) for one in several]
     box = bounds if bounds is None or isinstance(bounds, Bounds) else box_of(bounds, len(x))
     ends = (-np.inf, np.inf) if box is None else (box.lb, box.ub)
     x = np.clip(x, *ends)
@@ -154,6 +166,33 @@ def minimize_max(
     if given and not far and (wrong := mistaken(problem, best.x, *ends)):
         return without_gradient(problem, best.x, count, wrong)
     return answer(problem, best, count, endless=far)
+
+
+def apart(fun: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Values and derivative of a function that returns both, which is asked once a place."""
+    last: list[Any] = [None, None]
+
+    def both(x: Array, *args: Any) -> Any:
+        if last[0] != (place := x.tobytes()):
+            last[:] = place, fun(x, *args)
+        return last[1]
+
+    return (lambda x, *args: both(x, *args)[0]), (lambda x, *args: both(x, *args)[1])
+
+
+def as_scipys(given: Any) -> Any:
+    """A constraint as it is, or of a dictionary of type, fun, jac, args.  Raises OptionError."""
+    if not isinstance(given, Mapping):
+        return given
+    if given.get("type") not in ("eq", "ineq") or not callable(given.get("fun")):
+        raise OptionError(
+            "minimize_max: constraints are scipy.optimize's, or dictionaries of type 'eq' or "
+            f"'ineq', fun, jac and args, not dict of {', '.join(map(str, given)) or 'nothing'}"
+        )
+    args, upper = given.get("args", ()), 0.0 if given["type"] == "eq" else np.inf
+    jac = given.get("jac")
+    slopes: Any = (lambda x: jac(x, *args)) if callable(jac) else jac or "2-point"
+    return NonlinearConstraint(lambda x: given["fun"](x, *args), 0.0, upper, jac=slopes)
 
 
 def mistaken(problem: MaxOfFunctions, x: Array, low: Any, high: Any) -> str:
@@ -292,7 +331,7 @@ def counted(function: Function, count: Count) -> Function:
 
 def derivative(
     function: Function,
-    jac: Callable[..., Any] | str,
+    jac: Callable[..., Any] | str | bool,
     args: tuple[Any, ...],
     count: Count,
     length: Array,
@@ -312,7 +351,7 @@ def derivative(
 
     if not callable(jac) and jac not in ("cs", "3-point", "2-point"):
         raise OptionError(
-            f"minimize_max: jac {jac!r}: give a function, 'cs', '3-point' or '2-point'"
+            f"minimize_max: jac {jac!r}: give a function, True, 'cs', '3-point' or '2-point'"
         )
     return run
 

@@ -3,9 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from qpsolvers import solve_qp
 from scipy import sparse
 
-from qp_backends import Problem, ProblemError
+from qp_backends import Problem, ProblemError, solve
 
 
 def test_data_become_float_arrays_and_far_bounds_open():
@@ -13,6 +14,27 @@ def test_data_become_float_arrays_and_far_bounds_open():
     assert problem.P.dtype == problem.q.dtype == problem.A.dtype == np.float64
     assert_array_equal(problem.l, [-np.inf])
     assert_array_equal(problem.u, [5.0])
+
+
+@pytest.mark.parametrize("kind", [np.asarray, sparse.csc_matrix])
+def test_what_qpsolvers_takes_has_the_same_answer(kind):
+    """Each part alone and all together, against qpsolvers itself."""
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(5, 4))
+    P, q = root.T @ root + np.eye(4), rng.normal(size=4)
+    parts = {
+        "G": kind(rng.normal(size=(3, 4))), "h": np.ones(3),
+        "A": kind(rng.normal(size=(1, 4))), "b": np.array([0.3]),
+        "lb": np.full(4, -0.5), "ub": np.full(4, 0.4),
+    }  # fmt: skip
+    for names in ((), ("G", "h"), ("A", "b"), ("lb",), ("ub",), tuple(parts)):
+        given = {name: parts[name] for name in names}
+        plain = {n: v.toarray() if sparse.issparse(v) else v for n, v in given.items()}
+        expected = solve_qp(P, q, solver="daqp", **plain)
+        found = solve(Problem.from_qpsolvers(kind(P), q, **given), "daqp")
+        assert_allclose(found.x, expected, atol=1e-9)
+    with pytest.raises(ProblemError, match="G needs h"):
+        Problem.from_qpsolvers(P, q, G=parts["G"])
 
 
 def test_read_only_data_are_copied():

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -204,6 +205,41 @@ def test_linear_and_nonlinear_constraints_with_bounds():
     assert found.violation < 1e-8
 
 
+def test_dictionaries_of_constraints_are_scipys():
+    """As `scipy.optimize.minimize` has them: ineq is not below 0; the same corner as above."""
+    found = mc.minimize_max(
+        lambda x: x,
+        [1.0, -0.1],
+        jac="cs",
+        bounds=[(None, None), (-0.5, None)],
+        constraints=(
+            {"type": "ineq", "fun": lambda x, c: x[0] - x[1] - c, "args": (0.4,)},
+            {"type": "eq", "fun": lambda x: x @ x - 1.0, "jac": lambda x: 2.0 * x},
+        ),
+    )
+    assert found.success
+    assert_allclose(found.x, [np.sqrt(0.75), -0.5], atol=1e-7)
+    one = {"type": "ineq", "fun": lambda x: x[0] - 2.0}
+    assert_allclose(mc.minimize_max(lambda x: x, [3.0], constraints=one).fun, 2.0, rtol=1e-7)
+
+
+def test_a_function_that_returns_both_is_asked_once_a_place():
+    cb2, seen = CLASSICS["CB2"], []
+
+    def both(x):
+        seen.append(tuple(x))
+        eye = 1e-30j * np.eye(len(x))
+        slopes = np.stack([cb2.fun(x + step).imag / 1e-30 for step in eye], axis=-1)
+        return cb2.fun(x), slopes
+
+    found = mc.minimize_max(both, (2.0, 2.0), jac=True)
+    assert found.success
+    assert_allclose(found.fun, 1.9522245, rtol=1e-7)
+    assert all(one != other for one, other in pairwise(seen))
+    few = mc.minimize_max(both, (2.0, 2.0), jac=True, options={"maxiter": 2})
+    assert (few.nit, few.success) == (2, False)
+
+
 def test_start_outside_the_bounds_is_brought_in():
     seen = []
 
@@ -241,6 +277,7 @@ def test_unbounded_problem_does_not_claim_success():
         ({"maxiter": 0}, "give tol between"),
         ({"fun": lambda x: x * np.nan}, "finite"),
         ({"constraints": [{"type": "ineq"}]}, "not dict"),
+        ({"options": {"ftol": 1e-9}}, "no ftol; they are tol and maxiter"),
         ({"constraints": LinearConstraint(np.eye(3), 0, 1)}, "3 columns"),
         ({"bounds": Bounds([1.0], [0.0])}, "above"),
     ],
