@@ -56,7 +56,7 @@ for title, one in (("with the true cause", found), ("without it", without)):
 # Gravity's effects are relatives, and what is left of the family stands in for the one that is
 # missing. The verdict is not ``named`` any more, the error stays above the noise, and some of it
 # still follows the pose: all three say that something is amiss. `How often a diagnosis is right
-# <../blind_study.html>`_ has the shares, also for this case.
+# <../trust.html>`_ has the shares, also for this case.
 #
 # An effect that was found is fitted together with the geometry, and belongs to the robot from
 # then on.

@@ -24,9 +24,9 @@ PARTS = {
         "simulator",
         "compensate",
     ),
-    "Coming from": ("from_robodk", "from_ros2", "from_mujoco", "from_matlab"),
+    "Coming from": ("from_robodk", "from_ros2", "from_matlab"),
     "Extend": ("own_effect", "backends"),
-    "Background": ("mathematics", "papers", "blind_study"),
+    "Background": ("mathematics", "papers", "trust"),
     "Reference": ("api/cli", "api/minimax_cal", "api/parts", "api/qp_backends"),
 }
 

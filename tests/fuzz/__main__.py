@@ -1,6 +1,6 @@
 """Hostile runs of every command, and a table of how they ended.
 
-python -m tests.fuzz --cases 10000 --seed 7          # the table, as docs/reliability.md has it
+python -m tests.fuzz --cases 10000 --seed 7          # the table; docs/trust.md has its last row
 python -m tests.fuzz --seed 7 --only 4711            # one of them again, with its files
 python -m tests.fuzz --each-option                   # every option with every odd value
 """
