@@ -151,8 +151,11 @@ class Problem:
         high = np.full(n, np.inf) if ub is None else ub
         sides = ((G, np.full(np.shape(h), -np.inf), h), (A, b, b), (box, low, high))
         given: list[Any] = [side for side in sides if side[0] is not None]
-        if any(end is None for _, _, end in given):
+        if (G is None, A is None) != (h is None, b is None):
             raise ProblemError("G needs h, and A needs b")
+        for name, (matrix, _, end) in zip(("G", "A", "lb and ub"), sides, strict=True):
+            if matrix is not None and np.shape(matrix) not in {(np.size(end), n), (n,)}:
+                raise ProblemError(f"{name}: rows of {n} numbers, one for each of its bounds")
         thin = any(is_sparse(matrix) for matrix, _, _ in given)
         stack: Any = scipy.sparse.vstack if thin else np.vstack
         rows = stack([matrix for matrix, _, _ in given]) if given else np.zeros((0, n))

@@ -101,6 +101,7 @@ def calibrate_command(
     given = of_any(rest, in_rows, to)
     if files.given or not isinstance(given, Measurements):
         refuse(("replicates", "in_rows", "without"), "is for points of a tracker")
+        refuse(CAMERAS - OPTIONS, "is for pixels alone")
         every = given if isinstance(given, list) else [given]
         return together(calibrate, robot, every, files, to, asked)
     with work(brief=replicates is None and given.poses <= BRIEF), to.stages() as progress:

@@ -61,6 +61,7 @@ def diagnose_command(
     given = of_any(data, in_rows, to)
     if isinstance(given, list):
         refuse(("in_rows", "jobs", "cluster"), "is for points of a tracker")
+        to.undrawn()
     found = to.work(diagnose, robot, given, **chosen)
     if isinstance(given, list):
         return to.finish(found, status=found.status)
@@ -79,6 +80,7 @@ def by_torques(robot: str, logs: tuple[Path, ...], to: Output, chosen: dict[str,
     from minimax_cal.cli.torques import model_of
     from minimax_cal.dynamics.diagnose import diagnose_motion
     from minimax_cal.dynamics.given import read_logs
+    from minimax_cal.reporting.plots.motion import save_motion
 
     known = {"holdout", "exclude"}
     refuse({*chosen, "in_rows"} - known, "is for measurements; minimax-cal torques has its own")
@@ -86,7 +88,7 @@ def by_torques(robot: str, logs: tuple[Path, ...], to: Output, chosen: dict[str,
     own = {name: chosen[name] for name in on_command_line() & known}
     to.took(*((run.source, f"torques of {run.joints} joints") for run in runs))
     found = to.work(diagnose_motion, model_of(robot, runs), runs, **own)
-    return to.finish(found, sentences=found.sentences())
+    return to.finish(found, sentences=found.sentences(), draw=save_motion)
 
 
 def every_table(found: Diagnosis) -> Iterator[Table]:

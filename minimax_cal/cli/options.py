@@ -327,6 +327,13 @@ class Output:
         if shown and len(texts) > MOST_NOTICES:
             tell("notice", f"and {len(texts) - MOST_NOTICES} more, in the JSON")
 
+    def undrawn(self) -> None:
+        """Raise OptionError where a picture is asked for and there is none."""
+        if self.figure:
+            raise OptionError(
+                f"{self.figure}: a picture is of points of a tracker alone; write a .json"
+            )
+
     def took(self, *sources: tuple[str, str]) -> None:
         """Say on stderr what files were taken for, once the work comes to something."""
         if not self.quiet:
@@ -492,6 +499,11 @@ def together(
     """What a verb says of data of any instruments, and of what cameras saw; the exit code."""
     from minimax_cal.fitting.several.cameras import detected
 
+    to.undrawn()
+    if "objective" in on_command_line() and chosen.get("objective", "sum") != "sum":
+        raise OptionError(
+            "objective= is for points of a tracker, or for pixels alone: leave it out"
+        )
     seen = [detected(*files.paths())] if files.given else []
     found = to.work(verb, robot, [*data, *seen], **chosen)
     return to.finish(found, status=found.status)

@@ -122,7 +122,7 @@ def calibrate_with(
 
 def measured(data: Given) -> Measurements | list[Instrument]:
     """Measurements as they are, of files, or of joints (m, n) and points.  Raises DataError."""
-    if isinstance(data, tuple) and isinstance(data[0], np.ndarray | list | tuple):
+    if isinstance(data, tuple) and data and isinstance(data[0], np.ndarray | list | tuple):
         return measurements(*(np.asarray(part, dtype=float) for part in data))
     return taken(data)  # type: ignore[arg-type]
 

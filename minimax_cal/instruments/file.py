@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeGuard
 
 import numpy as np
 
@@ -50,21 +51,33 @@ def taken(data: Given | Sequence[Given]) -> Measurements | list[Instrument]:
     Several files of trackers are campaigns of one arm.  Raises DataError.
     """
     given = [data] if isinstance(data, Given) else list(data)
+    if not given:
+        raise DataError("no file of measurements is given")
     every = [read_rows(one) if isinstance(one, str | Path) else one for one in given]
     if not all(map(of_tracker, every)):
-        return [as_instrument(one) for one in every]
+        return [
+            points(measurements_in(one)) if has_points(one) else as_instrument(one) for one in every
+        ]
+    paths = [one for one in given if isinstance(one, str | Path)]
+    if len(given) > max(len(paths), 1):
+        raise DataError("several sets of points are campaigns: give their files")
     if len(every) > 1:
-        return measured(given)  # type: ignore[arg-type]  # refuses what is no file
+        return measured(paths)
     lone = every[0]
     if isinstance(lone, Instrument):
         return lone.at
     return measurements_in(lone) if isinstance(lone, Rows) else lone
 
 
+def has_points(data: Rows | Instrument | Measurements) -> TypeGuard[Rows]:
+    """Whether a file has columns of reflectors."""
+    return isinstance(data, Rows) and any(map(TARGET.fullmatch, data.header))
+
+
 def of_tracker(data: Rows | Instrument | Measurements) -> bool:
     """Whether data are points of a tracker, or of nothing that is known."""
     if isinstance(data, Rows):
-        return any(map(TARGET.fullmatch, data.header)) or not is_announced(data.header)
+        return has_points(data) or not is_announced(data.header)
     return isinstance(data, Measurements) or data.kind == Points.kind
 
 

@@ -140,6 +140,10 @@ def evaluated(
     """As `evaluate`, with what the reader should know."""
     given = taken(data)
     if isinstance(given, list):
+        if len(given) > 1:
+            raise DataError("evaluate judges by one file at a time")
+        if new_frame:
+            raise OptionError("new_frame= is for points of a tracker: leave it out")
         return of_instrument(source, given[0], rung)
     data = given
     opened = open_result(source, rung)
@@ -199,6 +203,11 @@ def of_instrument(source: Given, one: Instrument, rung: int | None) -> Evaluatio
     seen = bool(data.digest) and data.digest in opened.digest.split()
     said = [f"{data.source}: what the instrument has of its own is fitted to these rows"]
     said += [f"{data.source}: the fit was made of these rows"] * seen
+    if found.rms_mm > 1e3 * POOR_FIT * robot.reach():
+        said.append(
+            f"{data.source}: the fit misses by {found.rms_mm:.3g} mm: check that data and fit "
+            "belong to the same robot, units and order of columns"
+        )
     return Evaluation(
         fit=opened.source,
         rung=step,

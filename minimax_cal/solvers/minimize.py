@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -52,7 +53,7 @@ MESSAGES = {
 def minimize_max(
     fun: Callable[..., Any],
     x0: Any,
-    jac: Callable[..., Any] | str | bool = "2-point",
+    jac: Callable[..., Any] | str | bool | None = "2-point",
     bounds: Bounds | Sequence[tuple[float | None, float | None]] | None = None,
     constraints: Given | Sequence[Given] = (),
     qp: str | Callable[[Problem], Solution] = "daqp",
@@ -119,7 +120,10 @@ def minimize_max(
         raise OptionError("minimize_max: x0 holds NaN or infinite entries")
     asked = {"tol": tol, "maxiter": maxiter, **(options or {})}
     if unknown := asked.keys() - {"tol", "maxiter"}:
-        raise OptionError(f"minimize_max: options: no {min(unknown)}; they are tol and maxiter")
+        named = min(map(str, unknown))
+        raise OptionError(f"minimize_max: options: no {named}; they are tol and maxiter")
+    if jac is None or jac is False:
+        jac = "2-point"
     tol, maxiter = float(asked["tol"]), int(asked["maxiter"])
     if jac is True:
         fun, jac = apart(fun)
@@ -174,7 +178,10 @@ def apart(fun: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., An
 
     def both(x: Array, *args: Any) -> Any:
         if last[0] != (place := x.tobytes()):
-            last[:] = place, fun(x, *args)
+            found = fun(x, *args)
+            if not (isinstance(found, tuple) and len(found) == 2):
+                raise OptionError("minimize_max: jac=True: fun is to return values and derivative")
+            last[:] = place, copy.deepcopy(found)
         return last[1]
 
     return (lambda x, *args: both(x, *args)[0]), (lambda x, *args: both(x, *args)[1])
@@ -184,15 +191,18 @@ def as_scipys(given: Any) -> Any:
     """A constraint as it is, or of a dictionary of type, fun, jac, args.  Raises OptionError."""
     if not isinstance(given, Mapping):
         return given
-    if given.get("type") not in ("eq", "ineq") or not callable(given.get("fun")):
+    kind, fun, jac = str(given.get("type")).lower(), given.get("fun"), given.get("jac")
+    if kind not in ("eq", "ineq") or not callable(fun):
         raise OptionError(
             "minimize_max: constraints are scipy.optimize's, or dictionaries of type 'eq' or "
             f"'ineq', fun, jac and args, not dict of {', '.join(map(str, given)) or 'nothing'}"
         )
-    args, upper = given.get("args", ()), 0.0 if given["type"] == "eq" else np.inf
-    jac = given.get("jac")
+    args, upper = given.get("args", ()), 0.0 if kind == "eq" else np.inf
+    args = args if isinstance(args, tuple) else (args,)
+    if jac is True:
+        fun, jac = apart(fun)
     slopes: Any = (lambda x: jac(x, *args)) if callable(jac) else jac or "2-point"
-    return NonlinearConstraint(lambda x: given["fun"](x, *args), 0.0, upper, jac=slopes)
+    return NonlinearConstraint(lambda x: fun(x, *args), 0.0, upper, jac=slopes)
 
 
 def mistaken(problem: MaxOfFunctions, x: Array, low: Any, high: Any) -> str:

@@ -70,6 +70,27 @@ def test_one_verb_calibrates_all(
     alike(by_python["parameters"], found["parameters"])
 
 
+@pytest.mark.parametrize("column", ["socket", "surface", "wire_tension", "flange_load"])
+def test_points_stay_points_beside_others(column, files, tmp_path, capsys):
+    """What a file is does not depend on its neighbours."""
+    more = tmp_path / "more.csv"
+    header, *rows = files["tracker"].read_text().splitlines()
+    more.write_text("\n".join([f"{header},{column}", *(f"{row},3" for row in rows)]) + "\n")
+    _, alone = answered(capsys, "calibrate", "irb2600", more, "--objective", "sum")
+    found, beside = answered(capsys, "calibrate", "irb2600", more, files["wires_3"])
+    assert alone[0] == beside[0] == f"taken: {more} holds points at 80 poses"
+    assert [one["kind"] for one in found["instruments"]] == ["points", "distances"]
+
+
+def test_nothing_and_sets_without_files_are_refused():
+    for verb in (mc.calibrate, mc.diagnose):
+        with pytest.raises(mc.DataError, match="no file of measurements is given"):
+            verb("irb2600", [])
+    data = mc.simulate("irb2600", 20, 1, seed=1).data
+    with pytest.raises(mc.DataError, match="give their files"):
+        mc.calibrate("irb2600", [data, data])
+
+
 def test_campaigns_of_a_tracker_stay_one_fit(
     files: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -82,6 +103,9 @@ def test_campaigns_of_a_tracker_stay_one_fit(
     ("kind", "options", "said"),
     [
         ("wires_3", ["--objective", "point"], "--objective is for points of a tracker"),
+        ("wires_3", ["--objective", "minimax"], "--objective is for points of a tracker"),
+        ("wires_3", ["--figure", "x.png"], "x.png: a picture is of points of a tracker alone"),
+        ("wires_3", ["-o", "x.png"], "x.png: a picture is of points of a tracker alone"),
         ("wires_3", ["--bootstrap", "20"], "--bootstrap is for points of a tracker"),
         ("wires_3", ["--known-distance", "A,B,500"], "--known-distance is for closures"),
         ("tracker", ["--offset"], "--offset is for distances"),
@@ -130,6 +154,8 @@ def test_a_fit_is_judged_by_any_instrument(
     other, _ = answered(capsys, "evaluate", by_tracker, files[kind])
     assert other["accuracy"]["rms_mm"] < 0.2 * drawn["accuracy"]["rms_mm"]
     assert other["training_poses"] == 0
+    assert run("evaluate", fit, files[kind], "--new-frame") == 2
+    assert "--new-frame is for points of a tracker" in capsys.readouterr().err
 
 
 def test_detections_are_data_where_cameras_are_given(

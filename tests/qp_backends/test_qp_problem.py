@@ -33,8 +33,15 @@ def test_what_qpsolvers_takes_has_the_same_answer(kind):
         expected = solve_qp(P, q, solver="daqp", **plain)
         found = solve(Problem.from_qpsolvers(kind(P), q, **given), "daqp")
         assert_allclose(found.x, expected, atol=1e-9)
-    with pytest.raises(ProblemError, match="G needs h"):
-        Problem.from_qpsolvers(P, q, G=parts["G"])
+    for wrong, said in (
+        ({"G": parts["G"]}, "G needs h"),
+        ({"h": parts["h"]}, "G needs h"),
+        ({"G": parts["G"], "h": np.ones(2)}, "G: rows of 4 numbers"),
+        ({"A": np.ones((1, 3)), "b": [1.0]}, "A: rows of 4 numbers"),
+        ({"lb": np.zeros(3)}, "has shape"),
+    ):
+        with pytest.raises(ProblemError, match=said):
+            Problem.from_qpsolvers(P, q, **wrong)
 
 
 def test_read_only_data_are_copied():

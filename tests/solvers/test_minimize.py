@@ -219,7 +219,7 @@ def test_dictionaries_of_constraints_are_scipys():
     )
     assert found.success
     assert_allclose(found.x, [np.sqrt(0.75), -0.5], atol=1e-7)
-    one = {"type": "ineq", "fun": lambda x: x[0] - 2.0}
+    one = {"type": "INEQ", "fun": lambda x: (x[:1] - 2.0, np.eye(1)), "jac": True}
     assert_allclose(mc.minimize_max(lambda x: x, [3.0], constraints=one).fun, 2.0, rtol=1e-7)
 
 
@@ -236,6 +236,8 @@ def test_a_function_that_returns_both_is_asked_once_a_place():
     assert found.success
     assert_allclose(found.fun, 1.9522245, rtol=1e-7)
     assert all(one != other for one, other in pairwise(seen))
+    with pytest.raises(mc.OptionError, match="values and derivative"):
+        mc.minimize_max(lambda x: x, (2.0, 2.0), jac=True)
     few = mc.minimize_max(both, (2.0, 2.0), jac=True, options={"maxiter": 2})
     assert (few.nit, few.success) == (2, False)
 
@@ -277,7 +279,7 @@ def test_unbounded_problem_does_not_claim_success():
         ({"maxiter": 0}, "give tol between"),
         ({"fun": lambda x: x * np.nan}, "finite"),
         ({"constraints": [{"type": "ineq"}]}, "not dict"),
-        ({"options": {"ftol": 1e-9}}, "no ftol; they are tol and maxiter"),
+        ({"options": {"ftol": 1e-9, 3: 1}}, "no 3; they are tol and maxiter"),
         ({"constraints": LinearConstraint(np.eye(3), 0, 1)}, "3 columns"),
         ({"bounds": Bounds([1.0], [0.0])}, "above"),
     ],

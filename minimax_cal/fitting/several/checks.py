@@ -79,7 +79,8 @@ def with_others(
     default, known = type(options)(), {one.name for one in fields(RelativeOptions)}
     chosen = {one.name: getattr(options, one.name) for one in fields(options)}
     for name, value in chosen.items():
-        if name not in known and value not in (getattr(default, name), "sum"):
+        is_sum = name == "objective" and value == "sum"
+        if not (name in known or is_sum or value == getattr(default, name)):
             raise OptionError(f"{name}= is for points of a tracker; {held_by(every)}: leave it out")
     return replace(others, **{name: value for name, value in chosen.items() if name in known})
 
