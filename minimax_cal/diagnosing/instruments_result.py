@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from minimax_cal.diagnosing.result import FOUND, Explained, Finding, ends_of
+from minimax_cal.diagnosing.result import VERDICTS as VERDICTS  # in annotations that are inherited
+from minimax_cal.diagnosing.result import Untestable as Untestable
 from minimax_cal.diagnosing.sentences import explained
 from minimax_cal.evidence.limits import LEVEL
 from minimax_cal.fitting.opened import RELATIVE
@@ -18,6 +20,7 @@ from minimax_cal.ground.results import Result, merged
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.modelling.effects.words import name_step
+from minimax_cal.solvers.status import Status as Status
 
 RIVALS = ("effect", "alternative", "similarity", "power", "fits worse by")
 
