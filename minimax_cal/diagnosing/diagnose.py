@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from minimax_cal.diagnosing.causes import (
     Causes,
@@ -65,6 +64,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.options import check_left_out, grouped, takes
 from minimax_cal.ground.stages import name_rung, number_step
+from minimax_cal.ground.threads import one_thread
 from minimax_cal.ground.words import name_first
 from minimax_cal.instruments.file import Given, taken
 from minimax_cal.measuring import checks
@@ -207,7 +207,7 @@ def diagnose(
         )
     notices = (*notices, *few_judges(raw.take(held)), *unplaced(raw, ~held))
     raw = stationed(robot, raw, ~held)
-    with threadpool_limits(limits=1, user_api="blas"):  # more would wait for each other, and longer
+    with one_thread():
         asked = Asked(robot, raw, held, options, jobs, cluster)
         return examined(asked, notices, progress, began)
 

@@ -30,7 +30,7 @@ from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.options import check_left_out, takes
-from minimax_cal.ground.threads import on_one_thread
+from minimax_cal.ground.threads import one_thread
 from minimax_cal.instruments.file import Given
 from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.scene import Scene
@@ -109,7 +109,7 @@ def diagnosed(
     return examined(asked, tuple(exclude), progress, began)
 
 
-@on_one_thread
+@one_thread()
 def examined(
     asked: Asked, exclude: tuple[str, ...], progress: Progress, began: float
 ) -> RelativeDiagnosis:

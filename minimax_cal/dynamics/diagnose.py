@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from scipy.special import ndtr
-from threadpoolctl import threadpool_limits
 
 from minimax_cal.dynamics.budget import (
     LeftOut,
@@ -52,6 +51,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import check_left_out, takes
 from minimax_cal.ground.stages import Progress, silent
+from minimax_cal.ground.threads import one_thread
 from minimax_cal.measuring.faults import Amount
 from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.robot import Robot, load_robot
@@ -131,7 +131,7 @@ def diagnose_motion(
     holdout, named = known.holdout, named_runs(prepared, known.holdout_run)
     if not (named or 0.0 < holdout < 1.0):
         raise OptionError(f"holdout={holdout:g} must lie between 0 and 1")
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_thread():
         made = examined(arm, prepared, folds_of(prepared, holdout, named), exclude, progress)
     said = tuple(dict.fromkeys(text for run in runs for text in run.notices))
     return replace(made, notices=(*said, *made.notices), seconds=time.perf_counter() - began)

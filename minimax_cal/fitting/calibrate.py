@@ -31,7 +31,7 @@ from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning
 from minimax_cal.ground.options import takes
-from minimax_cal.ground.threads import on_one_thread
+from minimax_cal.ground.threads import one_thread
 from minimax_cal.instruments import file
 from minimax_cal.instruments.file import taken
 from minimax_cal.instruments.instrument import Instrument
@@ -102,7 +102,7 @@ def calibrate(
     return cast(Fit, relative_with(robot, given, asked, progress))  # as nearly all data have it
 
 
-@on_one_thread
+@one_thread()
 def calibrate_with(
     robot: Robot | str | Path, data: Measurements, options: Options, progress: Progress
 ) -> Fit:

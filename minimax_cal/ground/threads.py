@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache, wraps
-from typing import ParamSpec, TypeVar
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
 
 from threadpoolctl import ThreadpoolController
-
-Given = ParamSpec("Given")
-Made = TypeVar("Made")
 
 
 @cache
@@ -18,12 +15,8 @@ def libraries() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def on_one_thread(verb: Callable[Given, Made]) -> Callable[Given, Made]:
-    """Make a function do its linear algebra by one thread."""
-
-    @wraps(verb)
-    def alone(*given: Given.args, **named: Given.kwargs) -> Made:
-        with libraries().limit(limits=1, user_api="blas"):
-            return verb(*given, **named)
-
-    return alone
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Linear algebra by one thread, within a block or, as a decorator, a function."""
+    with libraries().limit(limits=1, user_api="blas"):
+        yield

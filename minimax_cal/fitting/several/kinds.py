@@ -33,7 +33,7 @@ from minimax_cal.fitting.several.result import (
 )
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.options import takes
-from minimax_cal.ground.threads import on_one_thread
+from minimax_cal.ground.threads import one_thread
 from minimax_cal.instruments.check import check_instrument
 from minimax_cal.instruments.file import Given, as_instrument
 from minimax_cal.instruments.instrument import Instrument, checked
@@ -100,7 +100,7 @@ def relative(
     return relative_with(robot, data, options, progress)
 
 
-@on_one_thread
+@one_thread()
 def relative_with(
     robot: Robot | str | Path,
     data: Given | Sequence[Given],

@@ -33,7 +33,7 @@ from minimax_cal.fitting.several.result import InstrumentResult, Measured
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
-from minimax_cal.ground.threads import on_one_thread
+from minimax_cal.ground.threads import one_thread
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.aside import TOOL, SetAside
 from minimax_cal.measuring.checks import check_joints, limit_notices
@@ -96,7 +96,7 @@ def calibrate_pixels(
     return fitted(robot, data, options, progress, began)
 
 
-@on_one_thread
+@one_thread()
 def fitted(
     robot: Robot,
     data: PixelData,

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from minimax_cal.dynamics.diagnose import diagnose_motion
 from minimax_cal.dynamics.given import MotionKnown, Payload, read_logs, runs_of
@@ -19,6 +18,7 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
+from minimax_cal.ground.threads import one_thread
 from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.robots.urdf import MODELS
@@ -100,7 +100,7 @@ def motion_gap(
     runs = read_logs(model, logs)
     opened = open_model(model, runs[0].joints if runs else 0, tip)
     runs = runs_of(model, opened.chain.robot, runs)
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_thread():
         judge = Judge.of(opened, runs, known)
         judge = judge.driving(opened, gains) if driven else judge
         first, notices = [judge.rung("as given", opened.chain)], tuple[str, ...]()
