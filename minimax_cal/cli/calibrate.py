@@ -32,6 +32,7 @@ from minimax_cal.fitting.pixels.options import PixelFiles, PixelOptions
 from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.ground.files import json_text, plain
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.reading.rows import read_rows
 from minimax_cal.reporting.plots.figures import save_errors
 from minimax_cal.robots.kernels.choice import work
 from minimax_cal.solvers.status import Status
@@ -94,7 +95,7 @@ def calibrate_command(
         )
     if not files.given:
         refuse(CAMERAS, "is about what cameras see, with pixels=, joints= and camera=")
-    files, rest = files.among(data)
+    files, rest = files.among([read_rows(path) for path in data])
     if files.given and not rest:
         return by_cameras(robot, files, to, chosen)
     asked = {name: chosen[name] for name in chosen if name in OPTIONS}

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from minimax_cal.fitting.pixels.options import PixelFiles
     from minimax_cal.instruments.instrument import Instrument
     from minimax_cal.measuring.measurements import Measurements
+    from minimax_cal.reading.rows import Rows
 
 WIDTH = 110  # of text that goes to no terminal
 FIRST_WIDTH = 80  # of a first screen, which any terminal can show
@@ -469,23 +470,29 @@ def measured(paths: Sequence[Path], in_rows: bool) -> Measurements:
     in_rows: visited row by row, where they tell no order.
     """
     from minimax_cal.measuring.campaigns import read_campaigns
+
+    return visited(read_campaigns(paths), in_rows)
+
+
+def visited(data: Measurements, in_rows: bool) -> Measurements:
+    """Measurements as they are, or visited row by row where they tell no order."""
     from minimax_cal.measuring.history import ordered
 
-    data = read_campaigns(paths)
     return data.in_visit_order() if in_rows and not ordered(data) else data
 
 
-def of_any(paths: Sequence[Path], in_rows: bool, to: Output) -> Measurements | list[Instrument]:
+def of_any(
+    files: Sequence[Path | Rows], in_rows: bool, to: Output
+) -> Measurements | list[Instrument]:
     """`measured` of trackers, or what else the files hold; stderr says what each was taken for."""
     from minimax_cal.instruments.file import taken
-    from minimax_cal.measuring.history import ordered
 
-    data = taken(paths)
+    data = taken(files)
     if isinstance(data, list):
         to.took(*((one.at.source, f"{one.kind} at {one.poses} poses") for one in data))
         return data
     to.took((data.source, f"points at {data.poses} poses"))
-    return data.in_visit_order() if in_rows and not ordered(data) else data
+    return visited(data, in_rows)
 
 
 def together(

@@ -45,8 +45,8 @@ def columns_of(path: Path | str, header: Sequence[str]) -> Columns:
     return first[0][1]
 
 
-def taken(data: Given | Sequence[Given]) -> Measurements | list[Instrument]:
-    """What data, or their files, hold: points of trackers alone, or measurements of instruments.
+def taken(data: Given | Sequence[Given | Rows]) -> Measurements | list[Instrument]:
+    """What data, their files or rows hold: points of trackers, or measurements of instruments.
 
     Several files of trackers are campaigns of one arm.  Raises DataError.
     """
@@ -58,7 +58,7 @@ def taken(data: Given | Sequence[Given]) -> Measurements | list[Instrument]:
         return [
             points(measurements_in(one)) if has_points(one) else as_instrument(one) for one in every
         ]
-    paths = [one for one in given if isinstance(one, str | Path)]
+    paths = [one.path for one in every if isinstance(one, Rows)]
     if len(given) > max(len(paths), 1):
         raise DataError("several sets of points are campaigns: give their files")
     if len(every) > 1:

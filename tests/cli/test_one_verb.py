@@ -156,6 +156,13 @@ def test_a_fit_is_judged_by_any_instrument(
     assert other["training_poses"] == 0
     assert run("evaluate", fit, files[kind], "--new-frame") == 2
     assert "--new-frame is for points of a tracker" in capsys.readouterr().err
+    with pytest.raises(mc.DataError, match="one file at a time"):
+        mc.evaluate(fit, [files["wires_3"], files["poses"]])
+    wrong = tmp_path / "wrong.json"
+    made["robot"] = mc.load_robot("ur10").to_dict()
+    wrong.write_text(json.dumps(made))
+    _, said = answered(capsys, "evaluate", wrong, files[kind])
+    assert any("the fit misses by" in line for line in said)
 
 
 def test_detections_are_data_where_cameras_are_given(
@@ -166,3 +173,9 @@ def test_detections_are_data_where_cameras_are_given(
     assert pixels == "--pixels"
     found, _ = answered(capsys, "calibrate", "ur5", detections, *rest)
     alike(found, answered(capsys, "calibrate", "ur5", pixels, detections, *rest)[0])
+    beside = tmp_path / "tracker.csv"
+    mc.write_measurements(beside, mc.simulate(cell.drawn, 30, 1, seed=1).data)
+    assert run("calibrate", "ur5", beside, detections, *rest, "--drawn-prior") == 2
+    assert "--drawn-prior is for pixels alone" in capsys.readouterr().err
+    assert run("calibrate", "ur5", detections) == 2
+    assert "cameras need all three of --pixels" in capsys.readouterr().err

@@ -14,7 +14,7 @@ from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import grouped
-from minimax_cal.reading.rows import read_rows
+from minimax_cal.reading.rows import Rows
 
 SUM, WORST_TARGET, WORST_CAMERA = OBJECTIVES = ("sum", "minimax", "camera")
 # How well a camera's file knows its lens: a share of the focal length, pixels of the centre, and
@@ -95,11 +95,11 @@ class PixelFiles:
         """Whether anything is."""
         return any(vars(self).values())
 
-    def among(self, data: Sequence[Path]) -> tuple[PixelFiles, list[Path]]:
+    def among(self, data: Sequence[Rows]) -> tuple[PixelFiles, list[Rows]]:
         """The same with what cameras saw where it is a file of the data, and the other files."""
-        seen = [] if self.pixels else [path for path in data if {*read_rows(path).given} >= PIXELS]
-        rest = [path for path in data if path not in seen]
-        return (replace(self, pixels=seen[0]) if seen else self), [*seen[1:], *rest]
+        seen = [] if self.pixels else [one for one in data if {*one.given} >= PIXELS]
+        rest = [one for one in data if one not in seen]
+        return (replace(self, pixels=Path(seen[0].path)) if seen else self), [*seen[1:], *rest]
 
     def paths(self) -> tuple[Path, Path, dict[str, str], Path | None]:
         """Detections, joints, cameras by name, board.  Raises OptionError."""
