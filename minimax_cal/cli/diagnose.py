@@ -36,7 +36,7 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.measuring.history import with_history
 from minimax_cal.reporting.plots.diagnosis import save_diagnosis
-from minimax_cal.reporting.tables import effects_list, effects_table, remainder_table, where_tables
+from minimax_cal.reporting.tables import effects_list, effects_table, remaining_table, where_tables
 from minimax_cal.solvers.status import Status
 
 
@@ -93,7 +93,7 @@ def by_torques(robot: str, logs: tuple[Path, ...], to: Output, chosen: dict[str,
 
 def every_table(found: Diagnosis) -> Iterator[Table]:
     """Those of the result, and of where its errors lie."""
-    yield from (*found.tables(), *filled(remainder_table(found)))
+    yield from (*found.tables(), *filled(remaining_table(found)))
     yield from where_tables(found.where)
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.diagnosing.where import joint_equivalent
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.records import array
@@ -130,6 +129,32 @@ def turns(left: Leftover) -> list[Array]:
     jacobian = np.concatenate([left.scene.jacobian] * count, axis=-1)
     together = np.concatenate(left.views, axis=1)
     return np.split(joint_equivalent(together, jacobian, left.noise), count, axis=0)
+
+
+def joint_equivalent(error: Array, jacobian: Array, noise: float) -> Array:
+    """Turns of the joints that would make the errors of each pose: (m, n) [rad, m].
+
+    Ridge least squares, min |e - S dq|^2 + lambda |dq|^2 with lambda = noise^2 / turn^2, where turn
+    is the RMS turn that would make all of the error if every joint had its part.  Without ridge a
+    wrist in line, or a single target, would ask for endless turns.
+
+    error: (k, m, 3), NaN where not measured [m].  jacobian: (n, k, 3, m) by the joints.  noise: of
+    a coordinate, NaN unknown [m].
+    """
+    n, k, _, m = jacobian.shape
+    rows = np.moveaxis(error, 0, 1).reshape(m, 3 * k)
+    seen = np.isfinite(rows)
+    rows = np.where(seen, rows, 0.0)
+    motion = jacobian.transpose(3, 1, 2, 0).reshape(m, 3 * k, n) * seen[..., None]
+    gram = np.swapaxes(motion, 1, 2) @ motion
+    size = np.trace(gram, axis1=1, axis2=2).mean()
+    square = (rows**2).sum(1).mean()
+    if not (size > 0.0 and square > 0.0):
+        return np.zeros((m, n))
+    floor = max(noise**2 if np.isfinite(noise) else 0.0, 1e-4 * square / seen.sum(1).mean())
+    ridge = floor * size / square
+    gradient = np.swapaxes(motion, 1, 2) @ rows[..., None]
+    return np.asarray(np.linalg.solve(gram + ridge * np.eye(n), gradient)[..., 0])
 
 
 def guilty(left: Leftover, turn: list[Array]) -> int:

@@ -36,16 +36,16 @@ from minimax_cal.diagnosing.gap import (
     with_shares,
 )
 from minimax_cal.diagnosing.joint import Joint
-from minimax_cal.diagnosing.last_question import known_noise
+from minimax_cal.diagnosing.last_question import down_to, known_noise
 from minimax_cal.diagnosing.moved import session_notices
-from minimax_cal.diagnosing.remainder import remainder
+from minimax_cal.diagnosing.remaining import remaining_of
 from minimax_cal.diagnosing.reseats import sized, with_targets
 from minimax_cal.diagnosing.result import Diagnosis, Finding, Step
 from minimax_cal.diagnosing.set_aside import judged_with
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.diagnosing.tails import are_wrong, unpulled, wrong_rows
 from minimax_cal.diagnosing.verdict import explanation
-from minimax_cal.diagnosing.where import Where, where
+from minimax_cal.diagnosing.where import where
 from minimax_cal.evidence.alternatives import resemblances
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
@@ -77,7 +77,7 @@ from minimax_cal.measuring.faults import (
     standing_out,
 )
 from minimax_cal.measuring.faults.nests import RESEAT
-from minimax_cal.measuring.floor import DISTANCES, Floor, floor_of, instrument_noise, noise_at_most
+from minimax_cal.measuring.floor import DISTANCES, Floor, floor_of, noise_at_most
 from minimax_cal.measuring.grouping import clusters, held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.instrument import with_instrument
@@ -257,13 +257,15 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     effects = valued(spoken.effects, ladder)
     findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.least)
     step_of(REMAINING)
-    rest = remainder(ladder.last, floor)
+    judge = steps[-1].trusted if steps[-1].trusted.poses else steps[-1].train
+    rest, complete = remaining_of(causes.left, judge.rms_mm, floor, clean.data)
     known = known_noise(ladder.last, floor, clean.data, robot.repeatability)
     beyond = NOT_ASKED if options.quick else beyond_of(study, causes, judges, step_of(PARTS))
     wrong = against(robot, floor, steps[-1])
     gone, counted = judged_with(asked.data, clean.data, clean.left, judges.held, ladder.last.cell)
+    told = explanation(findings, causes, known, study.fit.status, failed=bool(wrong))
     return Diagnosis(
-        **explanation(findings, causes, known, study.fit.status, failed=bool(wrong)),
+        **{**told, "meets_floor": down_to(known, complete)},
         robot=robot.name,
         ladder=tuple(steps),
         floor=floor,
@@ -271,7 +273,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         closed_ci=interval,
         beyond=beyond,
         noise=float(np.sqrt(study.uneven * causes.choice.noise.variance)),  # of a mean coordinate
-        where=located(study).to_dict(),
+        where=where(study).to_dict(),
         notices=(
             *asked.data.notices,
             *notices,
@@ -284,7 +286,8 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         held=~np.isin(clean.data.line, train.line),
         cells=tuple(fit.cell for fit in ladder.fits),
         nominal=study.nominal,
-        remainder=rest,
+        remaining=rest,
+        floor_known=complete,
         set_aside=gone,
         with_them=counted,
     )
@@ -398,20 +401,6 @@ def against(robot: Robot, floor: Floor, last: Step) -> str:
     known = (floor.value, floor.source) if certain else None
     scores = {"training": (last.train, last.train), "held-out": (last.holdout, last.trusted)}
     return too_far(robot, known, scores)
-
-
-def located(study: Study) -> Where:
-    """Where the geometric errors of the training poses lie."""
-    state = study.fit.state
-    return where(
-        study.data,
-        study.model.error(state),
-        study.scene.jacobian,
-        study.geometric.base,
-        instrument_noise(study.data),
-        fitted=study.model.jacobian(state)[..., study.fit.identification.active],
-        up=study.robot.up,
-    )
 
 
 # ---- data faults -------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.diagnosing.joint import Joint
-from minimax_cal.diagnosing.remainder import (
+from minimax_cal.diagnosing.left_out import (
     SHAPES,
     Beside,
     Block,

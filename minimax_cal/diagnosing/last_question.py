@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from minimax_cal.diagnosing.joint import Joint
-from minimax_cal.diagnosing.remainder import joint_units
+from minimax_cal.diagnosing.left_out import joint_units
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.evidence.limits import MAX_JOINT_JITTER, MAX_OVER_NOISE
 from minimax_cal.fitting.intervals import rms_interval
@@ -54,6 +54,15 @@ class Known:
     def is_repeatable(self) -> bool:
         """False where visits to one pose scatter more than instrument and sound joints do."""
         return not self.visits > MAX_OVER_NOISE * self.expected
+
+
+def down_to(known: Known, complete: bool) -> bool | None:
+    """Whether a model is down to the noise; None where that is not known.
+
+    complete: whether all noise is: where it is not, more may be the model's than sound joints do.
+    """
+    above = known.meets_floor is False
+    return not above if complete or above else None
 
 
 def known_noise(last: Joint, floor: Floor, data: Measurements, repeatability: float) -> Known:

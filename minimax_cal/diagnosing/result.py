@@ -14,6 +14,7 @@ import numpy as np
 
 from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual_curve
 from minimax_cal.evidence.limits import BAND, CONFIRMED, ENOUGH, LEVEL
+from minimax_cal.evidence.remains import FOLLOWING
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.set_aside import aside_sentence
@@ -273,26 +274,68 @@ def of_curve(curve: Array) -> list[dict[str, Any]]:
     ]
 
 
-class Share(NamedTuple):
-    """A share of what is predictable without a name, and its place."""
+class Dependence(NamedTuple):
+    """What errors still follow: a motion of a place, by a driver.
+
+    rms_mm: RMS distance of it, as far as it tells.  p: chance that anything that was asked is so
+    loud.
+    """
 
     place: str
-    share: float
+    driver: str
+    rms_mm: float
+    p: float
+
+    @property
+    def name(self) -> str:
+        """As J2 following time."""
+        return f"{self.place}{FOLLOWING}{self.driver}"
 
 
 @dataclass(frozen=True)
-class Remainder:
-    """What is left beneath the names, on groups of training poses left out in turn.
+class Remaining:
+    """What the last step leaves, by where it comes from; the squares of the parts add up.
 
-    predictable_mm: RMS distance that free functions of the joints predict, 0 where they do not.
-    where: place and share of each, the largest first.  unpredictable_mm: RMS distance that stays.
-    floor_mm: ends of what noise alone leaves, None where nothing tells.
+    depends: what it certainly follows, the loudest first; they overlap, so the first is the part.
+    unexplained_mm: RMS distance that neither that nor known noise accounts for.  noise_mm: of the
+    noise, NaN where nothing tells; noise_from: how it is known.
     """
 
-    predictable_mm: float
-    where: tuple[Share, ...]
-    unpredictable_mm: float
-    floor_mm: tuple[float, float] | None
+    depends: tuple[Dependence, ...]
+    unexplained_mm: float
+    noise_mm: float
+    noise_from: str
+
+    @property
+    def dependent_mm(self) -> float:
+        """RMS distance of what errors follow, 0 where that is nothing."""
+        return self.depends[0].rms_mm if self.depends else 0.0
+
+    def in_short(self, floor: tuple[float, float] | None) -> dict[str, Any]:
+        """For JSON: what could be predicted, what not.  floor: ends of the noise [mm]."""
+        noise = float(np.nan_to_num(self.noise_mm))
+        return {
+            "predictable_mm": self.dependent_mm,
+            "where": [{"place": one.place, "share": 1.0} for one in self.depends[:1]],
+            "unpredictable_mm": math.hypot(self.unexplained_mm, noise),
+            "floor_mm": floor,
+        }
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """One measurement to make next.
+
+    kind: of it.  text: for whoever carries it out.  settles: what is known then.  poses_file: of
+    its poses, None where any will do.  power: to tell that, `ENOUGH` does; None where that is not
+    worked out.
+    """
+
+    kind: str
+    text: str
+    settles: str
+    poses_file: str | None = None
+    power: float | None = None
 
 
 @dataclass(frozen=True)
@@ -412,7 +455,8 @@ class Diagnosis(Explained, Result):
     where: see `where.Where.to_dict`.  data: as it was fitted, faults mended; held: (m,) True where
     held out.  cells: geometric, then with each effect.  nominal: before, None in an old file.
     set_aside: points that no fit counts; with_them: how the last step does where they count.
-    remainder: what free functions still predict, None in an old file.
+    remaining: what the last step leaves, None in an old file.  floor_known: whether all noise
+    beneath it is: that of the joints, which only visits to one pose tell, where it matters.
     stated_errors, stated_curves: as they stand in the file that the diagnosis was read from.
     """
 
@@ -436,9 +480,10 @@ class Diagnosis(Explained, Result):
     stated_errors: Annotated[tuple[Array, Array] | None, APART] = None
     stated_curves: Annotated[Mapping[str, Curve] | None, APART] = None
     nominal: Annotated[Cell | None, APART] = None
-    remainder: Remainder | None = None
+    remaining: Remaining | None = None
     set_aside: tuple[SetAside, ...] = ()
     with_them: Annotated[Accuracy | None, Fact(key="accuracy.holdout_with_them", brief=True)] = None
+    floor_known: bool = True
 
     def __repr__(self) -> str:
         return f"<Diagnosis of {self.robot}: {self.verdict}. {self.headline()}>"
@@ -451,11 +496,11 @@ class Diagnosis(Explained, Result):
         return reasons(self)
 
     @derived()
-    def next(self) -> str | None:
-        """The one measurement to make next, as a sentence; None where none is worth it."""
-        from minimax_cal.diagnosing.sentences import proposal
+    def next(self) -> Proposal | None:
+        """The one measurement to make next; None where none is worth it."""
+        from minimax_cal.diagnosing.proposals import proposal
 
-        return proposal(self) or None
+        return proposal(self)
 
     @property
     def excess(self) -> str:
@@ -501,7 +546,7 @@ class Diagnosis(Explained, Result):
         explained, gain = self.minor_sizes
         errors = dict(zip(("geometric", "final"), self.errors, strict=True))
         return {
-            "floor_known": self.floor.certain,
+            "remainder": self.remaining.in_short(self.floor.ends) if self.remaining else None,
             "effects": self.effects,
             "gap": {
                 **held,

@@ -6,17 +6,23 @@ import math
 from collections.abc import Sequence
 
 from minimax_cal.diagnosing.last_question import ABOVE_NOISE, ONLY_MINOR
-from minimax_cal.diagnosing.result import Alternative, Diagnosis, Explained, Finding
+from minimax_cal.diagnosing.result import (
+    Alternative,
+    Dependence,
+    Diagnosis,
+    Explained,
+    Finding,
+    Remaining,
+)
 from minimax_cal.evidence.limits import HALF, STRUCTURE
-from minimax_cal.ground.words import capitalise
-from minimax_cal.modelling.effects.words import name_place, name_structure
+from minimax_cal.measuring.floor import REPEATS
+from minimax_cal.modelling.effects.words import name_chance, name_structure
 from minimax_cal.solvers.status import Status
 
 Named = Finding | Alternative
 NOTHING_MM = 5e-4  # of a length that is reported to three digits
 MAX_NAMED_MINOR = 2  # more minor effects than this are counted, not listed
-REVISIT = "Recommended: visit 10 poses twice, to know the measurement noise."
-ALL_JOINTS = "all joints together"  # no single joint predicts it
+NOT_VISITED = "it is not known whether the remaining error is the arm's repeatability"
 CONTRADICTED = (
     "Unexplained: the best fit contradicts the measurements. It is no calibration of this arm, and "
     "says nothing about causes."
@@ -39,7 +45,8 @@ def reasons(found: Diagnosis) -> tuple[str, ...]:
     """
     if found.status is Status.FAILED:
         return (CONTRADICTED,)
-    return tuple(
+    following = found.next
+    first, *others = (
         sentence
         for sentence in (
             *causes_first(found),
@@ -47,11 +54,13 @@ def reasons(found: Diagnosis) -> tuple[str, ...]:
             shrunk(found),
             remaining(found),
             away(found),
-            proposal(found),
+            f"Recommended: {following.text}, to know {following.settles}." if following else "",
             possible([f for f in found.by_rung if not f.established]),
         )
         if sentence
     )
+    known = "." if found.floor_known else f"; {NOT_VISITED}."
+    return (f"{first.removesuffix('.')}{known}", *others)
 
 
 def explained(found: Explained) -> tuple[str, ...]:
@@ -108,8 +117,8 @@ def unexplained(found: Explained) -> str:
     after = "after all effects" if sure else "after geometry"
     guess = " An effect that the library lacks may contribute to the causes above." if sure else ""
     return (
-        f"the error {after} is not random ({left}; p = {found.structure:.1g}, significant below "
-        f"{STRUCTURE:g}), and no known effect explains it.{guess}"
+        f"the error {after} is not random ({left}; p {name_chance(found.structure)}), and no known "
+        f"effect explains it.{guess}"
     )
 
 
@@ -238,26 +247,29 @@ def without_far(found: Diagnosis) -> str:
 
 
 def remaining(found: Diagnosis) -> str:
-    """The remaining error: what depends on the pose, what looks random, and the noise."""
-    floor, left = found.floor, found.remainder
-    noise = (
-        f"measurement noise is {floor.value:.3f} mm ({floor.source})"
-        if floor.certain
-        else f"measurement noise is at most {floor.value:.3f} mm (from the residuals)"
-    )
-    if left is None:
-        return f"{capitalise(noise)}."
-    if left.predictable_mm < NOTHING_MM:
-        return f"The remaining {found.ladder[-1].holdout.rms_mm:.3f} mm looks random; {noise}."
-    where = ", ".join(
-        f"{ALL_JOINTS if place == 'all' else name_place(place)} {100.0 * share:.0f} %"
-        for place, share in left.where[:3]
-    ).removesuffix(" 100 %")
-    named = f" ({where})" if where else ""
-    return (
-        f"Remaining error: {left.predictable_mm:.3f} mm depends on the pose{named}, "
-        f"{left.unpredictable_mm:.3f} mm looks random (noise and repeatability); {noise}."
-    )
+    """The remaining error: what is noise, what depends on something, and what nothing explains."""
+    if found.remaining is None:
+        return ""
+    rms = found.ladder[-1].trusted.rms_mm
+    return f"Remaining error {rms:.3f} mm RMS: {', '.join(parts_of(found, found.remaining))}."
+
+
+def parts_of(found: Diagnosis, left: Remaining) -> list[str]:
+    """What remains, part by part."""
+    own = "measurement noise" if left.noise_from == REPEATS else "the instrument's noise"
+    noise = f"{left.noise_mm:.3f} mm is {own} ({left.noise_from})"
+    parts = [noise if math.isfinite(left.noise_mm) else "its noise is not known"]
+    parts += [dependence(one) for one in left.depends[:1]] or ["no dependence was found"]
+    within = found.floor_known and found.meets_floor  # the noise is no surer than that
+    if left.unexplained_mm >= NOTHING_MM and not within:
+        what = "is unexplained" if found.floor_known else "may be the arm's repeatability"
+        parts.append(f"{left.unexplained_mm:.3f} mm {what}")
+    return parts
+
+
+def dependence(one: Dependence) -> str:
+    """How much of an error depends on what."""
+    return f"{one.rms_mm:.3f} mm is {name_structure(one.name)} (p {name_chance(one.p)})"
 
 
 def away(found: Diagnosis) -> str:
@@ -270,32 +282,3 @@ def away(found: Diagnosis) -> str:
             "do not extrapolate."
         )
     return text
-
-
-def proposal(found: Diagnosis) -> str:
-    """The one measurement to make next: what settles causes, else what shows the noise."""
-    settles = next_measurement([f for f in found.by_rung if f.established])
-    return settles or ("" if found.floor.certain else REVISIT)
-
-
-def next_measurement(causes: Sequence[Finding]) -> str:
-    """The one measurement that settles most of the gap; empty where none would.
-
-    That is causes by their share, and of equal ones the most alternatives.
-    """
-    by_text: dict[str, list[tuple[Finding, Alternative]]] = {}
-    for finding in causes:
-        for other in finding.alternatives:
-            if other.helps:
-                by_text.setdefault(other.separate_with, []).append((finding, other))
-    if not by_text:
-        return ""
-
-    def settled(pairs: Sequence[tuple[Finding, Alternative]]) -> tuple[float, int]:
-        shares = {f.term.key: f.share for f, _ in pairs if f.share > 0.0}
-        return sum(shares.values()), len(pairs)
-
-    text, pairs = max(by_text.items(), key=lambda entry: settled(entry[1]))
-    named = names_of(list({f.name: f for f, _ in pairs}.values()), " and ")
-    others = names_of(list({a.name: a for _, a in pairs}.values()), " and ")
-    return f"Recommended: {text}, to distinguish {named} from {others}."

@@ -10,7 +10,7 @@ import numpy as np
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.limits import MAX_JOINT_JITTER, STRUCTURE, WORTH
 from minimax_cal.evidence.noise import Noise, Problem, restricted
-from minimax_cal.evidence.remains import Remains, remains, rest_of
+from minimax_cal.evidence.remains import Asked, Remains, asked, rest_of
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
@@ -26,9 +26,9 @@ def left_by(study: Study, choice: Choice, more: Array | None = None) -> tuple[Re
 
     more: (N, q) columns that were fitted besides.
     """
+    known = choice.doubted if more is None else np.concatenate([choice.doubted, more], axis=1)
     if choice.noise.variance < study.rows.exact**2:
         return (NOTHING,)
-    known = choice.doubted if more is None else np.concatenate([choice.doubted, more], axis=1)
     return left_over(study.scene, study.rows, known, motions(choice))
 
 
@@ -36,9 +36,22 @@ def left_over(
     scene: Scene, rows: Posed, known: Array, named: Sequence[tuple[str, Array]] = ()
 ) -> tuple[Remains, ...]:
     """What geometry and known columns (N, q) leave.  named: motions as `components` has them."""
-    noise = anchored(restricted(rows, known), rows)
-    asked = list(components(scene, rows, named))
-    return remains(rest_of(rows, noise, known, rows.turn), asked) or (NOTHING,)
+    return asked_of(scene, rows, known, named).loud_ones or (NOTHING,)
+
+
+def asked_of(
+    scene: Scene,
+    rows: Posed,
+    known: Array | None = None,
+    named: Sequence[tuple[str, Array]] = (),
+) -> Asked:
+    """Everything that may remain, asked of what geometry and known columns leave.
+
+    As `left_over`.
+    """
+    columns = np.zeros((len(rows.error), 0)) if known is None else known
+    noise = anchored(restricted(rows, columns), rows)
+    return asked(rest_of(rows, noise, columns, rows.turn), list(components(scene, rows, named)))
 
 
 def anchored(noise: Noise, rows: Problem) -> Noise:
@@ -57,7 +70,11 @@ def motions(choice: Choice) -> list[tuple[str, Array]]:
     return out
 
 
+def certain(left: Sequence[Remains]) -> list[Remains]:
+    """What certainly remains and matters."""
+    return [one for one in left if one.p < STRUCTURE and one.share > WORTH]
+
+
 def loudest(left: Sequence[Remains]) -> Remains | None:
-    """What certainly remains and matters; None where nothing does."""
-    loud = [one for one in left if one.p < STRUCTURE and one.share > WORTH]
-    return loud[0] if loud else None
+    """Of what certainly remains and matters the loudest; None where nothing does."""
+    return next(iter(certain(left)), None)

@@ -75,8 +75,7 @@ CERTAIN = 1e-6  # chance below which something is there: a cause, though no name
 # noises so unlike each other that rows are weighed once more
 HALF = 0.5  # of what is there, by its size: more under no name that holds, and nothing is named
 MAX_OVER_NOISE = 1.1  # error, or scatter of visits, over the noise that may be: less is no matter
-TARGETS_SCATTER = 0.01  # chance of their distances below which targets move by themselves
-LEAST_SCATTER_DOF = 8.0  # of which the scatter of targets or visits is told
+MAX_ALONE = 1.2  # error over the instrument's noise: more may be the joints', which visits tell
 DISAGREE = 3.0  # sigmas by which the foot's reflectors contradict a law
 
 # ---- wrong points --------------------------------------------------------------------------------

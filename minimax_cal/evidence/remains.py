@@ -58,6 +58,11 @@ class Component:
     motion: Array
     feature: Array | Fading
 
+    @property
+    def functions(self) -> int:
+        """How many functions its motion may follow."""
+        return self.feature.shape[1] if isinstance(self.feature, np.ndarray) else len(self.motion)
+
 
 @dataclass(frozen=True)
 class Remains:
@@ -138,31 +143,59 @@ def rest_of(rows: Problem, noise: Noise, known: Array, turn: Array) -> Rest:
     return Rest(rest, basis, root, dof, rows.group[:: turn.shape[1]], turn)
 
 
-def remains(rest: Rest, components: Sequence[Component]) -> tuple[Remains, ...]:
-    """Components that the rest may hold, the loudest first, each with the chance of it."""
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What was asked of a rest, and how loud each component of it is.
+
+    score, p: (c,) as in `Remains`.  loud: numbers of those that chance does not make so loud, of
+    which alone it is known whether they scatter.  drawn: (N, 1 + b) the rows, and rows by chance.
+    """
+
+    rest: Rest
+    components: Sequence[Component]
+    score: Array
+    p: Array
+    loud: Sequence[int]
+    drawn: Array
+
+    @property
+    def loud_ones(self) -> tuple[Remains, ...]:
+        """Components that the rest may hold, the loudest first."""
+        return self.loudest(self.loud, SHOWN)
+
+    def loudest(self, numbers: Sequence[int], most: int) -> tuple[Remains, ...]:
+        """Of some components those that are least by chance."""
+        order = sorted(numbers, key=lambda i: (self.p[i], -self.score[i], i))
+        return tuple(self.told(i) for i in order[:most])
+
+    def told(self, number: int) -> Remains:
+        """What is known of a component."""
+        one = self.components[number]
+        share = share_of(self.rest, one, self.drawn)
+        score, p = float(self.score[number]), float(self.p[number])
+        return Remains(one.place, one.driver, score, p, share)
+
+
+def asked(rest: Rest, components: Sequence[Component]) -> Asked:
+    """Every component that moves anything, asked of the rest together."""
     rng = np.random.default_rng(0)
     moving = [one for one in components if np.any(one.motion)]
-    if not moving:
-        return ()
     # Drawn as measurements: the axes of rows that are alike, and all signs, are rounding's choice.
     measured = rng.normal(size=(len(rest.group), rest.width, DRAWS))
     white = (np.swapaxes(rest.turn, 1, 2) @ measured).reshape(-1, DRAWS)
     drawn = rest.beside(white * (rest.root > 0.0)[:, None])
     drawn[:, 1:] *= np.sqrt(rest.total / max(rest.dof, 1))
+    if not moving:
+        return Asked(rest, (), np.zeros(0), np.zeros(0), (), drawn)
     score, chance = largest(scores_of(rest, moving, drawn))
     order = np.argsort(-score).tolist()
     loud = sorted([i for i in order if chance[i] < AUDIBLE][:ASKED] or order[:1])
     signs = np.repeat(rng.choice((-1.0, 1.0), (len(rest.group), DRAWS)), rest.width, axis=0)
     flipped = rest.beside(signs * rest.even()[:, None])
     _, by_signs = largest(scores_of(rest, [moving[i] for i in loud], flipped))
-    told = sorted(
-        (1.0 if scatter > SCATTERS else float(chance[i]), -float(score[i]), i)
-        for i, scatter in zip(loud, by_signs, strict=True)
-    )[:SHOWN]
-    return tuple(
-        Remains(moving[i].place, moving[i].driver, -minus, p, share_of(rest, moving[i], drawn))
-        for p, minus, i in told
-    )
+    p = chance.copy()
+    p[loud] = np.where(by_signs > SCATTERS, 1.0, chance[loud])
+    return Asked(rest, moving, score, p, loud, drawn)
 
 
 def scores_of(rest: Rest, components: Sequence[Component], drawn: Array) -> Array:

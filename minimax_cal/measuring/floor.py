@@ -17,7 +17,7 @@ from minimax_cal.measuring.grouping import from_means, visits
 from minimax_cal.measuring.measurements import Measurements
 
 REPEATS, DECLARED, AT_MOST = "repeated poses", "declared", "at most"
-DISTANCES = "distances between the targets"
+DISTANCES, NOTHING_TELLS = "distances between the targets", "nothing"
 FEWEST = 5  # repeated visits that tell
 RESAMPLES = 500
 USUAL = float(chdtri(3.0, 0.5)) / 3.0  # median square of a Gaussian over its mean, in space
@@ -149,6 +149,18 @@ def instrument_noise(data: Measurements) -> float:
     """Of a coordinate by the instrument's u95 [m]; NaN if none is told."""
     u95 = data.columns.get("u95", np.full(data.poses, np.nan)) / SIGMAS
     return float(np.sqrt(np.nanmean(u95**2))) if np.isfinite(u95).any() else math.nan
+
+
+def instrument_alone(data: Measurements) -> tuple[float, str]:
+    """RMS distance by the instrument's noise, without that of the joints, and how it is known [mm].
+
+    As declared, or by the targets' distances where these show more; NaN where neither tells.
+    """
+    told, seen = of_coordinate(instrument_noise(data)), noise_between(data)
+    between = of_coordinate(seen[0]) if seen else math.nan
+    if math.isnan(told) and math.isnan(between):
+        return math.nan, NOTHING_TELLS
+    return (between, DISTANCES) if not between <= told else (told, DECLARED)
 
 
 def known_floor(data: Measurements, error: Array, repeatability: float) -> tuple[float, str] | None:

@@ -14,16 +14,9 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS
-from minimax_cal.modelling.effects.words import name_place
+from minimax_cal.modelling.effects.words import name_chance, name_structure
 from minimax_cal.robots.robot import load_robot
 
-LEVEL = 0.01  # chance of a pattern below which it is one
-TRIAGE = {  # mean squares per point, and what each is of
-    "noise": "noise, of any origin",
-    "shape": "targets against each other",
-    "repeat": "revisits against each other",
-    "pose": "static model error",
-}
 NOWHERE = "poses or joints at which it would show"
 
 
@@ -33,27 +26,24 @@ def numbers(entry: Mapping[str, Any], *keys: str) -> list[float]:
 
 
 def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
-    """Where the geometric errors lie: kind, targets, joints, directions, regions, trends.
+    """Where the geometric errors lie: targets, joints, regions, and what they follow.
 
     where: as in the JSON of a diagnosis.
     """
-    nothing = dict.fromkeys(("rms_mm", "share", "p"))
-    triage = (
-        (cause, *numbers(where["triage"][kind] or nothing, *nothing))
-        for kind, cause in TRIAGE.items()
-    )
+
+    def what(entry: Mapping[str, Any]) -> tuple[str, float, str]:
+        share, p = number(entry.get("share")), number(entry.get("p"))
+        return str(entry.get("follows", "")), 100.0 * share, name_chance(p)
+
     targets = (
-        (entry["target"], entry["points"], *numbers(entry, "rms_mm", "max_mm", "mean_sight_mm"))
+        (entry["target"], entry["points"], *numbers(entry, "rms_mm", "max_mm", "mean_sight_mm"),
+         *what(entry))
         for entry in where["by_target"]
-    )
+    )  # fmt: skip
     joints = (
-        (entry["joint"], unit, *numbers(entry, f"rms_{unit}", "share", "p"))
+        (entry["joint"], unit, *numbers(entry, f"rms_{unit}"), *what(entry))
         for entry in where["by_joint"]
         for unit in ("mm" if "rms_mm" in entry else "mrad",)
-    )
-    directions = (
-        (name.removesuffix("_mm").replace("_", " "), number(value))
-        for name, value in where["by_direction"].items()
     )
     regions = (
         (cell["region"], *map(number, (*cell["radius_mm"], *cell["height_mm"])), cell["points"],
@@ -61,41 +51,35 @@ def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
         for cell in where["by_region"]["cells"]
     )  # fmt: skip
     trends = (
-        ({"clock": "visit order"}.get(name, name), *numbers(trend, "share", "p"))
+        ({"clock": "visit order"}.get(name, name), trend.get("place", ""), *what(trend))
         for name, trend in where["by_order"].items()
         if trend
     )
-    sure, left = f"p-values below {LEVEL:g} are significant", "error after geometry,"
+    left, follows = "error after geometry,", "follows | % of it .0f | p-value"
     shown = filled(
-        Table.made(f"kind of error; {sure}", triage,
-                   "kind | RMS mm .4f | share .3f | p-value .2g"),
         Table.made(f"{left} by target", targets, "target | points d | RMS mm .4f | max mm .4f | "
-                   "mean along the line of sight mm +.4f"),
-        Table.made(f"{left} as rotations of each joint; {sure}", joints, "joint | unit | RMS .4f | "
-                   "share that its own value explains .2f | p-value .1g"),
-        Table.made(f"{left} by direction", directions, "direction | RMS mm .4f"),
+                   f"mean along the line of sight mm +.4f | {follows}"),
+        Table.made(f"{left} as rotations of each joint", joints,
+                   f"joint | unit | RMS .4f | {follows}"),
         Table.made(f"{left} by region", regions, "region | from the base axis mm .0f | to mm .0f | "
                    "height from mm .0f | to mm .0f | points d | RMS mm .4f"),
-        Table.made(f"{left} trends; {sure}", trends,
-                   "against | share explained .2f | p-value .1g"),
+        Table.made(f"{left} by time", trends, f"by | where | {follows}"),
     )  # fmt: skip
     for table in shown:
         table.cells()  # an entry that is no number is found here, where its file is known
     return shown
 
 
-def remainder_table(found: Diagnosis) -> Table:
-    """What the last rung leaves: what follows the pose, and where; what random."""
-    left, rows = found.remainder, []
+def remaining_table(found: Diagnosis) -> Table:
+    """What the last step leaves, by where it comes from."""
+    left, rows = found.remaining, []
     if left:
-        ends = zip(("at least", "at most"), left.floor_mm or (), strict=False)
         rows = [
-            ("follows the pose, and could be predicted", left.predictable_mm, None),
-            *((f"  of it {name_place(place)}", None, 100.0 * share) for place, share in left.where),
-            ("random", left.unpredictable_mm, None),
-            *((f"noise alone, {name}", end, None) for name, end in ends),
+            (f"noise ({left.noise_from})", left.noise_mm, "-"),
+            *((name_structure(one.name), one.rms_mm, name_chance(one.p)) for one in left.depends),
+            ("explained by nothing", left.unexplained_mm, "-"),
         ]
-    return Table.made("remaining error", rows, "part | RMS mm .4f | share % .0f")
+    return Table.made("remaining error", rows, "part | RMS mm .4f | p-value")
 
 
 def bare_scene() -> Scene:

@@ -42,7 +42,7 @@ def test_details_are_words_then_tables(here, capsys):
     titles = (
         "step by step",
         "effects found",
-        "kind of error",
+        "error after geometry, by target",
         "by target",
         "rotations of each joint",
     )
@@ -87,8 +87,7 @@ def test_json_is_alone_and_as_agreed(here, capsys):
     assert gap["closed_ci95"][0] <= gap["closed"] <= gap["closed_ci95"][1]
     assert gap["noise_floor_mm"] > 0.0
     where = content["where"]
-    assert where.keys() >= {"by_target", "by_joint", "by_direction", "by_order", "triage"}
-    assert where["triage"].keys() >= {"pose", "shape", "repeat"}
+    assert where.keys() == {"by_target", "by_joint", "by_region", "by_order", "noise_mm"}
     assert all(entry.keys() == {"effect", "needs"} for entry in content["not_testable"])
 
 
@@ -214,27 +213,23 @@ def test_places_that_data_can_test(here, capsys):
 
 
 def test_tables_of_where_show_dashes_for_what_cannot_be_told():
-    part = {"rms_mm": 0.5, "share": 1.0, "p": None}
     where = {
         "by_target": [
             {"target": "smr1", "points": 4, "rms_mm": 0.5, "max_mm": 1.0, "mean_sight_mm": None}
         ],
         "by_joint": [
-            {"joint": "J1", "rms_mrad": 0.25, "share": 0.5, "p": 0.01},
-            {"joint": "J2", "rms_mm": 0.75, "share": None, "p": None},
+            {"joint": "J1", "rms_mrad": 0.25, "follows": "its load", "share": 0.5, "p": 0.002},
+            {"joint": "J2", "rms_mm": 0.75, "follows": "", "share": None, "p": None},
         ],
-        "by_direction": {"x_mm": 0.5, "along_sight_mm": None},
         "by_region": {"cells": []},
-        "by_order": {"clock": {"share": 0.5, "p": None}, "temperature": None},
-        "triage": {"noise": part, "shape": None, "repeat": None, "pose": part},
-    }
-    kind, target, joint, direction, trend = tables.where_tables(where)
-    assert [row[1] for row in kind.cells()] == ["0.5000", "-", "-", "0.5000"]
-    assert target.cells() == [["smr1", "4", "0.5000", "1.0000", "-"]]
-    assert joint.cells() == [["J1", "mrad", "0.2500", "0.50", "0.01"],
-                             ["J2", "mm", "0.7500", "-", "-"]]  # fmt: skip
-    assert direction.cells() == [["x", "0.5000"], ["along sight", "-"]]
-    assert trend.cells() == [["visit order", "0.50", "-"]]
+        "by_order": {"clock": {"place": "base", "follows": "time", "share": 0.5, "p": 0.3},
+                     "temperature": None},
+    }  # fmt: skip
+    target, joint, trend = tables.where_tables(where)
+    assert target.cells() == [["smr1", "4", "0.5000", "1.0000", "-", "", "-", "-"]]
+    assert joint.cells() == [["J1", "mrad", "0.2500", "its load", "50", "< 0.005"],
+                             ["J2", "mm", "0.7500", "", "-", "-"]]  # fmt: skip
+    assert trend.cells() == [["visit order", "base", "time", "50", "0.3"]]
 
 
 def test_what_cannot_be_tested_and_what_to_measure_next(folder):

@@ -13,6 +13,7 @@ from minimax_cal.diagnosing.curves import (
     Curve,
     Leftover,
     guilty,
+    joint_equivalent,
     order_curve,
     residual_curve,
     turns,
@@ -212,3 +213,12 @@ def test_a_curve_names_its_views() -> None:
         {"name": "geometry alone", "values": [1.0, 1.0]},
         {"name": "with effects", "values": [None, 2.0]},
     ]
+
+
+def test_joint_equivalent_is_the_turn():
+    scene = left_by(NOTHING).scene
+    turn = 1e-3 * np.random.default_rng(0).normal(size=(scene.poses, scene.joints))
+    error = np.einsum("nkcm,mn->kmc", scene.jacobian, turn)
+    off = np.abs(joint_equivalent(error, scene.jacobian, 1e-7) - turn)
+    assert np.median(off) < 1e-5  # large only where the wrist or the arm is stretched
+    assert np.quantile(off[:, :3], 0.9) < 1e-4

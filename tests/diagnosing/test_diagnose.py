@@ -106,8 +106,8 @@ def test_the_json_is_the_contract(plain: mc.Diagnosis) -> None:
     for kind in ("holdout_rms_mm", "holdout_max_mm"):
         assert set(gap[kind]) == {"nominal", "geometric", "final"}
     assert {"noise_floor_mm", "closed", "closed_ci95"} <= set(gap)
-    assert {"by_target", "by_joint", "by_direction", "by_order", "triage"} <= set(said["where"])
-    assert set(said["where"]["triage"]) >= {"pose", "shape", "repeat"}
+    assert set(said["where"]) == {"by_target", "by_joint", "by_region", "by_order", "noise_mm"}
+    assert set(said["remaining"]) == {"depends", "unexplained_mm", "noise_mm", "noise_from"}
     for entry in said["not_testable"]:
         assert set(entry) == {"effect", "needs"}
 

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from test_remainder import geometric, rigid
+from test_left_out import geometric, rigid
 
 import minimax_cal as mc
 from minimax_cal.diagnosing import diagnose, gap

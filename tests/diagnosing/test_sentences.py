@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
 import minimax_cal as mc
-from minimax_cal.diagnosing.remainder import Remainder
-from minimax_cal.diagnosing.result import VERDICTS, Alternative, Diagnosis, Finding, Step
-from minimax_cal.diagnosing.sentences import OPENINGS, REVISIT
+from minimax_cal.diagnosing.proposals import REVISIT
+from minimax_cal.diagnosing.result import (
+    VERDICTS,
+    Alternative,
+    Dependence,
+    Diagnosis,
+    Finding,
+    Remaining,
+    Step,
+)
+from minimax_cal.diagnosing.sentences import NOT_VISITED, OPENINGS
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.measuring.accuracy import Accuracy
-from minimax_cal.measuring.floor import AT_MOST, Floor
+from minimax_cal.measuring.floor import AT_MOST, DISTANCES, REPEATS, Floor
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.modelling.simulate import simulate
-from minimax_cal.reporting.tables import remainder_table
+from minimax_cal.reporting.tables import remaining_table
 
 FOUND = (  # effect, place, share, held-out RMS before and after [mm]; by share, as in the file
     ("joint_compliance", "J2", 0.60, 0.5, 0.3),
@@ -59,7 +66,7 @@ def found(bare: Diagnosis) -> Diagnosis:
     return replace(
         bare, verdict="named", effects=tuple(finding(*row) for row in FOUND), closed=0.95,
         closed_ci=(0.9, 0.97), ladder=(step("nominal", 2.0), step("geometric", 0.8), *rungs),
-        floor=Floor(0.03, 0.0, 0.03, AT_MOST), beyond=Beyond(),
+        floor=Floor(0.03, 0.0, 0.03, AT_MOST), beyond=Beyond(), floor_known=True,
     )  # fmt: skip
 
 
@@ -149,7 +156,7 @@ def test_alternatives_stand_at_their_own_place(found: Diagnosis) -> None:
     both = replace(both, effects=(replace(large, alternatives=(others[1],)), second))
     text = next(text for text in both.reasons if text.startswith("Recommended: "))
     assert large.share > second.share > 0.0
-    assert text.startswith("Recommended: measure 2, to distinguish")
+    assert text.startswith("Recommended: measure 2, to know whether it is")
 
 
 def test_possible_effects_stand_together_below(found: Diagnosis) -> None:
@@ -164,19 +171,50 @@ def test_possible_effects_stand_together_below(found: Diagnosis) -> None:
         "gear ripple at joint 1", "possible, 0.00")  # fmt: skip
 
 
-def test_the_remaining_error_is_given_in_its_parts(found: Diagnosis) -> None:
-    assert not remainder_table(replace(found, remainder=None)).rows  # of a file without it
-    left = Remainder(0.2, (("J3", 0.6),), 0.05, (0.02, 0.03))
-    parts = replace(found, remainder=left)
+def test_the_remaining_error_is_given_in_its_parts(found):
+    assert not remaining_table(replace(found, remaining=None)).rows  # of a file without it
+    left = Remaining((Dependence("J3", "its load", 0.2, 0.002),), 0.1, 0.05, REPEATS)
+    parts = replace(found, remaining=left)
     text = next(text for text in parts.reasons if text.startswith("Remaining error"))
-    assert "0.200 mm depends on the pose (at joint 3 60 %), 0.050 mm looks random" in text
-    assert [row[1] for row in remainder_table(parts).rows if not math.isnan(float(row[1]))] == [
-        0.2, 0.05, 0.02, 0.03
-    ]  # fmt: skip
-    parts = replace(found, remainder=replace(left, predictable_mm=0.0))
-    assert any("0.230 mm looks random;" in text for text in parts.reasons)
-    parts = replace(found, remainder=None)
-    assert not any("looks random" in text for text in parts.reasons)
+    assert "0.050 mm is measurement noise (repeated poses), 0.200 mm is a motion of" in text
+    assert text.endswith("joint 3 that depends on its load (p < 0.005), 0.100 mm is unexplained.")
+    assert [row[1] for row in remaining_table(parts).rows] == [0.05, 0.2, 0.1]
+    none = replace(left, depends=(), noise_mm=0.02, noise_from=DISTANCES)
+    (text,) = [text for text in replace(found, remaining=none, floor_known=False).reasons
+               if text.startswith("Remaining error")]  # fmt: skip
+    assert "0.020 mm is the instrument's noise (distances between the targets)" in text
+    assert text.endswith("no dependence was found, 0.100 mm may be the arm's repeatability.")
+
+
+def test_what_nobody_measured_is_asked_for_first(found):
+    """For every verdict, in the first sentence too."""
+    for verdict in VERDICTS:
+        opened = replace(found, verdict=verdict, floor_known=False)
+        assert opened.next == REVISIT
+        assert opened.reasons[0].endswith(f"; {NOT_VISITED}.")
+        known = replace(opened, floor_known=True)
+        assert NOT_VISITED not in known.headline()
+        assert known.next != REVISIT
+        assert known.next or verdict not in ("unknown", "not_repeatable")
+
+
+@pytest.mark.parametrize(
+    ("driver", "kind"),
+    [
+        ("its last move and load", "approach"),
+        ("its load and angle", "payload"),
+        ("time, to and fro", "late"),
+        ("temperature", "warm"),
+        ("where it is", "instrument"),
+        ("two angles together", "more"),
+    ],
+)
+def test_each_kind_of_unknown_has_its_measurement(found, driver, kind):
+    sure = replace(found, effects=(), verdict="unknown", structure=0.002)
+    told = replace(sure, structure_in=f"J2 following {driver}").next
+    assert told.kind == kind
+    assert "joint 2" in told.settles
+    assert replace(sure, structure_in="anything else").next.kind == "more"
 
 
 def test_outliers_are_left_out_beside(found: Diagnosis) -> None:
@@ -196,29 +234,24 @@ def test_what_does_not_help_is_not_proposed(found: Diagnosis) -> None:
     changed = replace(found, verdict="one_of", effects=(first, *found.effects[1:]))
     (text,) = [text for text in changed.reasons if text.startswith("Recommended: ")]
     assert text == (
-        f"Recommended: {WIDER}, to distinguish joint compliance at joint 2 from link bending "
+        f"Recommended: {WIDER}, to know whether it is joint compliance at joint 2 or link bending "
         "at link 2."
     )
     assert "or base flex or link bending at link 2" in changed.reasons[0]
     nothing = replace(changed, effects=(replace(first, alternatives=others[1:]),))
     said = [text for text in nothing.reasons if text.startswith("Recommended: ")]
-    assert said == [REVISIT]  # the noise is not known here
+    assert not said
 
 
 def test_every_chance_and_power_says_what_is_enough(found: Diagnosis) -> None:
     place = "J3 following its own angle"
     told = replace(found, verdict="unknown", structure=1e-7, structure_in=place)
-    assert "p = 1e-07, significant below 0.005" in told.headline()
+    assert "p < 0.005" in told.headline()
     assert "Unexplained: the error after all effects is not random" in told.headline()
     assert replace(told, effects=()).headline().startswith("Unexplained: the error after geometry")
     assert "below 0.005 are significant" in told.effects_table().title
     assert "the power is below 25" in told.rival_table().title
     assert "lambda" not in told.summary()
-    from minimax_cal.reporting.tables import where_tables
-
-    for table in where_tables(found.where):
-        assert "p" not in table.header
-        assert ("p-value" in table.header) == ("significant" in table.title)
 
 
 def test_people_read_millimetres_and_milliradians_with_two_digits_of_sigma(

@@ -10,7 +10,6 @@ import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.causes import with_untested
 from minimax_cal.diagnosing.established import loose_among, mostly_loose
-from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.diagnosing.verdict import (
     UNASKED,
@@ -68,11 +67,14 @@ def test_two_orders_of_one_gear_are_one_effect(two_orders: mc.Diagnosis) -> None
 def test_the_file_tells_what_is_established_and_what_remains(two_orders: mc.Diagnosis) -> None:
     said = json.loads(two_orders.json())
     assert [e["established"] for e in said["effects"]] == [True]
+    left = said["remaining"]
+    assert set(left) == {"depends", "unexplained_mm", "noise_mm", "noise_from"}
+    parts = [left["noise_mm"], left["unexplained_mm"], *(d["rms_mm"] for d in left["depends"][:1])]
+    last = two_orders.ladder[-1].trusted.rms_mm
+    assert np.hypot.reduce(parts) == pytest.approx(max(last, left["noise_mm"]))  # it closes
     assert set(said["remainder"]) == {"predictable_mm", "where", "unpredictable_mm", "floor_mm"}
-    assert said["remainder"]["predictable_mm"] < said["remainder"]["unpredictable_mm"]
     again = mc.Diagnosis.from_dict(said)
-    assert isinstance(again.remainder, Remainder)
-    assert again.remainder == two_orders.remainder
+    assert again.remaining == two_orders.remaining
     assert json.loads(again.json())["effects"][0]["established"] is True
     assert said["effects"][0]["why_tentative"] is None
 
@@ -96,10 +98,10 @@ def test_what_is_tentative_stays_so_in_a_file(
 
 def test_an_old_file_holds_established_effects(two_orders: mc.Diagnosis) -> None:
     said = json.loads(two_orders.json())
-    del said["effects"][0]["established"], said["effects"][0]["frequency"], said["remainder"]
+    del said["effects"][0]["established"], said["effects"][0]["frequency"], said["remaining"]
     again = mc.Diagnosis.from_dict(said)
     assert all(found.established for found in again.effects)
-    assert again.remainder is None
+    assert again.remaining is None
 
 
 def test_a_name_that_is_not_found_again_is_tentative() -> None:

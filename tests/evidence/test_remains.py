@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
+from minimax_cal.evidence.evened import TOGETHER, evened, times_before
 from minimax_cal.evidence.noise import Noise, Problem, orthonormal
-from minimax_cal.evidence.remains import Component, Fading, Rest, remains, rest_of
+from minimax_cal.evidence.remains import Component, Fading, Rest, asked, rest_of
 from minimax_cal.ground.arrays import Array
 
 VISITS, WIDTH = 80, 6
@@ -30,7 +32,7 @@ def problem(rng: np.random.Generator, error: Array) -> Problem:
     )
 
 
-def asked(rng: np.random.Generator) -> list[Component]:
+def places(rng: np.random.Generator) -> list[Component]:
     """Four places, three drivers each."""
     x = rng.uniform(-1.0, 1.0, (3, VISITS))
     drivers = {f"driver {i + 1}": np.array([[u, u**2, np.cos(3.0 * u)]]) for i, u in enumerate(x)}
@@ -60,8 +62,8 @@ def test_noise_is_called_remains_as_often_as_the_level_says():
     rng = np.random.default_rng(5)
     chances = []
     for _ in range(60):
-        what = asked(rng)
-        chances.append(remains(rest(rng, rng.normal(size=VISITS * WIDTH)), what)[0].p)
+        what = places(rng)
+        chances.append(asked(rest(rng, rng.normal(size=VISITS * WIDTH)), what).loud_ones[0].p)
     rare = np.mean(np.array(chances) < 0.05)
     assert rare < 0.14  # 0.05 + 3 sigma
 
@@ -70,22 +72,22 @@ def test_a_motion_that_scatters_by_itself_is_no_remainder():
     rng = np.random.default_rng(6)
     chances = []
     for _ in range(25):
-        what = asked(rng)
+        what = places(rng)
         shaken = what[0].motion[:, 0] * np.repeat(rng.normal(size=VISITS), WIDTH)
         error = rng.normal(size=VISITS * WIDTH) + 5.0 * shaken
         error[:WIDTH] += 40.0  # and one visit that is off
-        chances.append(remains(rest(rng, error), what)[0].p)
+        chances.append(asked(rest(rng, error), what).loud_ones[0].p)
     assert np.mean(np.array(chances) < 0.05) < 0.15
 
 
 @pytest.mark.parametrize("size", [0.35, 1.0])
 def test_what_is_there_is_found_with_its_place_driver_and_size(size):
     rng = np.random.default_rng(7)
-    what = asked(rng)
+    what = places(rng)
     true = what[4]
     field = true.motion[:, 0] * np.repeat(true.feature[0, 0], WIDTH)
     field *= size / np.sqrt(np.mean(field**2))
-    found = remains(rest(rng, rng.normal(size=VISITS * WIDTH) + field), what)[0]
+    found = asked(rest(rng, rng.normal(size=VISITS * WIDTH) + field), what).loud_ones[0]
     assert (found.place, found.driver) == (true.place, true.driver)
     assert found.name == f"{true.place} following {true.driver}"
     assert found.p < 0.005
@@ -94,20 +96,20 @@ def test_what_is_there_is_found_with_its_place_driver_and_size(size):
 
 def test_what_was_fitted_does_not_remain():
     rng = np.random.default_rng(8)
-    what = asked(rng)
+    what = places(rng)
     field = what[4].motion[:, 0] * np.repeat(what[4].feature[0, 0], WIDTH)
     rows = problem(rng, rng.normal(size=VISITS * WIDTH) + 3.0 * field)
     beside = rest_of(rows, PLAIN, field[:, None], STRAIGHT)
-    assert remains(beside, what)[0].p > 0.01
+    assert asked(beside, what).loud_ones[0].p > 0.01
     assert beside.dof == VISITS * WIDTH - 9
     fixed = [replace(one, motion=np.zeros_like(one.motion)) for one in what]
-    assert remains(beside, fixed) == ()
+    assert asked(beside, fixed).loud_ones == ()
 
 
 def test_the_axes_of_a_visits_rows_do_not_matter():
     """Rows that are alike have any axes: those of `eigh` differ between processors."""
     rng = np.random.default_rng(9)
-    what, rows = asked(rng), problem(rng, rng.normal(size=VISITS * WIDTH))
+    what, rows = places(rng), problem(rng, rng.normal(size=VISITS * WIDTH))
     turn = np.linalg.qr(rng.normal(size=(VISITS, WIDTH, WIDTH)))[0]
 
     def turned(columns: Array) -> Array:
@@ -116,8 +118,23 @@ def test_the_axes_of_a_visits_rows_do_not_matter():
 
     other = replace(rows, error=turned(rows.error), basis=turned(rows.basis))
     none = np.zeros((VISITS * WIDTH, 0))
-    straight = remains(rest_of(rows, PLAIN, none, STRAIGHT), what)
+    straight = asked(rest_of(rows, PLAIN, none, STRAIGHT), what).loud_ones
     what = [replace(one, motion=turned(one.motion)) for one in what]
-    for one, same in zip(straight, remains(rest_of(other, PLAIN, none, turn), what), strict=True):
+    turned = asked(rest_of(other, PLAIN, none, turn), what).loud_ones
+    for one, same in zip(straight, turned, strict=True):
         assert (one.name, one.p) == (same.name, same.p)
         assert (one.score, one.share) == pytest.approx((same.score, same.share), rel=1e-9)
+
+
+def test_many_visits_to_one_pose_are_evened_some_at_a_time(rng):
+    """Blocks of few visits leave the rest as it was; times of a number are counted in order."""
+    group = np.array([3, 1, 3, 3, 1, 2])
+    assert times_before(group).tolist() == [0, 0, 1, 2, 1, 0]
+    m, wide, p = 200, 3, 4
+    basis = np.linalg.qr(rng.normal(size=(m * wide, p)))[0]
+    rows = rng.normal(size=m * wide)
+    rows = (rows - basis @ (basis.T @ rows)).reshape(m, wide)
+    spread = np.broadcast_to(np.eye(wide), (m, wide, wide))
+    apart, one = (evened(rows, basis.reshape(m, wide, p), spread, g)
+                  for g in (np.arange(m) // TOGETHER, np.zeros(m, dtype=int)))  # fmt: skip
+    assert_allclose(one, apart, atol=1e-12)

@@ -3,13 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import (
     REPEAT,
     clusters,
+    from_means,
     grouped,
     groups,
     mislabelled,
@@ -236,3 +237,10 @@ def test_visits_are_of_one_load(rng):
     assert len(np.unique(group)) == 8
     assert_array_equal(group[0::3], group[1::3])
     assert not np.isin(group[2::3], group[0::3]).any()
+
+
+def test_scatter_counts_what_was_measured():
+    values = np.array([[1.0, np.nan], [3.0, 5.0], [10.0, 7.0], [np.nan, 8.0]])
+    off, free = from_means(values, np.array([0, 0, 1, 1]))
+    assert_allclose(off, [[-1.0, 0.0], [1.0, 0.0], [0.0, -0.5], [0.0, 0.5]])
+    assert_allclose(free, [[0.5, 0.0], [0.5, 0.0], [0.0, 0.5], [0.0, 0.5]])

@@ -98,8 +98,8 @@ def test_the_page_says_which_model_is_signed(results, whole):
     both = rendered(WORDING, whole, results / "gap.json")
     assert any(title == "Model: geometry, joint compliance" for title in both.tables)
     assert "Signed is the calibration" not in both.text["verdict"]
-    # all that these data tell of the noise is that it is no larger than what the model leaves
-    assert "that looks random; measurement noise is at most" in both.text["verdict"]
+    # all that these data tell of the noise is that of the instrument
+    assert "is the instrument's noise" in both.text["verdict"]
     # parameters of effects stand once: with the fit if it has them
     assert "parameters of the effects" in plain.tables
     assert "parameters of the effects" not in both.tables
@@ -127,8 +127,7 @@ def test_only_what_a_diagnosis_establishes_is_told_for_established(results):
 
 def test_a_floor_that_is_an_upper_bound_is_no_cause(results):
     gap = load_diagnosis(results / "gap.json")
-    assert gap.remainder is not None
-    rest = replace(gap.remainder, predictable_mm=0.026)
+    rest = replace(gap.remaining, unexplained_mm=0.026)
     sure = Floor(0.043, 0.04, 0.046, "the instrument")
     open_ = Floor(0.043, 0.0, 0.043, AT_MOST)
     assert (sure.certain, open_.certain) == (True, False)
@@ -136,10 +135,9 @@ def test_a_floor_that_is_an_upper_bound_is_no_cause(results):
     assert left_now(replace(gap, floor=sure), near) == (
         "measurement noise (0.043\N{NO-BREAK SPACE}mm)."
     )
-    told = left_now(replace(gap, floor=open_, remainder=rest), near)
-    assert told.startswith("a remaining error that no known effect explains (0.026")
-    assert "at most 0.043" in told
-    assert "no pose was measured twice" in told
+    told = left_now(replace(gap, floor=open_, remaining=rest, floor_known=False), near)
+    assert told.startswith("a remaining error that no known effect explains (")
+    assert told.endswith("0.026 mm may be the arm's repeatability).")
 
 
 def test_rungs_of_a_diagnosis(results, tmp_path):

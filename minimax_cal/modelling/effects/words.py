@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
+from minimax_cal.evidence.limits import STRUCTURE
 from minimax_cal.evidence.remains import FOLLOWING
 from minimax_cal.modelling.effects.table import EFFECTS
 
@@ -60,6 +62,11 @@ def name_structure(text: str) -> str:
     part, mark, how = place.partition(" ")
     moving = name_label(name_part(part) or part) + mark + how
     return f"a motion of {moving} that depends on {driver}" if driver else text
+
+
+def name_chance(p: float) -> str:
+    """The chance of what may remain; below what is certain it matters not how small it is."""
+    return "-" if math.isnan(p) else f"< {STRUCTURE:g}" if p < STRUCTURE else f"{p:.2g}"
 
 
 def name_step(step: str) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.diagnosing.result import Diagnosis, Finding
-from minimax_cal.diagnosing.sentences import NOTHING_MM, OPENINGS
+from minimax_cal.diagnosing.sentences import OPENINGS, parts_of
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.checks import wild
 from minimax_cal.fitting.crossed import intervals_of
@@ -417,18 +417,11 @@ def left_now(gap: Diagnosis, left: float) -> str:
 
     A floor that is only the most that noise may be tells no cause: it is what the model leaves.
     """
-    floor, rest = gap.floor, gap.remainder
+    floor, rest = gap.floor, gap.remaining
     if floor.certain and left <= NEAR_NOISE * floor.value:
         return f"measurement noise ({number(floor.value)})."
-    noise = f"measurement noise is {'' if floor.certain else 'at most '}{number(floor.value)}"
-    if not floor.certain:
-        noise += " (from the residuals: no pose was measured twice)"
-    if rest and not rest.predictable_mm < NOTHING_MM:
-        known = f"{number(rest.predictable_mm)} of it depend on the pose"
-        return f"a remaining error that no known effect explains ({known}); {noise}."
-    if rest and not floor.certain:
-        return f"a remaining error of {number(left)} that looks random; {noise}."
-    return f"a remaining error that no known effect explains; {noise}."
+    parts = f" ({', '.join(parts_of(gap, rest))})" if rest else ""
+    return f"a remaining error that no known effect explains{parts}."
 
 
 def causes(gap: Diagnosis) -> list[Finding]:

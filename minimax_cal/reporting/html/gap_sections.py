@@ -11,14 +11,14 @@ from minimax_cal.ground.tables import filled
 from minimax_cal.reporting.html.content import Block, Blocks, missing, text
 from minimax_cal.reporting.html.more_charts import curve_chart, waterfall
 from minimax_cal.reporting.html.sources import Sources
-from minimax_cal.reporting.tables import remainder_table, where_tables
+from minimax_cal.reporting.tables import remaining_table, where_tables
 
 CURVES = ("residual", "order")
 
 
 def gap_steps(gap: Diagnosis) -> Blocks:
     """How far the gap closes, rung by rung."""
-    left = filled(remainder_table(gap))
+    left = filled(remaining_table(gap))
     return [waterfall(gap), gap.ladder_table(), text(closing(gap)), *left]
 
 

@@ -1,10 +1,8 @@
-"""How much of what is left can be predicted without a name, where it lives, and what nothing tells.
+"""Free curves of joints beside a fit, judged by groups of its poses that are left out in turn.
 
-Beside geometry and the effects that were named, blocks of free functions are tried in turn: of each
-joint a smooth turn by its own angle, then a shift of all targets that is smooth in all joints.  A
-block has a Gaussian prior [Rasmussen and Williams 2006], so that it is a ridge regression.  Its
-length and size are those that meet groups of poses left out best, and it stays only where those
-groups tell that it helps: what is fitted judges nothing.
+A block of free functions has a Gaussian prior [Rasmussen and Williams 2006], so that it is a ridge
+regression.  Its length and size are those that meet the groups left out best: what is fitted judges
+nothing.
 """
 
 from __future__ import annotations
@@ -16,15 +14,12 @@ from itertools import product
 
 import numpy as np
 import scipy
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
-from scipy.spatial.distance import cdist
+from scipy.linalg import cho_factor, cho_solve
 
 from minimax_cal.diagnosing.gap import folds
 from minimax_cal.diagnosing.joint import Joint
-from minimax_cal.diagnosing.result import Remainder, Share
-from minimax_cal.evidence.limits import FAR_OUT, FOLDS, GAIN_LEVEL, LEAST_SWEEP
+from minimax_cal.evidence.limits import FAR_OUT, FOLDS, LEAST_SWEEP
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.modelling.effects.maps import range_of, sines, spread, waves_over
 from minimax_cal.modelling.effects.scene import Scene
@@ -33,41 +28,7 @@ from minimax_cal.modelling.rows import MIN_COMPUTED_NOISE
 FEWEST = 10  # groups that can say anything
 LENGTHS = np.radians([4.0, 8.0, 20.0, 60.0]).tolist()  # of a joint's curve [rad]
 SHAPES = list(product((5e-5, 2e-4, 8e-4), LENGTHS))  # its size, beside what is left, and length
-LEAST_LEVER = 0.1  # of the largest: joints that move the targets less count so much
-CENTRES = 150  # poses about which the functions of all joints are built, at most
-WIDTHS = (1.0, 2.0, 4.0, 8.0)  # of them, in typical distances between those poses
-SHIFTS = (3e-5, 1e-4, 3e-4)  # sizes of the shift [m]
-JITTER = 1e-8  # added to a correlation, so that it is one for any poses
 RIDGE = 1e-10  # of a parameter's own weight: what poses do not tell stays where it is
-
-
-def remainder(last: Joint, floor: Floor) -> Remainder:
-    """What could be predicted beside the effects of a fit, judged by groups of its poses.
-
-    floor: what noise alone would leave.
-    """
-    nothing = Remainder(0.0, (), last.train.rms_mm, floor.ends)
-    left = Left.of(last)
-    if not len(left.parts):
-        return nothing
-    left = left.take(begun(left).usual)
-    if not len(left.parts):
-        return nothing
-    rungs, places = climbed(left)
-    if not rungs[-1].usual.all():  # what stands out now spoils what is fitted and judged
-        left = left.take(rungs[-1].usual)
-        if not len(left.parts):
-            return nothing
-        rungs, places = climbed(left)
-    squares, points = [rung.square for rung in rungs], float((left.root**2).sum()) / 3.0
-    gains = -np.diff(squares)
-    order = np.argsort(-gains)
-    return Remainder(
-        1e3 * float(np.sqrt(gains.sum() / points)),
-        tuple(Share(places[i], float(gains[i] / gains.sum())) for i in order),
-        1e3 * float(np.sqrt(squares[-1] / points)),
-        floor.ends,
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,22 +98,6 @@ def begun(left: Left) -> Beside:
     return Beside.of(left.parts, left.y, left.columns, left.prior)
 
 
-def climbed(left: Left) -> tuple[list[Beside], list[str]]:
-    """The fit, then with each block that helps; their places."""
-    rungs, places = [begun(left)], []
-    for blocks in (by_joint(left), by_all(left)):
-        waiting = list(blocks)
-        while waiting:
-            tried = ((rungs[-1].with_block(block), block.place) for block in waiting)
-            best, place = min(tried, key=lambda pair: pair[0].square)
-            if gain_chance(rungs[-1], best, left.group) > GAIN_LEVEL:
-                break
-            waiting = [block for block in waiting if block.place != place]
-            rungs.append(best)
-            places.append(place)
-    return rungs, places
-
-
 def gain_chance(before: Beside, after: Beside, group: Array) -> float:
     """Chance that groups of poses left out gain so much by what tells nothing.  group: (m,).
 
@@ -193,43 +138,6 @@ def by_joint(left: Left) -> Iterator[Block]:
         columns = left.arm[:, :, j, None] * sines(q, low, high, count).T[:, None]
         priors = [size * spread(length, high - low, count) for size, length in SHAPES]
         yield Block(f"J{j + 1}", columns, np.array(priors))
-
-
-def by_all(left: Left) -> Iterator[Block]:
-    """A shift of all targets that is smooth in all joints, for several widths.
-
-    A joint counts by how far it moves the targets.  Functions are those of a process that is known
-    at some of the poses [Quinonero-Candela and Rasmussen 2005].
-    """
-    lever = np.sqrt((left.arm**2).mean(axis=(0, 1)))
-    q = left.q * np.maximum(lever / max(lever.max(), 1e-300), LEAST_LEVER)
-    centre = far_apart(q, min(CENTRES, left.groups // 2))
-    if len(centre) < FEWEST:
-        return
-    between, away = cdist(centre, centre), cdist(q, centre)
-    usual = float(np.median(np.partition(between, 1, axis=1)[:, 1]))
-    axes = np.tile(np.eye(3), (left.y.shape[1] // 3, 1))
-    for width in WIDTHS:
-        square = matern(between / (width * usual)) + JITTER * np.eye(len(centre))
-        known = matern(away / (width * usual)).T
-        smooth = solve_triangular(np.linalg.cholesky(square), known, lower=True)
-        columns = np.einsum("mr,ra,cm->mrca", left.root, axes, smooth)
-        columns = columns.reshape(*left.root.shape, -1)
-        yield Block("all", columns, np.repeat(np.array(SHIFTS)[:, None], columns.shape[-1], axis=1))
-
-
-def matern(s: Array) -> Array:
-    """Matern's correlation of order 3/2.  s: distance over length."""
-    return np.asarray((1.0 + np.sqrt(3.0) * s) * np.exp(-np.sqrt(3.0) * s))
-
-
-def far_apart(q: Array, count: int) -> Array:
-    """(count, n) of the poses (m, n) those that lie farthest from each other."""
-    chosen, away = [0], np.full(len(q), np.inf)
-    for _ in range(count - 1):
-        away = np.minimum(away, np.linalg.norm(q - q[chosen[-1]], axis=1))
-        chosen.append(int(np.argmax(away)))
-    return np.asarray(q[chosen])
 
 
 # ---- fits without each part of the poses -------------------------------------------------------
