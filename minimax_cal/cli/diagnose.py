@@ -103,7 +103,13 @@ def advice(
     """What to do next, and its command.  written: where the diagnosis went."""
     if written and found.main and found.status is Status.CONVERGED:
         files = " ".join(map(str, data))
-        fit = f"minimax-cal calibrate {robot} {files} --effects {written} -o fit_effects.json"
+        told, usual = found.provenance.settings, vars(DiagnosisOptions())
+        given = [n for n in ("seed", "holdout", "holdout_by", "instrument") if told[n] != usual[n]]
+        split = "".join(f"--{name.replace('_', '-')} {told[name]} " for name in given)
+        fit = (
+            f"minimax-cal calibrate {robot} {files} --effects {written} --objective sum {split}"
+            "-o fit_effects.json"
+        )
         yield "Next, to calibrate with the confirmed causes", fit
         correct = "minimax-cal compensate fit_effects.json targets.csv -o corrected.csv"
         yield "Then, to correct joint targets, or a program, for the controller", correct

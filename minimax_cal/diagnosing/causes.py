@@ -56,6 +56,11 @@ class Causes:
     jobs: int = 1
     cluster: str = ""
 
+    @property
+    def confirmed(self) -> list[Finding]:
+        """The effects that hold."""
+        return [found for found in self.effects if found.established]
+
 
 def causes_of(
     study: Study,
@@ -130,6 +135,17 @@ def beside_maps(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
     fields = [study.rows.of(term.columns(study.scene).displacement(study.scene)) for term in maps]
     left = left_by(study, causes.choice, np.concatenate(fields, axis=1) if fields else None)
     return replace(causes, left=left, guessed=loudest(left) is not None)
+
+
+def left_beside(study: Study, causes: Causes, kept: Sequence[Term]) -> tuple[Remains, ...]:
+    """What some of the effects and maps leave.  kept: their terms."""
+    keys, choice = {term.key for term in kept}, causes.choice
+    known = {candidate.key for candidate in choice.chosen}
+    if known == keys:
+        return causes.left
+    found = tuple(one for one in choice.found if one.candidate.key in keys)
+    causes = replace(causes, choice=replace(choice, found=found))
+    return beside_maps(study, causes, [term for term in kept if term.key not in known]).left
 
 
 def chosen(study: Study, exclude: Sequence[str], first: Sequence[Added] = ()) -> Choice:

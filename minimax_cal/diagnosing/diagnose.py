@@ -17,6 +17,7 @@ from minimax_cal.diagnosing.causes import (
     beside_maps,
     causes_of,
     fault_findings,
+    left_beside,
     merged,
     whole,
     with_jumps,
@@ -90,14 +91,8 @@ from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.robots.robot import Robot, load_robot
 
 FAULTY, CAUSES, BUDGET = "faults of the data", "testing causes", "error budget"
-REMAINING, PARTS = "remaining error", "regions held out"
-STEPS = (
-    FAULTY,
-    CAUSES,
-    BUDGET,
-    REMAINING,
-    PARTS,
-)  # quick: without the last
+PARTS, REMAINING = "regions held out", "remaining error"
+STEPS = (FAULTY, CAUSES, BUDGET, PARTS, REMAINING)
 NOT_ASKED = Beyond(reason="not asked for")
 ROBUST = replace(SUM, trim=0.3)  # a fit that up to so many wrong points do not pull
 EARLIEST = 5  # visits before a jump that a study takes for possible, and after it
@@ -133,7 +128,8 @@ class DiagnosisOptions:
 
     def step_of(self, progress: Progress, name: str) -> Progress:
         """Progress of one of STEPS."""
-        return number_step(progress, STEPS.index(name) + 1, len(STEPS) - self.quick, name)
+        steps = [step for step in STEPS if not (self.quick and step == PARTS)]
+        return number_step(progress, steps.index(name) + 1, len(steps), name)
 
 
 OF_OTHERS = ("offset", "known_distances", "lever", "noises")
@@ -249,25 +245,35 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     workers = asked.jobs, asked.cluster
     study, causes = causes_of(study, clean.faults, options.exclude, step_of(CAUSES), *workers)
     causes, spoken, ladder = in_rungs(study, causes, step_of(BUDGET))
-    last, late = judges.marked(ladder.fits[0].cell, ladder.last.cell)
+    beyond = NOT_ASKED if options.quick else beyond_of(study, causes, judges, step_of(PARTS))
+    if beyond.typical_mm > beyond.geometric_typical_mm:  # what does not extrapolate
+        causes, spoken = (beside_them(one) for one in (causes, spoken))
+        ladder = replace(ladder, sure=0)
+    kept = ladder.confirmed
+    causes = replace(causes, left=left_beside(study, causes, kept.last.terms))
+    last, late = judges.marked(kept.fits[0].cell, kept.last.cell)
     steps = steps_of(asked, study, last, spoken, ladder)
     tell_steps(steps, progress)
-    floor = floor_beneath(robot, clean.data, ladder.last, steps[-1])
-    share, interval = closed(ladder, last, floor, options.seed)
-    effects = valued(spoken.effects, ladder)
+    count = len(steps) - len(ladder.taken) + ladder.sure
+    step = steps[count - 1]
+    floor = floor_beneath(robot, clean.data, kept.last, step)
+    share, interval = closed(kept, last, floor, options.seed)
+    effects = [*valued(spoken.effects, kept), *valued(spoken.effects, ladder)[ladder.sure :]]
     findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.least)
     step_of(REMAINING)
-    judge = steps[-1].trusted if steps[-1].trusted.poses else steps[-1].train
+    judge = step.trusted if step.trusted.poses else step.train
     rest, complete = remaining_of(causes.left, judge.rms_mm, floor, clean.data)
-    known = known_noise(ladder.last, floor, clean.data, robot.repeatability)
-    beyond = NOT_ASKED if options.quick else beyond_of(study, causes, judges, step_of(PARTS))
-    wrong = against(robot, floor, steps[-1])
-    gone, counted = judged_with(asked.data, clean.data, clean.left, judges.held, ladder.last.cell)
+    known = known_noise(kept.last, floor, clean.data, robot.repeatability)
+    wrong = against(robot, floor, step)
+    gone, counted = judged_with(asked.data, clean.data, clean.left, judges.held, kept.last.cell)
     told = explanation(findings, causes, known, study.fit.status, failed=bool(wrong))
+    more = ladder.last.cell if len(steps) > count else None
     return Diagnosis(
         **{**told, "meets_floor": down_to(known, complete)},
         robot=robot.name,
-        ladder=tuple(steps),
+        ladder=tuple(steps[:count]),
+        possible=steps[-1] if more else None,
+        possible_cell=more,
         floor=floor,
         closed=share,
         closed_ci=interval,
@@ -277,17 +283,18 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         notices=(
             *asked.data.notices,
             *notices,
-            *notices_of(study, clean, ladder, late, effects),
+            *notices_of(study, clean, kept, late, effects),
             *filter(None, [wrong]),
         ),
         provenance=Provenance.of(robot, asked.data, vars(options)),
         seconds=time.perf_counter() - began,
         data=study.geometric.placed(clean.data),
         held=~np.isin(clean.data.line, train.line),
-        cells=tuple(fit.cell for fit in ladder.fits),
+        cells=tuple(fit.cell for fit in kept.fits),
         nominal=study.nominal,
         remaining=rest,
         floor_known=complete,
+        repeatable=known.is_repeatable,
         set_aside=gone,
         with_them=counted,
     )
@@ -337,17 +344,28 @@ def with_maps(study: Study, causes: Causes, progress: Progress) -> tuple[Causes,
     found = often(causes.effects)
     chosen = [term for finding in found for term in finding.terms]
     causes = replace(causes, effects=tuple(whole(f, chosen, study.scene) for f in found))
-    ladder = climbed(study, [f.terms for f in causes.effects], guessed=causes.guessed)
+    ladder = laddered(study, causes)
     progress("error maps of joints")
     maps = error_maps(ladder.last, causes.exclude)
     if not maps.terms:
         return causes, ladder
     effects = merged(maps.findings([causes.effects[i] for i in ladder.taken], study.scene))
     causes = beside_maps(study, replace(causes, effects=tuple(effects), maps=maps), maps.terms)
-    ladder = climbed(study, [finding.terms for finding in effects], guessed=causes.guessed)
+    ladder = laddered(study, causes)
     texts = {term.text for term in ladder.last.terms}
     held = [term for term in maps.terms if term.text in texts]
     return (causes if len(held) == len(maps.terms) else beside_maps(study, causes, held)), ladder
+
+
+def laddered(study: Study, causes: Causes) -> Ladder:
+    """The ladder of all causes, those that are confirmed first."""
+    effects, sure = causes.effects, [found.established for found in causes.effects]
+    return climbed(study, [found.terms for found in effects], sure, guessed=causes.guessed)
+
+
+def beside_them(causes: Causes) -> Causes:
+    """The causes, none of them recommended: poses beyond those measured are met worse by them."""
+    return replace(causes, effects=tuple(replace(f, extends=False) for f in causes.effects))
 
 
 def floor_beneath(robot: Robot, data: Measurements, last: Joint, step: Step) -> Floor:

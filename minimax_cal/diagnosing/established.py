@@ -85,8 +85,13 @@ def loose_among(effects: Sequence[Finding], sure: Sequence[Finding]) -> list[Fin
 
 def is_same(one: Finding, other: Finding) -> bool:
     """Whether an effect is the other at all joints, or one of them, or a rival told with it."""
-    effect, place = one.term.key
-    names = [other.term.key, *((rival.effect, rival.place) for rival in other.alternatives)]
+    return is_named(other, one.term.key)
+
+
+def is_named(finding: Finding, key: Key) -> bool:
+    """Whether an effect, or a rival told with it, is so called, at all joints or one of them."""
+    effect, place = key
+    names = [finding.term.key, *((rival.effect, rival.place) for rival in finding.alternatives)]
     return any(effect == name and (place == at or "all" in (place, at)) for name, at in names)
 
 

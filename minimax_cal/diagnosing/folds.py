@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.diagnosing.causes import Causes, effects_of
+from minimax_cal.diagnosing.established import is_named
 from minimax_cal.diagnosing.gap import Judges, Ladder, climbed
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence.selection import select, tuned_again
@@ -25,13 +26,16 @@ from minimax_cal.modelling.parameters import State
 def fold_of(study: Study, causes: Causes, rows: Array, state: State) -> Ladder:
     """Effects sought and fitted on some rows only; maps of joints only fitted.
 
+    Of those that are confirmed on all rows, or stand for one.
+
     causes: of all rows; the products of their library serve every fold.  rows: (m,) True for those
     used.  state: the geometry that was fitted to them.
     """
     small = studied(study.robot, study.data.take(rows), replace(study.fit, state=state))
     choice = tuned_again(select(causes.choice.part(study.rows.at(rows))))
     named = causes.maps.beside(effects_of(choice))
-    return climbed(small, named, guessed=causes.guessed)
+    sure = [any(is_named(one, terms[0].key) for one in causes.confirmed) for terms in named]
+    return climbed(small, named, sure, guessed=causes.guessed).confirmed
 
 
 def fold_errors(

@@ -65,16 +65,27 @@ class Fits(Sequence[Joint]):
 
 @dataclass(frozen=True, eq=False)
 class Ladder:
-    """Geometry, then with each effect that helps.
+    """Geometry, then with each effect that helps, those that are confirmed first.
 
     taken: numbers of the effects that the ladder took.  With the others groups of poses that were
     left out, or the training poses themselves, are met no better.
-    parts: masks (m,) of those groups.
+    parts: masks (m,) of those groups.  sure: how many of those taken are confirmed.
     """
 
     fits: Sequence[Joint]
     taken: tuple[int, ...]
     parts: tuple[Array, ...]
+    sure: int
+
+    def upto(self, count: int) -> Ladder:
+        """With its first effects only."""
+        sure = min(self.sure, count)
+        return Ladder(self.fits[: 1 + count], self.taken[:count], self.parts, sure)
+
+    @property
+    def confirmed(self) -> Ladder:
+        """As far as it is recommended."""
+        return self.upto(self.sure)
 
     @property
     def last(self) -> Joint:
@@ -94,8 +105,12 @@ def folds(data: Measurements, count: int) -> Array:
     return np.asarray(order[group] % count)
 
 
-def climbed(study: Study, effects: Sequence[Sequence[Term]], *, guessed: bool = False) -> Ladder:
+def climbed(
+    study: Study, effects: Sequence[Sequence[Term]], sure: Sequence[bool], *, guessed: bool = False
+) -> Ladder:
     """The ladder of a study's effects, in their order; with maps of joints the largest first.
+
+    Those that are sure come first: what is recommended is fitted without the others.
 
     What is refused is tried again beside what was taken after it: beside errors much larger than
     its own the prior of a map is too wide.
@@ -108,22 +123,26 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]], *, guessed: bool = 
     last, taken = trials.trial(()), list[int]()
     spared = last.spared([part == number for number in range(FOLDS)])
     mapped = any(EFFECTS[term.effect].is_map for terms in effects for term in terms)
-    waiting = by_size(trials, study, effects) if mapped else list(range(len(effects)))
-    while waiting:
-        refused: list[tuple[int, int]] = []  # with how many were taken before
-        for number in waiting:
-            wide = trials.trial((*taken, number))
-            both = wide.spared(spared)
-            better = wide.cross_validated(both) < (1.0 - HELPS) * last.cross_validated(both)
-            ends = ends_of(study.scene, effects[number][0]) if guessed else []
-            if better and wide.no_worse(last) and not is_worse(last, wide, ends):
-                last = wide
-                taken.append(number)
-            else:
-                refused.append((number, len(taken)))
-        waiting = [number for number, before in refused if mapped and before < len(taken)]
+    order = by_size(trials, study, effects) if mapped else list(range(len(effects)))
+    counts = []
+    for first in (True, False):
+        waiting = [number for number in order if sure[number] == first]
+        while waiting:
+            refused: list[tuple[int, int]] = []  # with how many were taken before
+            for number in waiting:
+                wide = trials.trial((*taken, number))
+                both = wide.spared(spared)
+                better = wide.cross_validated(both) < (1.0 - HELPS) * last.cross_validated(both)
+                ends = ends_of(study.scene, effects[number][0]) if guessed else []
+                if better and wide.no_worse(last) and not is_worse(last, wide, ends):
+                    last = wide
+                    taken.append(number)
+                else:
+                    refused.append((number, len(taken)))
+            waiting = [number for number, before in refused if mapped and before < len(taken)]
+        counts.append(len(taken))
     fits = Fits(study, [effects[number] for number in taken])
-    return Ladder(fits, tuple(taken), tuple(spared))
+    return Ladder(fits, tuple(taken), tuple(spared), counts[0])
 
 
 def by_size(trials: Trials, study: Study, effects: Sequence[Sequence[Term]]) -> list[int]:

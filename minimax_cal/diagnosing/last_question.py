@@ -16,11 +16,11 @@ from scipy.special import chdtri
 from minimax_cal.diagnosing.joint import Joint
 from minimax_cal.diagnosing.left_out import joint_units
 from minimax_cal.diagnosing.result import Finding
-from minimax_cal.evidence.limits import MAX_JOINT_JITTER, MAX_OVER_NOISE
+from minimax_cal.evidence.limits import HALF, MAX_JOINT_JITTER, MAX_OVER_NOISE
 from minimax_cal.fitting.intervals import rms_interval
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults import noise_between
-from minimax_cal.measuring.floor import REPEATS, Floor, least_scatter, of_coordinate, wider
+from minimax_cal.measuring.floor import REPEATS, Floor, least_scatter, of_coordinate
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
 
@@ -32,7 +32,7 @@ ONLY_MINOR = "every confirmed cause is minor, and the remaining error is above t
 class Known:
     """What is known of the noise beneath a final model, as RMS distances [mm].
 
-    highest: that instrument, visits and sound joints may add up to; NaN where nothing tells.
+    highest: that visits, or instrument and sound joints, may add up to; NaN where nothing tells.
     remaining: lower 95 % limit of the model's error but for what its own fit takes.
     visits: lower 97.5 % limit of the scatter of repeated poses, NaN without.  expected: what
     instrument and sound joints would show there, NaN where the instrument is not known.
@@ -55,6 +55,11 @@ class Known:
         """False where visits to one pose scatter more than instrument and sound joints do."""
         return not self.visits > MAX_OVER_NOISE * self.expected
 
+    @property
+    def scatters_most(self) -> bool:
+        """Whether what visits scatter is most of what the model leaves."""
+        return self.meets_floor is True or self.visits**2 > HALF * self.remaining**2
+
 
 def down_to(known: Known, complete: bool) -> bool | None:
     """Whether a model is down to the noise; None where that is not known.
@@ -74,13 +79,8 @@ def known_noise(last: Joint, floor: Floor, data: Measurements, repeatability: fl
     told = math.isfinite(repeatability)
     arm = max(sound, 1e3 * repeatability) if told else sound
     repeats, between = floor.source == REPEATS, noise_between(data)
-    instrument, most = math.nan, math.nan
-    if between:
-        instrument = of_coordinate(between[0])
-        most = instrument * wider(between[1])
+    instrument = of_coordinate(between[0]) if between else math.nan
     highest = math.hypot(floor.high, 0.0 if repeats or told else sound)
-    if repeats:
-        highest = float(np.fmin(highest, math.hypot(most, arm)))
     return Known(
         highest=highest if floor.certain else math.nan,
         remaining=remaining_mm(last),
@@ -130,7 +130,7 @@ def answered(
 
     verdict, where: by the evidence.
     """
-    if not known.is_repeatable and verdict in ("none", "unknown"):
+    if not known.is_repeatable and known.scatters_most and verdict in ("none", "unknown"):
         return "not_repeatable", where
     sure = [found for found in findings if found.established]
     carry = [found for found in sure if not found.minor]

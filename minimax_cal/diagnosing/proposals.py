@@ -46,8 +46,8 @@ def of_unknown(found: Diagnosis) -> Proposal:
     driver = found.structure_in.partition(FOLLOWING)[2]
     asked = (one for one in ASKING if any(word in driver for word in one[0]))
     _, kind, text = next(asked, MORE)
-    what = name_structure(found.structure_in) if driver else "the causes"
-    return Proposal(kind, text, f"whether {what}" if driver else f"{what} that are uncertain")
+    what = f"what causes {name_structure(found.structure_in)}" if driver else "which causes hold"
+    return Proposal(kind, text, what)
 
 
 def separating(causes: Sequence[Finding]) -> Proposal | None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -61,8 +61,9 @@ PEOPLES = {  # how people read a unit of the file
 TOLD_AS = {"rad/(N m)": "mrad at most", "1/(N m^2)": "mm at most"}  # where masses are not told
 NONE_HELPS = "no measurement"  # how what is proposed begins where nothing helps
 VERDICTS = ("none", "named", "one_of", "unknown", "not_repeatable")
+WORSE_OUTSIDE = "with the effects regions left out are met worse"
 NAMED = {"geometric": "calibrated geometry (least squares)"}  # `calibrate` may have another
-MAX_STEPS = 6  # rows of the budget on a first screen: nominal, geometry, effects, noise
+IF_REAL = "if the possible causes are real"
 BELOW = math.nextafter(CONFIRMED, 0.0)  # what was tentative when it was written stays so
 
 
@@ -117,7 +118,8 @@ class Finding(Record):
     the poses of the fit [rad, or m for a bending], where its own unit rests on masses that nobody
     told; empty otherwise.  again: frequency, the share of the subsamples of the poses in which it
     is found again; NaN where poses are too few to ask.  minor: whether it is below 5 % of the
-    squared held-out error that geometry leaves.
+    squared held-out error that geometry leaves.  extends: False where the effects together make
+    regions that are left out worse than geometry alone.
     curve: (3, g) of an error map: joint value, turn, sigma [rad].
     shown: the terms that the data ask for, where `terms` are the whole law that these belong to.
     """
@@ -137,6 +139,7 @@ class Finding(Record):
     rows: Annotated[tuple[int, ...], Fact(key="lines")] = ()
     motion: Annotated[tuple[float, ...], APART] = ()
     again: Annotated[float, Fact(key="frequency")] = 1.0
+    extends: Annotated[bool, APART] = True
     minor: bool = False
     curve: Annotated[Array, APART] = field(default_factory=lambda: np.zeros((3, 0)))
     shown: Annotated[tuple[Term, ...], APART] = ()
@@ -159,6 +162,8 @@ class Finding(Record):
     @derived()
     def why_tentative(self) -> str | None:
         """What keeps it from being confirmed; None if nothing does."""
+        if not self.extends:
+            return WORSE_OUTSIDE
         if math.isnan(self.again):
             return "poses too few to leave any out"
         return "not found again without some of the poses" if self.again < CONFIRMED else None
@@ -250,7 +255,8 @@ class Finding(Record):
         listed = content.get("parameters", [])
         every = as_kind(tuple[Amount, ...], listed, Fact(), f"{at}.parameters")
         again, curve = told.get("again", math.nan), content.get("curve", {})
-        if content.get("established", True) != (again >= CONFIRMED):
+        told["extends"] = content.get("why_tentative") != WORSE_OUTSIDE
+        if told["extends"] and content.get("established", True) != (again >= CONFIRMED):
             told["again"] = 1.0 if content.get("established", True) else BELOW
         return Finding(
             **told,
@@ -448,8 +454,10 @@ class Explained:
 class Diagnosis(Explained, Result):
     """What is still wrong with a calibrated robot.
 
-    ladder: nominal, geometric, then with each effect.  beyond: on whole parts left out, effects
-    searched again without each.  floor: RMS that noise alone would leave.
+    ladder: nominal, geometric, then with each confirmed effect, to the arm that is recommended;
+    possible: with the possible ones besides, None without any, and its arm possible_cell.
+    beyond: on whole parts left out, effects searched again without each.
+    floor: RMS that noise alone would leave.
     closed: share of the gap closed, 0 to 1, with its interval, NaN where it says nothing.
     noise: of a coordinate [m].
     where: see `where.Where.to_dict`.  data: as it was fitted, faults mended; held: (m,) True where
@@ -457,6 +465,7 @@ class Diagnosis(Explained, Result):
     set_aside: points that no fit counts; with_them: how the last step does where they count.
     remaining: what the last step leaves, None in an old file.  floor_known: whether all noise
     beneath it is: that of the joints, which only visits to one pose tell, where it matters.
+    repeatable: False where visits to one pose scatter more than instrument and sound joints do.
     stated_errors, stated_curves: as they stand in the file that the diagnosis was read from.
     """
 
@@ -484,6 +493,9 @@ class Diagnosis(Explained, Result):
     set_aside: tuple[SetAside, ...] = ()
     with_them: Annotated[Accuracy | None, Fact(key="accuracy.holdout_with_them", brief=True)] = None
     floor_known: bool = True
+    repeatable: bool = True
+    possible: Annotated[Step | None, Fact(key="gap.possible")] = None
+    possible_cell: Annotated[Cell | None, APART] = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis of {self.robot}: {self.verdict}. {self.headline()}>"
@@ -494,6 +506,27 @@ class Diagnosis(Explained, Result):
         from minimax_cal.diagnosing.sentences import reasons
 
         return reasons(self)
+
+    @derived()
+    def budget(self) -> list[dict[str, Any]]:
+        """The error budget on held-out poses, to the arm that `calibrate --effects` fits."""
+        rows = [self.budget_row(step) for step in self.ladder]
+        rows[1]["outside_rms_mm"] = finite(self.beyond.geometric_typical_mm)
+        if len(rows) > 2:
+            rows[-1]["outside_rms_mm"] = finite(self.beyond.typical_mm)
+        return rows
+
+    @derived()
+    def budget_possible(self) -> dict[str, Any] | None:
+        """The same with the possible causes besides; None without any."""
+        return self.budget_row(replace(self.possible, name=IF_REAL)) if self.possible else None
+
+    @staticmethod
+    def budget_row(step: Step) -> dict[str, Any]:
+        """A step for JSON."""
+        told = step.holdout
+        sizes = {"rms_mm": finite(told.rms_mm), "max_mm": finite(told.max_mm)}
+        return {"name": step.name, **sizes, "outside_rms_mm": None, "poses": told.poses}
 
     @derived()
     def next(self) -> Proposal | None:
@@ -516,7 +549,9 @@ class Diagnosis(Explained, Result):
         """The effects in the order of the ladder, faults of the data first."""
         rungs = [step.name for step in self.ladder]
         names = [f.term.step for f in self.effects]
-        at = [rungs.index(name) if name in rungs else 0 for name in names]
+        last = len(rungs)  # what is possible follows
+        at = [last if not f.established else rungs.index(name) if name in rungs else 0
+              for f, name in zip(self.effects, names, strict=True)]  # fmt: skip
         return [self.effects[i] for i in sorted(range(len(at)), key=at.__getitem__)]
 
     def leftover(self) -> Leftover:
@@ -565,6 +600,7 @@ class Diagnosis(Explained, Result):
             "frames_convention": CONVENTION,
             "cells": [cell.whole() for cell in (self.cells[0], self.cells[-1])],
             "rungs": [{"name": name, **cell.whole()} for name, cell in self.rungs()],
+            "rung_possible": self.possible_cell and self.possible_cell.whole(),
             "poses": pose_rows(self.data, self.held, errors),
         }
 
@@ -580,7 +616,10 @@ class Diagnosis(Explained, Result):
         nominal, *cells = arms
         if len({(cell.robot.joints, cell.target_names) for cell in arms}) > 1:
             raise CalibrationError(f"{source}: its cells are not of one arm; {AGAIN} diagnose")
+        loose = content.get("rung_possible")
+        more = cell_from_dict(loose, f"{source}: rung_possible") if loose else None
         fitted, first = (cells[-1].effects.terms, cells[0]) if cells else ((), None)
+        fitted = more.effects.terms if more else fitted
         data, held, errors = measured_poses(content, source, first, "geometric")
         gap, pair = content["gap"], tuple[float, float]
         (low, high), closed = (
@@ -596,6 +635,7 @@ class Diagnosis(Explained, Result):
             "data": data,
             "held": held,
             "cells": tuple(cells),
+            "possible_cell": more,
             "nominal": nominal,
             "stated_errors": errors,
             "stated_curves": {
@@ -624,39 +664,35 @@ class Diagnosis(Explained, Result):
     def ladder_table(self) -> Table:
         """The error budget, step by step."""
         floor = self.floor.value
+        steps = [(name_step(step.name), step) for step in self.ladder]
         return Table.of(
             f"{self.robot}: error budget, step by step",
-            [(name_step(step.name), step) for step in self.ladder],
+            [*steps, *([(IF_REAL, self.possible)] if self.possible else [])],
             "0=model | 1.train.rms_mm=train RMS mm .4f | 1.train.max_mm=train max mm .4f | "
             "1.holdout.rms_mm=held-out RMS mm .4f | 1.holdout.max_mm=held-out max mm .4f",
         ).plus((f"noise floor ({self.floor.source})", floor, "", floor, ""))
 
     def first_tables(self) -> tuple[Table, ...]:
-        """What stands on the first screen: the budget in at most six steps.
+        """What stands on the first screen: the budget, minor effects that follow each other as one.
 
-        What follows the main causes is one step where they are more.
+        What the possible causes would do stands below.
         """
         if not self.ladder:
             return ()
-        every = [(NAMED.get(s.name) or name_step(s.name), s.holdout) for s in self.ladder]
-        most = MAX_STEPS - 1  # the last row is the noise
-        if len(every) > most:
-            main = [f.term.step for f in self.main]
-            last = max((i for i, step in enumerate(self.ladder) if step.name in main), default=1)
-            kept = min(last + 1, most - 1)
-            every = [*every[:kept], (self.rest_of(kept), every[-1][1])]
+        small = {f.term.step for f in self.minor}
+        every: list[tuple[str, Accuracy]] = []
+        for is_minor, steps in groupby(self.ladder, key=lambda step: step.name in small):
+            some = list(steps)
+            if is_minor and len(some) > 1:
+                every.append((f"+ {len(some)} minor effects", some[-1].holdout))
+            else:
+                every += [(NAMED.get(s.name) or name_step(s.name), s.holdout) for s in some]
+        if self.possible:
+            every.append((IF_REAL, self.possible.holdout))
         known = "" if self.floor.certain else ", at most"
         title = "error budget, step by step, on held-out poses"
         shown = Table.of(title, every, "0=model | 1.rms_mm=RMS mm .3f | 1.max_mm=max mm .3f")
         return (shown.plus((f"measurement noise{known}", self.floor.value, "")),)
-
-    def rest_of(self, kept: int) -> str:
-        """The steps after those kept, counted by kind, as + 16 minor and 2 possible effects."""
-        of_kind = (("main", self.main), ("minor", self.minor))
-        kinds = {f.term.step: kind for kind, some in of_kind for f in some}
-        counts = Counter(kinds.get(step.name, "possible") for step in self.ladder[kept:])
-        said = [f"{counts[kind]} {kind}" for kind in ("main", "minor", "possible") if counts[kind]]
-        return f"+ {' and '.join(said)} effect{'s' if counts.total() > 1 else ''}"
 
     def effects_table(self) -> Table:
         """The effects found, with what each does for held-out poses; possible ones last."""

@@ -23,6 +23,7 @@ Named = Finding | Alternative
 NOTHING_MM = 5e-4  # of a length that is reported to three digits
 MAX_NAMED_MINOR = 2  # more minor effects than this are counted, not listed
 NOT_VISITED = "it is not known whether the remaining error is the arm's repeatability"
+SCATTERS = "Visits to one pose scatter more than the instrument and sound joints do."
 CONTRADICTED = (
     "Unexplained: the best fit contradicts the measurements. It is no calibration of this arm, and "
     "says nothing about causes."
@@ -53,6 +54,7 @@ def reasons(found: Diagnosis) -> tuple[str, ...]:
             minor(found),
             shrunk(found),
             remaining(found),
+            SCATTERS if not (found.repeatable or found.verdict == "not_repeatable") else "",
             away(found),
             f"Recommended: {following.text}, to know {following.settles}." if following else "",
             possible([f for f in found.by_rung if not f.established]),
@@ -117,8 +119,8 @@ def unexplained(found: Explained) -> str:
     after = "after all effects" if sure else "after geometry"
     guess = " An effect that the library lacks may contribute to the causes above." if sure else ""
     return (
-        f"the error {after} is not random ({left}; p {name_chance(found.structure)}), and no known "
-        f"effect explains it.{guess}"
+        f"the error {after} is not random ({left}; p {name_chance(found.structure)}), and no "
+        f"confirmed effect explains it.{guess}"
     )
 
 
@@ -222,9 +224,8 @@ def shrunk(found: Diagnosis) -> str:
     )
     if len(found.ladder) < 3:
         return f"{text}."
-    more = "" if all(f.established for f in found.by_rung) else ", possible ones included,"
     far = f"largest {last.max_mm:.3f} mm{without_far(found)}"
-    text += f", all effects{more} {last.rms_mm:.3f} mm ({far})"
+    text += f", all confirmed effects {last.rms_mm:.3f} mm ({far})"
     return f"{text}; {closed_words(found)}." if math.isfinite(found.closed) else f"{text}."
 
 
@@ -279,6 +280,6 @@ def away(found: Diagnosis) -> str:
     if beyond.worst and beyond.typical_mm > beyond.geometric_typical_mm:
         text = text.removesuffix(".") + (
             f"; geometry alone is better there ({beyond.geometric_typical_mm:.3f} mm): the effects "
-            "do not extrapolate."
+            "do not extrapolate, and none is recommended."
         )
     return text

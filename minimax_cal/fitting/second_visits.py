@@ -31,7 +31,9 @@ def contradictions(data: Measurements, error: Array) -> Iterator[str]:
     A visit does to which no other comes nearer than Student's t, fitted to all visits, allows
     [Benjamini and Hochberg 1995], by far.  The errors of a fit are compared, or the points where
     these are nearer to each other: moves between visits are in the points, noise of joints that
-    were read back in the errors.  Fewer than five poses that were visited again tell nothing.
+    were read back in the errors.  By far: beside how far visits are from half of the others of
+    their pose, for joints that stop on either side part them into two groups.  Fewer than five
+    poses that were visited again tell nothing.
     error: (k, m, 3), NaN unknown [m].
     """
     group = visits(data)
@@ -39,10 +41,10 @@ def contradictions(data: Measurements, error: Array) -> Iterator[str]:
     known = np.isfinite(near[0][0])
     if len(np.unique(group[known.any(axis=0)])) < FEWEST:
         return
-    apart, other = min(near, key=lambda visit: float(np.median(visit[0][known])))
+    apart, other, amid = min(near, key=lambda visit: float(np.median(visit[0][known])))
     scores = Scores(np.where(known, apart, 0.0) ** 2, 3 * known)
     far = spread_of(scores, 3.0 * known.sum()).far(scores)
-    usual = float(np.quantile(apart[known & ~far], USUAL_QUANTILE)) if (known & ~far).any() else 0.0
+    usual = float(np.quantile(amid[known & ~far], USUAL_QUANTILE)) if (known & ~far).any() else 0.0
     far &= apart > max(MIN_GROSS_RATIO * usual, FAINT)
     if not far.any():
         return
@@ -62,18 +64,22 @@ def contradictions(data: Measurements, error: Array) -> Iterator[str]:
     )
 
 
-def nearest(points: Array, group: Array) -> tuple[Array, Array]:
-    """Of every visit its distance to the nearest other to the same pose, and the row of that.
+def nearest(points: Array, group: Array) -> tuple[Array, Array, Array]:
+    """Of every visit its distance to the nearest other to the same pose, the row of that, and its
+    median distance to the others.
 
     (k, m) [m], NaN where there is none.  points: (k, m, 3), NaN unknown.  group: (m,).
-    """
-    apart = np.full(points.shape[:2], np.inf)
+    """  # fmt: skip
+    apart, amid = np.full((2, *points.shape[:2]), np.inf)
     other = np.zeros(points.shape[:2], dtype=int)
     names, counts = np.unique(group, return_counts=True)
     for name in names[counts > 1]:
         rows = np.flatnonzero(group == name)
         between = np.linalg.norm(points[:, rows, None] - points[:, None, rows], axis=-1)
-        between[:, range(len(rows)), range(len(rows))] = np.inf
+        between[:, range(len(rows)), range(len(rows))] = np.nan
+        seen = np.isfinite(between).any(axis=2, keepdims=True)
+        half = np.nanmedian(np.where(seen, between, 0.0), axis=2)
+        amid[:, rows] = np.where(seen[..., 0], half, np.inf)
         between = np.where(np.isfinite(between), between, np.inf)
         apart[:, rows], other[:, rows] = between.min(axis=2), rows[between.argmin(axis=2)]
-    return np.where(np.isfinite(apart), apart, np.nan), other
+    return np.where(np.isfinite(apart), apart, np.nan), other, amid

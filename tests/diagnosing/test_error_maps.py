@@ -236,12 +236,14 @@ def test_a_ladder_keeps_a_map_whatever_its_place_among_the_effects(
     law = Term("joint_compliance", "all", plain)
     (curve,) = terms(study.scene, ["joint_error_map:J3:size=0.0001"])
     effects = [[(law,), (curve,)][number] for number in order]
-    ladder = climbed(study, effects)
+    ladder = climbed(study, effects, [True] * len(effects))
     assert [effects[number] for number in ladder.taken] == [(law,), (curve,)]
     assert ladder.maps == (curve,)
-    bare = climbed(study, [(law,)])
+    bare = climbed(study, [(law,)], [True])
     assert no_worse(ladder, bare)
     assert not no_worse(bare, ladder)
     monkeypatch.setattr(gap, "by_size", lambda trials, study, effects: list(range(len(effects))))
-    again = climbed(study, effects)  # the curve by itself is refused, and tried again
+    again = climbed(
+        study, effects, [True] * len(effects)
+    )  # the curve by itself is refused, and tried again
     assert again.taken == ladder.taken

@@ -80,7 +80,7 @@ def test_what_takes_the_place_of_a_name_is_its_alternative(geared: Choice) -> No
     assert as_alternative(effect, geared, ("no such", "J1")) == []
 
 
-def test_poses_too_few_to_ask_leave_an_effect_tentative_and_in_the_model() -> None:
+def test_poses_too_few_to_ask_leave_an_effect_possible_below_the_budget() -> None:
     """Twenty poses of one target: two thirds of them tell the geometry and little more."""
     made = make(
         Case("irb2600", "single", (Cause("joint_compliance", "J2", 2e4),), seed=3, poses=20)
@@ -93,8 +93,8 @@ def test_poses_too_few_to_ask_leave_an_effect_tentative_and_in_the_model() -> No
     assert np.isnan(one.again)
     assert not one.established
     assert told.to_dict()["effects"][0]["frequency"] is None
-    geometric, last = told.ladder[1].holdout, told.ladder[-1].holdout
-    assert last.rms_mm < 0.2 * geometric.rms_mm
+    assert told.ladder[-1].name == "geometric"
+    assert told.possible.holdout.rms_mm < 0.2 * told.ladder[-1].holdout.rms_mm
 
 
 def test_a_plain_cause_is_found_in_every_subsample() -> None:

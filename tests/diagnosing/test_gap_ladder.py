@@ -63,7 +63,7 @@ def mapped(play: Study) -> Term:
 @pytest.fixture(scope="module")
 def ladder(play: Study) -> Ladder:
     """Geometry, and with play: the first of two effects is one that no pose is met better with."""
-    return climbed(play, [(Term("gear_ripple", "J6", {"turns": 31.0}),), (PLAY,)])
+    return climbed(play, [(Term("gear_ripple", "J6", {"turns": 31.0}),), (PLAY,)], [True, True])
 
 
 def finding(effect: str, place: str, count: int = 1, unit: str = "rad", **more: object) -> Finding:
@@ -123,14 +123,14 @@ def test_a_rung_has_to_help_by_so_much(play: Study, monkeypatch: pytest.MonkeyPa
     assert 0.1 < fall < 0.9
     for helps, taken in ((0.99 * fall, (0,)), (1.01 * fall, ())):
         monkeypatch.setattr(gap, "HELPS", helps)
-        assert climbed(play, [(PLAY,)]).taken == taken
+        assert climbed(play, [(PLAY,)], [True]).taken == taken
 
 
 def test_what_meets_the_training_poses_worse_is_no_rung(
     play: Study, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Trial, "no_worse", lambda self, other: False)
-    assert climbed(play, [(PLAY,)]).taken == ()
+    assert climbed(play, [(PLAY,)], [True]).taken == ()
 
 
 @pytest.mark.parametrize(("law", "turns", "kept"), [
@@ -142,8 +142,8 @@ def test_where_structure_is_left_a_law_has_to_hold_at_the_ends(
     """Waves fitted to a jump of the joint are taken, but not where they are a best guess."""
     study = study_of(make(Case("irb2600", "single", (Cause(law, "J3", 1000.0),), seed=1)))
     wave = [(Term("gear_error", "J3", {"turns": turns}),)]
-    assert climbed(study, wave).taken == (0,)
-    assert climbed(study, wave, guessed=True).taken == ((0,) if kept else ())
+    assert climbed(study, wave, [True]).taken == (0,)
+    assert climbed(study, wave, [True], guessed=True).taken == ((0,) if kept else ())
 
 
 def test_the_ends_of_what_drives_a_law(play: Study, mapped: Term) -> None:
@@ -160,7 +160,7 @@ def test_the_ends_of_what_drives_a_law(play: Study, mapped: Term) -> None:
 
 def test_findings_get_the_values_of_the_last_rung(play: Study, ladder: Ladder) -> None:
     two = joint(play, (PLAY, TURN))
-    whole = Ladder((ladder.fits[0], joint(play, (PLAY,)), two), (2, 0), ladder.parts)
+    whole = Ladder((ladder.fits[0], joint(play, (PLAY,)), two), (2, 0), ladder.parts, 2)
     named = [finding("gear_error", "J3", 2), finding("gear_ripple", "J6", 2),
              finding("backlash", "J2")]  # fmt: skip
     found = valued(named, whole)
@@ -169,7 +169,7 @@ def test_findings_get_the_values_of_the_last_rung(play: Study, ladder: Ladder) -
     assert_allclose([v for f in found for v in f.sigmas], two.uncertainty.sigma[-3:])
     assert np.all(two.uncertainty.sigma[-3:] > 0.0)
     assert [(len(f.values), f.curve.shape) for f in found] == [(1, (3, 0)), (2, (3, 0))]
-    assert valued(named, Ladder(ladder.fits[:1], (), ladder.parts)) == []
+    assert valued(named, Ladder(ladder.fits[:1], (), ladder.parts, 0)) == []
 
 
 def test_an_error_map_is_drawn_with_its_own_uncertainty(
@@ -180,7 +180,7 @@ def test_an_error_map_is_drawn_with_its_own_uncertainty(
     named = [finding("backlash", "J2"), finding("joint_error_map", "J4", count),
              finding("gear_error", "J3", 2)]  # fmt: skip
     named[1] = replace(named[1], terms=(mapped,))
-    found = valued(named, Ladder((*ladder.fits[:1], last), (0, 1, 2), ladder.parts))
+    found = valued(named, Ladder((*ladder.fits[:1], last), (0, 1, 2), ladder.parts, 3))
     assert [f.curve.shape[1] > 0 for f in found] == [False, True, False]
     covariance = last.uncertainty.covariance[-2 - count : -2, -2 - count : -2]
     sign = float(play.robot.sign[3])
@@ -422,9 +422,9 @@ def test_what_other_training_poses_would_close_is_a_jackknife(play: Study) -> No
                 for fit in fits]  # fmt: skip
         shares.append(1.0 - pair[1] / pair[0])
     expected = (SPARED - 1) ** 2 / SPARED * np.var(shares, ddof=1)
-    found = spared(Ladder(fits, (0,), ()), judges, floor)
+    found = spared(Ladder(fits, (0,), (), 1), judges, floor)
     assert_allclose(found, expected, rtol=0.05)  # one step of Newton against its end
-    share, (low, high) = closed(Ladder(fits, (0,), ()), judges, floor, 4)
+    share, (low, high) = closed(Ladder(fits, (0,), (), 1), judges, floor, 4)
     before, after = (judges.errors(fit.cell) for fit in fits)
     same = closed_share(before, after, clusters(held), floor, found, np.random.default_rng(4))
     assert (share, (low, high)) == same
@@ -452,7 +452,7 @@ def test_parts_that_a_fit_needs_are_passed_over(
             return [one if i < count or not mine else None for i, one in enumerate(out)]
 
         monkeypatch.setattr(gap, "without", some)
-        return spared(Ladder(fits, (0,), ()), judges, floor)
+        return spared(Ladder(fits, (0,), (), 1), judges, floor)
 
     masks = [folds(judges.train, SPARED) == number for number in range(SPARED)]
     states = [plain(fit.estimator, fit.state, masks, 0) for fit in fits]

@@ -112,7 +112,7 @@ def test_no_effect_moves_a_point_by_more_than_a_fiftieth_of_the_reach(play: Stud
 def test_an_effect_that_is_not_there_is_no_rung(play: Study) -> None:
     """Backlash at joint 2 is there; ripple of a joint that has none is not."""
     idle = [(Term("gear_ripple", "J6", {"turns": turns}),) for turns in (31.0, 47.0, 83.0, 117.0)]
-    ladder = climbed(play, [(PLAY,), *idle])
+    ladder = climbed(play, [(PLAY,), *idle], [True] * (1 + len(idle)))
     assert ladder.taken[0] == 0
     assert len(ladder.taken) <= 3  # each helps groups of poses by accident about as often as not
     errors = [fit.cross_validated([folds(play.data, 5) == i for i in range(5)])

@@ -227,7 +227,7 @@ def test_errors_and_curves_are_those_of_the_cells(made: Diagnosis) -> None:
 
 
 def test_findings_stand_in_the_order_of_the_ladder(made: Diagnosis) -> None:
-    assert [f.term.effect for f in made.by_rung] == ["outliers", "backlash", "joint_compliance"]
+    assert [f.term.effect for f in made.by_rung] == ["outliers", "joint_compliance", "backlash"]
 
 
 def test_the_tables_hold_the_numbers_of_people(made: Diagnosis) -> None:

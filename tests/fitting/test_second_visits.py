@@ -36,7 +36,7 @@ def test_the_nearest_other_visit_by_brute_force():
     rng = np.random.default_rng(4)
     points, group = rng.normal(size=(2, 9, 3)), np.array([0, 1, 0, 2, 0, 1, 3, 4, 4])
     points[1, 8] = np.nan
-    apart, other = nearest(points, group)
+    apart, other, amid = nearest(points, group)
     for target in range(2):
         for row in range(9):
             rest = [i for i in np.flatnonzero(group == group[row]) if i != row]
@@ -45,6 +45,7 @@ def test_the_nearest_other_visit_by_brute_force():
                 assert np.isnan(apart[target, row])
             else:
                 assert_allclose(apart[target, row], np.nanmin(far), rtol=1e-12)
+                assert_allclose(amid[target, row], np.nanmedian(far), rtol=1e-12)
                 assert other[target, row] == rest[int(np.nanargmin(far))]
 
 

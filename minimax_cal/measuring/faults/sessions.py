@@ -13,6 +13,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.distances import FAINT, FEWEST
 from minimax_cal.measuring.faults.fault import NO_ERROR, NONE, Amount, Fault
 from minimax_cal.measuring.faults.limits import FALSE_ALARM
+from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.history import sessions, visits
 from minimax_cal.measuring.measurements import Measurements
 
@@ -93,13 +94,21 @@ def jumps(data: Measurements, error: Array) -> tuple[Array, Array]:
     count = known.sum(axis=0)[order, None]
     mean = np.where(known[..., None], error, 0.0).sum(axis=0)[order] / count
     place = np.where(known.T[..., None], data.y, 0.0).sum(axis=1)[order] / count
-    poses = Rigid.of(place, mean)
-    starts = jumps_in(poses, len(order))
+    begins = new_poses(data, order)
+    often = np.diff([*begins, len(order)])[:, None]  # visits in a row, which are one pose
+    poses = Rigid.of(*(np.add.reduceat(part, begins) / often for part in (place, mean)))
+    starts = jumps_in(poses, len(begins))
     if not starts:
         return NONE, np.zeros(0)
-    steps = [poses.fitted(a, b) for a, b in pairwise([0, *starts, len(order)])]
+    steps = [poses.fitted(a, b) for a, b in pairwise([0, *starts, len(begins)])]
     sizes = [poses.size(later - earlier) for earlier, later in pairwise(steps)]
-    return order[np.array(starts, dtype=int)], np.array(sizes)
+    return order[begins[np.array(starts, dtype=int)]], np.array(sizes)
+
+
+def new_poses(data: Measurements, order: Array) -> Array:
+    """(p,) at which visits another pose begins.  order: (v,) rows as visited."""
+    pose = groups(data)[order]
+    return np.flatnonzero(np.concatenate([[True], pose[1:] != pose[:-1]]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,139 @@
+"""The budget ends with the arm that is recommended, and says what nobody has measured."""
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import minimax_cal as mc
+from experiments.gap_cases import Case, Cause, make
+from minimax_cal.diagnosing.established import is_named
+from minimax_cal.diagnosing.proposals import REVISIT
+from minimax_cal.diagnosing.sentences import SCATTERS
+from minimax_cal.measuring.floor import instrument_alone
+from minimax_cal.modelling.simulate import Truth, gravity, simulate
+
+
+@cache
+def loose():
+    """A strong cause, play, and a ripple that not all subsamples find; and its diagnosis."""
+    causes = (
+        Cause("joint_compliance", "J2", 3000.0),
+        Cause("gear_ripple", "J4", 40.0),
+        Cause("backlash", "J3", 60.0),
+    )
+    made = make(Case("irb2600", "pair", causes, seed=5, poses=80))
+    return made, mc.diagnose(made.robot, made.data)
+
+
+def test_the_budget_ends_with_what_is_recommended():
+    made, found = loose()
+    assert [f.established for f in found.by_rung] == [True, True, False]
+    names = [row["name"] for row in found.budget]
+    assert names == ["nominal", "geometric", *(f.term.step for f in found.by_rung[:-1])]
+    held = {"objective": "sum", "effects": found}
+    fit = mc.calibrate(made.robot, made.data, **held)
+    last = found.budget[-1]
+    assert fit.accuracy["holdout"].rms_mm == pytest.approx(last["rms_mm"], rel=0.01)
+    assert fit.accuracy["holdout"].poses == last["poses"]
+    assert {t.key for t in fit.cell.effects.terms} == {t.key for t in found.cells[-1].effects.terms}
+    assert last["outside_rms_mm"] == pytest.approx(found.beyond.typical_mm)
+
+
+def test_what_is_possible_stands_below_and_in_the_file():
+    _, found = loose()
+    assert found.budget_possible["name"] == "if the possible causes are real"
+    assert found.budget_possible["rms_mm"] == found.possible.holdout.rms_mm
+    *_, row, noise = found.first_tables()[0].rows
+    assert row[:2] == (found.budget_possible["name"], found.possible.holdout.rms_mm)
+    assert noise[0].startswith("measurement noise")
+    again = mc.Diagnosis.from_dict(json.loads(found.json()))
+    assert again.budget == found.budget
+    assert again.budget_possible == found.budget_possible
+    assert len(again.possible_cell.effects.terms) == len(again.cells[-1].effects.terms) + 1
+    texts = ([t.text for f in one.effects for t in f.terms] for one in (again, found))
+    assert next(texts) == next(texts)
+
+
+def test_effects_that_do_not_extrapolate_are_not_recommended():
+    """They stay in the list, with the reason, and in the file."""
+    _, found = loose()
+    loosened = tuple(replace(one, extends=False) for one in found.effects)
+    assert not any(one.established for one in loosened)
+    again = mc.Diagnosis.from_dict(json.loads(replace(found, effects=loosened).json()))
+    assert {one.why_tentative for one in again.effects} == {loosened[0].why_tentative}
+    assert "regions" in loosened[0].why_tentative
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1.2e-5])
+def test_what_nobody_measured_is_not_assumed(jitter):
+    """Joints that scatter: without visits nobody knows; with them it is noise, and known."""
+    robot = mc.load_robot("irb2600")
+    sim = simulate(robot, 80, 3, seed=2, truth=Truth(compliance=0.0))
+    again = np.concatenate([np.arange(80), np.arange(20)])
+    q = sim.data.q[again]
+    rng = np.random.default_rng(5)
+    y = sim.cell.predict(q + jitter * rng.normal(size=q.shape))
+    y = y + 17e-6 * rng.normal(size=y.shape)
+    data = replace(sim.data.take(again), y=y, line=np.arange(100) + 1)
+    once, twice = (mc.diagnose(robot, each, quick=True) for each in (data.take(slice(80)), data))
+    instrument, _ = instrument_alone(once.data)
+    matters = once.ladder[-1].trusted.rms_mm > 1.2 * instrument
+    assert matters == (jitter > 0.0)
+    assert once.floor_known == (not matters)
+    assert (once.next == REVISIT) == matters
+    assert twice.floor_known
+    assert twice.next is None
+    assert {once.verdict, twice.verdict} == {"none"}
+    for found in (once, twice):
+        left = found.remaining
+        told = np.hypot(left.noise_mm, left.unexplained_mm)
+        assert told == pytest.approx(max(found.ladder[-1].trusted.rms_mm, left.noise_mm))
+
+
+def test_a_name_stands_for_its_rivals():
+    _, found = loose()
+    one = found.effects[0]
+    assert is_named(one, one.term.key)
+    assert is_named(one, (one.term.effect, "all"))
+    assert not is_named(one, ("frame_drift", "frame"))
+    for rival in one.alternatives:
+        assert is_named(one, (rival.effect, rival.place))
+
+
+def visited(poses, times, scatter, law=0.0, bend=0.0, cyclic=False):
+    """Poses that are visited again and again, joint 2 turned to either side by a scatter."""
+    robot, rng = mc.load_robot("irb2600"), np.random.default_rng(7)
+    sim = simulate(robot, poses, 3, seed=4, truth=Truth(compliance=0.0, span=1.2))
+    rows = np.tile(np.arange(poses), times) if cyclic else np.repeat(np.arange(poses), times)
+    q = sim.data.q[rows]
+    moved = q + bend * gravity(sim.cell.robot, q)
+    moved[:, 1] += law * np.sin(4.0 * q[:, 1] + 3.0 * q[:, 2] + 2.0 * q[:, 0])
+    moved[:, 1] += scatter * rng.choice([-1.0, 1.0], len(q))
+    y = sim.cell.predict(moved) + 12e-6 * rng.normal(size=(len(q), 3, 3))
+    return mc.diagnose(robot, mc.measurements(q, y), quick=True)
+
+
+def test_the_larger_part_has_the_first_sentence_and_a_visit_is_no_pose():
+    """A curve that no law knows, .2 mm, in visits that scatter by half of that."""
+    found = visited(24, 10, 60e-6, law=150e-6)
+    assert found.verdict == "unknown"
+    assert found.reasons[0].startswith("Unexplained")
+    assert not found.repeatable
+    assert SCATTERS in found.reasons
+    assert not any("elsewhere" in text or "contradict" in text for text in found.notices)
+
+
+@pytest.mark.parametrize("cyclic", [False, True])
+def test_what_visits_scatter_is_not_unexplained(cyclic):
+    found = visited(40, 5, 80e-6, bend=0.5e-6, cyclic=cyclic)
+    assert found.verdict in ("named", "one_of")
+    assert found.effects[0].term.effect == "joint_compliance"
+    assert found.meets_floor
+    assert not found.repeatable
+    assert not any("elsewhere" in text or "contradict" in text for text in found.notices)
+    alone = visited(40, 5, 80e-6, cyclic=cyclic)
+    assert alone.verdict == "not_repeatable"
+    assert alone.next.kind == "repeat"
