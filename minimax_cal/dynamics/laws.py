@@ -17,7 +17,7 @@ import numpy as np
 
 from minimax_cal.dynamics.regressor import PER_LINK
 from minimax_cal.dynamics.rows import CUTOFF_HZ
-from minimax_cal.dynamics.scene import Scene
+from minimax_cal.dynamics.scene import Scene, sense_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Table
@@ -173,6 +173,28 @@ def delay(scene: Scene, j: int, choice: Choice) -> Array:
     return np.asarray(-scene.logs.slope(scene.load + scene.friction))[..., None]
 
 
+def coupled_drive(scene: Scene, j: int, choice: Choice) -> Array:
+    """Friction of a motor that turns by a joint and the one before it, as of coupled wrists."""
+    sign, qd = choice["sign"], scene.logs.motion.qd
+    w = qd[:, j] + sign * qd[:, j - 1]
+    at_motor = np.stack([sense_of(w, scene.arm.soft[j]), w], axis=1)
+    out = np.zeros((*scene.load.shape, 2))
+    out[:, j], out[:, j - 1] = at_motor, sign * at_motor
+    return out
+
+
+def by_sign(scene: Scene, j: int) -> list[Choice]:
+    """With the joint before it, or against it."""
+    return [{"sign": 1.0}, {"sign": -1.0}]
+
+
+def has_neighbour(scene: Scene, j: int) -> str:
+    """Whether a joint and the one before it turn, and their torques have one unit."""
+    if not j or scene.arm.robot.prismatic[[j - 1, j]].any():
+        return "two joints that turn, one after the other"
+    return has_gains(scene, j)
+
+
 def by_length(scene: Scene, j: int) -> list[Choice]:
     """Lengths over which friction builds up, as shares of the way between reversals."""
     way = float(scene.since_reversal[:, j].max())
@@ -261,6 +283,10 @@ EVERY = (
         tuned={"seconds": Tuned(unit="s", bounds=(0.0, np.inf))}, held=()),
     Law("armature", "rotor inertia", ("a",), names=("inertia",), units=("t s^2/rad",),
         nonnegative=True, held=(ARMATURE,)),
+    # its rotor is no law: of parallel joints it is what a rotor of one joint and the links are
+    Law("coupled_drive", "drive that turns by two joints", (), ("Coulomb", "viscous"),
+        ("t", "t s/rad"), coupled_drive, choices=by_sign, needs=has_neighbour, nonnegative=True,
+        tuned={"sign": Tuned()}, held=(), why="give `coupling` in the robot file"),
     Law("drive_gain", "drive gain", ("load",), needs=has_gains, separate=KNOWN_LOAD, held=(GAIN,),
         why="scales what is logged, and no motor of the model holds it: give drive_gain=", **SHARE),
     Law("torque_offset", "torque offset", ("1.0",), names=("offset",), held=(),

@@ -403,3 +403,22 @@ def test_a_joint_that_stops_keeps_the_friction_of_its_bristles() -> None:
     bare = replace(found, models=(replace(last, held=np.zeros_like(last.held)),))
     assert np.all(whole < 0.25 * np.array(mc.evaluate_motion(bare, [stopping(7)]).steps[-1].rms))
     assert_allclose(last.held, [[0.0, 4.0], [0.0, 3.0], [0.0, 1.5]], rtol=0, atol=0.4)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_motor_that_turns_by_two_joints_is_named_with_its_friction(sign):
+    """As of a coupled wrist, whose file tells no coupling; friction at its joints is none of it."""
+
+    def more(motion, rigid, time):
+        w = motion.qd[:, 2] + sign * motion.qd[:, 1]
+        at_motor = 5.0 * np.sign(w) + 2.0 * w
+        return np.stack([0.0 * w, sign * at_motor, at_motor], axis=1)
+
+    found = mc.diagnose_motion(ARM, simulated(more, seed=3, noise=0.05))
+    assert found.verdict in ("named", "one_of")
+    (named,) = [one for one in found.effects if one.effect == "coupled_drive"]
+    assert (named.place, named.established) == ("J3", True)
+    values = [one.value for one in named.parameters]
+    assert_allclose(values, [5.0, 2.0, sign], rtol=0.01)
+    plain = mc.diagnose_motion(ARM, simulated(seed=3, noise=0.05))
+    assert "coupled_drive" not in [one.effect for one in plain.effects]
