@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.measurements import Measurements, read_measurements
-from minimax_cal.reading.rows import TEXT
 
 MOST_FILES = 100
 LABELS = ("pose", "group")  # which mean something in their own file only
@@ -98,20 +97,23 @@ def campaigns(parts: Sequence[Measurements], names: Sequence[str]) -> Measuremen
     """
     check_alike(parts)
     step = numbered_apart(parts)
+    targets = tuple(dict.fromkeys(name for part in parts for name in part.target_names))
+
+    def placed(part: Measurements, name: str, more: int) -> Measurements:
+        return with_targets(renumbered(in_session(part, name), more, name), targets)
+
     named = [
-        renumbered(in_session(part, name), number * step, name)
+        part.everywhere(partial(placed, name=name, more=number * step))
         for number, (part, name) in enumerate(zip(parts, names, strict=True))
     ]
-    named = in_turn(named)
-    targets = tuple(dict.fromkeys(name for part in named for name in part.target_names))
+    first, *others = in_turn(named)
     said = ", ".join(
         f"{part.source} from line {number * step + 1}"
         for number, part in enumerate(parts)
         if number
     )
-    whole = stacked([with_targets(part, targets) for part in named])
     return replace(
-        whole,
+        first.followed_by(*others),
         notices=(
             *(notice for part in parts for notice in part.notices),
             f"{len(parts)} files are sessions {', '.join(names)}; lines are numbered on: {said}",
@@ -149,8 +151,7 @@ def in_session(part: Measurements, name: str) -> Measurements:
     own = part.columns.get("session", np.full(part.poses, "")).astype(str)
     several = len(np.unique(own)) > 1
     label = np.array([f"{name}/{cell}" if several and cell else name for cell in own], dtype=str)
-    aside = in_session(part.aside, name) if part.aside else None
-    return replace(part, columns={**part.columns, "session": label}, aside=aside)
+    return replace(part, columns={**part.columns, "session": label})
 
 
 def renumbered(part: Measurements, more: int, name: str) -> Measurements:
@@ -167,7 +168,6 @@ def renumbered(part: Measurements, more: int, name: str) -> Measurements:
         line=part.line + more,
         columns=columns,
         set_aside=tuple(replace(point, row=point.row + more) for point in part.set_aside),
-        aside=renumbered(part.aside, more, name) if part.aside else None,
     )
 
 
@@ -181,65 +181,19 @@ def in_turn(parts: Sequence[Measurements]) -> list[Measurements]:
         if len(known):
             late = float(last - known.min()) if known.min() <= last else 0.0
             last = float(known.max()) + late
-            part = later(part, late + 1.0) if late else part
+            part = part.everywhere(partial(later, seconds=late + 1.0)) if late else part
         out.append(part)
     return out
 
 
 def later(part: Measurements, seconds: float) -> Measurements:
     """A part measured so much later [s]."""
-    aside = later(part.aside, seconds) if part.aside else None
     columns = {**part.columns, "time": part.columns["time"].astype(float) + seconds}
-    return replace(part, columns=columns, aside=aside)
+    return replace(part, columns=columns)
 
 
 def with_targets(part: Measurements, names: tuple[str, ...]) -> Measurements:
     """A part with all targets of some names, those that it lacks measured nowhere."""
     y = np.full((part.poses, len(names), 3), np.nan)
     y[:, [names.index(name) for name in part.target_names]] = part.y
-    aside = with_targets(part.aside, names) if part.aside else None
-    return replace(part, y=y, target_names=names, aside=aside)
-
-
-def stacked(parts: Sequence[Measurements]) -> Measurements:
-    """Parts of the same joints and targets one after the other."""
-    aside = [part.aside for part in parts if part.aside]
-    return replace(
-        parts[0],
-        q=np.concatenate([part.q for part in parts]),
-        y=np.concatenate([part.y for part in parts]),
-        line=np.concatenate([part.line for part in parts]),
-        columns=together(parts, lambda part: dict(part.columns)),
-        unknown=together(parts, lambda part: dict(part.unknown)),
-        simulated=all(part.simulated for part in parts),
-        set_aside=tuple(point for part in parts for point in part.set_aside),
-        aside=stacked(aside) if aside else None,
-    )
-
-
-def together(
-    parts: Sequence[Measurements], held: Callable[[Measurements], dict[str, Array]]
-) -> dict[str, Array]:
-    """Columns of all parts, empty where a part lacks one.  held: those of a part."""
-    names = dict.fromkeys(name for part in parts for name in held(part))
-    return {
-        name: np.concatenate([
-            held(part).get(name, empty(name, part, is_text(name, parts, held))) for part in parts
-        ])
-        for name in names
-    }  # fmt: skip
-
-
-def is_text(
-    name: str, parts: Sequence[Measurements], held: Callable[[Measurements], dict[str, Array]]
-) -> bool:
-    """Whether the cells of a column are text."""
-    found = next(held(part)[name] for part in parts if name in held(part))
-    return name in TEXT or found.dtype.kind in "US"
-
-
-def empty(name: str, part: Measurements, text: bool) -> Array:
-    """(m,) cells of a column that a part lacks; without a `split` all poses are for training."""
-    if name == "split":
-        return np.full(part.poses, "train")
-    return np.full(part.poses, "" if text else np.nan)
+    return replace(part, y=y, target_names=names)

@@ -14,13 +14,7 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import csv_text, write_whole
 from minimax_cal.ground.words import name_first, one_line
 from minimax_cal.measuring.aside import SetAside
-from minimax_cal.reading.rows import (
-    TARGET,
-    UNITS,
-    Rows,
-    header_check,
-    read_rows,
-)
+from minimax_cal.reading.rows import TARGET, TEXT, UNITS, Rows, header_check, read_rows
 from minimax_cal.reading.sheet import Lines
 from minimax_cal.reading.words import OWN, joints_of, kind_of, stems_of
 
@@ -122,20 +116,25 @@ class Measurements:
         )
 
     def followed_by(self, *others: Measurements) -> Measurements:
-        """These rows, then others with the same columns."""
+        """These rows, then others; a part that lacks a column knows nothing there."""
         parts = (self, *others)
-
-        def stacked(of: Callable[[Measurements], Mapping[str, Array]]) -> dict[str, Array]:
-            return {name: np.concatenate([of(part)[name] for part in parts]) for name in of(self)}
-
+        poses = [part.poses for part in parts]
+        aside = [part.aside for part in parts if part.aside]
         return replace(
             self,
             q=np.concatenate([part.q for part in parts]),
             y=np.concatenate([part.y for part in parts]),
             line=np.concatenate([part.line for part in parts]),
-            columns=stacked(lambda part: part.columns),
-            unknown=stacked(lambda part: part.unknown),
+            columns=stacked([part.columns for part in parts], poses),
+            unknown=stacked([part.unknown for part in parts], poses),
+            simulated=all(part.simulated for part in parts),
+            set_aside=tuple(point for part in parts for point in part.set_aside),
+            aside=aside[0].followed_by(*aside[1:]) if aside else None,
         )
+
+    def everywhere(self, change: Callable[[Measurements], Measurements]) -> Measurements:
+        """Changed, and the points that are set aside as well."""
+        return replace(change(self), aside=change(self.aside) if self.aside else None)
 
     def keep(self, targets: Array) -> Measurements:
         """Some targets only, at the poses where one of them was measured.  targets: (k,) mask."""
@@ -154,6 +153,21 @@ class Measurements:
     def with_y(self, y: Array) -> Measurements:
         """The same poses with other measured points."""
         return replace(self, y=y)
+
+
+def stacked(parts: Sequence[Mapping[str, Array]], poses: Sequence[int]) -> dict[str, Array]:
+    """Columns of parts of so many poses one after the other, empty where a part lacks one.
+
+    Without a `split` all its poses are for training.
+    """
+    out = {}
+    for name in dict.fromkeys(name for part in parts for name in part):
+        found = next(part[name] for part in parts if name in part)
+        text = name in TEXT or found.dtype.kind in "US"
+        none = "train" if name == "split" else "" if text else np.nan
+        every = [part.get(name, np.full(m, none)) for part, m in zip(parts, poses, strict=True)]
+        out[name] = np.concatenate(every)
+    return out
 
 
 def measurements(q: Array, y: Array, **columns: Array) -> Measurements:

@@ -57,35 +57,14 @@ def set_aside(data: Measurements, points: Array, why: str, by: str) -> Measureme
 
 
 def merged(one: Measurements, other: Measurements) -> Measurements:
-    """The points of two parts of one file, by line; rows that both have come once.
-
-    Columns are those of the first; rows of the second that lack one know nothing there.
-    """
+    """The points of two parts of one file, by line; rows that both have come once."""
     both = np.isin(other.line, one.line)
     y = one.y.copy()
     at = np.searchsorted(one.line, other.line[both], sorter=np.argsort(one.line))
     rows = np.argsort(one.line)[at]
     y[rows] = np.where(np.isfinite(y[rows]), y[rows], other.y[both])
-    more = other.take(~both)
-    whole = replace(
-        one,
-        q=np.concatenate([one.q, more.q]),
-        y=np.concatenate([y, more.y]),
-        line=np.concatenate([one.line, more.line]),
-        columns={name: joined(column, more.columns.get(name), more.poses)
-                 for name, column in one.columns.items()},
-        unknown={name: joined(column, more.unknown.get(name), more.poses)
-                 for name, column in one.unknown.items()},
-    )  # fmt: skip
+    whole = one.with_y(y).followed_by(other.take(~both))
     return whole.take(np.argsort(whole.line, kind="stable"))
-
-
-def joined(column: Array, more: Array | None, count: int) -> Array:
-    """A column with rows of another part, which know nothing where they lack it."""
-    if more is None:
-        text = column.dtype.kind in "US"
-        more = np.full(count, "") if text else np.full(count, np.nan)
-    return np.concatenate([column, more])
 
 
 def whole(data: Measurements) -> Measurements:

@@ -21,8 +21,7 @@ from minimax_cal.measuring.importers.join import (
     with_keys,
 )
 from minimax_cal.measuring.importers.reading import Column, Given, Reading
-from minimax_cal.measuring.importers.times import STAMPED, celsius, seconds
-from minimax_cal.measuring.importers.units import decide
+from minimax_cal.measuring.importers.units import STAMPED, celsius, decide, seconds
 from minimax_cal.measuring.measurements import Measurements, check_finite, marked
 from minimax_cal.measuring.set_aside import COLUMN, from_column, set_aside, sound
 from minimax_cal.measuring.tools import by_tool
