@@ -96,7 +96,8 @@ def campaigns(parts: Sequence[Measurements], names: Sequence[str]) -> Measuremen
     their names.  Raises DataError for parts of different joints.
     """
     check_alike(parts)
-    step = numbered_apart(parts)
+    last = max(int(part.line.max(initial=1)) for part in parts)
+    step = int(10 ** max(3, len(str(last))))  # a round number above all lines
     targets = tuple(dict.fromkeys(name for part in parts for name in part.target_names))
 
     def placed(part: Measurements, name: str, more: int) -> Measurements:
@@ -138,12 +139,6 @@ def check_alike(parts: Sequence[Measurements]) -> None:
                 f"{part.source}: joint {joint} is a length there and an angle in {first.source}, "
                 "or the other way round; name the column by its unit"
             )
-
-
-def numbered_apart(parts: Sequence[Measurements]) -> int:
-    """A round number above all lines of the parts."""
-    last = max(int(part.line.max(initial=1)) for part in parts)
-    return int(10 ** max(3, len(str(last))))
 
 
 def in_session(part: Measurements, name: str) -> Measurements:

@@ -31,6 +31,7 @@ KNOWN = ("order", "time_s", "temperature_C", "payload_kg", "session", "group", "
          "split", "set_aside", "tool", "payload_x_mm", "q1_rad", "q1_deg",
          *(f"smr1_{axis}_mm" for axis in "xyz"))  # fmt: skip
 NOTHING = re.compile(r"(?!)")
+THOUSANDS = re.compile(r"[-+]?\d{1,3}([.,' ]\d{3})+[.,]\d+")
 OF_JOINT = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
 
 
@@ -201,17 +202,31 @@ def useless(header: Sequence[str]) -> dict[str, str]:
     return out
 
 
-def numbers(path: Path | str, name: str, cells: list[str], line: Array, *, empty: bool) -> Array:
+def numbers(
+    path: Path | str,
+    name: str,
+    cells: Sequence[str],
+    line: Array,
+    *,
+    decimal: str = ".",
+    empty: bool,
+) -> Array:
     """One column as floats; an empty cell is NaN where that is allowed.  Raises DataError."""
-    out = numbers_of(cells)
+    out = numbers_of(cells, decimal)
     for i in np.flatnonzero(~np.isfinite(out)):
         cell = cells[i]
         if not cell and empty:
             continue
-        where = f"{path}:{line[i]}: column {name}: "
-        if cell and (np.isinf(out[i]) or cell.lower().strip("+-") == "nan"):
-            mend = "; leave the cell empty where it was not measured" if empty else ""
-            raise DataError(f"{where}{cell} is not a finite number{mend}")
-        comma = "; use a decimal point" if COMMA.fullmatch(cell) else ""
-        raise DataError(f"{where}{f'{cell!r} is not a number' if cell else 'is empty'}{comma}")
+        mends = (
+            (not cell, "complete it or delete the row"),
+            (COMMA.fullmatch(cell), "use a decimal point"),
+            (THOUSANDS.fullmatch(cell), "take the thousands separators out"),
+            (empty, "mend it, or leave the cell empty where it was not measured"),
+            (True, "mend it or delete the row"),
+        )
+        mend = next(mend for fits, mend in mends if fits)
+        wild = np.isinf(out[i]) or cell.lower().strip("+-") == "nan"
+        what = f"{cell} is not a finite number" if wild else f"{cell!r} is not a number"
+        what = what if cell else "is empty"
+        raise DataError(f"{path}:{line[i]}: column {name}: {what}; {mend}")
     return out

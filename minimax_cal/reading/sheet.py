@@ -115,10 +115,10 @@ def numbers_of(cells: Sequence[str], decimal: str = ".") -> Array:
     return np.array([number_of(cell) for cell in given], dtype=float)
 
 
-def number_of(cell: str) -> float:
+def number_of(cell: str, decimal: str = ".") -> float:
     """One number, NaN where the cell holds none."""
     try:
-        return float(cell if "_" not in cell else "nan")
+        return float(cell.replace(decimal, ".") if "_" not in cell else "nan")
     except ValueError:
         return np.nan
 
@@ -271,15 +271,12 @@ def below_table(rows: list[Row], padded: bool) -> range:
     lengths = [len(trimmed(row) if padded else row) for row in rows]
     width = Counter(lengths).most_common(1)[0][0]
     last = len(rows)
-    while last > 1 and 2 * lengths[last - 1] <= width and is_remark(rows[last - 1]):
+    while last > 1 and 2 * lengths[last - 1] <= width:
+        row = rows[last - 1]
+        if sum(map(is_number, row)) >= min(sum(map(bool, row)), COORDINATES):
+            break
         last -= 1
     return range(last, len(rows))
-
-
-def is_remark(row: Row) -> bool:
-    """Whether a row holds words, and too few numbers for a point."""
-    filled = sum(map(bool, row))
-    return numbers_in(row) < min(filled, COORDINATES)
 
 
 def split_header(rows: list[NumberedRow]) -> tuple[tuple[str, ...], list[NumberedRow]]:
@@ -381,11 +378,6 @@ def trimmed(row: Row) -> Row:
 def is_number(cell: str) -> bool:
     """Whether a cell is a number with either decimal sign."""
     return bool(POINT.fullmatch(cell) or COMMA.fullmatch(cell))
-
-
-def numbers_in(row: Row) -> int:
-    """How many cells of a row are numbers."""
-    return sum(map(is_number, row))
 
 
 def is_header(row: Row) -> bool:

@@ -25,6 +25,7 @@ from minimax_cal.measuring.importers.units import STAMPED, celsius, decide, seco
 from minimax_cal.measuring.measurements import Measurements, check_finite, marked
 from minimax_cal.measuring.set_aside import COLUMN, from_column, set_aside, sound
 from minimax_cal.measuring.tools import by_tool
+from minimax_cal.reading.sheet import number_of
 from minimax_cal.reading.words import ANGLES, LENGTHS
 
 TEXTS = ("session", "group", "split", "pose", "tool", COLUMN)
@@ -296,12 +297,13 @@ def understood(reading: Reading, column: Column, given: Given, scales: Scales, w
         return Meaning(column, "left out", unit, column.remark)
     if family == "q":
         unit, known = (unit, known) if unit else (scales.q, scales.why_q)
-        value = reading.number(column, 0, first) * (LENGTHS | ANGLES)[unit]
+        value = number_of(first, reading.sheet.decimal) * (LENGTHS | ANGLES)[unit]
         si = f"{value:.6g} {'m' if unit in LENGTHS else 'rad'}"
         return Meaning(column, f"joint {column.meaning[1:]}", unit, known, si)
     if family == "smr":
         unit, known = (unit, known) if unit else (scales.y, scales.why_y)
-        si = f"{reading.number(column, 0, first) * LENGTHS[unit]:.6g} m" if first else ""
+        value = number_of(first, reading.sheet.decimal) * LENGTHS[unit]
+        si = f"{value:.6g} m" if first else ""
         return Meaning(column, f"{who} {column.meaning[-1]}", unit, known, si)
     if family == "target":
         return Meaning(column, "name of the target", "", known, first)

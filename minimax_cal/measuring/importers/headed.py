@@ -18,7 +18,6 @@ from minimax_cal.reading.sheet import Sheet, is_number
 from minimax_cal.reading.words import (
     WORDS,
     along_arm,
-    joint_number,
     joints_of,
     kind_of,
     plain,
@@ -61,16 +60,10 @@ def in_words(stems: Stems) -> Meanings:
     return {**joints_of(stems), **points_of(stems)}
 
 
-def of_robodk(stems: Stems) -> Meanings:
-    """Joints J1 ... beside the point x, y, z."""
-    point = {axis: f"smr1_{axis}" for axis in "xyz"}
-    return point | {stem: f"q{number}" for stem in stems if (number := joint_number(stem))}
-
-
 def of_tracker6d(stems: Stems) -> Meanings:
     """Named joints beside the measured pose, of which the origin counts."""
     named = along_arm([stem for stem in stems if stem.endswith("_joint")])
-    return {**MEASURED, **{stem: f"q{i + 1}" for i, stem in enumerate(named)}}
+    return MEASURED | {stem: f"q{i + 1}" for i, stem in enumerate(named)}
 
 
 def of_figaroh(stems: Stems) -> Meanings:
@@ -78,22 +71,6 @@ def of_figaroh(stems: Stems) -> Meanings:
     others = [s for s in stems if not (MARKER.fullmatch(s) or TURNED.fullmatch(s) or plain(s))]
     joints = {stem: f"q{i + 1}" for i, stem in enumerate(along_arm(others))}
     return {s: f"smr{m[2]}_{m[1]}" for s in stems if (m := MARKER.fullmatch(s))} | joints
-
-
-def of_contract(stems: Stems) -> Meanings:
-    """The names of this project's own CSV; others are kept, whatever they mean elsewhere."""
-    return {stem: stem if kind_of(stem) or stem in WORDS else "" for stem in stems}
-
-
-def has_both(stems: Stems, joints: bool) -> bool:
-    """Whether the header names joints and points."""
-    enough = len(joints_of(stems)) >= LEAST_JOINTS and bool(points_of(stems))
-    return not joints and enough
-
-
-def has_joints(stems: Stems, joints: bool) -> bool:
-    """Whether the header names joints; beside x, y, z only if the user says so."""
-    return bool(joints_of(stems)) and (joints or not {*stems} >= XYZ)
 
 
 TRACKER6D = Format(
@@ -107,7 +84,7 @@ TRACKER6D = Format(
 ROBODK = Format(
     "RoboDK CSV",
     lambda stems, joints: {"j1", "j2", *XYZ} <= {*stems},
-    of_robodk,
+    lambda stems: {**joints_of(stems), **points_of("xyz")},
     {"q": "deg", "smr": "mm"},
     notice="x, y, z are taken as measured points; if they are the controller's own pose there is "
     "nothing to calibrate from",
@@ -119,8 +96,8 @@ FORMATS = (  # the first that fits is taken
     Format(
         "minimax-cal CSV",
         lambda stems, joints: bool({"q1", "smr1_x"} & {*stems}) and "q0" not in stems,
-        of_contract,
-        remark=lambda stem: KEPT,
+        lambda stems: {stem: stem if kind_of(stem) or stem in WORDS else "" for stem in stems},
+        remark=lambda stem: KEPT,  # whatever it means elsewhere
     ),
     Format(
         "FIGAROH CSV",
@@ -128,8 +105,18 @@ FORMATS = (  # the first that fits is taken
         of_figaroh,
         {"q": "rad", "smr": "m"},
     ),
-    Format("table of joints and points", has_both, in_words),
-    Format("joint values", has_joints, in_words),
+    Format(
+        "table of joints and points",
+        lambda stems, joints: (
+            not joints and len(joints_of(stems)) >= LEAST_JOINTS and bool(points_of(stems))
+        ),
+        in_words,
+    ),
+    Format(
+        "joint values",  # beside x, y, z only if the user says so
+        lambda stems, joints: bool(joints_of(stems)) and (joints or not {*stems} >= XYZ),
+        in_words,
+    ),
     POINTS,
 )
 

@@ -6,13 +6,11 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import name_first
-from minimax_cal.reading.rows import lacking
-from minimax_cal.reading.sheet import COMMA, POINT, Sheet, numbers_of
+from minimax_cal.reading.rows import lacking, numbers
+from minimax_cal.reading.sheet import Sheet
 
 POINT_NAME = re.compile(r"smr(\d+)_([xyz])")
 
@@ -132,29 +130,8 @@ class Reading:
 
     def numbers(self, column: Column, *, empty: bool = True) -> Array:
         """A column as floats, NaN where empty.  Raises DataError."""
-        out = numbers_of(column.cells, self.sheet.decimal)
-        for i in np.flatnonzero(~np.isfinite(out)):
-            if column.cells[i] or not empty:
-                out[i] = self.number(column, int(i), column.cells[i])
-        return out
-
-    def number(self, column: Column, row: int, cell: str) -> float:
-        """One cell.  Raises DataError."""
-        decimal_comma = self.sheet.decimal == ","
-        text = cell.replace(",", ".") if decimal_comma and COMMA.fullmatch(cell) else cell
-        if POINT.fullmatch(text) and np.isfinite(float(text)):
-            return float(text)
-        mend = "complete it or delete the row"
-        if COMMA.fullmatch(cell):
-            mend = "use a decimal point"
-        elif re.fullmatch(r"[-+]?\d{1,3}([.,' ]\d{3})+[.,]\d+", cell):
-            mend = "take the thousands separators out"
-        elif cell:
-            mend = "mend it, or leave it empty where it was not measured"
-            mend = mend if column.family != "q" else "mend it or delete the row"
-        what = f"{cell!r} is not a finite number" if cell else "is empty"
-        where = f"{self.sheet.path}:{self.line[row]}"
-        raise DataError(f"{where}: column {column.name}: {what}; {mend}")
+        path, sign = self.sheet.path, self.sheet.decimal
+        return numbers(path, column.name, column.cells, self.line, decimal=sign, empty=empty)
 
 
 def checked(reading: Reading) -> Reading:
