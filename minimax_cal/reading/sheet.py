@@ -39,7 +39,7 @@ WORKBOOK = "workbook"
 COORDINATES = 3  # of a point
 BLANK = " \t,;"
 MOST_COLUMNS = 1 << 14  # as of workbooks
-NUMERIC = b"0123456789+-.eE, "  # letters of numbers
+NUMERIC = b"0123456789+-.eE "  # letters of numbers
 AT_ONCE = 1 << 13  # rows that are made numbers at once
 LOOKED_AT = 200  # rows that decide the delimiter
 Row = tuple[str, ...]
@@ -155,9 +155,9 @@ def cut(
     the table.  alone: the delimiter of a table of one column.
     """
     path = sheet.path
-    delimiter, notes, lines = split(sheet, alone)
-    if (found := of_numbers(sheet, delimiter, lines)) is not None:
+    if (found := of_numbers(sheet, alone)) is not None:
         return replace(found, decimal=decimal or ".")
+    delimiter, notes, lines = split(sheet, alone)
     rows = rows_of(path, lines, delimiter)
     if not rows:
         raise DataError(f"{path}: is empty")
@@ -221,36 +221,38 @@ def split(sheet: Sheet, alone: str) -> tuple[str, dict[int, str], list[str]]:
     return delimiter, notes, lines
 
 
-def of_numbers(sheet: Sheet, delimiter: str, lines: list[str]) -> Sheet | None:
+def of_numbers(sheet: Sheet, alone: str) -> Sheet | None:
     """The table of a text that holds a header and below it numbers with points alone; else None.
 
     Read as JSON, whose numbers are rounded as Python's.
     """
     from pydantic_core import from_json
 
-    told = [n for n, line in enumerate(lines) if line.strip(BLANK)]
-    body = [lines[n] for n in told[1:]]
-    if not body or delimiter == " " or '"' in lines[told[0]]:
+    lines = sheet.text.split("\n")
+    told = (n for n, line in enumerate(lines)
+            if line.strip(BLANK) and not line.lstrip().startswith(COMMENTS))  # fmt: skip
+    top = next(told, len(lines))
+    last = next((n for n in range(len(lines), top, -1) if lines[n - 1].strip(BLANK)), top)
+    body = lines[top + 1 : last]
+    delimiter = delimiter_of(lines[top : min(top + LOOKED_AT, last)]) or alone
+    if not body or delimiter in ("", " ") or '"' in lines[top]:
         return None
-    head = trimmed(split_line(lines[told[0]], delimiter))
-    if not is_header(head):
-        return None
-    if any(line.count(delimiter) != len(head) - 1 for line in body):
-        return None
-    block = np.empty((len(body), len(head)))
-    for first in range(0, len(body), AT_ONCE):
+    head = trimmed(split_line(lines[top], delimiter))
+    block, sign = np.empty((len(body), len(head))), delimiter.encode()
+    cut = sign * (len(head) - 1) + b"\n"  # what a row holds beside its numbers
+    for first in range(0, len(body), AT_ONCE) if is_header(head) else ():
         some = body[first : first + AT_ONCE]
-        raw = delimiter.join(some).replace(delimiter, ",").encode()
-        if raw.translate(None, NUMERIC):
+        raw = "\n".join([*some, ""]).encode()
+        if raw.translate(None, NUMERIC) != cut * len(some):
             return None
         try:
-            values = np.array(from_json(b"[" + raw + b"]"), dtype=float)
-            block[first : first + AT_ONCE] = values.reshape(len(some), len(head))
+            values = from_json(b"[" + raw[:-1].replace(b"\n", sign).replace(sign, b",") + b"]")
         except ValueError:
             return None
-    if not np.isfinite(block).all():
+        block[first : first + AT_ONCE] = np.array(values, dtype=float).reshape(-1, len(head))
+    if not (is_header(head) and np.isfinite(block).all()):
         return None
-    line = np.array(told[1:]) + 1
+    line = np.arange(top + 1, last) + 1
     return replace(sheet, delimiter=delimiter, header=head, line=line,
                    cells=Lines(body, delimiter), block=block)  # fmt: skip
 

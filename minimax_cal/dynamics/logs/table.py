@@ -157,12 +157,13 @@ class Columns:
             values[kind] = block[:, 0] if single else block
         values["t"] = self.time(values, units.get("t", ("",))[0])
         run, sheet = self.of_kind("run"), self.sheet
-        whole = np.setdiff1d(np.arange(len(sheet.line)), list(self.broken))
+        whole = np.delete(np.arange(len(sheet.line)), list(self.broken))
+        kept = whole if self.broken else slice(None)
         return Log(
             source=str(sheet.path),
             title=self.form.title,
-            line=sheet.line[whole],
-            values={kind: value[whole] for kind, value in self.same_width(values).items()},
+            line=sheet.line[kept],
+            values={kind: value[kept] for kind, value in self.same_width(values).items()},
             headers=headers,
             units=units,
             joints=self.names(),
