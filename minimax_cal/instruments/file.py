@@ -58,11 +58,11 @@ def taken(data: Given | Sequence[Given | Rows]) -> Measurements | list[Instrumen
         return [
             points(measurements_in(one)) if has_points(one) else as_instrument(one) for one in every
         ]
-    paths = [one.path for one in every if isinstance(one, Rows)]
-    if len(given) > max(len(paths), 1):
+    sheets = [one.sheet for one in every if isinstance(one, Rows)]
+    if len(given) > max(len(sheets), 1):
         raise DataError("several sets of points are campaigns: give their files")
     if len(every) > 1:
-        return measured(paths)
+        return measured(sheets)
     lone = every[0]
     if isinstance(lone, Instrument):
         return lone.at

@@ -11,13 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.measuring.measurements import Measurements, measurements_in, read_measurements
+from minimax_cal.reading.rows import read_rows
+from minimax_cal.reading.sheet import Sheet, open_text
 
 MOST_FILES = 100
 LABELS = ("pose", "group")  # which mean something in their own file only
 
 
-def read_campaigns(paths: Sequence[Path | str]) -> Measurements:
+def read_campaigns(paths: Sequence[Path | str | Sheet]) -> Measurements:
     """The measurements of one file, or of several as sessions.
 
     Parameters
@@ -43,13 +45,18 @@ def read_campaigns(paths: Sequence[Path | str]) -> Measurements:
         raise DataError("no file of measurements is given")
     if len(paths) > MOST_FILES:
         raise DataError(f"{len(paths)} files of measurements; give at most {MOST_FILES}")
-    if len(paths) > 1 and (whole := apart(paths)):
+    sheets = [open_text(path) for path in paths]
+    if len(paths) > 1 and (whole := apart(sheets)):
         return whole
-    parts = [read_measurements(path) for path in paths]
-    return parts[0] if len(parts) == 1 else campaigns(parts, session_names(paths))
+    parts = [measurements_in(read_rows(sheet)) for sheet in sheets]
+    return (
+        parts[0]
+        if len(parts) == 1
+        else campaigns(parts, session_names([sheet.path for sheet in sheets]))
+    )
 
 
-def apart(paths: Sequence[Path | str]) -> Measurements | None:
+def apart(sheets: Sequence[Sheet]) -> Measurements | None:
     """Measurements whose points and joints lie in files of their own; None where none does.
 
     Raises DataError.
@@ -57,15 +64,15 @@ def apart(paths: Sequence[Path | str]) -> Measurements | None:
     from minimax_cal.measuring import importers  # few lie apart
 
     try:
-        readings = [importers.read_any(path, importers.Given()) for path in paths]
+        readings = [importers.read_any(sheet, importers.Given()) for sheet in sheets]
     except DataError:
         return None  # the reader of each says what is wrong
     if all(reading.smrs and reading.joints for reading in readings):
         return None
-    return importers.import_files(paths).understood()
+    return importers.import_files(sheets).understood()
 
 
-def measured(data: Measurements | Path | str | Sequence[Path | str]) -> Measurements:
+def measured(data: Measurements | Path | str | Sequence[Path | str | Sheet]) -> Measurements:
     """Measurements as they are, of a file, or of several as sessions.  Raises DataError."""
     if isinstance(data, Measurements | str | Path):
         return read_measurements(data)

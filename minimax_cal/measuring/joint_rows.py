@@ -31,6 +31,6 @@ def joint_rows(
     notices = (*file.notices, *idle)
     at = Measurements(
         q, np.zeros((len(q), 0, 3)), (), sliding, file.line, columns, {}, notices, str(file.path),
-        file.digest,
+        file.sheet.digest,
     )  # fmt: skip
     return file, check_u95(check_columns(at))

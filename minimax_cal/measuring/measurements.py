@@ -16,7 +16,7 @@ from minimax_cal.ground.words import name_first, one_line
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.reading.rows import TARGET, TEXT, UNITS, Rows, header_check, read_rows
 from minimax_cal.reading.sheet import Lines
-from minimax_cal.reading.words import OWN, joints_of, kind_of, stems_of
+from minimax_cal.reading.words import OWN, joints_of, kind_of, points_of, stems_of
 
 APPROACH = re.compile(r"approach\d+")
 FARTHEST = 1e5  # no instrument measures farther [m]
@@ -332,11 +332,12 @@ def read_measurements(path: Measurements | Path | str) -> Measurements:
 def measurements_in(file: Rows) -> Measurements:
     """The measurements in a file's rows.  Raises DataError."""
     path, header = file.path, file.header
-    if not file.own:
+    pointless = not any(map(TARGET.fullmatch, header))
+    if not file.own or (pointless and points_of(stems_of(file.given))):
         from minimax_cal.measuring.importers import import_files  # which makes measurements itself
 
         try:
-            return import_files([path]).understood()
+            return import_files([file.sheet]).understood()
         except DataError as error:
             if joints_of(stems_of(file.given)):
                 taken = "; the command import takes that" if "='" in str(error) else ""
@@ -364,8 +365,8 @@ def measurements_in(file: Rows) -> Measurements:
         columns=columns,
         unknown=unknown,
         source=str(path),
-        digest=file.digest,
-        simulated=file.simulated,
+        digest=file.sheet.digest,
+        simulated=file.sheet.simulated,
     )
     data = marked(check_finite(data))
     again, said = pasted(file, np.asarray(data.seen.any(axis=1)))

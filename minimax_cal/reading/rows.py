@@ -13,12 +13,15 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.reading.sheet import COMMA, Sheet, cut, numbers_of, open_text, sheet_of
 from minimax_cal.reading.words import (
+    JOINTS,
     OWN,
     SIZES,
+    folded,
     in_own_words,
     joint_number,
     near,
     own_kind,
+    own_name,
     split_unit,
     stems_of,
 )
@@ -39,17 +42,15 @@ OF_JOINT = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
 class Rows:
     """A table as text: header, rows, and the line on which each row ends.
 
-    header: names as this project has them.  given: as the file has them.  block: the
-    rows as numbers, where all cells are.  digest: SHA-256 of the
-    file.  simulated: whether its first line says `SIMULATED`.
+    header: names as this project has them.  given: as the file has them.  block: the rows as
+    numbers, where all cells are.
     """
 
+    sheet: Sheet
     path: Path | str
     header: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
     line: Array
-    digest: str
-    simulated: bool = False
     given: tuple[str, ...] = ()
     block: Array | None = None
     notices: tuple[str, ...] = ()
@@ -57,7 +58,8 @@ class Rows:
     @property
     def own(self) -> bool:
         """Whether joints or targets have this project's names in the file."""
-        return any(own_kind(name)[0] in ("q", "smr") for name in self.given)
+        names = (own_name(name, self.given) for name in self.given)
+        return any(own_kind(name)[0] in ("q", "smr") for name in names)
 
     def text(self, name: str) -> list[str]:
         """The cells of a column."""
@@ -118,7 +120,7 @@ class Rows:
         return q, np.array([unit in ("m", "mm") for _, unit, _ in found])
 
 
-def read_rows(path: Path | str) -> Rows:
+def read_rows(path: Path | str | Sheet) -> Rows:
     """The columns of a file.  Raises DataError where it is no table."""
     return rows_of(open_text(path))
 
@@ -140,8 +142,7 @@ def rows_of(sheet: Sheet) -> Rows:
     header = in_own_words(given)
     above = ", ".join(map(str, table.above))
     said = (f"{sheet.path}: above the table, and left out: line {above}",) if above else ()
-    told = (sheet.digest, sheet.simulated, given, table.block, said)
-    return Rows(sheet.path, header, rows, table.line, *told)
+    return Rows(sheet, sheet.path, header, rows, table.line, given, table.block, said)
 
 
 def header_check(path: Path | str, header: Sequence[str]) -> None:
@@ -150,7 +151,7 @@ def header_check(path: Path | str, header: Sequence[str]) -> None:
     stems: dict[str, str] = {}
     for name, (_, stem, _) in zip(header, kinds, strict=True):
         if (first := stems.get(stem)) is not None:
-            twice = f"column {name or '(without a name)'} stands twice"
+            twice = f"column {name or '(without a name)'} stands twice{numbering(header)}"
             other = f"{first} and {name} are one column; keep one unit"
             raise DataError(f"{path}:1: {twice if first == name else other}")
         stems[stem] = name
@@ -169,7 +170,17 @@ def header_check(path: Path | str, header: Sequence[str]) -> None:
     if lost := lacking([stem for kind, stem, _ in kinds if kind]):
         beside = lost[:-1] if "_" in lost else "q"
         unit = next(unit for _, stem, unit in kinds if stem.startswith(beside) and unit)
-        raise DataError(f"{path}:1: column {lost}_{unit} is missing")
+        raise DataError(f"{path}:1: column {lost}_{unit} is missing{numbering(header)}")
+
+
+def numbering(header: Sequence[str]) -> str:
+    """What to do about a joint without its number, as q [rad]; or ''."""
+    for name in header:
+        stem, unit = split_unit(name)
+        if re.fullmatch(JOINTS, folded(stem)):
+            unit = unit or "deg"
+            return f"; number the joints, as q1_{unit}, q2_{unit}, not {name}"
+    return ""
 
 
 def lacking(stems: Collection[str]) -> str:
@@ -213,7 +224,7 @@ def numbers(
 ) -> Array:
     """One column as floats; an empty cell is NaN where that is allowed.  Raises DataError."""
     out = numbers_of(cells, decimal)
-    for i in np.flatnonzero(~np.isfinite(out)):
+    for i in np.flatnonzero(~np.isfinite(out)).tolist():
         cell = cells[i]
         if not cell and empty:
             continue

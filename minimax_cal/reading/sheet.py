@@ -30,9 +30,10 @@ COMMA = re.compile(r"[-+]?(\d*),(\d+)([eE][-+]?\d+)?")
 COMMENTS = ("#", "%", "//", "!")
 SIMULATED = "# simulated"  # first line of a file whose points were computed, not measured
 ENCODINGS = (  # names and codecs; the last takes any bytes, and cp1252 is meant by latin-1 mostly
-    ("utf-8", "utf-8-sig"), ("utf-16", "utf-16"), ("gb2312", "gb2312"), ("latin-1", "cp1252"),
+    ("utf-8", "utf-8-sig"), ("utf-16", "utf-16"), ("gb2312", "gbk"), ("latin-1", "cp1252"),
     ("latin-1", "latin-1"),
 )  # fmt: skip
+CHINESE = re.compile(rb"([\xa1-\xd7][\xa1-\xfe])|[\x81-\xfe][\x40-\xfe]")  # signs; common ones
 MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 PACKED = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how spreadsheets begin
 WORKBOOK = "workbook"
@@ -123,8 +124,10 @@ def number_of(cell: str, decimal: str = ".") -> float:
         return np.nan
 
 
-def open_text(path: Path | str) -> Sheet:
-    """A text file, not yet cut into rows and columns.  Raises DataError."""
+def open_text(path: Path | str | Sheet) -> Sheet:
+    """A text file, not yet cut into rows and columns; one that is open stays.  Raises DataError."""
+    if isinstance(path, Sheet):
+        return path
     path = Path(path)
     return sheet_of(
         path, *((text_of_workbook(path), WORKBOOK) if is_workbook(path) else decoded(path))
@@ -337,8 +340,9 @@ def decoded(path: Path) -> tuple[str, str]:
     for name, codec in ENCODINGS:
         with suppress(UnicodeError):
             text = raw.decode(codec)
-            if name == "utf-16" and not raw.startswith(MARKS):
-                continue
+            common = [bool(sign[1]) for sign in CHINESE.finditer(raw)] if codec == "gbk" else [True]
+            if (name == "utf-16" and not raw.startswith(MARKS)) or 2 * sum(common) <= len(common):
+                continue  # letters with accents, by chance one of the rare signs each
             return text.replace("\r\n", "\n").replace("\r", "\n"), name
     raise DataError(f"{path}: is not a text file; expected rows of numbers")
 

@@ -69,10 +69,10 @@ ALIASES |= dict.fromkeys(("IN", "inches"), "in")
 KNOWN = {*ANGLES, *LENGTHS, *TIMES, *TEMPERATURES, *OTHERS}
 JOINTS = ("q|j|a|ax|axis|joint|theta|achse|achswert|gelenk|axe|articulation|eje|articulacion"
           "|\u5173\u8282|\u8f74")  # fmt: skip
-JOINT = re.compile(  # of folded names
-    f"(?:{JOINTS})[ _.-]?(\\d+)"
-    "(?:[ _.-]?(?:angle|winkel|ist|actual|position|pos|wert|value|angulo|\u89d2\u5ea6|\u89d2))?"
-    "|\u7b2c?(\\d+)(?:\u8f74|\u5173\u8282)(?:\u89d2\u5ea6|\u89d2)?"
+NUMBERED = (  # of folded names
+    f"(?:{JOINTS})[ _.-]?(?P<joint>\\d+)"
+    "(?:[ _.-]?(?:angle|winkel|ist|actual|position|pos|wert|value|angulo|\u89d2\u5ea6|\u89d2))?",
+    "\u7b2c?(?P<joint>\\d+)(?:\u8f74|\u5173\u8282)(?:\u89d2\u5ea6|\u89d2)?",
 )
 QUATERNION = re.compile(r"q\d+")
 # joints along the arm, where the names tell: a ROS log may sort them by alphabet
@@ -182,8 +182,8 @@ def plain(stem: str) -> str:
 
 def joint_number(stem: str) -> int:
     """The joint that a header's name means, 0 for none."""
-    found = JOINT.fullmatch(folded(stem))
-    return int(found[1] or found[2]) if found else 0
+    found = (re.fullmatch(pattern, folded(stem)) for pattern in NUMBERED)
+    return next((int(match["joint"]) for match in found if match), 0)
 
 
 def along_arm(names: Sequence[str]) -> list[str]:
@@ -225,6 +225,14 @@ def points_of(stems: Sequence[str]) -> dict[str, str]:
     }
 
 
+def own_name(name: str, header: Sequence[str]) -> str:
+    """One of this project's names with its unit in brackets, as q1 [rad], as it writes it."""
+    stem, unit = split_unit(name)
+    known = kind_of(stem.lower())
+    new = f"{stem.lower()}_{unit}"
+    return new if known and unit in OWN[known].units and new not in header else name
+
+
 def is_understood(names: Sequence[str]) -> bool:
     """Whether most names of a would-be header mean joints, coordinates or a plain column."""
     stems = stems_of(names)
@@ -237,7 +245,7 @@ def in_own_words(header: Sequence[str]) -> tuple[str, ...]:
 
     Beside its own joints or targets only what cannot mean anything else.
     """
-    stems = stems_of(header)
+    header, stems = [own_name(name, header) for name in header], stems_of(header)
     own = any(own_kind(name)[0] in ("q", "smr") for name in header)
     found = {} if own else joints_of(stems)
     found |= points_of(stems) if found else {axis: axis for axis in "xyz"}

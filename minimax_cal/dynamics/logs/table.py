@@ -157,7 +157,7 @@ class Columns:
             values[kind] = block[:, 0] if single else block
         values["t"] = self.time(values, units.get("t", ("",))[0])
         run, sheet = self.of_kind("run"), self.sheet
-        whole = np.delete(np.arange(len(sheet.line)), list(self.broken))
+        whole = np.delete(np.arange(len(sheet.line)), list(self.broken)).tolist()
         kept = whole if self.broken else slice(None)
         return Log(
             source=str(sheet.path),

@@ -128,7 +128,7 @@ def read_pixels(
         line=file.line,
         notices=at.notices,
         source=str(detections),
-        digest=digest_of(file.digest, at.digest, *(camera.source for camera in cameras)),
+        digest=digest_of(file.sheet.digest, at.digest, *(camera.source for camera in cameras)),
     )
     return without_single(checked(data))
 

@@ -18,6 +18,7 @@ from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.importers import cmm, headed, programs
 from minimax_cal.measuring.importers import columns as mapped
 from minimax_cal.measuring.importers.assemble import Assembly, assemble
+from minimax_cal.measuring.importers.join import SAME
 from minimax_cal.measuring.importers.reading import Given, Reading
 from minimax_cal.measuring.measurements import (
     Measurements,
@@ -97,9 +98,15 @@ class Imported:
 
     def understood(self) -> Measurements:
         """The measurements, with a line that says how the files were read."""
+        held = self.assembly.readings[-1].sheet.path
         said = [
             f"{file['file']}: read as {file['format']}, separated by {file['delimiter']}, decimal "
             f"{file['decimal']}, {file['encoding']}"
+            + (
+                f", matched with {held} by {how}"
+                if (how := file["matched by"]) and how != SAME
+                else ""
+            )
             for file in self.files().records()
         ]
         data = self.data
@@ -156,7 +163,7 @@ def units_of(given: str | Sequence[str] | Mapping[str, str]) -> Mapping[str, str
     return found
 
 
-def read_any(path: Path | str, given: Given, *, joints: bool = False) -> Reading:
+def read_any(path: Path | str | Sheet, given: Given, *, joints: bool = False) -> Reading:
     """A file in the first format that fits.  joints: the user said that it holds joint values.
 
     Raises DataError with what to add.
@@ -197,7 +204,7 @@ def unknown(sheet: Sheet) -> str:
 
 
 def import_files(
-    files: Sequence[Path | str],
+    files: Sequence[Path | str | Sheet],
     joints: Path | str | None = None,
     *,
     columns: str | Sequence[str] = "",
@@ -248,7 +255,9 @@ def import_files(
             "one at a time, or name the file of joints as joints="
         )
     else:
-        raise DataError(f"{points[0].sheet.path if points else files[0]}: {no_joints(points)}")
+        raise DataError(
+            f"{points[0].sheet.path if points else readings[0].sheet.path}: {no_joints(points)}"
+        )
     if not points:
         raise DataError(
             f"{held.sheet.path}: holds joint values but no points; add the tracker's file"

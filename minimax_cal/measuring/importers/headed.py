@@ -95,7 +95,9 @@ FORMATS = (  # the first that fits is taken
     TRACKER6D,
     Format(
         "minimax-cal CSV",
-        lambda stems, joints: bool({"q1", "smr1_x"} & {*stems}) and "q0" not in stems,
+        lambda stems, joints: (
+            "q0" not in stems and ("smr1_x" in stems or ("q1" in stems and not points_of(stems)))
+        ),
         lambda stems: {stem: stem if kind_of(stem) or stem in WORDS else "" for stem in stems},
         remark=lambda stem: KEPT,  # whatever it means elsewhere
     ),
@@ -140,7 +142,8 @@ def understood(sheet: Sheet, form: Format) -> Reading:
     meanings = form.meanings(stems)
     columns = []
     for i, (name, stem) in enumerate(zip(sheet.header, stems, strict=True)):
-        what = meanings[stem] if stem in meanings else plain(stem)
+        own = stem if kind_of(stem) not in ("", "q", "smr") else ""
+        what = meanings[stem] if stem in meanings else plain(stem) or own
         unit, known = split_unit(name)[1], "header"
         if not unit:
             unit = form.units.get(family_of(what), "")

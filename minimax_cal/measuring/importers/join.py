@@ -26,6 +26,7 @@ ENOUGH = 0.5  # of the points that a pattern must find poses for
 Parts = tuple[str | int, ...]
 LABELS = ("", "group", "tool")  # meanings of columns that may name targets
 LEAST_PARTS = 2  # of a name that holds a pose and a target: at least
+SAME = "same row"
 MOST_NAMED = 12  # points or poses that a notice names
 RIGID, LOOSE = 0.02, 0.1  # spread of the distances between targets, relative: one body, or not
 
@@ -150,7 +151,7 @@ def place(points: Reading, joints: Reading, layout: str) -> tuple[Reading, Place
 def placed(points: Reading, joints: Reading, layout: str) -> tuple[Reading, Places]:
     """Rows of points and where they go."""
     if points is joints:
-        return points, with_targets(points, np.arange(len(points.line)), "same row")
+        return points, with_targets(points, np.arange(len(points.line)), SAME)
     key, other = points.find("pose"), joints.find("pose")
     if not (key and other):
         return points, by_count(points, joints, layout)
@@ -405,7 +406,7 @@ def by_turns(points: Reading, joints: Reading, layout: str) -> Places:
         layout = rigid[0]
     pose, slot = ways[layout]
     names, _ = labels_of(points)
-    return Places(pose, slot, names * k, f"{k} points a row, by {layout}")
+    return Places(pose, slot, names * k, f"order, {k} points a row, by {layout}")
 
 
 def looseness(bodies: Array) -> float:
