@@ -63,7 +63,7 @@ def beside_joint(said: str) -> tuple[str, str]:
 
 OF_DRIVES = {
     "qd": "qd|dq|qdot|velocity|vel|speed|geschwindigkeit|drehzahl|vitesse|velocidad|\u901f\u5ea6",
-    "tau": "tau|torque|moment|drehmoment|effort|couple|par|\u626d\u77e9|\u529b\u77e9|\u8f6c\u77e9",
+    "tau": "tau|torque|m|moment|drehmoment|effort|couple|par|[\u626d\u529b\u8f6c]\u77e9",
     "i": "i|current|strom|motorstrom|courant|corriente|\u7535\u6d41",
 }
 SI = {"q": "rad", "qd": "rad", "qdd": "rad", "q_cmd": "rad", "tau": "Nm", "tau_cmd": "Nm"}
@@ -138,7 +138,7 @@ FORMATS = (  # tried in this order
             "t": ("t", *map(re.escape, WORDS["time"])),
             "q": NUMBERED,
             **{kind: beside_joint(said) for kind, said in OF_DRIVES.items()},
-            "payload": ("payload|traglast|nutzlast|last|charge|carga|\u8d1f\u8f7d",),
+            "payload": ("|".join(WORDS["payload"]),),
             "run": ("run|fahrt|lauf",),
         },
         units={"tau": "Nm", "i": "A"},

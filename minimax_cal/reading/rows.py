@@ -34,7 +34,7 @@ KNOWN = ("order", "time_s", "temperature_C", "payload_kg", "session", "group", "
          "split", "set_aside", "tool", "payload_x_mm", "q1_rad", "q1_deg",
          *(f"smr1_{axis}_mm" for axis in "xyz"))  # fmt: skip
 NOTHING = re.compile(r"(?!)")
-THOUSANDS = re.compile(r"[-+]?\d{1,3}([.,' ]\d{3})+[.,]\d+")
+MISSING = ("", "-", "--", "---", "n/a", "na", "#n/a", "n.a.", "k.a.", "null", "none")
 OF_JOINT = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
 
 
@@ -132,7 +132,7 @@ def rows_in(text: str, path: Path | str) -> Rows:
 
 def rows_of(sheet: Sheet) -> Rows:
     """The columns of a text.  Raises DataError."""
-    table = cut(sheet, remarks=False, alone=",")
+    table = cut(sheet, alone=",")
     rows = table.cells
     if table.decimal == ",":
         rows = tuple(
@@ -140,8 +140,7 @@ def rows_of(sheet: Sheet) -> Rows:
         )
     given = table.header or rows[0]
     header = in_own_words(given)
-    above = ", ".join(map(str, table.above))
-    said = (f"{sheet.path}: above the table, and left out: line {above}",) if above else ()
+    said = tuple(f"{sheet.path}: {text}" for text in table.left_out)
     return Rows(sheet, sheet.path, header, rows, table.line, given, table.block, said)
 
 
@@ -226,12 +225,11 @@ def numbers(
     out = numbers_of(cells, decimal)
     for i in np.flatnonzero(~np.isfinite(out)).tolist():
         cell = cells[i]
-        if not cell and empty:
+        if empty and cell.lower() in MISSING:
             continue
         mends = (
             (not cell, "complete it or delete the row"),
             (COMMA.fullmatch(cell), "use a decimal point"),
-            (THOUSANDS.fullmatch(cell), "take the thousands separators out"),
             (empty, "mend it, or leave the cell empty where it was not measured"),
             (True, "mend it or delete the row"),
         )

@@ -20,24 +20,24 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import read_raw
-from minimax_cal.reading.words import is_understood, unit_name
+from minimax_cal.reading.words import is_summary, is_understood, unit_name
 from minimax_cal.reading.workbook import is_workbook, text_of_workbook
 
 DELIMITERS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "spaces"}
 DECIMALS = {".": "point", ",": "comma"}
 POINT = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
+THOUSANDS = re.compile(r"[-+]?\d{1,3}([.,' \u00a0\u202f])\d{3}(?:\1\d{3})*(?!\1)([.,])\d+")
 COMMA = re.compile(r"[-+]?(\d*),(\d+)([eE][-+]?\d+)?")
 COMMENTS = ("#", "%", "//", "!")
 SIMULATED = "# simulated"  # first line of a file whose points were computed, not measured
 ENCODINGS = (  # names and codecs; the last takes any bytes, and cp1252 is meant by latin-1 mostly
-    ("utf-8", "utf-8-sig"), ("utf-16", "utf-16"), ("gb2312", "gbk"), ("latin-1", "cp1252"),
-    ("latin-1", "latin-1"),
+    ("utf-16", "utf-16"), ("utf-16", "utf-16-le"), ("utf-16", "utf-16-be"), ("utf-8", "utf-8-sig"),
+    ("gb2312", "gbk"), ("latin-1", "cp1252"), ("latin-1", "latin-1"),
 )  # fmt: skip
 CHINESE = re.compile(rb"([\xa1-\xd7][\xa1-\xfe])|[\x81-\xfe][\x40-\xfe]")  # signs; common ones
 MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 PACKED = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how spreadsheets begin
 WORKBOOK = "workbook"
-COORDINATES = 3  # of a point
 BLANK = " \t,;"
 MOST_COLUMNS = 1 << 14  # as of workbooks
 NUMERIC = b"0123456789+-.eE "  # letters of numbers
@@ -97,6 +97,16 @@ class Sheet:
         return len(self.header) or max(map(len, self.cells), default=0)
 
     @property
+    def left_out(self) -> tuple[str, ...]:
+        """What is said of lines that are not of the table."""
+        parts = (("above", self.above), ("below", self.below))
+        return tuple(
+            f"{where} the table, and left out: line {', '.join(map(str, lines))}"
+            for where, lines in parts
+            if lines
+        )
+
+    @property
     def digest(self) -> str:
         """SHA-256 of the text."""
         return hashlib.sha256(self.text.encode()).hexdigest()
@@ -113,11 +123,13 @@ def numbers_of(cells: Sequence[str], decimal: str = ".") -> Array:
     with suppress(ValueError):
         if "_" not in "".join(given):  # 1_000 is a number to Python only
             return np.array([cell or "nan" for cell in given], dtype=float)
-    return np.array([number_of(cell) for cell in given], dtype=float)
+    return np.array([number_of(cell, decimal) for cell in cells], dtype=float)
 
 
 def number_of(cell: str, decimal: str = ".") -> float:
-    """One number, NaN where the cell holds none."""
+    """One number, NaN where the cell holds none.  Thousands may stand apart, by another sign."""
+    if found := THOUSANDS.fullmatch(cell):
+        cell = f"{cell[: found.start(2)].replace(found[1], '')}.{cell[found.end(2) :]}"
     try:
         return float(cell.replace(decimal, ".") if "_" not in cell else "nan")
     except ValueError:
@@ -140,6 +152,8 @@ def sheet_of(path: Path | str, text: str, encoding: str = "utf-8") -> Sheet:
         raise DataError(f"{path}: is not a text file; expected rows of numbers")
     if not text.strip():
         raise DataError(f"{path}: is empty")
+    if not text.isascii():
+        text = text.replace("\u2212", "-")  # the minus of typographers
     return Sheet(Path(path), text, encoding, "", "", (), np.empty(0, dtype=int), ())
 
 
@@ -164,15 +178,10 @@ def cut(
     rows = rows_of(path, lines, delimiter)
     if not rows:
         raise DataError(f"{path}: is empty")
-    above = [] if most_torn else above_table([row for _, row in rows])
-    below = (
-        []
-        if most_torn or not remarks
-        else below_table([row for _, row in rows], sheet.encoding == WORKBOOK)
-    )
-    above, below = [[rows[i][0] for i in some] for some in (above, below)]
-    rows = rows[len(above) : len(rows) - len(below)]
-    header, rows = split_header(rows)
+    top, end = ends_of([row for _, row in rows], sheet.encoding == WORKBOOK)
+    end = end if remarks else len(rows)
+    above, below = (tuple(number for number, _ in some) for some in (rows[:top], rows[end:]))
+    header, rows = split_header(rows[top:end])
     if not header and not most_torn:
         header = noted_header(
             [line for n, line in notes.items() if n < rows[0][0]], delimiter, rows
@@ -198,7 +207,7 @@ def cut(
     plain = delimiter == "," and '"' not in sheet.text
     sign = decimal or ("." if plain else decimal_of(path, names, line, cells))
     found = replace(sheet, delimiter=delimiter, decimal=sign, header=header, line=line, cells=cells)
-    return replace(found, torn=lost, above=tuple(above), below=tuple(below))
+    return replace(found, torn=lost, above=above, below=below)
 
 
 def split(sheet: Sheet, alone: str) -> tuple[str, dict[int, str], list[str]]:
@@ -260,28 +269,25 @@ def of_numbers(sheet: Sheet, alone: str) -> Sheet | None:
                    cells=Lines(body, delimiter), block=block)  # fmt: skip
 
 
-def above_table(rows: list[Row]) -> range:
-    """Rows above the table that say something else: they are half as long, or shorter."""
-    lengths = [len(trimmed(row)) for row in rows]
-    width = Counter(lengths).most_common(1)[0][0]
-    first = next((i for i, length in enumerate(lengths) if 2 * length > width), 0)
-    return range(first if first < len(rows) - 1 else 0)
+def ends_of(rows: list[Row], padded: bool) -> tuple[int, int]:
+    """The first row of the table, and the first below it.
 
-
-def below_table(rows: list[Row], padded: bool) -> range:
-    """Rows below the table: half as long, or shorter, with words, too few numbers for a point.
-
-    padded: whether all rows have cells up to the last column.
+    Above it are rows that say something else, half as long, or shorter; below it means and the
+    like, or words alone in half the columns at most.  padded: whether all rows have cells up to
+    the last column.
     """
-    lengths = [len(trimmed(row) if padded else row) for row in rows]
-    width = Counter(lengths).most_common(1)[0][0]
+    short = [len(trimmed(row)) for row in rows]
+    lengths = short if padded else list(map(len, rows))
+    width, most = (Counter(some).most_common(1)[0][0] for some in (short, lengths))
+    first = next((i for i, length in enumerate(short) if 2 * length > width), 0)
     last = len(rows)
-    while last > 1 and 2 * lengths[last - 1] <= width:
-        row = rows[last - 1]
-        if sum(map(is_number, row)) >= min(sum(map(bool, row)), COORDINATES):
+    while last > 1:
+        filled = [cell for cell in rows[last - 1] if cell]
+        words = 2 * lengths[last - 1] <= most and not any(map(is_number, filled))
+        if not (words or is_summary(filled[0])):
             break
         last -= 1
-    return range(last, len(rows))
+    return first if first < len(rows) - 1 else 0, last
 
 
 def split_header(rows: list[NumberedRow]) -> tuple[tuple[str, ...], list[NumberedRow]]:
@@ -339,12 +345,22 @@ def decoded(path: Path) -> tuple[str, str]:
         raise DataError(f"{path}: is a spreadsheet, not text; save it as CSV")
     for name, codec in ENCODINGS:
         with suppress(UnicodeError):
-            text = raw.decode(codec)
-            common = [bool(sign[1]) for sign in CHINESE.finditer(raw)] if codec == "gbk" else [True]
-            if (name == "utf-16" and not raw.startswith(MARKS)) or 2 * sum(common) <= len(common):
-                continue  # letters with accents, by chance one of the rare signs each
-            return text.replace("\r\n", "\n").replace("\r", "\n"), name
+            if can_be(codec, raw):
+                text = raw.decode(codec)
+                return text.replace("\r\n", "\n").replace("\r", "\n"), name
     raise DataError(f"{path}: is not a text file; expected rows of numbers")
+
+
+def can_be(codec: str, raw: bytes) -> bool:
+    """Whether bytes look as in a codec: 16 bits a letter begin by a mark, or have zeros in turn.
+
+    Letters with accents can be Chinese signs, rare ones; a Chinese text has common ones mostly.
+    """
+    if codec.startswith("utf-16"):
+        zeros = {"utf-16-le": raw[1:8:2], "utf-16-be": raw[:8:2]}.get(codec, b"")
+        return raw.startswith(MARKS) if codec == "utf-16" else bool(zeros) and not any(zeros)
+    common = [bool(sign[1]) for sign in CHINESE.finditer(raw)] if codec == "gbk" else [True]
+    return 2 * sum(common) > len(common)
 
 
 def split_line(line: str, delimiter: str) -> Row:
@@ -383,7 +399,7 @@ def trimmed(row: Row) -> Row:
 
 def is_number(cell: str) -> bool:
     """Whether a cell is a number with either decimal sign."""
-    return bool(POINT.fullmatch(cell) or COMMA.fullmatch(cell))
+    return any(pattern.fullmatch(cell) for pattern in (POINT, COMMA, THOUSANDS))
 
 
 def is_header(row: Row) -> bool:
@@ -421,11 +437,14 @@ def decimal_of(
     comma, point, proven = "", "", False
     for number, row in zip(line, cells, strict=True):
         for name, cell in zip(names, row, strict=True):
+            apart = THOUSANDS.fullmatch(cell)
             if found := COMMA.fullmatch(cell):
-                comma = comma or f"{path}:{number}: column {name}: {cell}"
                 proven |= len(found[2]) != 3 or len(found[1]) > 3 or found[1] in ("", "0")
                 proven |= bool(found[3])
-            elif not point and "." in cell and POINT.fullmatch(cell):
+            if found or (apart and apart[2] == ","):
+                comma = comma or f"{path}:{number}: column {name}: {cell}"
+                proven |= bool(apart)
+            elif not point and (apart or ("." in cell and POINT.fullmatch(cell))):
                 point = f"column {name} of line {number}: {cell}"
     if comma and point:
         raise DataError(

@@ -103,6 +103,8 @@ WORDS = {  # plain names that mean the same in any file
                     "lufttemperatur", "temperatura", "\u6e29\u5ea6"),
     "target": ("target", "target name", "reflector", "smr", "ziel", "zielmarke", "reflektor",
                "cible", "reflecteur", "objetivo", "\u9776\u7403", "\u9776\u6807", "\u76ee\u6807"),
+    "payload": ("payload", "traglast", "nutzlast", "last", "charge", "charge utile", "carga",
+                "carga util", "\u8d1f\u8f7d"),
     "u95": ("u95", "u(95)", "u_95"),
     "pose": ("pose", "point", "point name", "pointid", "name", "id", "key", "no", "no.", "nr",
              "nr.", "pose no.", "pose nr.", "punkt", "punktname", "punkt-nr", "punkt-nr.",
@@ -119,6 +121,12 @@ WORDS = {  # plain names that mean the same in any file
     "split": ("split",),
     "set_aside": ("set_aside",),
 }  # fmt: skip
+SUMMARY = re.compile(  # of a row below a table, in folded words
+    r"(?:mittel(?:wert)?|durchschnitt|mean|average|avg|moyenne|media|promedio|\u5e73\u5747\u503c?"
+    r"|max(?:imum|imo)?|min(?:imum|imo)?|\u6700[\u5927\u5c0f]\u503c?|rms|sigma|std(?:ev|abw)?|stabw"
+    r"|standardabweichung|standard deviation|ecart[ -]type|desviacion|\u6807\u51c6\u5dee"
+    r"|sum(?:me|a)?|somme|total|anzahl|count|range|spannweite|\u603b\u8ba1|\u5408\u8ba1)\b"
+)
 SURE = ("tool", "temperature", "time")  # what means the same also beside names of this project
 PLAIN = {word: meaning for meaning, words in WORDS.items() for word in words}
 
@@ -151,6 +159,11 @@ def folded(text: str) -> str:
     return unicodedata.normalize("NFC", "".join(c for c in wide if not unicodedata.combining(c)))
 
 
+def is_summary(cell: str) -> bool:
+    """Whether a row's first cell says that the row sums up others."""
+    return bool(SUMMARY.match(folded(cell)))
+
+
 def unit_name(text: str) -> str:
     """A unit as this project writes it, or ''."""
     text = unicodedata.normalize("NFKC", text).strip()
@@ -160,12 +173,14 @@ def unit_name(text: str) -> str:
 
 def split_unit(name: str) -> tuple[str, str]:
     """A header's name without its unit, and the unit: 'X [mm]', 'x (mm)', 'x_mm', 'x mm'."""
-    name = unicodedata.normalize("NFKC", name).strip().lstrip("\ufeff").strip("'\"")
+    name = " ".join(unicodedata.normalize("NFKC", name).strip("\ufeff'\" \n").split())
     if (
         found := re.fullmatch("(.*?)\\s*[\\[(<\u3010]([^\\[\\](]*)[\\])>\u3011]", name)
     ) and unit_name(found[2]):
         return found[1].strip(), unit_name(found[2])
-    if (found := re.fullmatch(r"(.+)[ _]([^ _]+)", name)) and unit_name(found[2]):
+    if (found := re.fullmatch(r"(.+?)(?:[ _]|,\s*|\s+/\s*)([^ _,/]+)", name)) and unit_name(
+        found[2]
+    ):
         return found[1].strip(), unit_name(found[2])
     return name, ""
 

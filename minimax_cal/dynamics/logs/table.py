@@ -228,9 +228,10 @@ class Columns:
         kind = "q" if place.kind in ("q", "qd", "qdd", "q_cmd") else place.kind
         unit = self.given.get(kind, "") or place.unit
         if not unit and kind == "q":
+            name = self.sheet.header[at]
             raise DataError(
-                f"{self.sheet.path}: column {self.sheet.header[at]}: has no unit; add "
-                "units='q=deg' or units='q=rad'"
+                f"{self.sheet.path}: column {name}: has no unit; add units='q=deg' or "
+                f"units='q=rad', or name it {name} [deg] or {name} [rad]"
             )
         return unit
 
@@ -333,11 +334,12 @@ class Columns:
             row, what = next(iter(sorted(self.broken.items())))
             raise DataError(f"{path}:{line[row]}: {what}")
         lines = sorted({*self.sheet.torn, *(int(line[row]) for row in self.broken)})
+        said = [f"{path}: {text}" for text in self.sheet.left_out]
         if not lines:
-            return []
+            return said
         some = ", ".join(map(str, lines[:SHOWN])) + (" ..." if len(lines) > SHOWN else "")
         plural = "s are" if len(lines) > 1 else " is"
-        return [f"{path}: {len(lines)} torn line{plural} left out ({some})"]
+        return [*said, f"{path}: {len(lines)} torn line{plural} left out ({some})"]
 
 
 def typical_step(time: Array) -> float:

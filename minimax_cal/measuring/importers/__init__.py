@@ -179,11 +179,7 @@ def read_any(path: Path | str | Sheet, given: Given, *, joints: bool = False) ->
     reading = next(filter(None, (read(sheet, given, joints) for read in ways)), None)
     if reading is None:
         raise DataError(unknown(sheet))
-    for where, lines in (("above", sheet.above), ("below", sheet.below)):
-        if lines:
-            left_out = ", ".join(map(str, lines))
-            reading = reading.saying(f"{where} the table, and left out: line {left_out}")
-    return reading
+    return reading.saying(*sheet.left_out)
 
 
 def unknown(sheet: Sheet) -> str:
