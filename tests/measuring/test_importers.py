@@ -10,7 +10,7 @@ from conftest import run
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.measuring.importers import Imported, import_files, save
+from minimax_cal.measuring.importers import Imported, import_files
 from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.solvers.status import Status
 
@@ -31,7 +31,7 @@ def same(found: Imported, truth: mc.Measurements, targets: int = 3) -> None:
 
 def calibrates(found: Imported, folder: Path) -> mc.Measurements:
     out = folder / "out.csv"
-    save(out, found)
+    out.write_text(found.csv())
     data = mc.read_measurements(out)
     assert_allclose(data.q, found.data.q, rtol=0, atol=1e-8)
     fit = mc.calibrate("irb2600", data, objective="sum")
@@ -177,7 +177,7 @@ def test_leica_points_deleted_and_not_measured_again_are_set_aside(truth, write,
             (4, "smr1", "file"), (8, f"smr{targets}", "file")]  # fmt: skip
         assert found.aside is not None
         assert found.aside.y[0, 0, 0] == 9.0
-        save(tmp_path / "poses.csv", import_files([points], joints))
+        (tmp_path / "poses.csv").write_text(import_files([points], joints).csv())
         again = mc.read_measurements(tmp_path / "poses.csv")
         assert [(p.target, p.why, p.by) for p in again.set_aside] == [
             (p.target, p.why, p.by) for p in found.set_aside]  # fmt: skip

@@ -10,16 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
-from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.faults import distance_faults
-from minimax_cal.measuring.importers import cmm, headed, programs
-from minimax_cal.measuring.importers import columns as mapped
+from minimax_cal.measuring.importers import cmm, programs, tables
 from minimax_cal.measuring.importers.assemble import Assembly, assemble
 from minimax_cal.measuring.importers.join import SAME
-from minimax_cal.measuring.importers.reading import Given, Reading
+from minimax_cal.measuring.importers.tables import Given, Reading
 from minimax_cal.measuring.measurements import (
     Measurements,
     check_finite,
@@ -31,12 +28,12 @@ from minimax_cal.measuring.slips import mended
 from minimax_cal.reading.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
 from minimax_cal.reading.words import ANGLES, LENGTHS, TEMPERATURES, TIMES
 
-__all__ = ["Given", "Imported", "import_files", "read_any", "save", "units_of"]
+__all__ = ["Given", "Imported", "import_files", "read_any", "units_of"]
 
 # The first that fits a file is taken: of the text alone, then of its rows and columns.
 Read = Callable[[Sheet, Given, bool], Reading | None]  # None where a file is of another format
 OF_TEXT: tuple[Read, ...] = (programs.read, cmm.read)
-OF_ROWS: tuple[Read, ...] = (cmm.read, headed.read)
+OF_ROWS: tuple[Read, ...] = (cmm.read, tables.read)
 MEASURED = re.compile(r"q\d*|(?:smr|base)\d*(?:_[xyz])?|qread\d*|u95|temperature|time")
 OF_JOINTS = re.compile(r"(?:^|[,=])\s*q\d*(?:_|\s*(?:,|$))")
 LAYOUTS = ("", "pose", "target")
@@ -126,8 +123,7 @@ class Imported:
     def csv(self) -> str:
         """The contract's CSV; what nothing uses is kept as text, points set aside with why."""
         data = whole(self.data)
-        columns = {name: blanks(column) for name, column in data.columns.items()}
-        return measurements_text(replace(data, columns={**columns, **data.unknown}))
+        return measurements_text(replace(data, columns={**data.columns, **data.unknown}))
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -175,7 +171,7 @@ def read_any(path: Path | str | Sheet, given: Given, *, joints: bool = False) ->
             if found := read(sheet, given, joints):
                 return found
     sheet = cut(sheet, given.decimal)
-    ways = (mapped.read,) if given.columns else OF_ROWS
+    ways = (tables.mapped,) if given.columns else OF_ROWS
     reading = next(filter(None, (read(sheet, given, joints) for read in ways)), None)
     if reading is None:
         raise DataError(unknown(sheet))
@@ -326,17 +322,3 @@ def no_joints(points: Sequence[Reading]) -> str:
     if points:
         return "holds points but no joint values; add their file as joints="
     return "holds neither points nor joint values; say what its columns are as columns="
-
-
-def save(path: Path | str, imported: Imported) -> None:
-    """Write the contract's CSV."""
-    write_whole(path, imported.csv())
-
-
-def blanks(column: Array) -> Array:
-    """A column in which what is missing is an empty cell."""
-    if column.dtype.kind != "f" or np.isfinite(column).all():
-        return column
-    out = column.astype(object)
-    out[~np.isfinite(column)] = ""
-    return out

@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.importers.headed import POINTS, understood
-from minimax_cal.measuring.importers.reading import Given, Reading
+from minimax_cal.measuring.importers.tables import POINTS, Given, Reading, understood
 from minimax_cal.reading.sheet import Sheet, decimal_of
 from minimax_cal.reading.words import AXIS, MEASURED, folded, split_unit, unit_name
 

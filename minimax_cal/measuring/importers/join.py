@@ -16,7 +16,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import name_first
-from minimax_cal.measuring.importers.reading import Column, Reading
+from minimax_cal.measuring.importers.tables import Column, Reading
 from minimax_cal.reading.words import folded
 
 PART = re.compile(r"\d+|[^\W\d_]+")

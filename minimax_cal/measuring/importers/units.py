@@ -14,7 +14,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.importers.reading import Column, Reading
+from minimax_cal.measuring.importers.tables import Column, Reading
 from minimax_cal.reading.words import ANGLES, LENGTHS, TIMES
 
 MOST_TURN = 4.0 * np.pi  # a joint that turned farther was not written in radians
