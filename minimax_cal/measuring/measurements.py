@@ -14,7 +14,7 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import csv_text, write_whole
 from minimax_cal.ground.words import name_first, one_line
 from minimax_cal.measuring.aside import SetAside
-from minimax_cal.reading.rows import TARGET, TEXT, UNITS, Rows, header_check, read_rows
+from minimax_cal.reading.rows import NOTHING, TARGET, TEXT, UNITS, Rows, header_check, read_rows
 from minimax_cal.reading.sheet import Lines
 from minimax_cal.reading.words import OWN, joints_of, kind_of, points_of, stems_of
 
@@ -31,6 +31,8 @@ PLAUSIBLE = {  # least and largest value in SI of columns of a kind
 }
 MARK = "simulated"  # the column of 1 where points were computed
 NAMED = re.compile(r"smr\d+_target")  # what the tracker calls it
+OF_POINTS = re.compile(f"{NAMED.pattern}|{TARGET.pattern}")
+ANY_TARGET = ("smr1_x_mm", "smr1_y_mm", "smr1_z_mm")  # the header's rules ask for one
 U95 = re.compile(OWN["u95"].pattern)
 
 
@@ -343,39 +345,60 @@ def measurements_in(file: Rows) -> Measurements:
                 taken = "; the command import takes that" if "='" in str(error) else ""
                 raise DataError(f"{error}{taken}") from error
     header_check(path, header)
-    q, sliding = file.joints()
+    at = joint_rows(file, OF_POINTS, U95)
     found = sorted({int(m[1]) for name in header if (m := TARGET.fullmatch(name))})
-    y = np.full((len(q), len(found), 3), np.nan)
-    for name in header:
-        if m := TARGET.fullmatch(name):
-            y[:, found.index(int(m[1])), "xyz".index(m[2])] = file.number(
-                name, unit=m[3], empty=True
-            )
-    columns, unused = file.optional(NAMED, U95)
-    named = [name for name in header if NAMED.fullmatch(name)]  # by import
-    unknown = {name: np.array(file.text(name)) for name in (*unused, *named)}
-    idle = (f"{path}: column {name} is not used{why}" for name, why in unused.items())
-    notices = [*file.notices, *idle]
-    data = Measurements(
-        q=q,
+    y = np.full((at.poses, len(found), 3), np.nan)
+    for m in filter(None, map(TARGET.fullmatch, header)):
+        cells = file.number(m[0], unit=m[3], empty=True)
+        y[:, found.index(int(m[1])), "xyz".index(m[2])] = cells
+    unknown = {name: np.array(file.text(name)) for name in header if NAMED.fullmatch(name)}
+    data = replace(
+        at,
         y=y,
         target_names=tuple(f"smr{i}" for i in found),
-        sliding=sliding,
-        line=file.line,
-        columns=columns,
-        unknown=unknown,
-        source=str(path),
-        digest=file.sheet.digest,
+        unknown={**at.unknown, **unknown},
         simulated=file.sheet.simulated,
+        notices=(),
     )
     data = marked(check_finite(data))
     again, said = pasted(file, np.asarray(data.seen.any(axis=1)))
-    data = without_blind(replace(data, notices=(*data.notices, *notices)), again)
+    data = without_blind(replace(data, notices=(*data.notices, *at.notices)), again)
     data = replace(data, notices=(*data.notices, *said))
     from minimax_cal.measuring.set_aside import from_column  # which makes measurements itself
     from minimax_cal.measuring.tools import by_tool
 
     return from_column(by_tool(data))
+
+
+def joint_rows(
+    file: Rows,
+    own: re.Pattern[str],
+    doubts: re.Pattern[str] = NOTHING,
+    unused: str = "is not used",
+) -> Measurements:
+    """The poses of a file without any point, and the optional columns beside them.
+
+    own, doubts: as of `Rows.optional`.  unused: what is said of other columns.  Raises DataError.
+    """
+    bare = [name for name in file.header if not TARGET.fullmatch(name)]
+    header_check(file.path, [*bare, *ANY_TARGET])
+    q, sliding = file.joints()
+    columns, left = file.optional(own, doubts)
+    left |= {name: "" for name in file.header if TARGET.fullmatch(name) and not own.fullmatch(name)}
+    idle = (f"{file.path}: column {name} {unused}{why}" for name, why in left.items())
+    at = Measurements(
+        q,
+        np.zeros((len(q), 0, 3)),
+        (),
+        sliding,
+        file.line,
+        columns,
+        {name: np.array(file.text(name)) for name in left},
+        (*file.notices, *idle),
+        str(file.path),
+        file.sheet.digest,
+    )
+    return check_u95(check_columns(at))
 
 
 def marked(data: Measurements) -> Measurements:
