@@ -11,7 +11,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.reading.sheet import COMMA, Sheet, cut, numbers_of, open_text, sheet_of
+from minimax_cal.reading.sheet import COMMA, POINT, Sheet, cut, numbers_of, open_text, sheet_of
 from minimax_cal.reading.words import (
     JOINTS,
     OWN,
@@ -34,6 +34,7 @@ KNOWN = ("order", "time_s", "temperature_C", "payload_kg", "session", "group", "
          "split", "set_aside", "tool", "payload_x_mm", "q1_rad", "q1_deg",
          *(f"smr1_{axis}_mm" for axis in "xyz"))  # fmt: skip
 NOTHING = re.compile(r"(?!)")
+OF_UNIT = re.compile(rf"{POINT.pattern} ?[^\W\d_]{{1,3}}|{POINT.pattern} ?[\u00b0\u00ba]")
 MISSING = ("", "-", "--", "---", "n/a", "na", "#n/a", "n.a.", "k.a.", "null", "none")
 OF_JOINT = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
 
@@ -230,6 +231,7 @@ def numbers(
         mends = (
             (not cell, "complete it or delete the row"),
             (COMMA.fullmatch(cell), "use a decimal point"),
+            (OF_UNIT.fullmatch(cell), "write the unit in the header, not in the cells"),
             (empty, "mend it, or leave the cell empty where it was not measured"),
             (True, "mend it or delete the row"),
         )

@@ -20,14 +20,15 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import read_raw
-from minimax_cal.reading.words import is_summary, is_understood, unit_name
+from minimax_cal.reading.words import is_summary, is_understood, plain, unit_name
 from minimax_cal.reading.workbook import is_workbook, text_of_workbook
 
-DELIMITERS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "spaces"}
+DELIMITERS = {";": "semicolon", "\t": "tab", ",": "comma", "|": "bar", " ": "spaces"}
 DECIMALS = {".": "point", ",": "comma"}
 POINT = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 THOUSANDS = re.compile(r"[-+]?\d{1,3}([.,' \u00a0\u202f])\d{3}(?:\1\d{3})*(?!\1)([.,])\d+")
 COMMA = re.compile(r"[-+]?(\d*),(\d+)([eE][-+]?\d+)?")
+QUOTED = re.compile(r'"[^"]*[,;\t][^"]*"')
 COMMENTS = ("#", "%", "//", "!")
 SIMULATED = "# simulated"  # first line of a file whose points were computed, not measured
 ENCODINGS = (  # names and codecs; the last takes any bytes, and cp1252 is meant by latin-1 mostly
@@ -38,7 +39,7 @@ CHINESE = re.compile(rb"([\xa1-\xd7][\xa1-\xfe])|[\x81-\xfe][\x40-\xfe]")  # sig
 MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 PACKED = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how spreadsheets begin
 WORKBOOK = "workbook"
-BLANK = " \t,;"
+BLANK = " \t,;|"
 MOST_COLUMNS = 1 << 14  # as of workbooks
 NUMERIC = b"0123456789+-.eE "  # letters of numbers
 AT_ONCE = 1 << 13  # rows that are made numbers at once
@@ -152,6 +153,8 @@ def sheet_of(path: Path | str, text: str, encoding: str = "utf-8") -> Sheet:
         raise DataError(f"{path}: is not a text file; expected rows of numbers")
     if not text.strip():
         raise DataError(f"{path}: is empty")
+    if text.startswith('"') and all(map(QUOTED.fullmatch, text.rstrip("\n").split("\n"))):
+        text = text.replace('"', "")  # whole lines were taken for cells
     if not text.isascii():
         text = text.replace("\u2212", "-")  # the minus of typographers
     return Sheet(Path(path), text, encoding, "", "", (), np.empty(0, dtype=int), ())
@@ -204,8 +207,8 @@ def cut(
     line = np.array([number for number, _ in rows], dtype=int)
     cells = tuple(row[:width] for _, row in rows)
     names = header or tuple(f"column {i + 1}" for i in range(width))
-    plain = delimiter == "," and '"' not in sheet.text
-    sign = decimal or ("." if plain else decimal_of(path, names, line, cells))
+    sure = delimiter == "," and '"' not in sheet.text
+    sign = decimal or ("." if sure else decimal_of(path, names, line, cells))
     found = replace(sheet, delimiter=delimiter, decimal=sign, header=header, line=line, cells=cells)
     return replace(found, torn=lost, above=above, below=below)
 
@@ -273,8 +276,8 @@ def ends_of(rows: list[Row], padded: bool) -> tuple[int, int]:
     """The first row of the table, and the first below it.
 
     Above it are rows that say something else, half as long, or shorter; below it means and the
-    like, or words alone in half the columns at most.  padded: whether all rows have cells up to
-    the last column.
+    like, or in half the columns at most words alone, or what is of all rows.  padded: whether all
+    rows have cells up to the last column.
     """
     short = [len(trimmed(row)) for row in rows]
     lengths = short if padded else list(map(len, rows))
@@ -283,8 +286,8 @@ def ends_of(rows: list[Row], padded: bool) -> tuple[int, int]:
     last = len(rows)
     while last > 1:
         filled = [cell for cell in rows[last - 1] if cell]
-        words = 2 * lengths[last - 1] <= most and not any(map(is_number, filled))
-        if not (words or is_summary(filled[0])):
+        of_all = plain(filled[0].rstrip(":")) or not any(map(is_number, filled))
+        if not (is_summary(filled[0]) or (of_all and 2 * lengths[last - 1] <= most)):
             break
         last -= 1
     return first if first < len(rows) - 1 else 0, last

@@ -67,10 +67,10 @@ ALIASES |= dict.fromkeys(
 )
 ALIASES |= dict.fromkeys(("IN", "inches"), "in")
 KNOWN = {*ANGLES, *LENGTHS, *TIMES, *TEMPERATURES, *OTHERS}
-JOINTS = ("q|j|a|ax|axis|joint|theta|achse|achswert|gelenk|axe|articulation|eje|articulacion"
+JOINTS = ("q|j|a|\u03b8|ax|axis|joint|theta|achse|achswert|gelenk|axe|articulation|eje|articulacion"
           "|\u5173\u8282|\u8f74")  # fmt: skip
 NUMBERED = (  # of folded names
-    f"(?:{JOINTS})[ _.-]?(?P<joint>\\d+)"
+    f"(?:(?:robot(?:er)?|arm|ist|actual)[ _.-])?(?:{JOINTS})[ _.-]?(?P<joint>\\d+)"
     "(?:[ _.-]?(?:angle|winkel|ist|actual|position|pos|wert|value|angulo|\u89d2\u5ea6|\u89d2))?",
     "\u7b2c?(?P<joint>\\d+)(?:\u8f74|\u5173\u8282)(?:\u89d2\u5ea6|\u89d2)?",
 )
@@ -86,7 +86,10 @@ PLACE = (
     "|\u5750\u6807|\u503c"
 )
 SAID = f"(?:[ _.-]?(?:{ACTUAL}|{PLACE}))*"
-AXIS = re.compile(f"(?:(?:{ACTUAL}|{PLACE})[ _.-]?)?([xyz]){SAID}|(?:(.+?)[ _.-])([xyz]){SAID}")
+AXIS = re.compile(
+    f"(?:(?:{ACTUAL}|{PLACE})[ _.-]?)?([xyz]){SAID}|(?:(.+?)[ _.-])([xyz]){SAID}"
+    "|([xyz])[ _.-]?(\\d+)"
+)
 MEASURED = re.compile(f"(?:(?:{PLACE})[ _.-]?)?(?:{ACTUAL})(?:[ _.-]?(?:{PLACE}))?")
 NOMINAL = re.compile(  # no measured points: planned ones, differences, uncertainties
     r"u[ _]?\(?95\)?|target|goal|cmd|command|delta|d|tcp|robot|flange"
@@ -167,8 +170,8 @@ def is_summary(cell: str) -> bool:
 def unit_name(text: str) -> str:
     """A unit as this project writes it, or ''."""
     text = unicodedata.normalize("NFKC", text).strip()
-    text = ALIASES.get(text, text)
-    return text if text in KNOWN else ""
+    names = [text, text.lower()][: len(text)]  # M and S are no units
+    return next((unit for name in names if (unit := ALIASES.get(name, name)) in KNOWN), "")
 
 
 def split_unit(name: str) -> tuple[str, str]:
@@ -231,7 +234,7 @@ def points_of(stems: Sequence[str]) -> dict[str, str]:
         found = AXIS.fullmatch(folded(stem))
         if not found or kind_of(stem) not in ("", "smr"):
             continue
-        letter, target = found[1] or found[3], (found[2] or "").rstrip(".")
+        letter, target = found[1] or found[3] or found[4], (found[2] or found[5] or "").rstrip(".")
         if not NOMINAL.fullmatch(target):
             axes.setdefault(target, {}).setdefault(letter, stem)
     whole = [own for own in axes.values() if own.keys() == {"x", "y", "z"}]

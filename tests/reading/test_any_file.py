@@ -126,6 +126,22 @@ READ: dict[str, Callable[[Array, Array], bytes]] = {
     "own_joints.csv": lambda q, y: text(
         table(["Name", *(f"q{j}_deg" for j in JOINTS), "X [mm]", "Y [mm]", "Z [mm]"], q, y)
     ),
+    "wrapped.csv": lambda q, y: text([f'"{row}"' for row in table(GERMAN, q, y)]),
+    "bars.csv": lambda q, y: text(table(GERMAN, q, y, point, "|")),
+    "capitals.csv": lambda q, y: text(
+        table(["NAME", *(f"J{j} [DEG]" for j in JOINTS), "X1 [MM]", "Y1 [MM]", "Z1 [MM]"], q, y)
+    ),
+    "prefixes.csv": lambda q, y: text(
+        table(
+            ["No.", *(f"Robot J{j} (deg)" for j in JOINTS), *(f"Tracker {a} mm" for a in "XYZ")],
+            q,
+            y,
+        )
+    ),
+    "greek.csv": lambda q, y: text(
+        table(["Punkt", *(f"θ{j} [°]" for j in JOINTS), *GERMAN[7:]], q, y)
+    ),
+    "of_all.csv": lambda q, y: text([*table(GERMAN, q, y), "", "Temperatur: ;21.5"]),
     "remark.csv": lambda q, y: text([*table(GERMAN, q, y), "Total: 24 Punkte"]),
 }
 
@@ -138,7 +154,7 @@ def test_measurements_are_read_as_they_are(name, truth, tmp_path):
     assert_allclose(data.q, truth.q, rtol=0, atol=ROUNDED)
     assert_allclose(data.y, truth.y, rtol=0, atol=ROUNDED)
     assert any("left out" in text for text in data.notices) == (
-        name in ("german.csv", "french.txt", "remark.csv")
+        name in ("german.csv", "french.txt", "of_all.csv", "remark.csv")
     )
     assert list(data.columns.get("pose", NAMES)) == NAMES
 
