@@ -106,15 +106,12 @@ def campaigns(parts: Sequence[Measurements], names: Sequence[str]) -> Measuremen
     last = max(int(part.line.max(initial=1)) for part in parts)
     step = int(10 ** max(3, len(str(last))))  # a round number above all lines
     targets = tuple(dict.fromkeys(name for part in parts for name in part.target_names))
-
-    def placed(part: Measurements, name: str, more: int) -> Measurements:
-        return with_targets(renumbered(in_session(part, name), more, name), targets)
-
-    named = [
-        part.everywhere(partial(placed, name=name, more=number * step))
-        for number, (part, name) in enumerate(zip(parts, names, strict=True))
-    ]
-    first, *others = in_turn(named)
+    first, *others = in_turn(
+        [
+            part.everywhere(partial(placed, name=name, more=number * step, targets=targets))
+            for number, (part, name) in enumerate(zip(parts, names, strict=True))
+        ]
+    )
     said = ", ".join(
         f"{part.source} from line {number * step + 1}"
         for number, part in enumerate(parts)
@@ -148,25 +145,25 @@ def check_alike(parts: Sequence[Measurements]) -> None:
             )
 
 
-def in_session(part: Measurements, name: str) -> Measurements:
-    """A part whose session is its name, before that of the file where it has several."""
+def placed(part: Measurements, name: str, more: int, targets: tuple[str, ...]) -> Measurements:
+    """A part as the session of a name, before that of the file where it has several.
+
+    Its lines are counted on, its labels apart from those of other files; of all targets those that
+    it lacks are measured nowhere.
+    """
     own = part.columns.get("session", np.full(part.poses, "")).astype(str)
     several = len(np.unique(own)) > 1
     label = np.array([f"{name}/{cell}" if several and cell else name for cell in own], dtype=str)
-    return replace(part, columns={**part.columns, "session": label})
-
-
-def renumbered(part: Measurements, more: int, name: str) -> Measurements:
-    """A part with its lines counted on, and labels that mean something in their own file only."""
-    columns = dict(part.columns)
-    for column in LABELS:
-        if column in columns:
-            own = columns[column].astype(str)
-            columns[column] = np.array(
-                [f"{name}/{cell}" if cell else "" for cell in own], dtype=str
-            )
+    columns = {**part.columns, "session": label}
+    for column in {*LABELS} & {*columns}:
+        cells = columns[column].astype(str)
+        columns[column] = np.array([f"{name}/{cell}" if cell else "" for cell in cells], dtype=str)
+    y = np.full((part.poses, len(targets), 3), np.nan)
+    y[:, [targets.index(target) for target in part.target_names]] = part.y
     return replace(
         part,
+        y=y,
+        target_names=targets,
         line=part.line + more,
         columns=columns,
         set_aside=tuple(replace(point, row=point.row + more) for point in part.set_aside),
@@ -192,10 +189,3 @@ def later(part: Measurements, seconds: float) -> Measurements:
     """A part measured so much later [s]."""
     columns = {**part.columns, "time": part.columns["time"].astype(float) + seconds}
     return replace(part, columns=columns)
-
-
-def with_targets(part: Measurements, names: tuple[str, ...]) -> Measurements:
-    """A part with all targets of some names, those that it lacks measured nowhere."""
-    y = np.full((part.poses, len(names), 3), np.nan)
-    y[:, [names.index(name) for name in part.target_names]] = part.y
-    return replace(part, y=y, target_names=names)
