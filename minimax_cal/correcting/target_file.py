@@ -49,4 +49,6 @@ def read_targets(path: Path | str) -> TargetFile:
             f"{path}:1: column {done[0]}: these joints are corrected already, and would be twice; "
             "give the targets as programmed"
         )
+    if file.sheet.torn:
+        raise DataError(f"{path}:{file.sheet.torn[0]}: the line is torn; complete it or delete it")
     return TargetFile(file, joint_rows(file, KEPT, unused="is kept and not used"))

@@ -141,8 +141,8 @@ def rows_of(sheet: Sheet) -> Rows:
         )
     given = table.header or rows[0]
     header = in_own_words(given)
-    said = tuple(f"{sheet.path}: {text}" for text in table.left_out)
-    return Rows(sheet, sheet.path, header, rows, table.line, given, table.block, said)
+    told = (table.line, given, table.block, table.left_out())
+    return Rows(table, table.path, header, rows, *told)
 
 
 def header_check(path: Path | str, header: Sequence[str]) -> None:

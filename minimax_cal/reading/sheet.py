@@ -8,7 +8,7 @@ import hashlib
 import io
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,6 +43,8 @@ BLANK = " \t,;|"
 MOST_COLUMNS = 1 << 14  # as of workbooks
 NUMERIC = b"0123456789+-.eE "  # letters of numbers
 AT_ONCE = 1 << 13  # rows that are made numbers at once
+MOST_TORN, LEAST_ROWS = 0.01, 20  # share of rows that may be torn; one of so many
+SHOWN = 3  # lines that a notice names
 LOOKED_AT = 200  # rows that decide the delimiter
 Row = tuple[str, ...]
 NumberedRow = tuple[int, Row]  # the line of the file, and its cells
@@ -97,15 +99,19 @@ class Sheet:
         """Number of columns."""
         return len(self.header) or max(map(len, self.cells), default=0)
 
-    @property
-    def left_out(self) -> tuple[str, ...]:
-        """What is said of lines that are not of the table."""
+    def left_out(self, others: Iterable[int] = ()) -> tuple[str, ...]:
+        """What is said of lines that are not of the table, torn, or broken otherwise."""
         parts = (("above", self.above), ("below", self.below))
-        return tuple(
+        said = [
             f"{where} the table, and left out: line {', '.join(map(str, lines))}"
             for where, lines in parts
             if lines
-        )
+        ]
+        if lines := sorted({*self.torn, *others}):
+            some = ", ".join(map(str, lines[:SHOWN])) + (" ..." if len(lines) > SHOWN else "")
+            plural = "s are" if len(lines) > 1 else " is"
+            said.append(f"{len(lines)} torn line{plural} left out ({some})")
+        return tuple(f"{self.path}: {text}" for text in said)
 
     @property
     def digest(self) -> str:
@@ -164,15 +170,15 @@ def cut(
     sheet: Sheet,
     decimal: str = "",
     *,
-    most_torn: float = 0.0,
+    most_torn: float = MOST_TORN,
     remarks: bool = True,
     alone: str = "",
 ) -> Sheet:
     """The rows and columns of a text, by the delimiter and decimal sign found.  Raises DataError.
 
     decimal: the sign, where the user gives it.  most_torn: share of rows that may be left out
-    because they have fewer or more cells than the others.  remarks: whether there may be some below
-    the table.  alone: the delimiter of a table of one column.
+    because they have fewer or more cells than the others; one of `LEAST_ROWS` may.  remarks:
+    whether there may be some below the table.  alone: the delimiter of a table of one column.
     """
     path = sheet.path
     if (found := of_numbers(sheet, alone)) is not None:
@@ -185,7 +191,7 @@ def cut(
     end = end if remarks else len(rows)
     above, below = (tuple(number for number, _ in some) for some in (rows[:top], rows[end:]))
     header, rows = split_header(rows[top:end])
-    if not header and not most_torn:
+    if not header:
         header = noted_header(
             [line for n, line in notes.items() if n < rows[0][0]], delimiter, rows
         )
@@ -195,7 +201,7 @@ def cut(
     if width > MOST_COLUMNS:
         raise DataError(f"{path}: has {width} columns; a table has at most {MOST_COLUMNS}")
     torn = [(number, row) for number, row in rows if len(row) < width or any(row[width:])]
-    if len(torn) > (max(1.0, most_torn * len(rows)) if most_torn else 0.0):
+    if len(torn) > max(most_torn * len(rows), most_torn > 0.0 and len(rows) >= LEAST_ROWS):
         number, row = torn[0]
         what = "the header has" if header else "most rows have"
         raise DataError(

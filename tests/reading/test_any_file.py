@@ -178,8 +178,8 @@ def changed(line: int, cells: Callable[[list[str]], list[str]]) -> Callable[[lis
 
 BARE = ["Name", *["q [rad]"] * 6, "X [mm]", "Y [mm]", "Z [mm]"]
 REFUSED: list[tuple[Callable[[list[str]], list[str]], str]] = [
-    (changed(25, lambda cells: cells[:5]), ":25: 5 cells, but the header has 10; complete the row"),
-    (changed(9, lambda cells: [*cells, "1"]), ":9: 11 cells, but the header has 10"),
+    (lambda rows: [*rows, "P1;2", "P2;3"], ":26: 2 cells, but the header has 10; complete the row"),
+    (lambda rows: [*rows[:9], "P1;2"], ":10: 2 cells, but the header has 10"),
     (
         changed(9, lambda cells: [*cells[:8], "12.5.3", cells[9]]),
         ":9: column Y .*'12.5.3' is not a n",
@@ -191,6 +191,18 @@ REFUSED: list[tuple[Callable[[list[str]], list[str]], str]] = [
     (changed(9, lambda cells: GERMAN), ":9: column Achse 1 .* is not a number; mend it or delete"),
     (changed(1, lambda cells: BARE), "twice; number the joints, as q1_rad, q2_rad, not q .rad"),
 ]
+
+
+def test_one_torn_line_of_many_is_left_out_and_named(truth, tmp_path):
+    """Not where rows are matched by their order, or where each row is a target to drive to."""
+    rows = table(GERMAN, np.degrees(truth.q), 1e3 * truth.y[:, 0])
+    rows[8] = rows[8][:40]
+    (tmp_path / "x.csv").write_bytes(text(rows))
+    data = mc.read_measurements(tmp_path / "x.csv")
+    assert_allclose(data.y, np.delete(truth.y, 7, axis=0), rtol=0, atol=ROUNDED)
+    assert any(said.endswith("1 torn line is left out (9)") for said in data.notices)
+    with pytest.raises(mc.DataError, match=":9: the line is torn; complete it or delete it"):
+        read_targets(tmp_path / "x.csv")
 
 
 @pytest.mark.parametrize(("change", "said"), REFUSED)

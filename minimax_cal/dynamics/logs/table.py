@@ -12,10 +12,9 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.reading.formats import FORMATS, Format, Place, format_of
-from minimax_cal.reading.sheet import Sheet, cut, numbers_of, open_text
+from minimax_cal.reading.sheet import MOST_TORN, Sheet, cut, numbers_of, open_text
 from minimax_cal.reading.words import SIZES, near
 
-MOST_TORN = 0.01  # share of rows that a log may lose to torn lines
 MOST_JOINTS = 100  # of any machine; guards against a number that is none of a joint
 MOST = 1e6  # of a joint value, speed, acceleration, torque or current, in any unit
 MOST_TIME = 1e20  # nanoseconds since 1970 are 2e18
@@ -333,13 +332,7 @@ class Columns:
         if len(self.broken) > max(1.0, MOST_TORN * len(line)):
             row, what = next(iter(sorted(self.broken.items())))
             raise DataError(f"{path}:{line[row]}: {what}")
-        lines = sorted({*self.sheet.torn, *(int(line[row]) for row in self.broken)})
-        said = [f"{path}: {text}" for text in self.sheet.left_out]
-        if not lines:
-            return said
-        some = ", ".join(map(str, lines[:SHOWN])) + (" ..." if len(lines) > SHOWN else "")
-        plural = "s are" if len(lines) > 1 else " is"
-        return [*said, f"{path}: {len(lines)} torn line{plural} left out ({some})"]
+        return list(self.sheet.left_out(int(line[row]) for row in self.broken))
 
 
 def typical_step(time: Array) -> float:

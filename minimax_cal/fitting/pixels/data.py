@@ -125,7 +125,7 @@ def read_pixels(
         target=numbered(file, "target", targets, f"has no place in {board}"),
         pixel=pixel,
         line=file.line,
-        notices=at.notices,
+        notices=(*file.notices, *at.notices),
         source=str(detections),
         digest=digest_of(file.sheet.digest, at.digest, *(camera.source for camera in cameras)),
     )

@@ -175,7 +175,7 @@ def read_any(path: Path | str | Sheet, given: Given, *, joints: bool = False) ->
     reading = next(filter(None, (read(sheet, given, joints) for read in ways)), None)
     if reading is None:
         raise DataError(unknown(sheet))
-    return reading.saying(*sheet.left_out)
+    return replace(reading, notices=(*reading.notices, *sheet.left_out()))
 
 
 def unknown(sheet: Sheet) -> str:

@@ -347,6 +347,12 @@ def poses_of(reading: Reading) -> Reading | None:
 
 def by_count(points: Reading, joints: Reading, layout: str) -> Places:
     """Match by order: one point a row of joints, or as many for each."""
+    for sheet in (points.sheet, joints.sheet):
+        if sheet.torn:
+            raise DataError(
+                f"{sheet.path}:{sheet.torn[0]}: the line is torn, and rows are matched by their "
+                "order; complete it, or give both files a column pose"
+            )
     names, slot = labels_of(points)
     m, poses = len(points.line), len(joints.line)
     if len(names) > 1:
