@@ -28,7 +28,6 @@ DECIMALS = {".": "point", ",": "comma"}
 POINT = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 THOUSANDS = re.compile(r"[-+]?\d{1,3}([.,' \u00a0\u202f])\d{3}(?:\1\d{3})*(?!\1)([.,])\d+")
 COMMA = re.compile(r"[-+]?(\d*),(\d+)([eE][-+]?\d+)?")
-QUOTED = re.compile(r'"[^"]*[,;\t][^"]*"')
 COMMENTS = ("#", "%", "//", "!")
 SIMULATED = "# simulated"  # first line of a file whose points were computed, not measured
 ENCODINGS = (  # names and codecs; the last takes any bytes, and cp1252 is meant by latin-1 mostly
@@ -159,11 +158,16 @@ def sheet_of(path: Path | str, text: str, encoding: str = "utf-8") -> Sheet:
         raise DataError(f"{path}: is not a text file; expected rows of numbers")
     if not text.strip():
         raise DataError(f"{path}: is empty")
-    if text.startswith('"') and all(map(QUOTED.fullmatch, text.rstrip("\n").split("\n"))):
-        text = text.replace('"', "")  # whole lines were taken for cells
+    if text.startswith('"') and all(map(is_wrapped, text.rstrip("\n").split("\n"))):
+        text = text.replace('"', "")
     if not text.isascii():
         text = text.replace("\u2212", "-")  # the minus of typographers
     return Sheet(Path(path), text, encoding, "", "", (), np.empty(0, dtype=int), ())
+
+
+def is_wrapped(line: str) -> bool:
+    """Whether a whole line was taken for one cell, and stands in quotation marks."""
+    return line.startswith('"') and line.endswith('"') and line.count('"') == 2
 
 
 def cut(
@@ -291,7 +295,7 @@ def ends_of(rows: list[Row], padded: bool) -> tuple[int, int]:
     first = next((i for i, length in enumerate(short) if 2 * length > width), 0)
     last = len(rows)
     while last > 1:
-        filled = [cell for cell in rows[last - 1] if cell]
+        filled = [cell for cell in rows[last - 1] if cell] or [""]
         of_all = plain(filled[0].rstrip(":")) or not any(map(is_number, filled))
         if not (is_summary(filled[0]) or (of_all and 2 * lengths[last - 1] <= most)):
             break
