@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.measurements import Measurements, measurements_in, read_measurements
+from minimax_cal.measuring.measurements import Measurements, measurements_in
 from minimax_cal.reading.rows import read_rows
 from minimax_cal.reading.sheet import Sheet, open_text
 
@@ -70,13 +70,6 @@ def apart(sheets: Sequence[Sheet]) -> Measurements | None:
     if all(reading.smrs and reading.joints for reading in readings):
         return None
     return importers.import_files(sheets).understood()
-
-
-def measured(data: Measurements | Path | str | Sequence[Path | str | Sheet]) -> Measurements:
-    """Measurements as they are, of a file, or of several as sessions.  Raises DataError."""
-    if isinstance(data, Measurements | str | Path):
-        return read_measurements(data)
-    return read_campaigns(data)
 
 
 def session_names(paths: Sequence[Path | str]) -> list[str]:

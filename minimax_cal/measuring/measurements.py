@@ -244,17 +244,25 @@ def check_finite(data: Measurements) -> Measurements:
             f"{data.source}:{data.line[row]}: {data.target_names[target]} is more than "
             f"{FARTHEST / 1e3:g} km away; check the number and its unit"
         )
-    unmeasured = ~data.seen.any(axis=0)
-    if unmeasured.all():
-        raise DataError(f"{data.source}: no target was measured at any pose")
-    if unmeasured.any():
-        name = data.target_names[int(np.argmax(unmeasured))]
-        raise DataError(f"{data.source}: {name} is measured at no pose; delete its columns")
+    check_seen(data, "no target was measured at any pose")
     for target, name in enumerate(data.target_names):
         points = data.y[data.seen[:, target], target]
         if len(points) > 2 and np.all(np.ptp(points, axis=0) == 0.0):
             raise DataError(f"{data.source}: all points of {name} are the same")
     return check_u95(check_columns(data))
+
+
+def check_seen(data: Measurements, none: str, but: str = "") -> Measurements:
+    """The data, if a point of each target counts; else says `none`, or what one lacks.
+
+    Raises DataError.
+    """
+    seen = np.asarray(data.seen.any(axis=0))
+    if not seen.all():
+        name = data.target_names[int(np.argmin(seen))]
+        said = f"{name} is measured at no pose{but}; delete its columns" if seen.any() else none
+        raise DataError(f"{data.source}: {said}")
+    return data
 
 
 def check_columns(data: Measurements) -> Measurements:

@@ -16,7 +16,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.words import name_first, one_line
 from minimax_cal.measuring.aside import FILE, TOOL, USER, SetAside
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.measurements import Measurements, check_seen
 
 COLUMN = "set_aside"
 TARGET = r"smr\d+(?:@[\w.-]+)?"  # smr1, or smr1@gripper where there are several tools
@@ -125,16 +125,8 @@ def entries(cell: str) -> list[tuple[str, str, str]]:
 
 def sound(data: Measurements) -> Measurements:
     """The data, if a point of each target counts.  Raises DataError."""
-    seen = np.asarray(data.seen.any(axis=0))
-    if not seen.any():
-        raise DataError(f"{data.source}: every measured point is set aside")
-    if not seen.all():
-        name = data.target_names[int(np.argmin(seen))]
-        raise DataError(
-            f"{data.source}: {name} is measured at no pose, but for points that are set aside; "
-            "delete its columns"
-        )
-    return data
+    but = ", but for points that are set aside"
+    return check_seen(data, "every measured point is set aside", but)
 
 
 def left_out(data: Measurements, points: Iterable[str]) -> Measurements:

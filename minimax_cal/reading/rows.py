@@ -11,7 +11,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.reading.sheet import COMMA, POINT, Sheet, cut, numbers_of, open_text, sheet_of
+from minimax_cal.reading.sheet import COMMA, POINT, Sheet, cut, numbers_of, open_text
 from minimax_cal.reading.words import (
     JOINTS,
     OWN,
@@ -122,18 +122,8 @@ class Rows:
 
 
 def read_rows(path: Path | str | Sheet) -> Rows:
-    """The columns of a file.  Raises DataError where it is no table."""
-    return rows_of(open_text(path))
-
-
-def rows_in(text: str, path: Path | str) -> Rows:
-    """The columns of a text that is, or shall be, in a file.  Raises DataError."""
-    return rows_of(sheet_of(path, text))
-
-
-def rows_of(sheet: Sheet) -> Rows:
-    """The columns of a text.  Raises DataError."""
-    table = cut(sheet, alone=",")
+    """The columns of a file, or of a text.  Raises DataError where it is no table."""
+    table = cut(open_text(path), alone=",")
     rows = table.cells
     if table.decimal == ",":
         rows = tuple(
