@@ -236,35 +236,20 @@ def import_files(
     readings = [read_any(path, given) for path in files]
     check_twice(readings)
     points = [reading for reading in readings if reading.smrs]
-    turns = [reading for reading in readings if reading.joints]
-    if joints is not None:
-        held = file_of_joints(joints, turns, given)
-    elif len(turns) == 1:
-        held = turns[0]
-    elif turns:
-        raise DataError(
-            f"{turns[1].sheet.path}: holds joint values, as {turns[0].sheet.path} does; import "
-            "one at a time, or name the file of joints as joints="
-        )
-    else:
-        raise DataError(
-            f"{points[0].sheet.path if points else readings[0].sheet.path}: {no_joints(points)}"
-        )
+    held = file_of_joints(joints, readings, given)
+    where = held.sheet.path
     if not points:
-        raise DataError(
-            f"{held.sheet.path}: holds joint values but no points; add the tracker's file"
-        )
-    neither = [reading for reading in readings if not (reading.smrs or reading.joints)]
+        raise DataError(f"{where}: holds joint values but no points; add the tracker's file")
+    neither = [r.sheet.path for r in readings if not (r.smrs or r.joints)]
     if neither:
-        raise DataError(f"{neither[0].sheet.path}: holds neither points nor joint values")
-    if held not in points or len(points) == 1:
-        assembly = assemble(points, held, given)
-        return Imported(assembly.data, assembly)
-    other = next(r for r in points if r is not held)
-    raise DataError(
-        f"{other.sheet.path}: holds points without joints, but {held.sheet.path} holds both; "
-        "import it alone"
-    )
+        raise DataError(f"{neither[0]}: holds neither points nor joint values")
+    other = next((r.sheet.path for r in points if r is not held and held in points), None)
+    if other:
+        raise DataError(
+            f"{other}: holds points without joints, but {where} holds both; import it alone"
+        )
+    assembly = assemble(points, held, given)
+    return Imported(assembly.data, assembly)
 
 
 def check_twice(readings: Sequence[Reading]) -> None:
@@ -304,21 +289,32 @@ def given_by(
     return Given("".join(others), "".join(of_joints), units_of(units), layout, sign)
 
 
-def file_of_joints(path: Path | str, turns: Sequence[Reading], given: Given) -> Reading:
-    """The file named for joint values.  turns: other files that hold some.  Raises DataError."""
-    held = read_any(path, given, joints=True)
-    if not held.joints:
-        raise DataError(f"{path}: holds no joint values; name its columns q1_deg, q2_deg ...")
-    if turns:
+def file_of_joints(path: Path | str | None, readings: Sequence[Reading], given: Given) -> Reading:
+    """The file of joint values: that of the path, or the only one that holds some.
+
+    Raises DataError.
+    """
+    turns = [reading for reading in readings if reading.joints]
+    others = [reading.sheet.path for reading in turns]
+    if path is not None:
+        held = read_any(path, given, joints=True)
+        if not held.joints:
+            raise DataError(f"{path}: holds no joint values; name its columns q1_deg, q2_deg ...")
+        if turns:
+            raise DataError(
+                f"{others[0]}: holds joint values, as joints={str(path)!r} does; leave one of "
+                "them out"
+            )
+        return held
+    if len(turns) > 1:
         raise DataError(
-            f"{turns[0].sheet.path}: holds joint values, as joints={str(path)!r} does; leave one "
-            "of them out"
+            f"{others[1]}: holds joint values, as {others[0]} does; import one at a time, or name "
+            "the file of joints as joints="
         )
-    return held
-
-
-def no_joints(points: Sequence[Reading]) -> str:
-    """What to do about missing joint values."""
-    if points:
-        return "holds points but no joint values; add their file as joints="
-    return "holds neither points nor joint values; say what its columns are as columns="
+    points = [reading for reading in readings if reading.smrs]
+    if not turns:
+        lacks = "points but no joint values; add their file as joints="
+        neither = "neither points nor joint values; say what its columns are as columns="
+        of = (points or readings)[0].sheet.path
+        raise DataError(f"{of}: holds {lacks if points else neither}")
+    return turns[0]
