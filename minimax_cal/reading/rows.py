@@ -148,7 +148,7 @@ def header_check(path: Path | str, header: Sequence[str]) -> None:
     units = {kind: {unit for one, _, unit in kinds if one == kind} for kind in ("q", "smr")}
     if not units["q"]:
         pairs = zip(header, stems_of(header), strict=True)
-        bare = [n for n, stem in pairs if joint_number(stem) and not split_unit(n)[1]]
+        bare = [n for n, stem in pairs if joint_number(stem) >= 0 and not split_unit(n)[1]]
         hint = f"; {bare[0]} has no unit: write {bare[0]} [deg], or [rad]" if bare else ""
         raise DataError(
             f"{path}:1: no joint columns; name them q1_rad (or q1_deg, q1_mm), q2_rad, ...{hint}"

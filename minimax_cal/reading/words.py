@@ -199,9 +199,9 @@ def plain(stem: str) -> str:
 
 
 def joint_number(stem: str) -> int:
-    """The joint that a header's name means, 0 for none."""
+    """The joint that a header's name means, -1 for none."""
     found = (re.fullmatch(pattern, folded(stem)) for pattern in NUMBERED)
-    return next((int(match["joint"]) for match in found if match), 0)
+    return next((int(match["joint"]) for match in found if match), -1)
 
 
 def along_arm(names: Sequence[str]) -> list[str]:
@@ -213,13 +213,15 @@ def along_arm(names: Sequence[str]) -> list[str]:
 
 
 def joints_of(stems: Sequence[str]) -> dict[str, str]:
-    """Meanings q1 ... of the names that are joints: numbered, named, or a maker's letters.
+    """Meanings q1 ... of names that are joints: numbered from 1 or 0, or a maker's names, letters.
 
     A tracker's q0 to q3 turn the target, not the arm.
     """
     named = along_arm([stem for stem in stems if stem.endswith("_joint")])
-    arm = [stem for stem in stems if not (QUATERNION.fullmatch(stem) and "q0" in stems)]
-    found = {stem: f"q{number}" for stem in arm if (number := joint_number(stem))}
+    turns = "q0" in stems and "q4" not in stems
+    arm = [stem for stem in stems if not (QUATERNION.fullmatch(stem) and turns)]
+    numbers = {stem: number for stem in arm if (number := joint_number(stem)) >= 0}
+    found = {stem: f"q{number + (0 in numbers.values())}" for stem, number in numbers.items()}
     found |= {stem: f"q{i + 1}" for i, stem in enumerate(named)}
     for letters in () if found else reversed(YASKAWA):
         if set(letters) <= set(stems):

@@ -138,6 +138,13 @@ READ: dict[str, Callable[[Array, Array], bytes]] = {
             y,
         )
     ),
+    "from_0.csv": lambda q, y: text(
+        table(
+            ["Name", *(f"actual_q_{j - 1} [deg]" for j in JOINTS), "X [mm]", "Y [mm]", "Z [mm]"],
+            q,
+            y,
+        )
+    ),
     "greek.csv": lambda q, y: text(
         table(["Punkt", *(f"θ{j} [°]" for j in JOINTS), *GERMAN[7:]], q, y)
     ),
