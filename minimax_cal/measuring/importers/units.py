@@ -65,21 +65,15 @@ def decide(
     q_able = [q_unit] if q_unit else [u for u in BOTH[0] if u == "deg" or turned <= MOST_TURN]
     y_able = [y_unit] if y_unit else lengths(ways, far)
     found = lever(q, y, sliding)
-    plausible = [
-        (a, b) for a, b in product(q_able, y_able) if possible(found * LENGTHS[b] / ANGLES[a])
-    ]
+    long = {(a, b): found * LENGTHS[b] / ANGLES[a] for a, b in product(q_able, y_able)}
+    plausible = [way for way in long if not (long[way] < SHORTEST or long[way] > LONGEST)]
     if len(plausible) != 1:
         raise DataError(question(where, q_able, y_able or list(BOTH[1]), turned, far))
     ((a, b),) = plausible
-    arm = f"else the arm would not be {found * LENGTHS[b] / ANGLES[a]:.2g} m long"
+    arm = f"else the arm would not be {long[a, b]:.2g} m long"
     why_q = arm if len(q_able) > 1 else f"|q| up to {turned:.4g} is beyond 4 pi"
     why_y = arm if len(y_able) > 1 else f"points over {ways:.4g}, up to {far:.4g} away"
     return a, b, "" if q_unit else why_q, "" if y_unit else why_y
-
-
-def possible(length: float) -> bool:
-    """Whether an arm can have this lever; NaN tells nothing, so yes."""
-    return not (length < SHORTEST or length > LONGEST)
 
 
 def lengths(ways: float, far: float) -> list[str]:
