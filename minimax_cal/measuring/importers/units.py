@@ -66,9 +66,8 @@ def decide(
     y_able = [y_unit] if y_unit else lengths(ways, far)
     found = lever(q, y, sliding)
     long = {(a, b): found * LENGTHS[b] / ANGLES[a] for a, b in product(q_able, y_able)}
-    plausible = [
-        way for way in long if not (long[way] < SHORTEST or long[way] > LONGEST)
-    ]  # NaN: yes
+    # where nothing tells, a length is NaN, and may be
+    plausible = [way for way in long if not (long[way] < SHORTEST or long[way] > LONGEST)]
     if len(plausible) != 1:
         raise DataError(question(where, q_able, y_able or list(BOTH[1]), turned, far))
     ((a, b),) = plausible
