@@ -125,7 +125,7 @@ def read_rows(path: Path | str | Sheet) -> Rows:
     """The columns of a file, or of a text.  Raises DataError where it is no table."""
     table = cut(open_text(path), alone=",")
     rows = table.cells
-    if table.decimal == ",":
+    if table.decimal == "," and table.block is None:
         rows = tuple(
             tuple(c.replace(",", ".") if COMMA.fullmatch(c) else c for c in row) for row in rows
         )

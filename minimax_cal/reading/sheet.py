@@ -28,6 +28,7 @@ DECIMALS = {".": "point", ",": "comma"}
 POINT = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 THOUSANDS = re.compile(r"[-+]?\d{1,3}([.,' \u00a0\u202f])\d{3}(?:\1\d{3})*(?!\1)([.,])\d+")
 COMMA = re.compile(r"[-+]?(\d*),(\d+)([eE][-+]?\d+)?")
+PROVEN = re.compile(r",(?!\d{3}(?!\d))|\d{4},|(?<!\d)0,")  # no sign of thousands
 COMMENTS = ("#", "%", "//", "!")
 SIMULATED = "# simulated"  # first line of a file whose points were computed, not measured
 ENCODINGS = (  # names and codecs; the last takes any bytes, and cp1252 is meant by latin-1 mostly
@@ -185,8 +186,8 @@ def cut(
     whether there may be some below the table.  alone: the delimiter of a table of one column.
     """
     path = sheet.path
-    if (found := of_numbers(sheet, alone)) is not None:
-        return replace(found, decimal=decimal or ".")
+    if (found := of_numbers(sheet, alone, decimal)) is not None:
+        return found
     delimiter, notes, lines = split(sheet, alone)
     rows = rows_of(path, lines, delimiter)
     if not rows:
@@ -246,8 +247,8 @@ def split(sheet: Sheet, alone: str) -> tuple[str, dict[int, str], list[str]]:
     return delimiter, notes, lines
 
 
-def of_numbers(sheet: Sheet, alone: str) -> Sheet | None:
-    """The table of a text that holds a header and below it numbers with points alone; else None.
+def of_numbers(sheet: Sheet, alone: str, decimal: str) -> Sheet | None:
+    """The table of a text that holds a header and below it plain numbers alone; else None.
 
     Read as JSON, whose numbers are rounded as Python's.
     """
@@ -263,6 +264,11 @@ def of_numbers(sheet: Sheet, alone: str) -> Sheet | None:
     if not body or delimiter in ("", " ") or '"' in lines[top]:
         return None
     head = trimmed(split_line(lines[top], delimiter))
+    if comma := delimiter != "," and "," in body[0] and decimal != ".":
+        every = "\n".join(body)
+        if "." in every or not (decimal or PROVEN.search(every)):
+            return None
+        body = every.replace(",", ".").split("\n")
     block, sign = np.empty((len(body), len(head))), delimiter.encode()
     cut = sign * (len(head) - 1) + b"\n"  # what a row holds beside its numbers
     for first in range(0, len(body), AT_ONCE) if is_header(head) else ():
@@ -278,8 +284,8 @@ def of_numbers(sheet: Sheet, alone: str) -> Sheet | None:
     if not (is_header(head) and np.isfinite(block).all()):
         return None
     line = np.arange(top + 1, last) + 1
-    return replace(sheet, delimiter=delimiter, header=head, line=line,
-                   cells=Lines(body, delimiter), block=block)  # fmt: skip
+    return replace(sheet, delimiter=delimiter, header=head, line=line, block=block,
+                   decimal="," if comma else ".", cells=Lines(body, delimiter))  # fmt: skip
 
 
 def ends_of(rows: list[Row], padded: bool) -> tuple[int, int]:
@@ -450,8 +456,9 @@ def decimal_of(
     comma, point, proven = "", "", False
     for number, row in zip(line, cells, strict=True):
         for name, cell in zip(names, row, strict=True):
-            apart = THOUSANDS.fullmatch(cell)
-            if found := COMMA.fullmatch(cell):
+            found = COMMA.fullmatch(cell)
+            apart = None if found else THOUSANDS.fullmatch(cell)
+            if found:
                 proven |= len(found[2]) != 3 or len(found[1]) > 3 or found[1] in ("", "0")
                 proven |= bool(found[3])
             if found or (apart and apart[2] == ","):
