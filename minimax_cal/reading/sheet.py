@@ -171,19 +171,12 @@ def is_wrapped(line: str) -> bool:
     return line.startswith('"') and line.endswith('"') and line.count('"') == 2
 
 
-def cut(
-    sheet: Sheet,
-    decimal: str = "",
-    *,
-    most_torn: float = MOST_TORN,
-    remarks: bool = True,
-    alone: str = "",
-) -> Sheet:
+def cut(sheet: Sheet, decimal: str = "", *, most_torn: float = MOST_TORN, alone: str = "") -> Sheet:
     """The rows and columns of a text, by the delimiter and decimal sign found.  Raises DataError.
 
     decimal: the sign, where the user gives it.  most_torn: share of rows that may be left out
-    because they have fewer or more cells than the others; one of `LEAST_ROWS` may.  remarks:
-    whether there may be some below the table.  alone: the delimiter of a table of one column.
+    because they have fewer or more cells than the others, one of `LEAST_ROWS` in any case; where
+    it is 0 none may, nor remarks below the table.  alone: the delimiter of a table of one column.
     """
     path = sheet.path
     if (found := of_numbers(sheet, alone, decimal)) is not None:
@@ -193,7 +186,7 @@ def cut(
     if not rows:
         raise DataError(f"{path}: is empty")
     top, end = ends_of([row for _, row in rows], sheet.encoding == WORKBOOK)
-    end = end if remarks else len(rows)
+    end = end if most_torn else len(rows)
     above, below = (tuple(number for number, _ in some) for some in (rows[:top], rows[end:]))
     header, rows = split_header(rows[top:end])
     if not header:
@@ -218,8 +211,7 @@ def cut(
     line = np.array([number for number, _ in rows], dtype=int)
     cells = tuple(row[:width] for _, row in rows)
     names = header or tuple(f"column {i + 1}" for i in range(width))
-    sure = delimiter == "," and '"' not in sheet.text
-    sign = decimal or ("." if sure else decimal_of(path, names, line, cells))
+    sign = decimal or decimal_of(path, names, line, cells)
     found = replace(sheet, delimiter=delimiter, decimal=sign, header=header, line=line, cells=cells)
     return replace(found, torn=lost, above=above, below=below)
 

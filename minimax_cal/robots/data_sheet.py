@@ -38,7 +38,7 @@ OF_ROW = re.compile(r"(a|d|theta|alpha)\s*[_ ]?[({\[]?\s*i\s*[)}\]]?")
 def content_of(path: Path) -> dict[str, Any]:
     """The robot in the file schema.  Raises RobotError."""
     try:
-        sheet = cut(open_text(path), most_torn=0.0, remarks=False)
+        sheet = cut(open_text(path), most_torn=0.0)
     except DataError as error:
         raise RobotError(str(error)) from error
     known = [key_of(path, name) for name in sheet.header]
