@@ -198,7 +198,8 @@ def cut(sheet: Sheet, decimal: str = "", *, most_torn: float = MOST_TORN, alone:
     width = len(header) or Counter(len(trimmed(row)) for _, row in rows).most_common(1)[0][0]
     if width > MOST_COLUMNS:
         raise DataError(f"{path}: has {width} columns; a table has at most {MOST_COLUMNS}")
-    torn = [(number, row) for number, row in rows if len(row) < width or any(row[width:])]
+    torn = [(number, row) for number, row in rows
+            if len(row) < width or any(row[width:]) or row[:width] == header]  # fmt: skip
     if len(torn) > max(most_torn * len(rows), most_torn > 0.0 and len(rows) >= LEAST_ROWS):
         number, row = torn[0]
         what = "the header has" if header else "most rows have"
