@@ -29,7 +29,8 @@ from minimax_cal.ground.options import Option
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.importers import Imported, import_files
 from minimax_cal.measuring.measurements import measurements_in
-from minimax_cal.reading.rows import rows_in
+from minimax_cal.reading.rows import read_rows
+from minimax_cal.reading.sheet import sheet_of
 
 TOLD = "What the files do not tell"
 
@@ -106,7 +107,7 @@ def import_command(
 
     def rows() -> str:
         text = to.cells(found.csv(), safe_cells)
-        measurements_in(rows_in(text, to.output or ""))  # it can be read again
+        measurements_in(read_rows(sheet_of(to.output or "", text)))  # it can be read again
         return text
 
     tables = (found.files(), *found.columns(), *[found.preview()] * preview)

@@ -9,8 +9,7 @@ from pathlib import Path
 from minimax_cal.correcting.compensate import Compensation
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import csv_text
-from minimax_cal.measuring.joint_rows import joint_rows
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.measurements import Measurements, joint_rows
 from minimax_cal.reading.rows import JOINT, UNITS, Rows, read_rows
 from minimax_cal.reading.words import OWN
 
@@ -50,4 +49,6 @@ def read_targets(path: Path | str) -> TargetFile:
             f"{path}:1: column {done[0]}: these joints are corrected already, and would be twice; "
             "give the targets as programmed"
         )
-    return TargetFile(*joint_rows(file, KEPT, unused="is kept and not used"))
+    if file.sheet.torn:
+        raise DataError(f"{path}:{file.sheet.torn[0]}: the line is torn; complete it or delete it")
+    return TargetFile(file, joint_rows(file, KEPT, unused="is kept and not used"))

@@ -23,7 +23,9 @@ from minimax_cal.evidence.remains import Remains, rest_of
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
+from minimax_cal.measuring.faults import in_lines
+from minimax_cal.measuring.faults.fault import Fault
+from minimax_cal.measuring.faults.joints import looks_read_back
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.scene import Scene, joint_of, unmasked

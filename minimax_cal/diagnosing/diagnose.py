@@ -69,15 +69,10 @@ from minimax_cal.ground.threads import one_thread
 from minimax_cal.ground.words import name_first
 from minimax_cal.instruments.file import Given, taken
 from minimax_cal.measuring import checks
-from minimax_cal.measuring.faults import (
-    Fault,
-    find_faults,
-    in_lines,
-    mended,
-    session_jumps,
-    standing_out,
-)
+from minimax_cal.measuring.faults import find_faults, in_lines, mended, standing_out
+from minimax_cal.measuring.faults.fault import Fault
 from minimax_cal.measuring.faults.nests import RESEAT
+from minimax_cal.measuring.faults.sessions import session_jumps
 from minimax_cal.measuring.floor import DISTANCES, Floor, floor_of, noise_at_most
 from minimax_cal.measuring.grouping import clusters, held_out, split, with_groups
 from minimax_cal.measuring.history import with_history

@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.faults import Fault, mended, spoilt
+from minimax_cal.measuring.faults import mended, spoilt
+from minimax_cal.measuring.faults.fault import Fault
 from minimax_cal.measuring.faults.nests import RESEAT
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell

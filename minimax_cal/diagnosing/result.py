@@ -29,7 +29,7 @@ from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.units import in_files
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.aside import SetAside
-from minimax_cal.measuring.faults import Amount
+from minimax_cal.measuring.faults.fault import Amount
 from minimax_cal.measuring.faults.nests import RESEAT
 from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.history import with_history

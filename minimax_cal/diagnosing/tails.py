@@ -9,8 +9,8 @@ import numpy as np
 from minimax_cal.evidence.limits import HEAVY, MAX_GAUSSIAN
 from minimax_cal.fitting.suspects import Scores, Spread, spread_of
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.faults import Fault, far_off
-from minimax_cal.measuring.faults.distances import between
+from minimax_cal.measuring.faults.fault import Fault, between
+from minimax_cal.measuring.faults.points import far_off
 from minimax_cal.measuring.history import visits
 from minimax_cal.measuring.measurements import Measurements
 

@@ -20,7 +20,7 @@ from minimax_cal.evidence.remains import Asked, Component
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.facts import Fact, Milli, Mm, derived, in_file
 from minimax_cal.ground.files import plain
-from minimax_cal.measuring.faults import noise_between
+from minimax_cal.measuring.faults.points import noise_between
 from minimax_cal.measuring.floor import instrument_noise
 from minimax_cal.measuring.stations import stood
 

@@ -52,7 +52,7 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import check_left_out, takes
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.ground.threads import one_thread
-from minimax_cal.measuring.faults import Amount
+from minimax_cal.measuring.faults.fault import Amount
 from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.robot import Robot, load_robot
 

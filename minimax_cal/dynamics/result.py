@@ -20,7 +20,7 @@ from minimax_cal.ground.facts import APART, Fact
 from minimax_cal.ground.records import stored
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table, filled
-from minimax_cal.measuring.faults import Amount
+from minimax_cal.measuring.faults.fault import Amount
 from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.robots.robot import robot_from_dict
 

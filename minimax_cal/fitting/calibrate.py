@@ -35,9 +35,11 @@ from minimax_cal.ground.threads import one_thread
 from minimax_cal.instruments import file
 from minimax_cal.instruments.file import taken
 from minimax_cal.instruments.instrument import Instrument
-from minimax_cal.measuring import checks, faults
+from minimax_cal.measuring import checks
 from minimax_cal.measuring.aside import TOOL
-from minimax_cal.measuring.faults.declared import noise
+from minimax_cal.measuring.faults import distance_faults
+from minimax_cal.measuring.faults.points import noise
+from minimax_cal.measuring.faults.sessions import jumps
 from minimax_cal.measuring.grouping import groups, mislabelled, split, with_groups
 from minimax_cal.measuring.history import time_notices, with_history
 from minimax_cal.measuring.instrument import with_instrument
@@ -175,7 +177,7 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     data = stationed(robot, data, kept)
     train, held = seen_from(train, data.frames), seen_from(held, data.frames)
     doubts = (*checks.limit_notices(robot, data), *time_notices(data), mislabelled(data))
-    off = (*faults.distance_faults(data), *noise(data))
+    off = (*distance_faults(data), *noise(data))
     doubts = (*doubts, *(fault.text for fault in off))
     notices = (*data.notices, *filter(None, doubts), *said)
     few = train.seen.sum(axis=0) < LEAST_POSES
@@ -203,7 +205,7 @@ def with_jump(robot: Robot, poses: Parts, options: Options, progress: Progress) 
         return options
     plain = replace(options, effects=(), objective="sum")
     cell = fit_cell(robot, poses.train, plain, progress).cell(robot, poses.data)
-    rows, sizes = faults.jumps(cell.placed(poses.data), cell.error(poses.data))
+    rows, sizes = jumps(cell.placed(poses.data), cell.error(poses.data))
     if not len(rows):
         return options
     since = float(poses.data.columns["clock"][rows[np.argmax(sizes)]])

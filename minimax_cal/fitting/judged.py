@@ -42,8 +42,9 @@ from minimax_cal.fitting.stations import jumps
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import Later
-from minimax_cal.measuring import checks, faults
+from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.faults.sessions import session_jumps
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Frames
 from minimax_cal.modelling.cell import Cell
@@ -179,7 +180,7 @@ class Judged:
             *remarks(self.options, self.poses),
             *checks.outliers(data, np.linalg.norm(after, axis=-1)),
             *contradictions(data, after),
-            *(fault.text for fault in faults.session_jumps(data, after)),
+            *(fault.text for fault in session_jumps(data, after)),
             *(change.sentence for change in self.moved),
             *self.alarming,
             *bad_rows(self.suspects, data),

@@ -14,7 +14,7 @@ from minimax_cal.ground.files import csv_text, write_whole
 from minimax_cal.instruments.instrument import Columns, Instrument, checked
 from minimax_cal.instruments.table import INSTRUMENTS, instrument
 from minimax_cal.instruments.tracker import Points, points
-from minimax_cal.measuring.campaigns import measured
+from minimax_cal.measuring.campaigns import read_campaigns
 from minimax_cal.measuring.measurements import Measurements, file_column, measurements_in
 from minimax_cal.reading.rows import TARGET, Rows, read_rows
 
@@ -58,11 +58,11 @@ def taken(data: Given | Sequence[Given | Rows]) -> Measurements | list[Instrumen
         return [
             points(measurements_in(one)) if has_points(one) else as_instrument(one) for one in every
         ]
-    paths = [one.path for one in every if isinstance(one, Rows)]
-    if len(given) > max(len(paths), 1):
+    sheets = [one.sheet for one in every if isinstance(one, Rows)]
+    if len(given) > max(len(sheets), 1):
         raise DataError("several sets of points are campaigns: give their files")
     if len(every) > 1:
-        return measured(paths)
+        return read_campaigns(sheets)
     lone = every[0]
     if isinstance(lone, Instrument):
         return lone.at

@@ -26,8 +26,7 @@ from minimax_cal.instruments.protocol import FlangePoses
 from minimax_cal.instruments.reflectors import LEVER, posed, reflectors, spots_of
 from minimax_cal.instruments.tracker import Points
 from minimax_cal.measuring.grouping import groups
-from minimax_cal.measuring.joint_rows import joint_rows
-from minimax_cal.measuring.measurements import FARTHEST, Measurements
+from minimax_cal.measuring.measurements import FARTHEST, Measurements, joint_rows
 from minimax_cal.modelling.cell import pose_to_dict
 from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.kinematics import hat, rotation_vector
@@ -217,7 +216,7 @@ def family(file: Rows, pattern: re.Pattern[str], axes: str) -> Array:
 
 def read(file: Rows) -> WholePoses:
     """Whole poses, orientation as a rotation vector or a quaternion.  Raises DataError."""
-    file, at = joint_rows(file, FLANGE, DOUBTS)
+    at = joint_rows(file, FLANGE, DOUBTS)
     place = family(file, PLACE, "xyz")
     vector, quaternion = family(file, TURN, "xyz"), family(file, QUATERNION, "wxyz")
     if not place.shape[1]:

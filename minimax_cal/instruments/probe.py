@@ -32,7 +32,7 @@ from minimax_cal.instruments.instrument import (
 from minimax_cal.instruments.options import FAR, InstrumentOptions
 from minimax_cal.instruments.protocol import Arm, FlangePoses, ResidualRows
 from minimax_cal.instruments.shapes import PLANE, SPHERE, Shapes, Surface, placed_best
-from minimax_cal.measuring.joint_rows import joint_rows
+from minimax_cal.measuring.measurements import joint_rows
 from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.kinematics import hat, right_jacobian
 from minimax_cal.robots.robot import Robot
@@ -285,7 +285,7 @@ def contacts(
 
 def read(file: Rows) -> Touches:
     """Contacts of a probe.  Raises DataError."""
-    file, at = joint_rows(file, CONTACT)
+    at = joint_rows(file, CONTACT)
     labels = np.array(file.text("surface"))
     rows = len(labels)
     if "kind" not in file.header:

@@ -29,8 +29,7 @@ from minimax_cal.instruments.instrument import (
 from minimax_cal.instruments.options import InstrumentOptions, Known, known_text
 from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
 from minimax_cal.measuring.grouping import groups, held_out
-from minimax_cal.measuring.joint_rows import joint_rows
-from minimax_cal.measuring.measurements import FARTHEST
+from minimax_cal.measuring.measurements import FARTHEST, joint_rows
 from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.robot import Robot
 
@@ -284,7 +283,7 @@ def closures(q: Array, socket: Array, **columns: Array) -> Visits:
 
 def read(file: Rows) -> Visits:
     """The sockets' labels.  Raises DataError."""
-    file, at = joint_rows(file, SOCKET)
+    at = joint_rows(file, SOCKET)
     labels = np.array(file.text("socket"))
     return without_blind(Visits(at, labels), np.asarray(labels == ""))
 

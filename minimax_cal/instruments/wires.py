@@ -26,8 +26,7 @@ from minimax_cal.instruments.instrument import (
 )
 from minimax_cal.instruments.options import InstrumentOptions
 from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
-from minimax_cal.measuring.joint_rows import joint_rows
-from minimax_cal.measuring.measurements import FARTHEST
+from minimax_cal.measuring.measurements import FARTHEST, joint_rows
 from minimax_cal.measuring.slips import MAX_TRIAL_POSES
 from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.robot import Robot
@@ -260,7 +259,7 @@ def wire_names(numbers: Iterable[int]) -> tuple[str, ...]:
 
 def read(file: Rows) -> Lengths:
     """The wires' columns.  Raises DataError."""
-    file, at = joint_rows(file, WIRE)
+    at = joint_rows(file, WIRE)
     found = sorted((int(m[1]), n, m[2]) for n in file.header if (m := WIRE.fullmatch(n)))
     numbers = [number for number, _, _ in found]
     twice = [number for number in numbers if numbers.count(number) > 1]

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.measurements import Measurements, read_measurements
-from minimax_cal.reading.rows import TEXT
+from minimax_cal.measuring.measurements import Measurements, measurements_in
+from minimax_cal.reading.rows import read_rows
+from minimax_cal.reading.sheet import Sheet, open_text
 
 MOST_FILES = 100
 LABELS = ("pose", "group")  # which mean something in their own file only
 
 
-def read_campaigns(paths: Sequence[Path | str]) -> Measurements:
+def read_campaigns(paths: Sequence[Path | str | Sheet]) -> Measurements:
     """The measurements of one file, or of several as sessions.
 
     Parameters
@@ -44,13 +45,18 @@ def read_campaigns(paths: Sequence[Path | str]) -> Measurements:
         raise DataError("no file of measurements is given")
     if len(paths) > MOST_FILES:
         raise DataError(f"{len(paths)} files of measurements; give at most {MOST_FILES}")
-    if len(paths) > 1 and (whole := apart(paths)):
+    sheets = [open_text(path) for path in paths]
+    if len(paths) > 1 and (whole := apart(sheets)):
         return whole
-    parts = [read_measurements(path) for path in paths]
-    return parts[0] if len(parts) == 1 else campaigns(parts, session_names(paths))
+    parts = [measurements_in(read_rows(sheet)) for sheet in sheets]
+    return (
+        parts[0]
+        if len(parts) == 1
+        else campaigns(parts, session_names([sheet.path for sheet in sheets]))
+    )
 
 
-def apart(paths: Sequence[Path | str]) -> Measurements | None:
+def apart(sheets: Sequence[Sheet]) -> Measurements | None:
     """Measurements whose points and joints lie in files of their own; None where none does.
 
     Raises DataError.
@@ -58,19 +64,12 @@ def apart(paths: Sequence[Path | str]) -> Measurements | None:
     from minimax_cal.measuring import importers  # few lie apart
 
     try:
-        readings = [importers.read_any(path, importers.Given()) for path in paths]
+        readings = [importers.read_any(sheet, importers.Given()) for sheet in sheets]
     except DataError:
         return None  # the reader of each says what is wrong
     if all(reading.smrs and reading.joints for reading in readings):
         return None
-    return importers.import_files(paths).understood()
-
-
-def measured(data: Measurements | Path | str | Sequence[Path | str]) -> Measurements:
-    """Measurements as they are, of a file, or of several as sessions.  Raises DataError."""
-    if isinstance(data, Measurements | str | Path):
-        return read_measurements(data)
-    return read_campaigns(data)
+    return importers.import_files(sheets).understood()
 
 
 def session_names(paths: Sequence[Path | str]) -> list[str]:
@@ -97,21 +96,22 @@ def campaigns(parts: Sequence[Measurements], names: Sequence[str]) -> Measuremen
     their names.  Raises DataError for parts of different joints.
     """
     check_alike(parts)
-    step = numbered_apart(parts)
-    named = [
-        renumbered(in_session(part, name), number * step, name)
-        for number, (part, name) in enumerate(zip(parts, names, strict=True))
-    ]
-    named = in_turn(named)
-    targets = tuple(dict.fromkeys(name for part in named for name in part.target_names))
+    last = max(int(part.line.max(initial=1)) for part in parts)
+    step = int(10 ** max(3, len(str(last))))  # a round number above all lines
+    targets = tuple(dict.fromkeys(name for part in parts for name in part.target_names))
+    first, *others = in_turn(
+        [
+            part.everywhere(partial(placed, name=name, more=number * step, targets=targets))
+            for number, (part, name) in enumerate(zip(parts, names, strict=True))
+        ]
+    )
     said = ", ".join(
         f"{part.source} from line {number * step + 1}"
         for number, part in enumerate(parts)
         if number
     )
-    whole = stacked([with_targets(part, targets) for part in named])
     return replace(
-        whole,
+        first.followed_by(*others),
         notices=(
             *(notice for part in parts for notice in part.notices),
             f"{len(parts)} files are sessions {', '.join(names)}; lines are numbered on: {said}",
@@ -138,36 +138,28 @@ def check_alike(parts: Sequence[Measurements]) -> None:
             )
 
 
-def numbered_apart(parts: Sequence[Measurements]) -> int:
-    """A round number above all lines of the parts."""
-    last = max(int(part.line.max(initial=1)) for part in parts)
-    return int(10 ** max(3, len(str(last))))
+def placed(part: Measurements, name: str, more: int, targets: tuple[str, ...]) -> Measurements:
+    """A part as the session of a name, before that of the file where it has several.
 
-
-def in_session(part: Measurements, name: str) -> Measurements:
-    """A part whose session is its name, before that of the file where it has several."""
+    Its lines are counted on, its labels apart from those of other files; of all targets those that
+    it lacks are measured nowhere.
+    """
     own = part.columns.get("session", np.full(part.poses, "")).astype(str)
     several = len(np.unique(own)) > 1
     label = np.array([f"{name}/{cell}" if several and cell else name for cell in own], dtype=str)
-    aside = in_session(part.aside, name) if part.aside else None
-    return replace(part, columns={**part.columns, "session": label}, aside=aside)
-
-
-def renumbered(part: Measurements, more: int, name: str) -> Measurements:
-    """A part with its lines counted on, and labels that mean something in their own file only."""
-    columns = dict(part.columns)
-    for column in LABELS:
-        if column in columns:
-            own = columns[column].astype(str)
-            columns[column] = np.array(
-                [f"{name}/{cell}" if cell else "" for cell in own], dtype=str
-            )
+    columns = {**part.columns, "session": label}
+    for column in {*LABELS} & {*columns}:
+        cells = columns[column].astype(str)
+        columns[column] = np.array([f"{name}/{cell}" if cell else "" for cell in cells], dtype=str)
+    y = np.full((part.poses, len(targets), 3), np.nan)
+    y[:, [targets.index(target) for target in part.target_names]] = part.y
     return replace(
         part,
+        y=y,
+        target_names=targets,
         line=part.line + more,
         columns=columns,
         set_aside=tuple(replace(point, row=point.row + more) for point in part.set_aside),
-        aside=renumbered(part.aside, more, name) if part.aside else None,
     )
 
 
@@ -181,65 +173,12 @@ def in_turn(parts: Sequence[Measurements]) -> list[Measurements]:
         if len(known):
             late = float(last - known.min()) if known.min() <= last else 0.0
             last = float(known.max()) + late
-            part = later(part, late + 1.0) if late else part
+            part = part.everywhere(partial(later, seconds=late + 1.0)) if late else part
         out.append(part)
     return out
 
 
 def later(part: Measurements, seconds: float) -> Measurements:
     """A part measured so much later [s]."""
-    aside = later(part.aside, seconds) if part.aside else None
     columns = {**part.columns, "time": part.columns["time"].astype(float) + seconds}
-    return replace(part, columns=columns, aside=aside)
-
-
-def with_targets(part: Measurements, names: tuple[str, ...]) -> Measurements:
-    """A part with all targets of some names, those that it lacks measured nowhere."""
-    y = np.full((part.poses, len(names), 3), np.nan)
-    y[:, [names.index(name) for name in part.target_names]] = part.y
-    aside = with_targets(part.aside, names) if part.aside else None
-    return replace(part, y=y, target_names=names, aside=aside)
-
-
-def stacked(parts: Sequence[Measurements]) -> Measurements:
-    """Parts of the same joints and targets one after the other."""
-    aside = [part.aside for part in parts if part.aside]
-    return replace(
-        parts[0],
-        q=np.concatenate([part.q for part in parts]),
-        y=np.concatenate([part.y for part in parts]),
-        line=np.concatenate([part.line for part in parts]),
-        columns=together(parts, lambda part: dict(part.columns)),
-        unknown=together(parts, lambda part: dict(part.unknown)),
-        simulated=all(part.simulated for part in parts),
-        set_aside=tuple(point for part in parts for point in part.set_aside),
-        aside=stacked(aside) if aside else None,
-    )
-
-
-def together(
-    parts: Sequence[Measurements], held: Callable[[Measurements], dict[str, Array]]
-) -> dict[str, Array]:
-    """Columns of all parts, empty where a part lacks one.  held: those of a part."""
-    names = dict.fromkeys(name for part in parts for name in held(part))
-    return {
-        name: np.concatenate([
-            held(part).get(name, empty(name, part, is_text(name, parts, held))) for part in parts
-        ])
-        for name in names
-    }  # fmt: skip
-
-
-def is_text(
-    name: str, parts: Sequence[Measurements], held: Callable[[Measurements], dict[str, Array]]
-) -> bool:
-    """Whether the cells of a column are text."""
-    found = next(held(part)[name] for part in parts if name in held(part))
-    return name in TEXT or found.dtype.kind in "US"
-
-
-def empty(name: str, part: Measurements, text: bool) -> Array:
-    """(m,) cells of a column that a part lacks; without a `split` all poses are for training."""
-    if name == "split":
-        return np.full(part.poses, "train")
-    return np.full(part.poses, "" if text else np.nan)
+    return replace(part, columns=columns)

@@ -65,12 +65,12 @@ def with_passive(robot: Robot, data: Measurements) -> Measurements:
         found = OF_JOINT.fullmatch(name)
         return f"{name[: found.start(1)]}{driven[int(found[1]) - 1] + 1}" if found else name
 
-    columns = {renumbered(name): column for name, column in data.columns.items()}
-    sliding = np.where(robot.passive, robot.prismatic, whole(data.sliding, robot.passive))
-    aside = with_passive(robot, data.aside) if data.aside else None
-    return replace(
-        data, q=whole(data.q, robot.passive), sliding=sliding, columns=columns, aside=aside
-    )
+    def widened(part: Measurements) -> Measurements:
+        columns = {renumbered(name): column for name, column in part.columns.items()}
+        sliding = np.where(robot.passive, robot.prismatic, whole(part.sliding, robot.passive))
+        return replace(part, q=whole(part.q, robot.passive), sliding=sliding, columns=columns)
+
+    return data.everywhere(widened)
 
 
 def span(robot: Robot) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.faults import noise_between
+from minimax_cal.measuring.faults.points import noise_between
 from minimax_cal.measuring.grouping import from_means, visits
 from minimax_cal.measuring.measurements import Measurements
 

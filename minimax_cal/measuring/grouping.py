@@ -150,20 +150,22 @@ def close_pairs(q: Array, within: float) -> Array:
     return np.concatenate(found)
 
 
-def shortest_tree(q: Array) -> Array:
-    """(m - 1,) edges of the shortest tree that joins all rows of q (m, n) [Prim 1957].
+def shortest_tree(q: Array) -> tuple[Array, Array]:
+    """Edges (m - 1, 2) of the shortest tree that joins all rows of q (m, n), and their lengths.
 
-    They are the heights at which single linkage joins.
+    These are the heights at which single linkage joins [Prim 1957].
     """
     apart = sum((joint[:, None] - joint) ** 2 for joint in q.T)
-    distance, edges, at = np.full(len(q), np.inf), np.empty(len(q) - 1), 0
-    for step in range(len(edges)):
+    distance, nearest, at = np.full(len(q), np.inf), np.zeros(len(q), dtype=int), 0
+    pairs, length = np.empty((len(q) - 1, 2), dtype=int), np.empty(len(q) - 1)
+    for step in range(len(length)):
         apart[:, at] = np.inf  # nothing leads there any more
+        nearest = np.where(apart[at] < distance, at, nearest)
         distance = np.minimum(distance, apart[at])
         distance[at] = np.inf
         at = int(distance.argmin())
-        edges[step] = distance[at]
-    return np.sqrt(edges)
+        pairs[step], length[step] = (nearest[at], at), distance[at]
+    return pairs, np.sqrt(length)
 
 
 def numbered_by_joints(group: Array, q: Array) -> Array:
@@ -211,16 +213,12 @@ def clusters(data: Measurements) -> Array:
     _, first = np.unique(group, return_index=True)
     if not 2 * FEWEST_CLUSTERS <= len(first) <= MOST:
         return group
-    steps = np.maximum(np.sort(shortest_tree(data.q[first])), REPEAT)
-    if (steps[1:] < APART * steps[:-1]).all():
-        return group
-    fcluster, linkage = scipy.cluster.hierarchy.fcluster, scipy.cluster.hierarchy.linkage
-    tree = linkage(data.q[first], "single")
-    height = np.maximum(tree[:, 2], REPEAT)
+    pairs, length = shortest_tree(data.q[first])
+    height = np.maximum(np.sort(length), REPEAT)
     for at in np.argsort(-(height[1:] / height[:-1])):
         if height[at + 1] < APART * height[at]:
             break
-        label = fcluster(tree, height[at] * (1.0 + 1e-9), "distance")
+        label = joined(pairs[length <= height[at] * (1.0 + 1e-9)], len(first))
         alone = np.bincount(label)[label] == 1
         if len(np.unique(label)) >= FEWEST_CLUSTERS and alone.mean() < 0.5:
             return numbered_by_joints(label[group], data.q)

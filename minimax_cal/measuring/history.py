@@ -183,12 +183,15 @@ def clock(data: Measurements) -> Array:
 
 def timed_by(data: Measurements) -> str:
     """The column that tells when poses were visited: `time`, `order`, or none."""
+    session = sessions(data)
+    parts = [session == one for one in np.unique(session)]
     for name in ("time", "order"):
         if name not in data.columns:
             continue
         given = data.columns[name].astype(float)
-        if name == "order" and restarts(given, sessions(data)):
-            return ""
+        spans = [(given[one].min(), given[one].max()) for one in parts]
+        if name == "order" and any(nxt[0] <= last[1] for last, nxt in pairwise(spans)):
+            return ""  # the numbers of a later session begin again
         if np.isfinite(given).sum() > 1:
             return name
     return ""
@@ -199,12 +202,6 @@ def filled(visit: Array, given: Array) -> Array:
     known = np.isfinite(given)
     by_visit = np.argsort(visit[known])
     return np.interp(visit, visit[known][by_visit], given[known][by_visit])
-
-
-def restarts(number: Array, session: Array) -> bool:
-    """Whether the visit numbers of a later session begin again among those of an earlier one."""
-    spans = [(number[session == s].min(), number[session == s].max()) for s in np.unique(session)]
-    return any(nxt[0] <= last[1] for last, nxt in pairwise(spans))
 
 
 @dataclass(frozen=True)

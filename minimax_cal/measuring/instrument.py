@@ -9,12 +9,10 @@ import numpy as np
 
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.reading.sheet import number_of
+from minimax_cal.reading.words import LENGTHS
 
-LENGTHS = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "m": 1.0}
-PATTERN = re.compile(
-    r"(?P<base>[\d.]+)\s*(?P<unit>um|µm|mm)"
-    r"(\s*\+\s*(?P<more>[\d.]+)\s*(?P<of>um|µm|mm)\s*/\s*m)?"
-)
+PATTERN = re.compile(r"([\d.]+)\s*(um|mm)(?:\s*\+\s*([\d.]+)\s*(um|mm)\s*/\s*m)?")
 
 
 @dataclass(frozen=True)
@@ -27,15 +25,12 @@ class Instrument:
 
 def instrument_of(text: str) -> Instrument:
     """As ``10um+2.5um/m`` or ``0.05mm``.  Raises OptionError."""
-    found = PATTERN.fullmatch(text.strip())
-    try:
-        base = float(found["base"]) * LENGTHS[found["unit"]] if found else 0.0
-        more = float(found["more"]) * LENGTHS[found["of"]] if found and found["more"] else 0.0
-    except ValueError:
-        base, more = 0.0, 0.0
-    if not 0.0 < base < 1.0 or more > 1e-2:
+    found = PATTERN.fullmatch(text.strip().replace("µ", "u"))
+    base, unit, more, of = found.groups("") if found else ("", "mm", "", "")
+    told = Instrument(number_of(base) * LENGTHS[unit], number_of(more or "0") * LENGTHS[of or "mm"])
+    if not (0.0 < told.base < 1.0 and told.per_metre <= 1e-2):
         raise OptionError(f"instrument={text!r}: write u95 as 10um+2.5um/m, or as 0.05mm")
-    return Instrument(base, more)
+    return told
 
 
 def with_instrument(data: Measurements, text: str | None) -> Measurements:

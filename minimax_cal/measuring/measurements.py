@@ -14,15 +14,9 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import csv_text, write_whole
 from minimax_cal.ground.words import name_first, one_line
 from minimax_cal.measuring.aside import SetAside
-from minimax_cal.reading.rows import (
-    TARGET,
-    UNITS,
-    Rows,
-    header_check,
-    read_rows,
-)
+from minimax_cal.reading.rows import NOTHING, TARGET, TEXT, UNITS, Rows, header_check, read_rows
 from minimax_cal.reading.sheet import Lines
-from minimax_cal.reading.words import OWN, joints_of, kind_of, stems_of
+from minimax_cal.reading.words import OWN, joints_of, kind_of, points_of, stems_of
 
 APPROACH = re.compile(r"approach\d+")
 FARTHEST = 1e5  # no instrument measures farther [m]
@@ -37,6 +31,8 @@ PLAUSIBLE = {  # least and largest value in SI of columns of a kind
 }
 MARK = "simulated"  # the column of 1 where points were computed
 NAMED = re.compile(r"smr\d+_target")  # what the tracker calls it
+OF_POINTS = re.compile(f"{NAMED.pattern}|{TARGET.pattern}")
+ANY_TARGET = ("smr1_x_mm", "smr1_y_mm", "smr1_z_mm")  # the header's rules ask for one
 U95 = re.compile(OWN["u95"].pattern)
 
 
@@ -122,20 +118,25 @@ class Measurements:
         )
 
     def followed_by(self, *others: Measurements) -> Measurements:
-        """These rows, then others with the same columns."""
+        """These rows, then others; a part that lacks a column knows nothing there."""
         parts = (self, *others)
-
-        def stacked(of: Callable[[Measurements], Mapping[str, Array]]) -> dict[str, Array]:
-            return {name: np.concatenate([of(part)[name] for part in parts]) for name in of(self)}
-
+        poses = [part.poses for part in parts]
+        aside = [part.aside for part in parts if part.aside]
         return replace(
             self,
             q=np.concatenate([part.q for part in parts]),
             y=np.concatenate([part.y for part in parts]),
             line=np.concatenate([part.line for part in parts]),
-            columns=stacked(lambda part: part.columns),
-            unknown=stacked(lambda part: part.unknown),
+            columns=stacked([part.columns for part in parts], poses),
+            unknown=stacked([part.unknown for part in parts], poses),
+            simulated=all(part.simulated for part in parts),
+            set_aside=tuple(point for part in parts for point in part.set_aside),
+            aside=aside[0].followed_by(*aside[1:]) if aside else None,
         )
+
+    def everywhere(self, change: Callable[[Measurements], Measurements]) -> Measurements:
+        """Changed, and the points that are set aside as well."""
+        return replace(change(self), aside=change(self.aside) if self.aside else None)
 
     def keep(self, targets: Array) -> Measurements:
         """Some targets only, at the poses where one of them was measured.  targets: (k,) mask."""
@@ -154,6 +155,21 @@ class Measurements:
     def with_y(self, y: Array) -> Measurements:
         """The same poses with other measured points."""
         return replace(self, y=y)
+
+
+def stacked(parts: Sequence[Mapping[str, Array]], poses: Sequence[int]) -> dict[str, Array]:
+    """Columns of parts of so many poses one after the other, empty where a part lacks one.
+
+    Without a `split` all its poses are for training.
+    """
+    out = {}
+    for name in dict.fromkeys(name for part in parts for name in part):
+        found = next(part[name] for part in parts if name in part)
+        text = name in TEXT or found.dtype.kind in "US"
+        none = "train" if name == "split" else "" if text else np.nan
+        every = [part.get(name, np.full(m, none)) for part, m in zip(parts, poses, strict=True)]
+        out[name] = np.concatenate(every)
+    return out
 
 
 def measurements(q: Array, y: Array, **columns: Array) -> Measurements:
@@ -228,17 +244,25 @@ def check_finite(data: Measurements) -> Measurements:
             f"{data.source}:{data.line[row]}: {data.target_names[target]} is more than "
             f"{FARTHEST / 1e3:g} km away; check the number and its unit"
         )
-    unmeasured = ~data.seen.any(axis=0)
-    if unmeasured.all():
-        raise DataError(f"{data.source}: no target was measured at any pose")
-    if unmeasured.any():
-        name = data.target_names[int(np.argmax(unmeasured))]
-        raise DataError(f"{data.source}: {name} is measured at no pose; delete its columns")
+    check_seen(data, "no target was measured at any pose")
     for target, name in enumerate(data.target_names):
         points = data.y[data.seen[:, target], target]
         if len(points) > 2 and np.all(np.ptp(points, axis=0) == 0.0):
             raise DataError(f"{data.source}: all points of {name} are the same")
     return check_u95(check_columns(data))
+
+
+def check_seen(data: Measurements, none: str, but: str = "") -> Measurements:
+    """The data, if a point of each target counts; else says `none`, or what one lacks.
+
+    Raises DataError.
+    """
+    seen = np.asarray(data.seen.any(axis=0))
+    if not seen.all():
+        name = data.target_names[int(np.argmin(seen))]
+        said = f"{name} is measured at no pose{but}; delete its columns" if seen.any() else none
+        raise DataError(f"{data.source}: {said}")
+    return data
 
 
 def check_columns(data: Measurements) -> Measurements:
@@ -318,49 +342,71 @@ def read_measurements(path: Measurements | Path | str) -> Measurements:
 def measurements_in(file: Rows) -> Measurements:
     """The measurements in a file's rows.  Raises DataError."""
     path, header = file.path, file.header
-    if not file.own:
+    pointless = not any(map(TARGET.fullmatch, header))
+    if not file.own or (pointless and points_of(stems_of(file.given))):
         from minimax_cal.measuring.importers import import_files  # which makes measurements itself
 
         try:
-            return import_files([path]).understood()
+            return import_files([file.sheet]).understood()
         except DataError as error:
             if joints_of(stems_of(file.given)):
                 taken = "; the command import takes that" if "='" in str(error) else ""
                 raise DataError(f"{error}{taken}") from error
     header_check(path, header)
-    q, sliding = file.joints()
+    at = joint_rows(file, OF_POINTS, U95)
     found = sorted({int(m[1]) for name in header if (m := TARGET.fullmatch(name))})
-    y = np.full((len(q), len(found), 3), np.nan)
-    for name in header:
-        if m := TARGET.fullmatch(name):
-            y[:, found.index(int(m[1])), "xyz".index(m[2])] = file.number(
-                name, unit=m[3], empty=True
-            )
-    columns, unused = file.optional(NAMED, U95)
-    named = [name for name in header if NAMED.fullmatch(name)]  # by import
-    unknown = {name: np.array(file.text(name)) for name in (*unused, *named)}
-    idle = (f"{path}: column {name} is not used{why}" for name, why in unused.items())
-    notices = [*file.notices, *idle]
-    data = Measurements(
-        q=q,
+    y = np.full((at.poses, len(found), 3), np.nan)
+    for m in filter(None, map(TARGET.fullmatch, header)):
+        cells = file.number(m[0], unit=m[3], empty=True)
+        y[:, found.index(int(m[1])), "xyz".index(m[2])] = cells
+    unknown = {name: np.array(file.text(name)) for name in header if NAMED.fullmatch(name)}
+    data = replace(
+        at,
         y=y,
         target_names=tuple(f"smr{i}" for i in found),
-        sliding=sliding,
-        line=file.line,
-        columns=columns,
-        unknown=unknown,
-        source=str(path),
-        digest=file.digest,
-        simulated=file.simulated,
+        unknown={**at.unknown, **unknown},
+        simulated=file.sheet.simulated,
+        notices=(),
     )
     data = marked(check_finite(data))
     again, said = pasted(file, np.asarray(data.seen.any(axis=1)))
-    data = without_blind(replace(data, notices=(*data.notices, *notices)), again)
+    data = without_blind(replace(data, notices=(*data.notices, *at.notices)), again)
     data = replace(data, notices=(*data.notices, *said))
     from minimax_cal.measuring.set_aside import from_column  # which makes measurements itself
     from minimax_cal.measuring.tools import by_tool
 
     return from_column(by_tool(data))
+
+
+def joint_rows(
+    file: Rows,
+    own: re.Pattern[str],
+    doubts: re.Pattern[str] = NOTHING,
+    unused: str = "is not used",
+) -> Measurements:
+    """The poses of a file without any point, and the optional columns beside them.
+
+    own, doubts: as of `Rows.optional`.  unused: what is said of other columns.  Raises DataError.
+    """
+    bare = [name for name in file.header if not TARGET.fullmatch(name)]
+    header_check(file.path, [*bare, *ANY_TARGET])
+    q, sliding = file.joints()
+    columns, left = file.optional(own, doubts)
+    left |= {name: "" for name in file.header if TARGET.fullmatch(name) and not own.fullmatch(name)}
+    idle = (f"{file.path}: column {name} {unused}{why}" for name, why in left.items())
+    at = Measurements(
+        q,
+        np.zeros((len(q), 0, 3)),
+        (),
+        sliding,
+        file.line,
+        columns,
+        {name: np.array(file.text(name)) for name in left},
+        (*file.notices, *idle),
+        str(file.path),
+        file.sheet.digest,
+    )
+    return check_u95(check_columns(at))
 
 
 def marked(data: Measurements) -> Measurements:

@@ -16,7 +16,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.words import name_first, one_line
 from minimax_cal.measuring.aside import FILE, TOOL, USER, SetAside
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.measurements import Measurements, check_seen
 
 COLUMN = "set_aside"
 TARGET = r"smr\d+(?:@[\w.-]+)?"  # smr1, or smr1@gripper where there are several tools
@@ -57,35 +57,14 @@ def set_aside(data: Measurements, points: Array, why: str, by: str) -> Measureme
 
 
 def merged(one: Measurements, other: Measurements) -> Measurements:
-    """The points of two parts of one file, by line; rows that both have come once.
-
-    Columns are those of the first; rows of the second that lack one know nothing there.
-    """
+    """The points of two parts of one file, by line; rows that both have come once."""
     both = np.isin(other.line, one.line)
     y = one.y.copy()
     at = np.searchsorted(one.line, other.line[both], sorter=np.argsort(one.line))
     rows = np.argsort(one.line)[at]
     y[rows] = np.where(np.isfinite(y[rows]), y[rows], other.y[both])
-    more = other.take(~both)
-    whole = replace(
-        one,
-        q=np.concatenate([one.q, more.q]),
-        y=np.concatenate([y, more.y]),
-        line=np.concatenate([one.line, more.line]),
-        columns={name: joined(column, more.columns.get(name), more.poses)
-                 for name, column in one.columns.items()},
-        unknown={name: joined(column, more.unknown.get(name), more.poses)
-                 for name, column in one.unknown.items()},
-    )  # fmt: skip
+    whole = one.with_y(y).followed_by(other.take(~both))
     return whole.take(np.argsort(whole.line, kind="stable"))
-
-
-def joined(column: Array, more: Array | None, count: int) -> Array:
-    """A column with rows of another part, which know nothing where they lack it."""
-    if more is None:
-        text = column.dtype.kind in "US"
-        more = np.full(count, "") if text else np.full(count, np.nan)
-    return np.concatenate([column, more])
 
 
 def whole(data: Measurements) -> Measurements:
@@ -146,16 +125,8 @@ def entries(cell: str) -> list[tuple[str, str, str]]:
 
 def sound(data: Measurements) -> Measurements:
     """The data, if a point of each target counts.  Raises DataError."""
-    seen = np.asarray(data.seen.any(axis=0))
-    if not seen.any():
-        raise DataError(f"{data.source}: every measured point is set aside")
-    if not seen.all():
-        name = data.target_names[int(np.argmin(seen))]
-        raise DataError(
-            f"{data.source}: {name} is measured at no pose, but for points that are set aside; "
-            "delete its columns"
-        )
-    return data
+    but = ", but for points that are set aside"
+    return check_seen(data, "every measured point is set aside", but)
 
 
 def left_out(data: Measurements, points: Iterable[str]) -> Measurements:

@@ -70,8 +70,9 @@ def seen_from(data: Measurements, frames: Frames) -> Measurements:
     """The data with all points in the first of some frames; as they are where there are none."""
     if not frames or frames is data.frames:
         return data
-    aside = seen_from(data.aside, frames) if data.aside else None
-    return replace(data, y=moved(data.y, shifts(data, frames)), frames=frames, aside=aside)
+    return data.everywhere(
+        lambda part: replace(part, y=moved(part.y, shifts(part, frames)), frames=frames)
+    )
 
 
 def stood(data: Measurements) -> Array:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
-from minimax_cal.reading.words import ANY, JOINTS, WORDS, folded, split_unit
+from minimax_cal.reading.words import ANY, JOINTS, NUMBERED, WORDS, folded, split_unit
 
 Q = f"(?P<unit>{'|'.join(ANY)})"
 JOINT = r"(?P<joint>\d+)"
@@ -52,6 +53,19 @@ def ros(word: str) -> tuple[str, ...]:
     )
 
 
+def beside_joint(said: str) -> tuple[str, str]:
+    """Names of what a joint does, in folded words: before its number, or after it."""
+    return (
+        rf"(?:{said})[ _.-]?(?:{JOINTS})?[ _.-]?{JOINT}",
+        rf"(?:{JOINTS})[ _.-]?{JOINT}[ _.-]?(?:{said})",
+    )
+
+
+OF_DRIVES = {
+    "qd": "qd|dq|qdot|velocity|vel|speed|geschwindigkeit|drehzahl|vitesse|velocidad|\u901f\u5ea6",
+    "tau": "tau|torque|m|moment|drehmoment|effort|couple|par|[\u626d\u529b\u8f6c]\u77e9",
+    "i": "i|current|strom|motorstrom|courant|corriente|\u7535\u6d41",
+}
 SI = {"q": "rad", "qd": "rad", "qdd": "rad", "q_cmd": "rad", "tau": "Nm", "tau_cmd": "Nm"}
 SI |= {"i": "A", "i_cmd": "A", "temperature": "C", "payload": "kg"}
 STAMP = r"(?:.*[./])?(?:header[./])?stamp"
@@ -122,11 +136,9 @@ FORMATS = (  # tried in this order
         "table in words",
         {
             "t": ("t", *map(re.escape, WORDS["time"])),
-            "q": (rf"(?:{JOINTS})[ _.-]?{JOINT}",),
-            "qd": (rf"(?:qd|dq|qdot|velocity|vel|speed|geschwindigkeit|vitesse)[ _.-]?{JOINT}",),
-            "tau": (rf"(?:tau|torque|moment|drehmoment|effort|couple)[ _.-]?{JOINT}",),
-            "i": (rf"(?:i|current|strom|courant|corriente)[ _.-]?{JOINT}",),
-            "payload": ("payload|traglast|last",),
+            "q": NUMBERED,
+            **{kind: beside_joint(said) for kind, said in OF_DRIVES.items()},
+            "payload": ("|".join(WORDS["payload"]),),
             "run": ("run|fahrt|lauf",),
         },
         units={"tau": "Nm", "i": "A"},
@@ -138,16 +150,14 @@ FORMATS = (  # tried in this order
 
 def place_of(form: Format, name: str) -> Place | None:
     """What a column of a format holds, or None."""
-    told = ""
-    if form.words:
-        found = OF_MOTION.fullmatch(name.strip())
-        name, told = (found[1], found[2]) if found else split_unit(name)
-        name = folded(name)
+    found = OF_MOTION.fullmatch(name.strip())
+    stem, told = (found[1], found[2]) if found else split_unit(name)
+    ways = ((folded(stem), told),) if form.words else ((name, ""), (stem, told))
     for kind, patterns in form.names.items():
-        for pattern in patterns:
-            if found := re.fullmatch(pattern, name, re.ASCII):
-                groups = found.groupdict()
-                unit = groups.get("unit") or MOTIONS.get(told, told) or form.units.get(kind, "")
+        for (text, unit), pattern in product(ways, patterns):
+            if match := re.fullmatch(pattern, text, re.ASCII):
+                groups = match.groupdict()
+                unit = groups.get("unit") or MOTIONS.get(unit, unit) or form.units.get(kind, "")
                 return Place(kind, groups.get("joint") or "", unit)
     return None
 

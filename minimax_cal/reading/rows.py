@@ -11,14 +11,17 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.reading.sheet import COMMA, Sheet, cut, numbers_of, open_text, sheet_of
+from minimax_cal.reading.sheet import COMMA, POINT, Sheet, cut, numbers_of, open_text
 from minimax_cal.reading.words import (
+    JOINTS,
     OWN,
     SIZES,
+    folded,
     in_own_words,
     joint_number,
     near,
     own_kind,
+    own_name,
     split_unit,
     stems_of,
 )
@@ -31,6 +34,8 @@ KNOWN = ("order", "time_s", "temperature_C", "payload_kg", "session", "group", "
          "split", "set_aside", "tool", "payload_x_mm", "q1_rad", "q1_deg",
          *(f"smr1_{axis}_mm" for axis in "xyz"))  # fmt: skip
 NOTHING = re.compile(r"(?!)")
+OF_UNIT = re.compile(rf"{POINT.pattern} ?[^\W\d_]{{1,3}}|{POINT.pattern} ?[\u00b0\u00ba]")
+MISSING = ("", "-", "--", "---", "n/a", "na", "#n/a", "n.a.", "k.a.", "null", "none")
 OF_JOINT = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
 
 
@@ -38,17 +43,15 @@ OF_JOINT = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
 class Rows:
     """A table as text: header, rows, and the line on which each row ends.
 
-    header: names as this project has them.  given: as the file has them.  block: the
-    rows as numbers, where all cells are.  digest: SHA-256 of the
-    file.  simulated: whether its first line says `SIMULATED`.
+    header: names as this project has them.  given: as the file has them.  block: the rows as
+    numbers, where all cells are.
     """
 
+    sheet: Sheet
     path: Path | str
     header: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
     line: Array
-    digest: str
-    simulated: bool = False
     given: tuple[str, ...] = ()
     block: Array | None = None
     notices: tuple[str, ...] = ()
@@ -56,7 +59,8 @@ class Rows:
     @property
     def own(self) -> bool:
         """Whether joints or targets have this project's names in the file."""
-        return any(own_kind(name)[0] in ("q", "smr") for name in self.given)
+        names = (own_name(name, self.given) for name in self.given)
+        return any(own_kind(name)[0] in ("q", "smr") for name in names)
 
     def text(self, name: str) -> list[str]:
         """The cells of a column."""
@@ -117,30 +121,18 @@ class Rows:
         return q, np.array([unit in ("m", "mm") for _, unit, _ in found])
 
 
-def read_rows(path: Path | str) -> Rows:
-    """The columns of a file.  Raises DataError where it is no table."""
-    return rows_of(open_text(path))
-
-
-def rows_in(text: str, path: Path | str) -> Rows:
-    """The columns of a text that is, or shall be, in a file.  Raises DataError."""
-    return rows_of(sheet_of(path, text))
-
-
-def rows_of(sheet: Sheet) -> Rows:
-    """The columns of a text.  Raises DataError."""
-    table = cut(sheet, remarks=False, alone=",")
+def read_rows(path: Path | str | Sheet) -> Rows:
+    """The columns of a file, or of a text.  Raises DataError where it is no table."""
+    table = cut(open_text(path), alone=",")
     rows = table.cells
-    if table.decimal == ",":
+    if table.decimal == "," and table.block is None:
         rows = tuple(
             tuple(c.replace(",", ".") if COMMA.fullmatch(c) else c for c in row) for row in rows
         )
     given = table.header or rows[0]
     header = in_own_words(given)
-    above = ", ".join(map(str, table.above))
-    said = (f"{sheet.path}: above the table, and left out: line {above}",) if above else ()
-    told = (sheet.digest, sheet.simulated, given, table.block, said)
-    return Rows(sheet.path, header, rows, table.line, *told)
+    told = (table.line, given, table.block, table.left_out())
+    return Rows(table, table.path, header, rows, *told)
 
 
 def header_check(path: Path | str, header: Sequence[str]) -> None:
@@ -149,14 +141,14 @@ def header_check(path: Path | str, header: Sequence[str]) -> None:
     stems: dict[str, str] = {}
     for name, (_, stem, _) in zip(header, kinds, strict=True):
         if (first := stems.get(stem)) is not None:
-            twice = f"column {name or '(without a name)'} stands twice"
+            twice = f"column {name or '(without a name)'} stands twice{numbering(header)}"
             other = f"{first} and {name} are one column; keep one unit"
             raise DataError(f"{path}:1: {twice if first == name else other}")
         stems[stem] = name
     units = {kind: {unit for one, _, unit in kinds if one == kind} for kind in ("q", "smr")}
     if not units["q"]:
         pairs = zip(header, stems_of(header), strict=True)
-        bare = [n for n, stem in pairs if joint_number(stem) and not split_unit(n)[1]]
+        bare = [n for n, stem in pairs if joint_number(stem) >= 0 and not split_unit(n)[1]]
         hint = f"; {bare[0]} has no unit: write {bare[0]} [deg], or [rad]" if bare else ""
         raise DataError(
             f"{path}:1: no joint columns; name them q1_rad (or q1_deg, q1_mm), q2_rad, ...{hint}"
@@ -168,7 +160,17 @@ def header_check(path: Path | str, header: Sequence[str]) -> None:
     if lost := lacking([stem for kind, stem, _ in kinds if kind]):
         beside = lost[:-1] if "_" in lost else "q"
         unit = next(unit for _, stem, unit in kinds if stem.startswith(beside) and unit)
-        raise DataError(f"{path}:1: column {lost}_{unit} is missing")
+        raise DataError(f"{path}:1: column {lost}_{unit} is missing{numbering(header)}")
+
+
+def numbering(header: Sequence[str]) -> str:
+    """What to do about a joint without its number, as q [rad]; or ''."""
+    for name in header:
+        stem, unit = split_unit(name)
+        if re.fullmatch(JOINTS, folded(stem)):
+            unit = unit or "deg"
+            return f"; number the joints, as q1_{unit}, q2_{unit}, not {name}"
+    return ""
 
 
 def lacking(stems: Collection[str]) -> str:
@@ -201,17 +203,31 @@ def useless(header: Sequence[str]) -> dict[str, str]:
     return out
 
 
-def numbers(path: Path | str, name: str, cells: list[str], line: Array, *, empty: bool) -> Array:
+def numbers(
+    path: Path | str,
+    name: str,
+    cells: Sequence[str],
+    line: Array,
+    *,
+    decimal: str = ".",
+    empty: bool,
+) -> Array:
     """One column as floats; an empty cell is NaN where that is allowed.  Raises DataError."""
-    out = numbers_of(cells)
-    for i in np.flatnonzero(~np.isfinite(out)):
+    out = numbers_of(cells, decimal)
+    for i in np.flatnonzero(~np.isfinite(out)).tolist():
         cell = cells[i]
-        if not cell and empty:
+        if empty and cell.lower() in MISSING:
             continue
-        where = f"{path}:{line[i]}: column {name}: "
-        if cell and (np.isinf(out[i]) or cell.lower().strip("+-") == "nan"):
-            mend = "; leave the cell empty where it was not measured" if empty else ""
-            raise DataError(f"{where}{cell} is not a finite number{mend}")
-        comma = "; use a decimal point" if COMMA.fullmatch(cell) else ""
-        raise DataError(f"{where}{f'{cell!r} is not a number' if cell else 'is empty'}{comma}")
+        mends = (
+            (not cell, "complete it or delete the row"),
+            (COMMA.fullmatch(cell), "use a decimal point"),
+            (OF_UNIT.fullmatch(cell), "write the unit in the header, not in the cells"),
+            (empty, "mend it, or leave the cell empty where it was not measured"),
+            (True, "mend it or delete the row"),
+        )
+        mend = next(mend for fits, mend in mends if fits)
+        wild = np.isinf(out[i]) or cell.lower().strip("+-") == "nan"
+        what = f"{cell} is not a finite number" if wild else f"{cell!r} is not a number"
+        what = what if cell else "is empty"
+        raise DataError(f"{path}:{line[i]}: column {name}: {what}; {mend}")
     return out

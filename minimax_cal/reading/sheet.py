@@ -8,7 +8,7 @@ import hashlib
 import io
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,27 +20,31 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import read_raw
-from minimax_cal.reading.words import is_understood, unit_name
+from minimax_cal.reading.words import is_summary, is_understood, plain, unit_name
 from minimax_cal.reading.workbook import is_workbook, text_of_workbook
 
-DELIMITERS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "spaces"}
+DELIMITERS = {";": "semicolon", "\t": "tab", ",": "comma", "|": "bar", " ": "spaces"}
 DECIMALS = {".": "point", ",": "comma"}
 POINT = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
+THOUSANDS = re.compile(r"[-+]?\d{1,3}([.,' \u00a0\u202f])\d{3}(?:\1\d{3})*(?!\1)([.,])\d+")
 COMMA = re.compile(r"[-+]?(\d*),(\d+)([eE][-+]?\d+)?")
+PROVEN = re.compile(r",(?!\d{3}(?!\d))|\d{4},|(?<!\d)0,")  # no sign of thousands
 COMMENTS = ("#", "%", "//", "!")
 SIMULATED = "# simulated"  # first line of a file whose points were computed, not measured
 ENCODINGS = (  # names and codecs; the last takes any bytes, and cp1252 is meant by latin-1 mostly
-    ("utf-8", "utf-8-sig"), ("utf-16", "utf-16"), ("gb2312", "gb2312"), ("latin-1", "cp1252"),
-    ("latin-1", "latin-1"),
+    ("utf-16", "utf-16"), ("utf-16", "utf-16-le"), ("utf-16", "utf-16-be"), ("utf-8", "utf-8-sig"),
+    ("gb2312", "gbk"), ("latin-1", "cp1252"), ("latin-1", "latin-1"),
 )  # fmt: skip
+CHINESE = re.compile(rb"([\xa1-\xd7][\xa1-\xfe])|[\x81-\xfe][\x40-\xfe]")  # signs; common ones
 MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 PACKED = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how spreadsheets begin
 WORKBOOK = "workbook"
-COORDINATES = 3  # of a point
-BLANK = " \t,;"
+BLANK = " \t,;|"
 MOST_COLUMNS = 1 << 14  # as of workbooks
-NUMERIC = b"0123456789+-.eE, "  # letters of numbers
+NUMERIC = b"0123456789+-.eE "  # letters of numbers
 AT_ONCE = 1 << 13  # rows that are made numbers at once
+MOST_TORN, LEAST_ROWS = 0.01, 20  # share of rows that may be torn; one of so many
+SHOWN = 3  # lines that a notice names
 LOOKED_AT = 200  # rows that decide the delimiter
 Row = tuple[str, ...]
 NumberedRow = tuple[int, Row]  # the line of the file, and its cells
@@ -95,6 +99,20 @@ class Sheet:
         """Number of columns."""
         return len(self.header) or max(map(len, self.cells), default=0)
 
+    def left_out(self, others: Iterable[int] = ()) -> tuple[str, ...]:
+        """What is said of lines that are not of the table, torn, or broken otherwise."""
+        parts = (("above", self.above), ("below", self.below))
+        said = [
+            f"{where} the table, and left out: line {', '.join(map(str, lines))}"
+            for where, lines in parts
+            if lines
+        ]
+        if lines := sorted({*self.torn, *others}):
+            some = ", ".join(map(str, lines[:SHOWN])) + (" ..." if len(lines) > SHOWN else "")
+            plural = "s are" if len(lines) > 1 else " is"
+            said.append(f"{len(lines)} torn line{plural} left out ({some})")
+        return tuple(f"{self.path}: {text}" for text in said)
+
     @property
     def digest(self) -> str:
         """SHA-256 of the text."""
@@ -112,19 +130,23 @@ def numbers_of(cells: Sequence[str], decimal: str = ".") -> Array:
     with suppress(ValueError):
         if "_" not in "".join(given):  # 1_000 is a number to Python only
             return np.array([cell or "nan" for cell in given], dtype=float)
-    return np.array([number_of(cell) for cell in given], dtype=float)
+    return np.array([number_of(cell, decimal) for cell in cells], dtype=float)
 
 
-def number_of(cell: str) -> float:
-    """One number, NaN where the cell holds none."""
+def number_of(cell: str, decimal: str = ".") -> float:
+    """One number, NaN where the cell holds none.  Thousands may stand apart, by another sign."""
+    if found := THOUSANDS.fullmatch(cell):
+        cell = f"{cell[: found.start(2)].replace(found[1], '')}.{cell[found.end(2) :]}"
     try:
-        return float(cell if "_" not in cell else "nan")
+        return float(cell.replace(decimal, ".") if "_" not in cell else "nan")
     except ValueError:
         return np.nan
 
 
-def open_text(path: Path | str) -> Sheet:
-    """A text file, not yet cut into rows and columns.  Raises DataError."""
+def open_text(path: Path | str | Sheet) -> Sheet:
+    """A text file, not yet cut into rows and columns; one that is open stays.  Raises DataError."""
+    if isinstance(path, Sheet):
+        return path
     path = Path(path)
     return sheet_of(
         path, *((text_of_workbook(path), WORKBOOK) if is_workbook(path) else decoded(path))
@@ -137,40 +159,37 @@ def sheet_of(path: Path | str, text: str, encoding: str = "utf-8") -> Sheet:
         raise DataError(f"{path}: is not a text file; expected rows of numbers")
     if not text.strip():
         raise DataError(f"{path}: is empty")
+    if text.startswith('"') and all(map(is_wrapped, text.rstrip("\n").split("\n"))):
+        text = text.replace('"', "")
+    if not text.isascii():
+        text = text.replace("\u2212", "-")  # the minus of typographers
     return Sheet(Path(path), text, encoding, "", "", (), np.empty(0, dtype=int), ())
 
 
-def cut(
-    sheet: Sheet,
-    decimal: str = "",
-    *,
-    most_torn: float = 0.0,
-    remarks: bool = True,
-    alone: str = "",
-) -> Sheet:
+def is_wrapped(line: str) -> bool:
+    """Whether a whole line was taken for one cell, and stands in quotation marks."""
+    return line.startswith('"') and line.endswith('"') and line.count('"') == 2
+
+
+def cut(sheet: Sheet, decimal: str = "", *, most_torn: float = MOST_TORN, alone: str = "") -> Sheet:
     """The rows and columns of a text, by the delimiter and decimal sign found.  Raises DataError.
 
     decimal: the sign, where the user gives it.  most_torn: share of rows that may be left out
-    because they have fewer or more cells than the others.  remarks: whether there may be some below
-    the table.  alone: the delimiter of a table of one column.
+    because they have fewer or more cells than the others, one of `LEAST_ROWS` in any case; where
+    it is 0 none may, nor remarks below the table.  alone: the delimiter of a table of one column.
     """
     path = sheet.path
+    if (found := of_numbers(sheet, alone, decimal)) is not None:
+        return found
     delimiter, notes, lines = split(sheet, alone)
-    if (found := of_numbers(sheet, delimiter, lines)) is not None:
-        return replace(found, decimal=decimal or ".")
     rows = rows_of(path, lines, delimiter)
     if not rows:
         raise DataError(f"{path}: is empty")
-    above = [] if most_torn else above_table([row for _, row in rows])
-    below = (
-        []
-        if most_torn or not remarks
-        else below_table([row for _, row in rows], sheet.encoding == WORKBOOK)
-    )
-    above, below = [[rows[i][0] for i in some] for some in (above, below)]
-    rows = rows[len(above) : len(rows) - len(below)]
-    header, rows = split_header(rows)
-    if not header and not most_torn:
+    top, end = ends_of([row for _, row in rows], sheet.encoding == WORKBOOK)
+    end = end if most_torn else len(rows)
+    above, below = (tuple(number for number, _ in some) for some in (rows[:top], rows[end:]))
+    header, rows = split_header(rows[top:end])
+    if not header:
         header = noted_header(
             [line for n, line in notes.items() if n < rows[0][0]], delimiter, rows
         )
@@ -179,8 +198,9 @@ def cut(
     width = len(header) or Counter(len(trimmed(row)) for _, row in rows).most_common(1)[0][0]
     if width > MOST_COLUMNS:
         raise DataError(f"{path}: has {width} columns; a table has at most {MOST_COLUMNS}")
-    torn = [(number, row) for number, row in rows if len(row) < width or any(row[width:])]
-    if len(torn) > (max(1.0, most_torn * len(rows)) if most_torn else 0.0):
+    torn = [(number, row) for number, row in rows
+            if len(row) < width or any(row[width:]) or row[:width] == header]  # fmt: skip
+    if len(torn) > max(most_torn * len(rows), most_torn > 0.0 and len(rows) >= LEAST_ROWS):
         number, row = torn[0]
         what = "the header has" if header else "most rows have"
         raise DataError(
@@ -192,10 +212,9 @@ def cut(
     line = np.array([number for number, _ in rows], dtype=int)
     cells = tuple(row[:width] for _, row in rows)
     names = header or tuple(f"column {i + 1}" for i in range(width))
-    plain = delimiter == "," and '"' not in sheet.text
-    sign = decimal or ("." if plain else decimal_of(path, names, line, cells))
+    sign = decimal or decimal_of(path, names, line, cells)
     found = replace(sheet, delimiter=delimiter, decimal=sign, header=header, line=line, cells=cells)
-    return replace(found, torn=lost, above=tuple(above), below=tuple(below))
+    return replace(found, torn=lost, above=above, below=below)
 
 
 def split(sheet: Sheet, alone: str) -> tuple[str, dict[int, str], list[str]]:
@@ -221,65 +240,66 @@ def split(sheet: Sheet, alone: str) -> tuple[str, dict[int, str], list[str]]:
     return delimiter, notes, lines
 
 
-def of_numbers(sheet: Sheet, delimiter: str, lines: list[str]) -> Sheet | None:
-    """The table of a text that holds a header and below it numbers with points alone; else None.
+def of_numbers(sheet: Sheet, alone: str, decimal: str) -> Sheet | None:
+    """The table of a text that holds a header and below it plain numbers alone; else None.
 
     Read as JSON, whose numbers are rounded as Python's.
     """
     from pydantic_core import from_json
 
-    told = [n for n, line in enumerate(lines) if line.strip(BLANK)]
-    body = [lines[n] for n in told[1:]]
-    if not body or delimiter == " " or '"' in lines[told[0]]:
+    lines = sheet.text.split("\n")
+    told = (n for n, line in enumerate(lines)
+            if line.strip(BLANK) and not line.lstrip().startswith(COMMENTS))  # fmt: skip
+    top = next(told, len(lines))
+    last = next((n for n in range(len(lines), top, -1) if lines[n - 1].strip(BLANK)), top)
+    body = lines[top + 1 : last]
+    delimiter = delimiter_of(lines[top : min(top + LOOKED_AT, last)]) or alone
+    if not body or delimiter in ("", " ") or '"' in lines[top]:
         return None
-    head = trimmed(split_line(lines[told[0]], delimiter))
-    if not is_header(head):
-        return None
-    if any(line.count(delimiter) != len(head) - 1 for line in body):
-        return None
-    block = np.empty((len(body), len(head)))
-    for first in range(0, len(body), AT_ONCE):
+    head = trimmed(split_line(lines[top], delimiter))
+    if comma := delimiter != "," and "," in body[0] and decimal != ".":
+        every = "\n".join(body)
+        if "." in every or not (decimal or PROVEN.search(every)):
+            return None
+        body = every.replace(",", ".").split("\n")
+    block, sign = np.empty((len(body), len(head))), delimiter.encode()
+    cut = sign * (len(head) - 1) + b"\n"  # what a row holds beside its numbers
+    for first in range(0, len(body), AT_ONCE) if is_header(head) else ():
         some = body[first : first + AT_ONCE]
-        raw = delimiter.join(some).replace(delimiter, ",").encode()
-        if raw.translate(None, NUMERIC):
+        raw = "\n".join([*some, ""]).encode()
+        if raw.translate(None, NUMERIC) != cut * len(some):
             return None
         try:
-            values = np.array(from_json(b"[" + raw + b"]"), dtype=float)
-            block[first : first + AT_ONCE] = values.reshape(len(some), len(head))
+            values = from_json(b"[" + raw[:-1].replace(b"\n", sign).replace(sign, b",") + b"]")
         except ValueError:
             return None
-    if not np.isfinite(block).all():
+        block[first : first + AT_ONCE] = np.array(values, dtype=float).reshape(-1, len(head))
+    if not (is_header(head) and np.isfinite(block).all()):
         return None
-    line = np.array(told[1:]) + 1
-    return replace(sheet, delimiter=delimiter, header=head, line=line,
-                   cells=Lines(body, delimiter), block=block)  # fmt: skip
+    line = np.arange(top + 1, last) + 1
+    return replace(sheet, delimiter=delimiter, header=head, line=line, block=block,
+                   decimal="," if comma else ".", cells=Lines(body, delimiter))  # fmt: skip
 
 
-def above_table(rows: list[Row]) -> range:
-    """Rows above the table that say something else: they are half as long, or shorter."""
-    lengths = [len(trimmed(row)) for row in rows]
-    width = Counter(lengths).most_common(1)[0][0]
-    first = next((i for i, length in enumerate(lengths) if 2 * length > width), 0)
-    return range(first if first < len(rows) - 1 else 0)
+def ends_of(rows: list[Row], padded: bool) -> tuple[int, int]:
+    """The first row of the table, and the first below it.
 
-
-def below_table(rows: list[Row], padded: bool) -> range:
-    """Rows below the table: half as long, or shorter, with words, too few numbers for a point.
-
-    padded: whether all rows have cells up to the last column.
+    Above it are rows that say something else, half as long, or shorter; below it means and the
+    like, or in half the columns at most words alone, or what is of all rows.  padded: whether all
+    rows have cells up to the last column.
     """
-    lengths = [len(trimmed(row) if padded else row) for row in rows]
-    width = Counter(lengths).most_common(1)[0][0]
+    short = [len(trimmed(row)) for row in rows]
+    lengths = short if padded else list(map(len, rows))
+    width, most = (Counter(some).most_common(1)[0][0] for some in (short, lengths))
+    first = next((i for i, length in enumerate(short) if 2 * length > width), 0)
     last = len(rows)
-    while last > 1 and 2 * lengths[last - 1] <= width and is_remark(rows[last - 1]):
+    while last > 1:
+        filled = [cell for cell in rows[last - 1] if cell] or [""]
+        of_all = plain(filled[0].rstrip(":")) or not any(map(is_number, filled))
+        if not (is_summary(filled[0]) or (of_all and 2 * lengths[last - 1] <= most)):
+            break
         last -= 1
-    return range(last, len(rows))
-
-
-def is_remark(row: Row) -> bool:
-    """Whether a row holds words, and too few numbers for a point."""
-    filled = sum(map(bool, row))
-    return numbers_in(row) < min(filled, COORDINATES)
+    return first if first < len(rows) - 1 else 0, last
 
 
 def split_header(rows: list[NumberedRow]) -> tuple[tuple[str, ...], list[NumberedRow]]:
@@ -337,11 +357,22 @@ def decoded(path: Path) -> tuple[str, str]:
         raise DataError(f"{path}: is a spreadsheet, not text; save it as CSV")
     for name, codec in ENCODINGS:
         with suppress(UnicodeError):
-            text = raw.decode(codec)
-            if name == "utf-16" and not raw.startswith(MARKS):
-                continue
-            return text.replace("\r\n", "\n").replace("\r", "\n"), name
+            if can_be(codec, raw):
+                text = raw.decode(codec)
+                return text.replace("\r\n", "\n").replace("\r", "\n"), name
     raise DataError(f"{path}: is not a text file; expected rows of numbers")
+
+
+def can_be(codec: str, raw: bytes) -> bool:
+    """Whether bytes look as in a codec: 16 bits a letter begin by a mark, or have zeros in turn.
+
+    Letters with accents can be Chinese signs, rare ones; a Chinese text has common ones mostly.
+    """
+    if codec.startswith("utf-16"):
+        zeros = {"utf-16-le": raw[1:8:2], "utf-16-be": raw[:8:2]}.get(codec, b"")
+        return raw.startswith(MARKS) if codec == "utf-16" else bool(zeros) and not any(zeros)
+    common = [bool(sign[1]) for sign in CHINESE.finditer(raw)] if codec == "gbk" else [True]
+    return 2 * sum(common) > len(common)
 
 
 def split_line(line: str, delimiter: str) -> Row:
@@ -380,12 +411,7 @@ def trimmed(row: Row) -> Row:
 
 def is_number(cell: str) -> bool:
     """Whether a cell is a number with either decimal sign."""
-    return bool(POINT.fullmatch(cell) or COMMA.fullmatch(cell))
-
-
-def numbers_in(row: Row) -> int:
-    """How many cells of a row are numbers."""
-    return sum(map(is_number, row))
+    return any(pattern.fullmatch(cell) for pattern in (POINT, COMMA, THOUSANDS))
 
 
 def is_header(row: Row) -> bool:
@@ -423,11 +449,15 @@ def decimal_of(
     comma, point, proven = "", "", False
     for number, row in zip(line, cells, strict=True):
         for name, cell in zip(names, row, strict=True):
-            if found := COMMA.fullmatch(cell):
-                comma = comma or f"{path}:{number}: column {name}: {cell}"
+            found = COMMA.fullmatch(cell)
+            apart = None if found else THOUSANDS.fullmatch(cell)
+            if found:
                 proven |= len(found[2]) != 3 or len(found[1]) > 3 or found[1] in ("", "0")
                 proven |= bool(found[3])
-            elif not point and "." in cell and POINT.fullmatch(cell):
+            if found or (apart and apart[2] == ","):
+                comma = comma or f"{path}:{number}: column {name}: {cell}"
+                proven |= bool(apart)
+            elif not point and (apart or ("." in cell and POINT.fullmatch(cell))):
                 point = f"column {name} of line {number}: {cell}"
     if comma and point:
         raise DataError(

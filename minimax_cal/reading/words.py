@@ -67,12 +67,12 @@ ALIASES |= dict.fromkeys(
 )
 ALIASES |= dict.fromkeys(("IN", "inches"), "in")
 KNOWN = {*ANGLES, *LENGTHS, *TIMES, *TEMPERATURES, *OTHERS}
-JOINTS = ("q|j|a|ax|axis|joint|theta|achse|achswert|gelenk|axe|articulation|eje|articulacion"
+JOINTS = ("q|j|a|\u03b8|ax|axis|joint|theta|achse|achswert|gelenk|axe|articulation|eje|articulacion"
           "|\u5173\u8282|\u8f74")  # fmt: skip
-JOINT = re.compile(  # of folded names
-    f"(?:{JOINTS})[ _.-]?(\\d+)"
-    "(?:[ _.-]?(?:angle|winkel|ist|actual|position|pos|wert|value|angulo|\u89d2\u5ea6|\u89d2))?"
-    "|\u7b2c?(\\d+)(?:\u8f74|\u5173\u8282)(?:\u89d2\u5ea6|\u89d2)?"
+NUMBERED = (  # of folded names
+    f"(?:(?:robot(?:er)?|arm|ist|actual)[ _.-])?(?:{JOINTS})[ _.-]?(?P<joint>\\d+)"
+    "(?:[ _.-]?(?:angle|winkel|ist|actual|position|pos|wert|value|angulo|\u89d2\u5ea6|\u89d2))?",
+    "\u7b2c?(?P<joint>\\d+)(?:\u8f74|\u5173\u8282)(?:\u89d2\u5ea6|\u89d2)?",
 )
 QUATERNION = re.compile(r"q\d+")
 # joints along the arm, where the names tell: a ROS log may sort them by alphabet
@@ -86,7 +86,10 @@ PLACE = (
     "|\u5750\u6807|\u503c"
 )
 SAID = f"(?:[ _.-]?(?:{ACTUAL}|{PLACE}))*"
-AXIS = re.compile(f"(?:(?:{ACTUAL}|{PLACE})[ _.-]?)?([xyz]){SAID}|(?:(.+?)[ _.-])([xyz]){SAID}")
+AXIS = re.compile(
+    f"(?:(?:{ACTUAL}|{PLACE})[ _.-]?)?([xyz]){SAID}|(?:(.+?)[ _.-])([xyz]){SAID}"
+    "|([xyz])[ _.-]?(\\d+)"
+)
 MEASURED = re.compile(f"(?:(?:{PLACE})[ _.-]?)?(?:{ACTUAL})(?:[ _.-]?(?:{PLACE}))?")
 NOMINAL = re.compile(  # no measured points: planned ones, differences, uncertainties
     r"u[ _]?\(?95\)?|target|goal|cmd|command|delta|d|tcp|robot|flange"
@@ -103,6 +106,8 @@ WORDS = {  # plain names that mean the same in any file
                     "lufttemperatur", "temperatura", "\u6e29\u5ea6"),
     "target": ("target", "target name", "reflector", "smr", "ziel", "zielmarke", "reflektor",
                "cible", "reflecteur", "objetivo", "\u9776\u7403", "\u9776\u6807", "\u76ee\u6807"),
+    "payload": ("payload", "traglast", "nutzlast", "last", "charge", "charge utile", "carga",
+                "carga util", "\u8d1f\u8f7d"),
     "u95": ("u95", "u(95)", "u_95"),
     "pose": ("pose", "point", "point name", "pointid", "name", "id", "key", "no", "no.", "nr",
              "nr.", "pose no.", "pose nr.", "punkt", "punktname", "punkt-nr", "punkt-nr.",
@@ -119,6 +124,12 @@ WORDS = {  # plain names that mean the same in any file
     "split": ("split",),
     "set_aside": ("set_aside",),
 }  # fmt: skip
+SUMMARY = re.compile(  # of a row below a table, in folded words
+    r"(?:mittel(?:wert)?|durchschnitt|mean|average|avg|moyenne|media|promedio|\u5e73\u5747\u503c?"
+    r"|max(?:imum|imo)?|min(?:imum|imo)?|\u6700[\u5927\u5c0f]\u503c?|rms|sigma|std(?:ev|abw)?|stabw"
+    r"|standardabweichung|standard deviation|ecart[ -]type|desviacion|\u6807\u51c6\u5dee"
+    r"|sum(?:me|a)?|somme|total|anzahl|count|range|spannweite|\u603b\u8ba1|\u5408\u8ba1)\b"
+)
 SURE = ("tool", "temperature", "time")  # what means the same also beside names of this project
 PLAIN = {word: meaning for meaning, words in WORDS.items() for word in words}
 
@@ -151,21 +162,28 @@ def folded(text: str) -> str:
     return unicodedata.normalize("NFC", "".join(c for c in wide if not unicodedata.combining(c)))
 
 
+def is_summary(cell: str) -> bool:
+    """Whether a row's first cell says that the row sums up others."""
+    return bool(SUMMARY.match(folded(cell)))
+
+
 def unit_name(text: str) -> str:
     """A unit as this project writes it, or ''."""
     text = unicodedata.normalize("NFKC", text).strip()
-    text = ALIASES.get(text, text)
-    return text if text in KNOWN else ""
+    names = [text, text.lower()][: len(text)]  # M and S are no units
+    return next((unit for name in names if (unit := ALIASES.get(name, name)) in KNOWN), "")
 
 
 def split_unit(name: str) -> tuple[str, str]:
     """A header's name without its unit, and the unit: 'X [mm]', 'x (mm)', 'x_mm', 'x mm'."""
-    name = unicodedata.normalize("NFKC", name).strip().lstrip("\ufeff").strip("'\"")
+    name = " ".join(unicodedata.normalize("NFKC", name).strip("\ufeff'\" \n").split())
     if (
         found := re.fullmatch("(.*?)\\s*[\\[(<\u3010]([^\\[\\](]*)[\\])>\u3011]", name)
     ) and unit_name(found[2]):
         return found[1].strip(), unit_name(found[2])
-    if (found := re.fullmatch(r"(.+)[ _]([^ _]+)", name)) and unit_name(found[2]):
+    if (found := re.fullmatch(r"(.+?)(?:[ _]|,\s*|\s+/\s*)([^ _,/]+)", name)) and unit_name(
+        found[2]
+    ):
         return found[1].strip(), unit_name(found[2])
     return name, ""
 
@@ -181,9 +199,9 @@ def plain(stem: str) -> str:
 
 
 def joint_number(stem: str) -> int:
-    """The joint that a header's name means, 0 for none."""
-    found = JOINT.fullmatch(folded(stem))
-    return int(found[1] or found[2]) if found else 0
+    """The joint that a header's name means, -1 for none."""
+    found = (re.fullmatch(pattern, folded(stem)) for pattern in NUMBERED)
+    return next((int(match["joint"]) for match in found if match), -1)
 
 
 def along_arm(names: Sequence[str]) -> list[str]:
@@ -195,13 +213,15 @@ def along_arm(names: Sequence[str]) -> list[str]:
 
 
 def joints_of(stems: Sequence[str]) -> dict[str, str]:
-    """Meanings q1 ... of the names that are joints: numbered, named, or a maker's letters.
+    """Meanings q1 ... of names that are joints: numbered from 1 or 0, or a maker's names, letters.
 
     A tracker's q0 to q3 turn the target, not the arm.
     """
     named = along_arm([stem for stem in stems if stem.endswith("_joint")])
-    arm = [stem for stem in stems if not (QUATERNION.fullmatch(stem) and "q0" in stems)]
-    found = {stem: f"q{number}" for stem in arm if (number := joint_number(stem))}
+    turns = "q0" in stems and "q4" not in stems
+    arm = [stem for stem in stems if not (QUATERNION.fullmatch(stem) and turns)]
+    numbers = {stem: number for stem in arm if (number := joint_number(stem)) >= 0}
+    found = {stem: f"q{number + (0 in numbers.values())}" for stem, number in numbers.items()}
     found |= {stem: f"q{i + 1}" for i, stem in enumerate(named)}
     for letters in () if found else reversed(YASKAWA):
         if set(letters) <= set(stems):
@@ -216,13 +236,21 @@ def points_of(stems: Sequence[str]) -> dict[str, str]:
         found = AXIS.fullmatch(folded(stem))
         if not found or kind_of(stem) not in ("", "smr"):
             continue
-        letter, target = found[1] or found[3], (found[2] or "").rstrip(".")
+        letter, target = found[1] or found[3] or found[4], (found[2] or found[5] or "").rstrip(".")
         if not NOMINAL.fullmatch(target):
             axes.setdefault(target, {}).setdefault(letter, stem)
     whole = [own for own in axes.values() if own.keys() == {"x", "y", "z"}]
     return {
         stem: f"smr{i + 1}_{letter}" for i, own in enumerate(whole) for letter, stem in own.items()
     }
+
+
+def own_name(name: str, header: Sequence[str]) -> str:
+    """One of this project's names with its unit in brackets, as q1 [rad], as it writes it."""
+    stem, unit = split_unit(name)
+    known = kind_of(stem.lower())
+    new = f"{stem.lower()}_{unit}"
+    return new if known and unit in OWN[known].units and new not in header else name
 
 
 def is_understood(names: Sequence[str]) -> bool:
@@ -237,7 +265,7 @@ def in_own_words(header: Sequence[str]) -> tuple[str, ...]:
 
     Beside its own joints or targets only what cannot mean anything else.
     """
-    stems = stems_of(header)
+    header, stems = [own_name(name, header) for name in header], stems_of(header)
     own = any(own_kind(name)[0] in ("q", "smr") for name in header)
     found = {} if own else joints_of(stems)
     found |= points_of(stems) if found else {axis: axis for axis in "xyz"}

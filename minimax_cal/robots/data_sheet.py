@@ -29,7 +29,7 @@ KEYS = ("a", "d", "theta", "alpha", "beta", "offset", "sign", "lower", "upper", 
 TYPES = {"r": "revolute", "rotation": "revolute", "rotary": "revolute", "p": "prismatic"}
 TYPES |= {"linear": "prismatic", "revolute": "revolute", "prismatic": "prismatic"}
 STATED = r"[#%]?\s*(?:{})\s*[:=;,\t]\s*(.*\w[.)]*)"  # of a line above the header
-CONVENTION, NAME = (re.compile(STATED.format(w), re.I) for w in ("[ck]onvention", "name|robot"))
+CONVENTION, NAME = (re.compile(STATED.format(w), re.I) for w in ("[ck]onvention", r"name|robot\w*"))
 GREEK = str.maketrans({"\u03b1": "alpha", "\u03b2": "beta", "\u03b8": "theta"})
 BEFORE = re.compile(r"(a|alpha)\s*[_ ]?[({\[]?\s*i\s*-\s*1\s*[)}\]]?")  # Craig's a_(i-1)
 OF_ROW = re.compile(r"(a|d|theta|alpha)\s*[_ ]?[({\[]?\s*i\s*[)}\]]?")
@@ -38,7 +38,7 @@ OF_ROW = re.compile(r"(a|d|theta|alpha)\s*[_ ]?[({\[]?\s*i\s*[)}\]]?")
 def content_of(path: Path) -> dict[str, Any]:
     """The robot in the file schema.  Raises RobotError."""
     try:
-        sheet = cut(open_text(path), remarks=False)
+        sheet = cut(open_text(path), most_torn=0.0)
     except DataError as error:
         raise RobotError(str(error)) from error
     known = [key_of(path, name) for name in sheet.header]
@@ -81,6 +81,8 @@ def key_of(path: Path, name: str) -> tuple[str, str, bool]:
     if found or (found := OF_ROW.fullmatch(stem)):
         stem = found[1]
     key = NAMES.get(stem, stem)
+    said = [word for word in re.findall(r"\w+", key) if word in KEYS]  # as in: length a
+    key = said[0] if len(said) == 1 else key
     if unit not in ("", "kg", *LENGTHS, *ANGLES) or (key and key not in (*KEYS, "type", "name")):
         (near,) = difflib.get_close_matches(key, KEYS, 1, cutoff=0.0)
         raise RobotError(f"{path}: unknown column {name!r}; did you mean {near}?")
@@ -106,7 +108,7 @@ def value_of(where: str, key: str, cell: str, decimal: str) -> object:
         if cell.lower() not in TYPES:
             raise RobotError(f"{where}type {cell!r}; write revolute or prismatic")
         return TYPES[cell.lower()]
-    value = number_of(cell.replace(decimal, "."))
+    value = number_of(cell, decimal)
     if value != value:
         raise RobotError(f"{where}column {key}: {cell!r} is not a number")
     return int(value) if key == "sign" and value in (1.0, -1.0) else value

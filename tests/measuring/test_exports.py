@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.measuring.importers import Imported, import_files
-from minimax_cal.measuring.importers.names import match_names
+from minimax_cal.measuring.importers.join import match_names
 from minimax_cal.modelling.simulate import simulate
 
 DEG = 180.0 / np.pi

@@ -8,9 +8,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring import faults
-from minimax_cal.measuring.faults import Fault, find_faults, mended
+from minimax_cal.measuring.faults import find_faults, mended
+from minimax_cal.measuring.faults.fault import Fault
+from minimax_cal.measuring.faults.joints import looks_read_back, read_back, unsettled
 from minimax_cal.measuring.faults.nests import ranked
+from minimax_cal.measuring.faults.points import noise, noise_between, swapped_rows
+from minimax_cal.measuring.faults.sessions import jumps, mixed_units, session_jumps
 from minimax_cal.measuring.history import moves
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
@@ -145,10 +148,10 @@ def test_a_fit_names_the_targets_of_an_even_triangle(robot):
     y = good.y.copy()
     y[40] = y[40][[1, 2, 0]]
     bad = good.with_y(y)
-    (fault,) = faults.swapped_rows(bad, cell.error(bad))
+    (fault,) = swapped_rows(bad, cell.error(bad))
     assert_array_equal(mended(bad, (fault,)).y, good.y)
     y[41] = y[41][[0, 2, 1]]  # the exchange of the alike ones shows in no distance
-    assert_array_equal(faults.swapped_rows(good.with_y(y))[0].rows, [40])
+    assert_array_equal(swapped_rows(good.with_y(y))[0].rows, [40])
 
 
 def test_a_nest_that_moved_is_found_with_its_time_and_size(robot):
@@ -214,14 +217,14 @@ def test_irb120_with_points_spoilt_on_purpose():
 
 def test_irb120_read_its_joints_back_too_early():
     data = mc.read_measurements(shared("irb120")[1])
-    (late,) = faults.unsettled(data)
+    (late,) = unsettled(data)
     amounts = {amount.name: amount.value for amount in late.parameters}
     assert "q is used as commanded" in late.text
     assert amounts["explained"] > 0.95  # one fraction of the last move in each row
     assert amounts["fraction"] > 0.0
     read = {f"qread{j + 1}": data.q[:, j] for j in range(6)}
-    exchanged = replace(data, q=faults.read_back(data), columns={**data.columns, **read})
-    (wrong,) = faults.unsettled(exchanged)
+    exchanged = replace(data, q=read_back(data), columns={**data.columns, **read})
+    (wrong,) = unsettled(exchanged)
     assert "give the commanded" in wrong.text
 
 
@@ -230,9 +233,9 @@ def test_irb120_tells_commanded_from_read_joints_by_its_errors(which):
     path, file = shared("irb120")
     robot, data = mc.load_robot(path), mc.read_measurements(file)
     if which == "read back":
-        data = replace(data, q=faults.read_back(data))
+        data = replace(data, q=read_back(data))
     cell = mc.calibrate(robot, data, "sum", holdout=0.0).cell
-    found = faults.looks_read_back(data, cell.error(data), pushes(Simulation(data, cell), data))
+    found = looks_read_back(data, cell.error(data), pushes(Simulation(data, cell), data))
     assert bool(found) == (which == "read back")
 
 
@@ -245,7 +248,7 @@ def test_backlash_is_not_taken_for_read_back_joints(robot):
     for by, expected in ((slack, 0), (late, 1)):
         bad = data.with_y(data.y + by)
         error = mc.calibrate(robot, bad, "sum", holdout=0.0).cell.error(bad)
-        assert len(faults.looks_read_back(bad, error, push)) == expected
+        assert len(looks_read_back(bad, error, push)) == expected
 
 
 def test_read_joints_that_agree_are_nothing(robot, rng):
@@ -253,7 +256,7 @@ def test_read_joints_that_agree_are_nothing(robot, rng):
     for size, count in ((1e-6, 0), (1e-3, 1)):
         read = data.q + size * rng.normal(size=data.q.shape)
         columns = {**data.columns, **{f"qread{j + 1}": read[:, j] for j in range(6)}}
-        found = faults.unsettled(replace(data, columns=columns))
+        found = unsettled(replace(data, columns=columns))
         assert len(found) == count
         assert all("settled" not in fault.text for fault in found)  # noise is no lag
 
@@ -270,7 +273,7 @@ def test_sessions_in_other_units(robot):
     millimetres = data.with_y(np.where(later[:, None, None], 1e3, 1.0) * data.y)
     degrees = replace(data, q=np.where(later[:, None], np.degrees(data.q), data.q))
     for bad in (millimetres, degrees):
-        (fault,) = faults.mixed_units(bad)
+        (fault,) = mixed_units(bad)
         assert_array_equal(fault.rows, np.flatnonzero(later))
 
 
@@ -284,10 +287,10 @@ def test_a_base_that_jumps_is_found_at_its_rows(robot):
         step = np.where(visit >= 40, first, 0.0) + np.where(visit >= 75, second, 0.0)
         moved = data.with_y(data.y + step[:, None, None] * np.array([0.0, 0.6, 0.8]))
         fit = mc.calibrate(robot, moved, "sum", holdout=0.0)
-        rows, sizes = faults.jumps(fit.data, fit.error)
+        rows, sizes = jumps(fit.data, fit.error)
         assert visit[rows].tolist() == starts
         assert_allclose(sizes, np.abs([first, second][: len(starts)]), rtol=0.15)
-        assert len(faults.session_jumps(fit.data, fit.error)) == bool(starts)
+        assert len(session_jumps(fit.data, fit.error)) == bool(starts)
 
 
 @pytest.mark.parametrize("targets", [1, 3])
@@ -297,7 +300,7 @@ def test_noise_other_than_declared(robot, targets):
     twice = twice.with_y(twice.y + 17.5e-6 * np.random.default_rng(0).normal(size=twice.y.shape))
     for declared, count in ((0.04e-3, 0), (0.4e-3, 1)):
         columns = {**twice.columns, "u95": np.full(120, declared)}
-        assert len(faults.noise(replace(twice, columns=columns))) == count
+        assert len(noise(replace(twice, columns=columns))) == count
 
 
 def untimed(data: Measurements) -> Measurements:
@@ -358,7 +361,7 @@ def test_distances_tell_the_noise_beside_a_reseat(robot):
     sim = simulate(robot, 400, 3, seed=1, truth=TRUTH)
     data = reseated(sim, untimed(sim.data), 200, 1, np.array([3e-3, 4e-3, 0.0]))
     for some in (sim.data, data):
-        found = faults.noise_between(some)
+        found = noise_between(some)
         assert found is not None
         assert_allclose(found[0], TRUTH.noise, rtol=3 * found[1])
-    assert faults.noise_between(simulate(robot, 60, 1, seed=1).data) is None
+    assert noise_between(simulate(robot, 60, 1, seed=1).data) is None

@@ -9,13 +9,14 @@ from minimax_cal.reading.sheet import cut, numbers_of, open_text, sheet_of
 from minimax_cal.reading.words import in_own_words
 
 
-@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
-def test_a_table_read_at_once_is_that_of_its_cells(delimiter):
+@pytest.mark.parametrize(("delimiter", "sign"), [",.", ";.", "\t.", ";,", "\t,"])
+def test_a_table_read_at_once_is_that_of_its_cells(delimiter, sign):
     rng = np.random.default_rng(0)
     values = rng.normal(size=(20_000, 4)) * 10.0 ** rng.integers(-30, 30, (20_000, 4))
-    rows = [delimiter.join(map(repr, row)) for row in values.tolist()]
+    rows = [delimiter.join(map(repr, row)).replace(".", sign) for row in values.tolist()]
     table = cut(sheet_of("x.csv", "\n".join([delimiter.join("abcd"), *rows, ""])))
     assert table.block is not None
+    assert table.decimal == sign
     assert_array_equal(table.block, values)
     assert_array_equal(table.line, np.arange(len(values)) + 2)
     assert_array_equal(numbers_of([row[2] for row in table.cells]), values[:, 2])
@@ -28,6 +29,14 @@ def test_what_is_no_plain_number_is_left_to_the_cells(row):
     table = cut(sheet_of("x.csv", f"a,b,c\n1,2,3\n{row}\n4,5,6\n"))
     assert table.block is None
     assert table.cells[1] == tuple(row.replace('"', "").split(","))
+
+
+@pytest.mark.parametrize("cell", ["1,234", "12,345", "-1,234"])
+def test_a_comma_that_may_part_thousands_is_asked_about(cell):
+    sheet = sheet_of("x.csv", f"a;b\n{cell};{cell}\n{cell};7\n")
+    with pytest.raises(mc.DataError, match=r"x.csv:2: column a: .* decimal comma or be thousands"):
+        cut(sheet)
+    assert cut(sheet, ",").cells[0][0].replace(",", ".") == cell.replace(",", ".")
 
 
 def test_words_that_mean_a_column_of_this_project():

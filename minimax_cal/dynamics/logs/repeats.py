@@ -24,15 +24,15 @@ def words(values: Array) -> list[bytes]:
 
 def check_repeats(drafts: Sequence[Draft]) -> None:
     """Raise DataError for a run given twice, or torques equal to the digit in other motions."""
-    of_torque = [set(words(draft.torque)) for draft in drafts]
-    of_motion = [set(words(draft.q)) for draft in drafts]
+    said = [words(draft.torque) for draft in drafts]
+    of_torque = [set(every) for every in said]
     for a, b in combinations(range(len(drafts)), 2):
         few = min(len(of_torque[a]), len(of_torque[b]))
         if len(of_torque[a] & of_torque[b]) <= MOST_ALIKE * few:
             continue
         one, other = drafts[a], drafts[b]
-        few = min(len(of_motion[a]), len(of_motion[b]))
-        if len(of_motion[a] & of_motion[b]) > MOST_ALIKE * few:
+        moved = set(words(one.q)), set(words(other.q))
+        if len(moved[0] & moved[1]) > MOST_ALIKE * min(map(len, moved)):
             raise DataError(
                 f"{other.log.source}: run {other.name} holds rows of {one.name}; give each once"
             )
@@ -40,20 +40,20 @@ def check_repeats(drafts: Sequence[Draft]) -> None:
             f"{other.log.source}: torques of run {other.name} equal those of {one.name} to the "
             "digit, but the motions differ: they are commands; log the measured ones"
         )
-    for draft, torque in zip(drafts, of_torque, strict=True):
-        if within(draft, torque):
+    for draft, every, torque in zip(drafts, said, of_torque, strict=True):
+        if within(draft, every, len(every) - len(torque)):
             raise draft.error(
                 "torques repeat to the digit while the motion differs: they are commands; log the "
                 "measured ones"
             )
 
 
-def within(draft: Draft, torque: set[bytes]) -> bool:
-    """Whether torques of one run repeat to the digit, and its motion does not."""
-    said, moved = words(draft.torque), words(draft.q)
-    repeated = len(said) - len(torque)
-    return (
-        len(said) > WORD
-        and repeated > MOST_ALIKE * len(said)
-        and len(moved) - len(set(moved)) < 0.5 * repeated
-    )
+def within(draft: Draft, said: Sequence[bytes], repeated: int) -> bool:
+    """Whether torques of one run repeat to the digit, and its motion does not.
+
+    said: their words, of which so many stand there before.
+    """
+    if len(said) <= WORD or repeated <= MOST_ALIKE * len(said):
+        return False
+    moved = words(draft.q)
+    return len(moved) - len(set(moved)) < 0.5 * repeated

@@ -12,10 +12,9 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.reading.formats import FORMATS, Format, Place, format_of
-from minimax_cal.reading.sheet import Sheet, cut, numbers_of, open_text
+from minimax_cal.reading.sheet import MOST_TORN, Sheet, cut, numbers_of, open_text
 from minimax_cal.reading.words import SIZES, near
 
-MOST_TORN = 0.01  # share of rows that a log may lose to torn lines
 MOST_JOINTS = 100  # of any machine; guards against a number that is none of a joint
 MOST = 1e6  # of a joint value, speed, acceleration, torque or current, in any unit
 MOST_TIME = 1e20  # nanoseconds since 1970 are 2e18
@@ -157,12 +156,13 @@ class Columns:
             values[kind] = block[:, 0] if single else block
         values["t"] = self.time(values, units.get("t", ("",))[0])
         run, sheet = self.of_kind("run"), self.sheet
-        whole = np.setdiff1d(np.arange(len(sheet.line)), list(self.broken))
+        whole = np.delete(np.arange(len(sheet.line)), list(self.broken)).tolist()
+        kept = whole if self.broken else slice(None)
         return Log(
             source=str(sheet.path),
             title=self.form.title,
-            line=sheet.line[whole],
-            values={kind: value[whole] for kind, value in self.same_width(values).items()},
+            line=sheet.line[kept],
+            values={kind: value[kept] for kind, value in self.same_width(values).items()},
             headers=headers,
             units=units,
             joints=self.names(),
@@ -227,9 +227,10 @@ class Columns:
         kind = "q" if place.kind in ("q", "qd", "qdd", "q_cmd") else place.kind
         unit = self.given.get(kind, "") or place.unit
         if not unit and kind == "q":
+            name = self.sheet.header[at]
             raise DataError(
-                f"{self.sheet.path}: column {self.sheet.header[at]}: has no unit; add "
-                "units='q=deg' or units='q=rad'"
+                f"{self.sheet.path}: column {name}: has no unit; add units='q=deg' or "
+                f"units='q=rad', or name it {name} [deg] or {name} [rad]"
             )
         return unit
 
@@ -331,12 +332,7 @@ class Columns:
         if len(self.broken) > max(1.0, MOST_TORN * len(line)):
             row, what = next(iter(sorted(self.broken.items())))
             raise DataError(f"{path}:{line[row]}: {what}")
-        lines = sorted({*self.sheet.torn, *(int(line[row]) for row in self.broken)})
-        if not lines:
-            return []
-        some = ", ".join(map(str, lines[:SHOWN])) + (" ..." if len(lines) > SHOWN else "")
-        plural = "s are" if len(lines) > 1 else " is"
-        return [f"{path}: {len(lines)} torn line{plural} left out ({some})"]
+        return list(self.sheet.left_out(int(line[row]) for row in self.broken))
 
 
 def typical_step(time: Array) -> float:

@@ -14,8 +14,7 @@ import numpy as np
 from minimax_cal.fitting.pixels.camera import Camera
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.joint_rows import joint_rows
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.measurements import Measurements, joint_rows
 from minimax_cal.reading.rows import Rows, read_rows
 
 POSE = re.compile("pose")
@@ -126,9 +125,9 @@ def read_pixels(
         target=numbered(file, "target", targets, f"has no place in {board}"),
         pixel=pixel,
         line=file.line,
-        notices=at.notices,
+        notices=(*file.notices, *at.notices),
         source=str(detections),
-        digest=digest_of(file.digest, at.digest, *(camera.source for camera in cameras)),
+        digest=digest_of(file.sheet.digest, at.digest, *(camera.source for camera in cameras)),
     )
     return without_single(checked(data))
 
@@ -168,7 +167,8 @@ def numbered(file: Rows, name: str, known: tuple[str, ...], fault: str) -> Array
 
 def read_joints(path: Path | str) -> tuple[Measurements, tuple[str, ...]]:
     """Joint values by pose, and the poses' names.  Raises DataError."""
-    file, at = joint_rows(read_rows(path), POSE)
+    file = read_rows(path)
+    at = joint_rows(file, POSE)
     header_of(file, ("pose",), "joints")
     labels = tuple(file.text("pose"))
     for row, label in enumerate(labels):

@@ -8,8 +8,7 @@ import numpy as np
 import scipy
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.faults.distances import FEWEST
-from minimax_cal.measuring.faults.fault import Amount, Fault
+from minimax_cal.measuring.faults.fault import FEWEST, Amount, Fault
 from minimax_cal.measuring.history import followed, moves
 from minimax_cal.measuring.measurements import Measurements
 

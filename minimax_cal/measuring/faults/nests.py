@@ -13,9 +13,15 @@ import numpy as np
 from scipy.special import chdtri, ndtri
 
 from minimax_cal.ground.arrays import Array, known_median
-from minimax_cal.measuring.faults.distances import Between, between, scatter
-from minimax_cal.measuring.faults.fault import Amount, Fault
-from minimax_cal.measuring.faults.limits import ALIKE, FALSE_ALARM
+from minimax_cal.measuring.faults.fault import (
+    ALIKE,
+    FALSE_ALARM,
+    Amount,
+    Between,
+    Fault,
+    between,
+    scatter,
+)
 from minimax_cal.measuring.history import is_timed, sessions, visits
 from minimax_cal.measuring.measurements import Measurements
 

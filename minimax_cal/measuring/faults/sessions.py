@@ -10,9 +10,15 @@ import numpy as np
 from scipy.special import fdtrc
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.faults.distances import FAINT, FEWEST
-from minimax_cal.measuring.faults.fault import NO_ERROR, NONE, Amount, Fault
-from minimax_cal.measuring.faults.limits import FALSE_ALARM
+from minimax_cal.measuring.faults.fault import (
+    FAINT,
+    FALSE_ALARM,
+    FEWEST,
+    NO_ERROR,
+    NONE,
+    Amount,
+    Fault,
+)
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.history import sessions, visits
 from minimax_cal.measuring.measurements import Measurements

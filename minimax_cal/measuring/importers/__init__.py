@@ -10,15 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
-from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.faults import distance_faults
-from minimax_cal.measuring.importers import cmm, headed, programs
-from minimax_cal.measuring.importers import columns as mapped
+from minimax_cal.measuring.importers import cmm, programs, tables
 from minimax_cal.measuring.importers.assemble import Assembly, assemble
-from minimax_cal.measuring.importers.reading import Given, Reading
+from minimax_cal.measuring.importers.join import SAME
+from minimax_cal.measuring.importers.tables import Given, Reading
 from minimax_cal.measuring.measurements import (
     Measurements,
     check_finite,
@@ -30,12 +28,12 @@ from minimax_cal.measuring.slips import mended
 from minimax_cal.reading.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
 from minimax_cal.reading.words import ANGLES, LENGTHS, TEMPERATURES, TIMES
 
-__all__ = ["Given", "Imported", "import_files", "read_any", "save", "units_of"]
+__all__ = ["Given", "Imported", "import_files", "read_any", "units_of"]
 
 # The first that fits a file is taken: of the text alone, then of its rows and columns.
 Read = Callable[[Sheet, Given, bool], Reading | None]  # None where a file is of another format
 OF_TEXT: tuple[Read, ...] = (programs.read, cmm.read)
-OF_ROWS: tuple[Read, ...] = (cmm.read, headed.read)
+OF_ROWS: tuple[Read, ...] = (cmm.read, tables.read)
 MEASURED = re.compile(r"q\d*|(?:smr|base)\d*(?:_[xyz])?|qread\d*|u95|temperature|time")
 OF_JOINTS = re.compile(r"(?:^|[,=])\s*q\d*(?:_|\s*(?:,|$))")
 LAYOUTS = ("", "pose", "target")
@@ -97,9 +95,15 @@ class Imported:
 
     def understood(self) -> Measurements:
         """The measurements, with a line that says how the files were read."""
+        held = self.assembly.readings[-1].sheet.path
         said = [
             f"{file['file']}: read as {file['format']}, separated by {file['delimiter']}, decimal "
             f"{file['decimal']}, {file['encoding']}"
+            + (
+                f", matched with {held} by {how}"
+                if (how := file["matched by"]) and how != SAME
+                else ""
+            )
             for file in self.files().records()
         ]
         data = self.data
@@ -119,8 +123,7 @@ class Imported:
     def csv(self) -> str:
         """The contract's CSV; what nothing uses is kept as text, points set aside with why."""
         data = whole(self.data)
-        columns = {name: blanks(column) for name, column in data.columns.items()}
-        return measurements_text(replace(data, columns={**columns, **data.unknown}))
+        return measurements_text(replace(data, columns={**data.columns, **data.unknown}))
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -156,7 +159,7 @@ def units_of(given: str | Sequence[str] | Mapping[str, str]) -> Mapping[str, str
     return found
 
 
-def read_any(path: Path | str, given: Given, *, joints: bool = False) -> Reading:
+def read_any(path: Path | str | Sheet, given: Given, *, joints: bool = False) -> Reading:
     """A file in the first format that fits.  joints: the user said that it holds joint values.
 
     Raises DataError with what to add.
@@ -168,15 +171,11 @@ def read_any(path: Path | str, given: Given, *, joints: bool = False) -> Reading
             if found := read(sheet, given, joints):
                 return found
     sheet = cut(sheet, given.decimal)
-    ways = (mapped.read,) if given.columns else OF_ROWS
+    ways = (tables.mapped,) if given.columns else OF_ROWS
     reading = next(filter(None, (read(sheet, given, joints) for read in ways)), None)
     if reading is None:
         raise DataError(unknown(sheet))
-    for where, lines in (("above", sheet.above), ("below", sheet.below)):
-        if lines:
-            left_out = ", ".join(map(str, lines))
-            reading = reading.saying(f"{where} the table, and left out: line {left_out}")
-    return reading
+    return replace(reading, notices=(*reading.notices, *sheet.left_out()))
 
 
 def unknown(sheet: Sheet) -> str:
@@ -197,7 +196,7 @@ def unknown(sheet: Sheet) -> str:
 
 
 def import_files(
-    files: Sequence[Path | str],
+    files: Sequence[Path | str | Sheet],
     joints: Path | str | None = None,
     *,
     columns: str | Sequence[str] = "",
@@ -237,33 +236,20 @@ def import_files(
     readings = [read_any(path, given) for path in files]
     check_twice(readings)
     points = [reading for reading in readings if reading.smrs]
-    turns = [reading for reading in readings if reading.joints]
-    if joints is not None:
-        held = file_of_joints(joints, turns, given)
-    elif len(turns) == 1:
-        held = turns[0]
-    elif turns:
-        raise DataError(
-            f"{turns[1].sheet.path}: holds joint values, as {turns[0].sheet.path} does; import "
-            "one at a time, or name the file of joints as joints="
-        )
-    else:
-        raise DataError(f"{points[0].sheet.path if points else files[0]}: {no_joints(points)}")
+    held = file_of_joints(joints, readings, given)
+    where = held.sheet.path
     if not points:
-        raise DataError(
-            f"{held.sheet.path}: holds joint values but no points; add the tracker's file"
-        )
-    neither = [reading for reading in readings if not (reading.smrs or reading.joints)]
+        raise DataError(f"{where}: holds joint values but no points; add the tracker's file")
+    neither = [r.sheet.path for r in readings if not (r.smrs or r.joints)]
     if neither:
-        raise DataError(f"{neither[0].sheet.path}: holds neither points nor joint values")
-    if held not in points or len(points) == 1:
-        assembly = assemble(points, held, given)
-        return Imported(assembly.data, assembly)
-    other = next(r for r in points if r is not held)
-    raise DataError(
-        f"{other.sheet.path}: holds points without joints, but {held.sheet.path} holds both; "
-        "import it alone"
-    )
+        raise DataError(f"{neither[0]}: holds neither points nor joint values")
+    other = next((r.sheet.path for r in points if r is not held and held in points), None)
+    if other:
+        raise DataError(
+            f"{other}: holds points without joints, but {where} holds both; import it alone"
+        )
+    assembly = assemble(points, held, given)
+    return Imported(assembly.data, assembly)
 
 
 def check_twice(readings: Sequence[Reading]) -> None:
@@ -303,35 +289,32 @@ def given_by(
     return Given("".join(others), "".join(of_joints), units_of(units), layout, sign)
 
 
-def file_of_joints(path: Path | str, turns: Sequence[Reading], given: Given) -> Reading:
-    """The file named for joint values.  turns: other files that hold some.  Raises DataError."""
-    held = read_any(path, given, joints=True)
-    if not held.joints:
-        raise DataError(f"{path}: holds no joint values; name its columns q1_deg, q2_deg ...")
-    if turns:
+def file_of_joints(path: Path | str | None, readings: Sequence[Reading], given: Given) -> Reading:
+    """The file of joint values: that of the path, or the only one that holds some.
+
+    Raises DataError.
+    """
+    turns = [reading for reading in readings if reading.joints]
+    others = [reading.sheet.path for reading in turns]
+    if path is not None:
+        held = read_any(path, given, joints=True)
+        if not held.joints:
+            raise DataError(f"{path}: holds no joint values; name its columns q1_deg, q2_deg ...")
+        if turns:
+            raise DataError(
+                f"{others[0]}: holds joint values, as joints={str(path)!r} does; leave one of "
+                "them out"
+            )
+        return held
+    if len(turns) > 1:
         raise DataError(
-            f"{turns[0].sheet.path}: holds joint values, as joints={str(path)!r} does; leave one "
-            "of them out"
+            f"{others[1]}: holds joint values, as {others[0]} does; import one at a time, or name "
+            "the file of joints as joints="
         )
-    return held
-
-
-def no_joints(points: Sequence[Reading]) -> str:
-    """What to do about missing joint values."""
-    if points:
-        return "holds points but no joint values; add their file as joints="
-    return "holds neither points nor joint values; say what its columns are as columns="
-
-
-def save(path: Path | str, imported: Imported) -> None:
-    """Write the contract's CSV."""
-    write_whole(path, imported.csv())
-
-
-def blanks(column: Array) -> Array:
-    """A column in which what is missing is an empty cell."""
-    if column.dtype.kind != "f" or np.isfinite(column).all():
-        return column
-    out = column.astype(object)
-    out[~np.isfinite(column)] = ""
-    return out
+    points = [reading for reading in readings if reading.smrs]
+    if not turns:
+        lacks = "points but no joint values; add their file as joints="
+        neither = "neither points nor joint values; say what its columns are as columns="
+        of = (points or readings)[0].sheet.path
+        raise DataError(f"{of}: holds {lacks if points else neither}")
+    return turns[0]

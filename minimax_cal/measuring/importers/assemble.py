@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import count
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.aside import FILE
-from minimax_cal.measuring.importers.headed import KEPT
 from minimax_cal.measuring.importers.join import (
     Places,
     in_file_order,
@@ -20,18 +20,19 @@ from minimax_cal.measuring.importers.join import (
     settled,
     with_keys,
 )
-from minimax_cal.measuring.importers.reading import Column, Given, Reading
-from minimax_cal.measuring.importers.times import STAMPED, celsius, seconds
-from minimax_cal.measuring.importers.units import decide
+from minimax_cal.measuring.importers.tables import KEPT, Column, Given, Reading
+from minimax_cal.measuring.importers.units import STAMPED, celsius, decide, seconds
 from minimax_cal.measuring.measurements import Measurements, check_finite, marked
 from minimax_cal.measuring.set_aside import COLUMN, from_column, set_aside, sound
 from minimax_cal.measuring.tools import by_tool
+from minimax_cal.reading.sheet import number_of
 from minimax_cal.reading.words import ANGLES, LENGTHS
 
 TEXTS = ("session", "group", "split", "pose", "tool", COLUMN)
 MARKED = "marked deleted in the tracker's file"
 OF_UNIT = {"u95": LENGTHS, "base": LENGTHS, "qread": ANGLES}  # optional columns with a choice
 MIXED = "mixed"
+EXTREME = {"u95": np.fmax, "time": np.fmin}  # which of several values of a pose counts
 
 
 NOTHING = np.empty(0)
@@ -104,11 +105,11 @@ class Scales:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A file, the pose (m,) of each of its rows, and which target its columns smr1 ... are."""
+    """A file, the pose (m,) of each of its rows, and which targets its columns smr1 ... are."""
 
     reading: Reading
     pose: Array
-    targets: Mapping[str, str]
+    targets: Mapping[str, tuple[str, ...]]
 
 
 def assemble(points: Sequence[Reading], joints: Reading, given: Given) -> Assembly:
@@ -124,23 +125,21 @@ def assemble(points: Sequence[Reading], joints: Reading, given: Given) -> Assemb
     joints = joints if alone else points[0]
     placed = [place(reading, joints, given.layout) for reading in points]
     points, places = [reading for reading, _ in placed], [spot for _, spot in placed]
-    poses = len(joints.line)
-    raw = raw_of(points, places, joints, given)
     called = callings(points, places)
     parts = [Part(r, at.pose, c) for r, at, c in zip(points, places, called, strict=True)]
+    data, scales = raw_of(parts, places, joints, given)
     if alone:
-        parts.append(Part(without_points(joints), np.arange(poses), {}))
-    columns, unknown, meanings = gathered(parts, given, raw.scales, poses)
-    targets = target_names(points, places)
-    names = zip(targets, raw.names, strict=True)
-    unknown |= {f"{target}_target": np.full(poses, name) for target, name in names if name}
+        parts.append(Part(without_points(joints), np.arange(data.poses), {}))
+    columns, unknown, meanings = gathered(parts, given, scales, data.poses)
+    names = (name for r, spot in placed for _ in r.smrs for name in spot.names)
+    unknown |= {
+        f"{target}_target": np.full(data.poses, name)
+        for target, name in zip(data.target_names, names, strict=True)
+        if name
+    }
     readings = tuple(part.reading for part in parts)
-    data = Measurements(
-        q=raw.q,
-        y=raw.y,
-        target_names=targets,
-        sliding=raw.sliding,
-        line=joints.line,
+    data = replace(
+        data,
         columns=columns,
         unknown=unknown,
         notices=tuple(notice for reading in readings for notice in reading.notices),
@@ -167,39 +166,28 @@ def without_marked(
     return sound(set_aside(data, marked, MARKED, FILE)) if marked.any() else data
 
 
-@dataclass(frozen=True, eq=False)
-class Raw:
-    """Joints q (m, n) and points y (m, k, 3) in SI, the targets' names, and the units they had.
-
-    sliding: (n,) True where a joint slides.
-    """
-
-    q: Array
-    y: Array
-    names: tuple[str, ...]
-    sliding: Array
-    scales: Scales
-
-
 def raw_of(
-    points: Sequence[Reading], places: Sequence[Places], joints: Reading, given: Given
-) -> Raw:
+    parts: Sequence[Part], places: Sequence[Places], joints: Reading, given: Given
+) -> tuple[Measurements, Scales]:
     """The numbers of joints and points, their units decided.  Raises DataError."""
+    points = [part.reading for part in parts]
     q_units = [unit_of(column, given)[0] for column in joints.joints]
     sliding = np.array([unit in LENGTHS for unit in q_units])
     turning = [(joints, c) for c, slides in zip(joints.joints, sliding, strict=True) if not slides]
     q_unit = one_unit(turning, given, ANGLES)
-    coordinates = [(r, c) for r in points for c in r.columns if c.family == "smr"]
-    y_unit = one_unit(coordinates, given, LENGTHS)
+    y_unit = one_unit(
+        [(r, c) for r in points for c in r.columns if c.family == "smr"], given, LENGTHS
+    )
     if q_unit == MIXED:
         raise DataError(f"{joints.sheet.path}: joint columns mix units of angle; use one of them")
     q = np.stack([joints.numbers(column, empty=False) for column in joints.joints], axis=1)
     mixed = y_unit == MIXED
-    y, names = raw_points(points, places, len(q), given if mixed else None)
+    y = raw_points(points, places, len(q), given if mixed else None)
     where = (joints.sheet.path, points[0].sheet.path)
     scales = Scales(*decide(q, y, q_unit, "m" if mixed else y_unit, sliding, where))
     scale = [LENGTHS.get(unit, ANGLES[scales.q]) for unit in q_units]
-    return Raw(q * scale, y * LENGTHS[scales.y], names, sliding, scales)
+    targets = tuple(name for part in parts for names in part.targets.values() for name in names)
+    return Measurements(q * scale, y * LENGTHS[scales.y], targets, sliding, joints.line, {}), scales
 
 
 def without_points(joints: Reading) -> Reading:
@@ -222,7 +210,9 @@ def gathered(
     for part in parts:
         mine = []
         for column in part.reading.columns:
-            name, target = column.meaning, part.targets.get(column.meaning.partition("_")[0], "")
+            name = column.meaning
+            who = part.targets.get(name.partition("_")[0], ("",))
+            target = " to ".join(dict.fromkeys((who[0], who[-1])))
             found = understood(part.reading, column, given, scales, target)
             mine.append(found)
             if len(found.values) and found.kept:
@@ -236,36 +226,29 @@ def gathered(
     return columns, unknown, tuple(meanings)
 
 
-def target_names(points: Sequence[Reading], places: Sequence[Places]) -> tuple[str, ...]:
-    """smr1, smr2, ...; one file keeps the numbers it has."""
-    if len(points) == 1 and len(places[0].names) == 1:
-        return tuple(f"smr{number}" for number in points[0].smrs)
-    count = sum(len(r.smrs) * len(spot.names) for r, spot in zip(points, places, strict=True))
-    return tuple(f"smr{i + 1}" for i in range(count))
-
-
-def callings(points: Sequence[Reading], places: Sequence[Places]) -> list[dict[str, str]]:
-    """For each file: which target, or targets in turn, its columns smr1 ... are."""
-    targets = iter(target_names(points, places))
-    out = []
-    for reading, spot in zip(points, places, strict=True):
-        mine = {}
-        for number in reading.smrs:
-            names = [next(targets) for _ in spot.names]
-            mine[f"smr{number}"] = names[0] + (f" to {names[-1]}" if len(names) > 1 else "")
-        out.append(mine)
-    return out
+def callings(
+    points: Sequence[Reading], places: Sequence[Places]
+) -> list[dict[str, tuple[str, ...]]]:
+    """For each file: which targets its columns smr1 ... are; one file keeps the numbers it has."""
+    new = count(1)
+    own = len(points) == 1 and len(places[0].names) == 1
+    return [
+        {
+            f"smr{number}": tuple(f"smr{number if own else next(new)}" for _ in spot.names)
+            for number in reading.smrs
+        }
+        for reading, spot in zip(points, places, strict=True)
+    ]
 
 
 def raw_points(
     points: Sequence[Reading], places: Sequence[Places], poses: int, given: Given | None
-) -> tuple[Array, tuple[str, ...]]:
-    """(poses, k, 3) points as in the files, and the targets' names.
+) -> Array:
+    """(poses, k, 3) points as in the files.
 
     given: where the columns' units differ; the points are then in metres.  Raises DataError.
     """
     blocks: list[Array] = []
-    names: list[str] = []
     for reading, spot in zip(points, places, strict=True):
         for number in reading.smrs:
             block = np.full((poses, len(spot.names), 3), np.nan)
@@ -282,8 +265,7 @@ def raw_points(
                     "complete it, or leave all three empty"
                 )
             blocks.append(block)
-            names += spot.names
-    return np.concatenate(blocks, axis=1), tuple(names)
+    return np.concatenate(blocks, axis=1)
 
 
 def understood(reading: Reading, column: Column, given: Given, scales: Scales, who: str) -> Meaning:
@@ -295,15 +277,16 @@ def understood(reading: Reading, column: Column, given: Given, scales: Scales, w
         if column.remark == KEPT:
             return Meaning(column, "kept", unit, "", first, np.array(column.cells), kept=True)
         return Meaning(column, "left out", unit, column.remark)
-    if family == "q":
-        unit, known = (unit, known) if unit else (scales.q, scales.why_q)
-        value = reading.number(column, 0, first) * (LENGTHS | ANGLES)[unit]
-        si = f"{value:.6g} {'m' if unit in LENGTHS else 'rad'}"
-        return Meaning(column, f"joint {column.meaning[1:]}", unit, known, si)
-    if family == "smr":
-        unit, known = (unit, known) if unit else (scales.y, scales.why_y)
-        si = f"{reading.number(column, 0, first) * LENGTHS[unit]:.6g} m" if first else ""
-        return Meaning(column, f"{who} {column.meaning[-1]}", unit, known, si)
+    if family in ("q", "smr"):
+        what, *decided = (
+            (f"joint {column.meaning[1:]}", scales.q, scales.why_q)
+            if family == "q"
+            else (f"{who} {column.meaning[-1]}", scales.y, scales.why_y)
+        )
+        unit, known = (unit, known) if unit else decided
+        value = number_of(first, reading.sheet.decimal) * (LENGTHS | ANGLES)[unit]
+        si = f"{value:.6g} {'m' if unit in LENGTHS else 'rad'}" if first else ""
+        return Meaning(column, what, unit, known, si)
     if family == "target":
         return Meaning(column, "name of the target", "", known, first)
     if column.meaning in TEXTS:
@@ -351,13 +334,13 @@ def spread(values: Array, pose: Array, poses: int, name: str) -> Array:
     out = np.full(poses, np.nan)
     if name == "temperature":
         given = np.isfinite(values)
-        count = np.bincount(pose[given], minlength=poses)
+        many = np.bincount(pose[given], minlength=poses)
         total = np.bincount(pose[given], values[given], minlength=poses)
-        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    if name in ("u95", "time"):
-        (np.fmax if name == "u95" else np.fmin).at(out, pose, values)
-        return out
-    out[pose[::-1]] = values[::-1]
+        return np.where(many > 0, total / np.maximum(many, 1), np.nan)
+    if name in EXTREME:
+        EXTREME[name].at(out, pose, values)
+    else:
+        out[pose[::-1]] = values[::-1]
     return out
 
 
@@ -369,6 +352,6 @@ def together(name: str, one: Array, other: Array) -> Array:
     if one.dtype.kind in "US":
         one, other = (other, one) if name == "pose" else (one, other)
         return np.where(one != "", one, other)
-    if name in ("u95", "time"):
-        return np.asarray((np.fmax if name == "u95" else np.fmin)(one, other))
+    if name in EXTREME:
+        return np.asarray(EXTREME[name](one, other))
     return np.where(np.isfinite(one), one, other)

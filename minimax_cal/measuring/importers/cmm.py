@@ -6,13 +6,11 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.importers.headed import POINTS, understood
-from minimax_cal.measuring.importers.reading import Given, Reading
+from minimax_cal.measuring.importers.tables import POINTS, Given, Reading, understood
 from minimax_cal.reading.sheet import Sheet, decimal_of
 from minimax_cal.reading.words import AXIS, MEASURED, folded, split_unit, unit_name
 
@@ -38,9 +36,9 @@ class Coordinate:
     unit: str
 
 
-def text_rows(path: Path, text: str) -> list[Coordinate]:
+def text_rows(sheet: Sheet) -> list[Coordinate]:
     """The coordinates of a report in blocks, as PC-DMIS writes it.  Raises DataError."""
-    out = []
+    out, text = [], sheet.text
     blocks = list(BLOCK.finditer(text))
     ends = [*(block.start() for block in blocks), len(text)][1:]
     for here, end in zip(blocks, ends, strict=False):
@@ -51,18 +49,12 @@ def text_rows(path: Path, text: str) -> list[Coordinate]:
             cells, line = row[2].split(), text.count("\n", 0, row.start(1)) + 1
             if len(cells) < len(names):
                 raise DataError(
-                    f"{path}:{line}: point {here[1]}: {len(cells)} values, but {len(names)} "
+                    f"{sheet.path}:{line}: point {here[1]}: {len(cells)} values, but {len(names)} "
                     "columns; complete the row or delete the point"
                 )
             unit = unit_name(here[2].lower())
             out.append(Coordinate(line, here[1], row[1].lower(), cells[at], unit))
     return out
-
-
-def axis_in(cell: str) -> str:
-    """The axis that a cell names, or ''."""
-    found = AXIS.fullmatch(folded(cell))
-    return (found[1] or "") if found else ""
 
 
 def table_rows(sheet: Sheet) -> list[Coordinate]:
@@ -73,7 +65,8 @@ def table_rows(sheet: Sheet) -> list[Coordinate]:
     columns = list(zip(*sheet.cells, strict=True))
     if len(measured) != 1 or not columns:
         return []
-    axes = [[axis_in(cell) for cell in column] for column in columns]
+    found = [[AXIS.fullmatch(folded(cell)) for cell in column] for column in columns]
+    axes = [[(axis[1] or "") if axis else "" for axis in column] for column in found]
     filled = [sum(map(bool, column)) for column in axes]
     at = int(np.argmax(filled))
     if not 0 < len(sheet.cells) <= filled[at] / MOST_OTHERS:
@@ -113,17 +106,13 @@ def whole(pairs: Sequence[tuple[str, str]]) -> bool:
     return bool(good) and 2 * len(good) > len(points) and 3 * len(points) <= 2 * len(pairs)
 
 
-def coordinates_of(sheet: Sheet) -> list[Coordinate]:
-    """The coordinates of a text, or of a table."""
-    return table_rows(sheet) if sheet.delimiter else text_rows(sheet.path, sheet.text)
-
-
 def read(sheet: Sheet, given: Given, joints: bool) -> Reading | None:
     """A row a point; None unless there is a row for each coordinate.
 
     Raises DataError for a coordinate that is there twice.
     """
-    found = [] if joints else coordinates_of(sheet)
+    ways = (text_rows, table_rows)  # of a text, of a table that is cut
+    found = [] if joints else ways[bool(sheet.delimiter)](sheet)
     if not found:
         return None
     points: dict[str, dict[str, Coordinate]] = {}

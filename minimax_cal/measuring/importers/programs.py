@@ -10,7 +10,7 @@ import numpy as np
 
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import blanked, name_first
-from minimax_cal.measuring.importers.reading import Column, Given, Reading
+from minimax_cal.measuring.importers.tables import Column, Given, Reading
 from minimax_cal.reading.sheet import POINT, Sheet
 
 RAPID_ASIDE = re.compile(r'"[^"\r\n]*"|![^\r\n]*')  # strings and comments
