@@ -1,6 +1,7 @@
 import copy
+import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import reduce
 from operator import getitem
@@ -142,12 +143,44 @@ def shared(name: str) -> tuple[str, str]:
     return str(folder / "robot.json"), str(folder / "measurements.csv")
 
 
-def run(*arguments: object) -> int:
-    """A command line in this process; its exit code."""
+def run(first: object = "", *rest: object) -> int:
+    """A command line in this process; its exit code.  first: words that blanks separate."""
     with pytest.raises(SystemExit) as ended:
-        main([str(a) for a in arguments])
+        main([*str(first).split(), *map(str, rest)])
     code = ended.value.code
     return code if isinstance(code, int) else 0
+
+
+@pytest.fixture
+def says(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
+    """What a command line says on stdout and stderr, having ended with this code."""
+
+    def ask(*arguments: object, code: int = 0) -> Any:
+        capsys.readouterr()
+        assert run(*arguments) == code, capsys.readouterr().err
+        return capsys.readouterr()
+
+    return ask
+
+
+@pytest.fixture
+def answered(says: Callable[..., Any]) -> Callable[..., Any]:
+    """What a command line answers in JSON, which stands on stdout alone."""
+    return lambda *arguments: json.loads(says(*arguments, "--json").out)
+
+
+@pytest.fixture
+def refuses(says: Callable[..., Any]) -> Callable[..., None]:
+    """Checks that a command line ends in one line of error that says so, and nothing else."""
+
+    def check(words: str, *arguments: object) -> None:
+        out, err = says(*arguments, code=2)
+        (line,) = (line for line in err.splitlines() if line.startswith("error: "))
+        assert words in line
+        assert "Traceback" not in err
+        assert out == ""
+
+    return check
 
 
 def invoked(command: click.Command, *arguments: object) -> tuple[int, str, str]:

@@ -110,7 +110,7 @@ def test_help_explains_the_arguments_and_shows_an_example(name):
         (mc.iso9283, ("fit.json",)),
     ],
 )
-def test_a_typo_is_told_by_its_name(function, given):  # type: ignore[no-untyped-def]
+def test_a_typo_is_told_by_its_name(function, given):
     with pytest.raises(TypeError, match="holdot"):
         function(*given, holdot=0.1)
 
@@ -118,7 +118,7 @@ def test_a_typo_is_told_by_its_name(function, given):  # type: ignore[no-untyped
 @pytest.mark.parametrize(
     ("function", "options"), [(mc.plan, PlanOptions), (mc.relative, RelativeOptions)]
 )
-def test_keywords_are_those_of_the_options(function, options):  # type: ignore[no-untyped-def]
+def test_keywords_are_those_of_the_options(function, options):
     said = inspect.signature(function).parameters
     for name, default in vars(options()).items():
         assert said[name].default == (default if default != {} else None), name

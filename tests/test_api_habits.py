@@ -22,7 +22,7 @@ def test_bounds_as_pairs_are_bounds():
     assert told.x[0] <= 0.8 + 1e-9
     for wrong in ([(0.0, 1.0)], [(0.0, 1.0), 3.0], [("a", 1.0), (0.0, 1.0)]):
         with pytest.raises(mc.OptionError, match="give 2 pairs"):
-            mc.minimize_max(largest, [2.0, 2.0], bounds=wrong)  # type: ignore[arg-type]
+            mc.minimize_max(largest, [2.0, 2.0], bounds=wrong)
 
 
 def test_central_differences_are_nearer_than_forward_ones():

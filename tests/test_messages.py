@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import click
 import pytest
-from conftest import ROOT, run
+from conftest import ROOT
 
 import minimax_cal as mc
 from minimax_cal.cli.commands import ENTRIES
@@ -50,7 +50,7 @@ def test_messages_of_python_speak_of_no_flag():
     assert not found, "\n".join(found)
 
 
-def test_the_command_line_calls_arguments_by_its_options(tmp_path, capsys):
+def test_the_command_line_calls_arguments_by_its_options(tmp_path, refuses, says):
     plan = cli.commands["plan"]
     for said, shown in (
         ("candidates=5: give more", "--candidates 5: give more"),
@@ -67,21 +67,20 @@ def test_the_command_line_calls_arguments_by_its_options(tmp_path, capsys):
     assert in_flags(mend, cli.commands["import"]) == mend
     with pytest.raises(mc.OptionError, match=r"^candidates=5: "):
         mc.plan("irb120", 8, candidates=5)
-    assert run("plan", "irb120", "--poses", 8, "--candidates", 5) == 2
-    assert capsys.readouterr().err.startswith("error: --candidates 5: ")
+    assert says("plan irb120 --poses 8 --candidates 5", code=2).err.startswith(
+        "error: --candidates 5: "
+    )
     (tmp_path / "raw.csv").write_text("1,2,3,4,5,6,7,8,9\n2,3,4,5,6,7,8,9,1\n")
     with pytest.raises(mc.DataError, match=r"say what they are, as columns='"):
         mc.import_files([tmp_path / "raw.csv"])
-    assert run("import", tmp_path / "raw.csv") == 2
-    assert "as --columns smr1_mm,q_deg (6 joints) or --columns" in capsys.readouterr().err
+    refuses("as --columns smr1_mm,q_deg (6 joints) or --columns", "import", tmp_path / "raw.csv")
 
 
 @pytest.mark.parametrize("name", ENTRIES)
-def test_help_is_in_groups_and_whole_sentences(name, capsys):
+def test_help_is_in_groups_and_whole_sentences(name, says):
     command = cli.commands[name]
     assert isinstance(command, InGroups)
-    assert run(name, "--help") == 0
-    out = capsys.readouterr().out
+    out = says(name, "--help").out
     titles = re.findall(r"^(\S.*):$", out, re.M)
     assert titles[-1] == RESULT
     assert len(titles) == len(set(titles))

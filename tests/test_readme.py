@@ -68,7 +68,7 @@ def test_the_python_examples_run(tmp_path, monkeypatch):
         scope: dict[str, object] = {}
         exec(compile(code, "page", "exec"), scope)
     assert mc.load_cell(tmp_path / "fit.json").target_names == ("smr1", "smr2", "smr3")
-    assert f"{scope['found'].fun:.6f}" == blocks[-1][1].strip()  # type: ignore[attr-defined]
+    assert f"{scope['found'].fun:.6f}" == blocks[-1][1].strip()
 
 
 def test_all_brings_what_every_page_needs():

@@ -49,7 +49,7 @@ class Node:
 
     def __init__(self, name: str) -> None:
         self.heard: dict[str, Any] = {}
-        Node.made = self  # type: ignore[attr-defined]
+        Node.made = self
 
     def declare_parameter(self, name: str, default: Any) -> Any:
         return SimpleNamespace(value=self.given.get(name, default))
@@ -82,7 +82,7 @@ def test_what_the_node_writes_is_a_measurement_file(tmp_path, monkeypatch):
     from minimax_cal_ros2.record import main
 
     main()
-    topics = Node.made.heard  # type: ignore[attr-defined]
+    topics = Node.made.heard
     now = 0.0
     for q, y in zip(data.q, data.y, strict=True):
         for _ in range(15):

@@ -148,9 +148,9 @@ def public(thing: object) -> Iterator[str]:
 
 @pytest.mark.parametrize("package", [mc, qp_backends], ids=lambda package: package.__name__)
 def test_every_public_name_is_in_the_reference(site, package):
-    name = package.__name__  # type: ignore[attr-defined]
+    name = package.__name__
     ids = Anchors(site / "api" / f"{name}.html").ids
-    for public_name in package.__all__:  # type: ignore[attr-defined]
+    for public_name in package.__all__:
         full, thing = f"{name}.{public_name}", getattr(package, public_name)
         assert f"module-{thing.__name__}" in ids if inspect.ismodule(thing) else full in ids, full
         for member in public(thing):

@@ -27,7 +27,7 @@ HIDDEN = re.compile(r"<(script|style)\b.*?</\1>|\{[%#].*?[%#]\}|\{\{.*?\}\}|<[^>
 def listed() -> dict[str, str]:
     """Pattern of each word that must go, and what to write instead."""
     lines = (line for line in LIST.read_text().splitlines() if line and not line.startswith("#"))
-    return dict(re.split(r"\s{2,}", line, maxsplit=1) for line in lines)  # type: ignore[arg-type]
+    return dict(re.split(r"\s{2,}", line, maxsplit=1) for line in lines)
 
 
 INSTEAD = listed()

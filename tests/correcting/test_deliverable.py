@@ -13,9 +13,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import minimax_cal as mc
 from minimax_cal.cli.export import export_command
 from minimax_cal.correcting import deliverable
-from minimax_cal.correcting.deliverable import DELIVERABLES, Delivered
+from minimax_cal.correcting.deliverable import DELIVERABLES
 from minimax_cal.correcting.export import exported
-from minimax_cal.correcting.exporters import EXPORTERS
 from minimax_cal.fitting.opened import place
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.history import with_history
@@ -139,6 +138,8 @@ def test_it_is_the_fit_of_exactly_that(soft):
         assert found.figures.rms == pytest.approx(plain.within.after.rms_mm, rel=1e-4)
         assert found.figures.typical == pytest.approx(plain.beyond.typical_mm, rel=1e-3)
         assert found.whole.rms == soft.within.after.rms_mm
+    with pytest.raises(mc.CalibrationError, match="no such format"):
+        mc.deliver(soft, "step")
 
 
 def test_priors_fixed_names_and_the_objective_stay():
@@ -276,13 +277,6 @@ def test_the_command_tells_figures_and_json(soft, tmp_path):
     assert f"the full model: held-out RMS {own.whole.rms:.3f} mm" in asked.stderr
     assert json.loads(told("--to", "json", "--json").stdout).keys() == {"delivered"}
     assert "delivered" not in told("--to", "json").stdout
-
-
-def test_an_unknown_format_is_one_line(soft):
-    with pytest.raises(mc.OptionError, match="no such format; choose one of urdf"):
-        mc.deliver(soft, "step")
-    assert set(EXPORTERS) < set(DELIVERABLES)
-    assert isinstance(mc.deliver(soft, "json"), Delivered)
 
 
 def test_a_refit_that_is_no_better_than_the_drawing_is_not_delivered_unasked(monkeypatch):

@@ -228,7 +228,7 @@ def test_a_program_of_offsets_alone_is_refused(tmp_path):
         ("a.dat", "&ACCESS RVP\nDEFDAT m PUBLIC ; of m\n{}", 3),
     ],
 )
-def test_a_program_is_corrected_once(name, text, line, fit, target, place, tmp_path, capsys):
+def test_a_program_is_corrected_once(name, text, line, fit, target, place, tmp_path, says):
     """A comment tells that it was, and nothing else changes but the numbers."""
     body = f"CONST robtarget p1:={target};" if name == "a.mod" else f"E6POS X={{{place},S 2,T 0}}"
     fit.save(tmp_path / "fit.json")
@@ -242,9 +242,7 @@ def test_a_program_is_corrected_once(name, text, line, fit, target, place, tmp_p
     numbers = re.compile(r"-?\d+\.\d+")
     assert numbers.sub("", "".join(rest.split())) == numbers.sub("", "".join(
         text.format(body).split()))  # fmt: skip
-    capsys.readouterr()
-    assert run(*words, tmp_path / f"b_{name}", "-o", tmp_path / f"c_{name}") == 2
-    err = capsys.readouterr().err
+    err = says(*words, tmp_path / f"b_{name}", "-o", tmp_path / f"c_{name}", code=2).err
     assert f"b_{name}:{line}: these points are corrected already" in err
     assert len(err.splitlines()) == 1
     assert not (tmp_path / f"c_{name}").exists()
@@ -252,22 +250,22 @@ def test_a_program_is_corrected_once(name, text, line, fit, target, place, tmp_p
 
 @pytest.mark.parametrize(("given", "out"), [("a.mod", "b.csv"), ("a.csv", "b.mod"),
                                             ("a.mod", "b.src"), ("a.txt", "b.dat")])  # fmt: skip
-def test_a_program_goes_into_no_table_nor_a_table_into_a_program(given, out, fit, tmp_path, capsys):
+def test_a_program_goes_into_no_table_nor_a_table_into_a_program(given, out, fit, tmp_path, says):
     fit.save(tmp_path / "fit.json")
     (tmp_path / given).write_text("")
-    assert run("compensate", tmp_path / "fit.json", tmp_path / given, "-o", tmp_path / out) == 2
-    err = capsys.readouterr().err
+    err = says(
+        "compensate", tmp_path / "fit.json", tmp_path / given, "-o", tmp_path / out, code=2
+    ).err
     assert f"{out}: " in err
     assert f"end it {'.mod' if given == 'a.mod' else '.csv'}" in err
     assert len(err.splitlines()) == 1
 
 
-def test_an_arm_without_its_nominal_robot_asks_for_it(fit, tmp_path, capsys):
+def test_an_arm_without_its_nominal_robot_asks_for_it(fit, tmp_path, says):
     (tmp_path / "cell.json").write_text(json.dumps(fit.cell.whole()))
     (tmp_path / "a.csv").write_text("q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n1,2,3,4,50,6\n")
     (tmp_path / "a.src").write_text(f"PTP {JOINTS}")
     for targets in ("a.csv", "a.src"):
-        assert run("compensate", tmp_path / "cell.json", tmp_path / targets) == 2
-        err = capsys.readouterr().err
+        err = says("compensate", tmp_path / "cell.json", tmp_path / targets, code=2).err
         assert err.endswith("cell.json: does not tell its nominal robot; give --robot\n")
         assert len(err.splitlines()) == 1

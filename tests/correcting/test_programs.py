@@ -130,7 +130,7 @@ def test_all_else_stays_byte_for_byte(language, fit, robot, tmp_path):
         kept = old[at_old : number.start]
         assert new[at_new : at_new + len(kept)] == kept
         at_new += len(kept)
-        at_new = re.compile(r"[-+.\dEe]+").match(new, at_new).end()  # type: ignore[union-attr]
+        at_new = re.compile(r"[-+.\dEe]+").match(new, at_new).end()
         at_old = number.stop
     assert new[at_new:] == old[at_old:]
     lines = [(a, b) for a, b in zip(text.splitlines(), made.splitlines(), strict=True) if a != b]
@@ -190,11 +190,10 @@ def test_a_quarter_turn_that_changed_is_told():
         ("a.csv", "q1_deg\n1\n", ["--tool", "t"], "go with a program"),
     ],
 )  # fmt: skip
-def test_a_wrong_program_is_one_line(name, text, options, said, fit, tmp_path, capsys):  # fmt: skip
+def test_a_wrong_program_is_one_line(name, text, options, said, fit, tmp_path, says):  # fmt: skip
     fit.save(tmp_path / "fit.json")
     (tmp_path / name).write_text(text)
-    assert run("compensate", tmp_path / "fit.json", tmp_path / name, *options) == 2
-    err = capsys.readouterr().err
+    err = says("compensate", tmp_path / "fit.json", tmp_path / name, *options, code=2).err
     assert said in err
     assert len(err.splitlines()) == 1
 

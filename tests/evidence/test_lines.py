@@ -21,7 +21,6 @@ from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.periodogram import (
-    SEVERAL,
     Line,
     alike,
     bands,
@@ -87,26 +86,6 @@ def test_lines_near_a_ratio_are_few():
     assert [term.place for term in near] == ["J1", "J1", "J2", "J2", "J3", "J3"]  # of these told
 
 
-def test_once_a_gear_has_a_line_each_other_is_asked_for_by_itself():
-    made = opened("irb120")
-    none = np.zeros((len(made.rows.error), 0))
-    noise = restricted(made.rows, none)
-    heard = [Term("gear_ripple", "J4", {"turns": 100.0})]
-    alone, beside = (
-        {term.text: tries for term, tries in found}
-        for found in (
-            strongest_lines(made.scene, made.rows, noise, none),
-            strongest_lines(made.scene, made.rows, noise, none, heard=heard),
-        )
-    )
-    near = {t for t, tries in alone.items() if tries == min(alone.values())}
-    assert_allclose(
-        sum(beside[text] - SEVERAL for text in near) / 2.0,  # two waves of each gear
-        min(alone.values()) - SEVERAL,
-    )
-    assert max(alone.values()) == max(beside.values())  # of other waves no joint tells another
-
-
 @pytest.mark.parametrize(
     ("place", "turns", "heard", "expected"),
     [
@@ -130,7 +109,7 @@ def test_the_level_is_shared_once():
     choice = chosen(opened("irb120"), ())
     table = bench(choice.library, ())
     laws = [c for c in choice.library.candidates if not c.is_line]
-    lines = {c.tries: c for c in choice.library.lines.candidates}  # type: ignore[union-attr]
+    lines = {c.tries: c for c in choice.library.lines.candidates}
     assert_allclose(sum(1.0 / table.looked_at(c) for c in laws), 1.0 - 2.0 * LINES)
     assert_allclose([c.tries / table.looked_at(c) for c in lines.values()], LINES)
 

@@ -10,16 +10,21 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from experiments import blind_gap, gap_cases
-from experiments.gap_cases import ARMS, FAULTS, LAWS, Case, Cause, Sealed, Truth, World
+from experiments import blind_gap, gap_cases, machine_gap, machines
+from experiments.gap_cases import ARMS, FAULTS, LAWS, Case, Cause, Truth, World
+from experiments.machines import LAWS as SHOP_LAWS
+from experiments.machines import MAKES, Asked
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import plain
+
+# ---- gap cases -----------------------------------------------------------------------------------
+
 
 ROBOTS = tuple(ARMS)
 
 
 def world(robot: str = "irb2600", **options: float) -> World:
-    return gap_cases.world_of(Case(robot, "test", **options), np.random.default_rng(4))  # type: ignore[arg-type]
+    return gap_cases.world_of(Case(robot, "test", **options), np.random.default_rng(4))
 
 
 def moved(place: World, cause: Cause, amplitude: float, seed: int = 0) -> Array:
@@ -46,14 +51,6 @@ def test_lambda_is_what_was_asked_for(law, robot):
             assert_allclose(sealed.powers, [70.0], rtol=1e-6)
         assert_allclose(sealed.parts[0], sealed.displacement, rtol=0, atol=1e-12)
         assert sealed.displacement.shape == (3, sealed.data.poses, 3)
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_no_power_moves_nothing(law):
-    place = gap_cases.places(law, "irb2600")[0]
-    sealed = gap_cases.make(Case("irb2600", "test", (Cause(law, place, 0.0),), poses=60))
-    assert np.all(sealed.displacement == 0.0)
-    assert sealed.amplitudes == (0.0,)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -112,54 +109,6 @@ def test_geometry_alone_has_no_power():
         assert np.linalg.norm(motion) > 1e-3
 
 
-def test_power_without_jitter_is_the_squared_ratio_to_noise():
-    place = world()
-    ruler = gap_cases.judge(place, np.full((len(place.q), 3), 2e-5), 0.0)
-    bare = dataclasses.replace(ruler, geometry=ruler.geometry[:, :0])
-    motion = np.zeros((len(place.q), 3, 3))
-    motion[place.train, 1, 2] = 1e-5
-    assert_allclose(bare.power(motion), 0.25 * place.train.sum(), rtol=1e-12)
-
-
-def test_encoder_gain_is_a_difference_of_forward_kinematics():
-    place = world(jitter=0.0)
-    gain = np.array([1.0, 1.0, 1.003, 1.0, 1.0, 1.0])
-    expected = seen(place, place.robot, place.q * gain, place.spots)
-    expected -= seen(place, place.robot, place.q, place.spots)
-    found = moved(place, Cause("encoder_gain", "J3", 1.0), 0.003)
-    assert_allclose(found, expected, rtol=0, atol=1e-13)
-
-
-def test_coupling_backlash_and_settling_by_hand():
-    place = world(jitter=0.0)
-    last = np.concatenate([place.q[:1], place.q[:-1]])
-    for cause, joint, dq in (
-        (Cause("joint_coupling", "J5", 1.0), 4, place.q[:, 3]),
-        (Cause("joint_coupling", "J6", 1.0), 5, place.q[:, 4]),
-        (Cause("backlash", "J2", 1.0), 1, np.sign(place.q[:, 1] - last[:, 1])),
-        (Cause("settling", "J4", 1.0), 3, last[:, 3] - place.q[:, 3]),
-    ):
-        q = place.q.copy()
-        q[:, joint] += 2e-4 * dq
-        expected = seen(place, place.robot, q, place.spots)
-        expected -= seen(place, place.robot, place.q, place.spots)
-        assert_allclose(moved(place, cause, 2e-4), expected, rtol=0, atol=1e-13)
-
-
-def test_growth_is_another_geometry_at_every_row():
-    place = world(jitter=0.0)
-    found = moved(place, Cause("thermal_growth", "all", 1.0), 1e-4)
-    assert_allclose(found[0], 0.0, atol=1e-15)  # time 0
-    mdh = place.robot.mdh.copy()
-    for joint, column in place.arm.hot:
-        mdh[joint - 1, column] *= 1 + 1e-4
-    whole = seen(place, place.robot.with_mdh(mdh), place.q, place.spots)
-    whole -= seen(place, place.robot, place.q, place.spots)
-    share = np.sum(found * whole, axis=(1, 2)) / np.sum(whole**2, axis=(1, 2))
-    assert np.all(np.diff(share) > 0.0)
-    assert_allclose(found, share[:, None, None] * whole, rtol=0, atol=1e-9)
-
-
 def test_target_laws_move_what_they_say():
     place = world(jitter=0.0)
     still = gap_cases.measure(place, gap_cases.rigid(place))
@@ -188,15 +137,6 @@ def test_a_beam_under_a_weight_at_its_end_sags_as_the_textbook_says():
     assert_allclose(unit.links[:, 1, 5], -weight * 1.3**3 / 3.0, rtol=1e-12)
     assert_allclose(unit.links[:, 1, 1], weight * 1.3**2 / 2.0, rtol=1e-12)
     assert_allclose(unit.links[:, 1, [0, 2, 3, 4]], 0.0, atol=1e-9)
-
-
-def test_base_flex_tips_the_arm_towards_its_load():
-    place = world()
-    unit = LAWS["base_flex"](place, Cause("base_flex", "frame", 1.0), np.random.default_rng(0))
-    centres = gap_cases.centres(place.robot, gap_cases.frames(place.robot, place.q))
-    middle = np.einsum("mni,n->mi", centres, place.robot.mass)
-    motion = np.cross(unit.base[:, :3], place.robot.up)  # of the top
-    assert_allclose(motion[:, :2], gap_cases.G * middle[:, :2], rtol=1e-9)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -281,7 +221,7 @@ def truth_of(*names: tuple[str, str], power: float = 100.0, **more: object) -> T
         truth=names, background=(), displacement=none.sum(0), parts=none,
         powers=(power,) * len(names), power=power, amplitudes=(), floor=4e-5,
     )  # fmt: skip
-    return Truth(**(fields | more))  # type: ignore[arg-type]
+    return Truth(**(fields | more))
 
 
 def answer(verdict: str, *names: tuple[str, str], also: tuple[tuple[str, str], ...] = ()) -> dict:
@@ -345,12 +285,6 @@ def test_score_of_several_effects():
     assert blind_gap.score(case, small, answer("named", J2, GAIN, J3))["strange"] == 1
 
 
-def test_nearest_rival_is_not_the_truth_itself():
-    alike = {J2: 1.0, ALL: 0.99, J3: 0.2, GAIN: 0.8, ("backlash", "J1"): float("nan")}
-    assert blind_gap.nearest(J2, alike) == (GAIN, 0.8)
-    assert blind_gap.nearest(J2, {J2: 1.0}) == (("", ""), 0.0)
-
-
 def test_criteria_and_tables_of_made_up_rows():
     def row(condition: str, said: dict, *names: tuple[str, str], **more: object) -> dict:
         causes = tuple(Cause(effect, place, 100.0) for effect, place in names)
@@ -392,23 +326,6 @@ def test_criteria_and_tables_of_made_up_rows():
     assert lines == ("gear_error", "encoder_gain")
     assert counts[0, columns.index("encoder_gain")] == 1
     assert counts[1, columns.index("unknown")] == 1
-
-
-@pytest.mark.parametrize(
-    ("hits", "limit", "good", "shown"),
-    [
-        (197, 0.985, True, (">= 98.5 %", "met")),
-        (196, 0.985, True, (">= 98.5 %", "MISSED")),
-        (1, 0.005, False, ("<= 0.5 %", "met")),
-        (2, 0.005, False, ("<= 0.5 %", "MISSED")),
-        (1, 0.0, False, ("<= 0 %", "MISSED")),
-        (1, float("nan"), True, ("", "")),
-    ],
-)
-def test_a_limit_is_shown_as_it_is_asked(hits, limit, good, shown):
-    rows = [{"hit": i < hits} for i in range(200)]
-    line = blind_gap.Criterion("", "", rows, lambda row: row["hit"], limit, good).line()
-    assert line[5:] == shown
 
 
 def test_a_run_shows_the_diagnosis_files_only(monkeypatch):
@@ -460,6 +377,56 @@ def test_plan_covers_every_condition(size):
             assert cause.place in gap_cases.places(cause.law, case.robot)
 
 
-def test_sealed_fields_are_what_is_written():
-    names = {field.name for field in dataclasses.fields(Sealed)}
-    assert {field.name for field in dataclasses.fields(Truth)} <= names
+def test_laws_of_joints_are_differences_of_forward_kinematics():
+    place = world(jitter=0.0)
+    last = np.concatenate([place.q[:1], place.q[:-1]])
+    for cause, joint, dq in (
+        (Cause("encoder_gain", "J3", 1.0), 2, place.q[:, 2]),
+        (Cause("joint_coupling", "J5", 1.0), 4, place.q[:, 3]),
+        (Cause("joint_coupling", "J6", 1.0), 5, place.q[:, 4]),
+        (Cause("backlash", "J2", 1.0), 1, np.sign(place.q[:, 1] - last[:, 1])),
+        (Cause("settling", "J4", 1.0), 3, last[:, 3] - place.q[:, 3]),
+    ):
+        q = place.q.copy()
+        q[:, joint] += 2e-4 * dq
+        expected = seen(place, place.robot, q, place.spots)
+        expected -= seen(place, place.robot, place.q, place.spots)
+        assert_allclose(moved(place, cause, 2e-4), expected, rtol=0, atol=1e-13)
+
+
+# ---- machines ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("robot", MAKES)
+def test_an_arm_moves_as_the_package_says_slides_too(robot):
+    place = machines.world_of(Asked(robot, "test", poses=40), np.random.default_rng(4))
+    pose = place.base @ place.robot.pose(place.q + place.jitter)
+    expected = np.einsum("mij,kj->mki", pose[:, :3, :3], place.spots) + pose[:, None, :3, 3]
+    assert_allclose(gap_cases.measure(place, gap_cases.rigid(place)), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("law", SHOP_LAWS)
+def test_lambda_is_what_was_asked_for_in_shops(law):
+    able = [robot for robot in MAKES if machines.places(law, robot, 3)]
+    for robot in (able[0], able[-1]):
+        place = machines.places(law, robot, 3)[-1]
+        made = machines.make(Asked(robot, "test", (Cause(law, place, 70.0, 1),), poses=60))
+        assert_allclose(made.powers, [70.0], rtol=1e-5)
+        assert made.displacement.shape == (1, 3, made.data.poses, 3)
+
+
+def test_a_separable_cause_is_told_from_one_that_is_not():
+    row = {"verdict": "named", "all_right": True, "lambda": 60.0, "telling": 30.0}
+    assert machine_gap.separable(row)
+    assert machine_gap.right(row)
+    assert not machine_gap.separable(row | {"telling": 20.0})
+    assert not machine_gap.right(row | {"verdict": "unknown"})
+    assert not machine_gap.right(row | {"all_right": False})
+
+
+def test_every_case_can_be_made_and_has_a_seed_of_its_own():
+    cases = machine_gap.plan(5, machine_gap.QUICK)
+    assert len({case.seed for case in cases}) == len(cases)
+    for case in cases:
+        for cause in case.causes:
+            assert cause.place in machines.places(cause.law, case.robot, case.targets)

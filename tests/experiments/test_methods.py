@@ -10,7 +10,9 @@ from conftest import SHARED, shared
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+import minimax_cal as mc
 from experiments import methods
+from experiments.hand_eye import closed_form, mdh_pose, place
 from experiments.methods import (
     FIGURES,
     MINIMAX,
@@ -22,9 +24,11 @@ from experiments.methods import (
     Studies,
     figure_of,
 )
+from experiments.poe import Screws, fit_poses, fit_positions, screws_of
 from experiments.poses import (
     euler_deviation,
     exp,
+    inverse,
     lever,
     orientation_error,
     points,
@@ -34,7 +38,10 @@ from experiments.poses import (
     triangle,
 )
 from minimax_cal.ground.arrays import Array
-from minimax_cal.robots.kinematics import hat
+from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.robots.sampling import random_poses
+
+# ---- methods -------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -77,12 +84,6 @@ def test_euler_angles_exaggerate_near_gimbal_lock():
     assert_allclose(euler_deviation(*near), np.radians([[40, 0, 40]]), atol=1e-9)
 
 
-def test_lever_weighs_an_angle_like_the_three_points(rng):
-    shape = triangle(rng.normal(size=(1, 3, 3)))
-    spread = sum(np.trace(hat(s).T @ hat(s)) for s in shape) / 3.0  # mean over axes of the turn
-    assert 3.0 * lever(shape) ** 2 == pytest.approx(spread, rel=1e-12)
-
-
 def test_sum_and_minimax_are_the_best_at_what_they_minimise(alone):
     # all methods but the nominal one fit the same family of arms
     _, results = alone[0]
@@ -113,26 +114,6 @@ def test_absent_data_are_said_to_be_absent(alone):
     text = "\n".join(table.text(200) for table in methods.tables(alone, []))
     assert text.count("data absent") == 2 * 2  # title and row, for each real robot
     assert list(methods.figures(alone)) == ["methods_1"]
-
-
-def test_training_never_stands_without_held_out(alone):
-    for table in methods.tables(alone, []):
-        for name in table.header:
-            if name.endswith("training"):
-                assert name.replace("training", "held out") in table.header
-
-
-def test_splits_part_the_poses():
-    shared("fanuc_r2000")
-    for case in methods.cases(quick=False):
-        joints = [methods.divided(case, split, 3, SHARED)[1:] for split in range(case.splits)]
-        for train, held in joints:
-            assert train.poses == case.train
-            both = np.concatenate([train.q, held.q])
-            assert len(np.unique(both, axis=0)) == len(both)
-        if case.folds:
-            every = np.concatenate([held.q for _, held in joints])
-            assert len(np.unique(every, axis=0)) == len(every) == train.poses + held.poses
 
 
 def test_real_robots_improve_held_out():
@@ -182,3 +163,109 @@ def test_command(alone, tmp_path, monkeypatch):
     for name in ("methods.md", "methods.tex", "methods_1.csv", "methods_1.png", "methods_1.svg"):
         assert (out / name).exists()
     assert '"schema": 1' in figures.read_text()
+
+
+# ---- poe -----------------------------------------------------------------------------------------
+
+
+EXACT = Truth(compliance=0, noise=0, noise_per_metre=0)
+ROUNDING = 1e-12
+
+
+@pytest.mark.parametrize("name", mc.builtin_robots())
+def test_same_forward_kinematics_as_the_links(name, rng):
+    robot = mc.load_robot(name)
+    q, tool = random_poses(robot, 40, rng), exp(rng.normal(size=6))
+    found = screws_of(robot, tool).poses(q * robot.sign)
+    assert_allclose(found, robot.pose(q) @ tool, rtol=0, atol=ROUNDING)
+
+
+def measured_arm(name: str, truth: Truth) -> tuple[mc.Robot, Array, Array, float, Screws]:
+    """Robot, joints, poses in the nominal base, lever, and nominal screws."""
+    robot = mc.load_robot(name)
+    data = simulate(robot, 40, 3, seed=3, truth=truth).data
+    q, shape = data.q * robot.sign, triangle(data.y)
+    poses = poses_of(shape, data.y)
+    arm = place(robot.mdh, q, robot.prismatic, poses, lever(shape)).x
+    return robot, q, inverse(arm.base) @ poses, lever(shape), screws_of(robot, arm.tool)
+
+
+@pytest.mark.parametrize(
+    ("name", "independent"), [("irb2600", 30), ("ur10", 30), ("scara_600", 20)]
+)
+def test_exact_poses_are_met(name, independent):
+    _, q, poses, length, nominal = measured_arm(name, EXACT)
+    found = fit_poses(nominal, q, poses, length)
+    assert found.status == "converged"
+    assert found.identified == independent  # 4 a turning joint, 2 a slide, 6 of the tool
+    assert_allclose(found.x.poses(q), poses, rtol=0, atol=1e-10)
+    spot = pose(np.eye(3), np.array([0.1, 0.0, 0.0]))  # off the last axis, to see that it turns
+    seen = (poses @ spot)[:, :3, 3]
+    found = fit_positions(Screws(nominal.twists, nominal.tool @ spot), q, seen)
+    assert found.identified == independent - 3
+    assert_allclose(found.x.poses(q)[:, :3, 3], seen, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["irb2600", "ur10", "scara_600"])
+def test_poe_and_mdh_describe_the_same_arms(name):
+    robot, q, poses, length, nominal = measured_arm(name, Truth())
+    screws = fit_poses(nominal, q, poses, length)
+    links = place(robot.mdh, q, robot.prismatic, poses, length, links=True)
+    assert screws.identified == links.identified
+    assert screws.cost == pytest.approx(links.cost, rel=1e-8)
+
+
+# ---- hand eye ------------------------------------------------------------------------------------
+
+
+LENGTH = 0.1
+
+
+def cell(robot: mc.Robot, count: int, seed: int) -> tuple[Array, Array, Array, Array, Array]:
+    """Joints, A, exact B = Z^-1 A X, X and Z at a random place."""
+    rng = np.random.default_rng(seed)
+    q = random_poses(robot, count, rng)
+    X, Z = exp(rng.normal(size=(2, 6)) * [1, 1, 1, 2, 2, 2])
+    A = robot.pose(q)
+    return q, A, inverse(Z) @ A @ X, X, Z
+
+
+@pytest.mark.parametrize("name", ["irb2600", "ur10", "meca500"])
+@pytest.mark.parametrize("seed", range(20))
+def test_closed_form_recovers_both_frames(name, seed):
+    robot = mc.load_robot(name)
+    _, A, B, X, Z = cell(robot, 20, seed)
+    found_x, found_z = closed_form(A, B)
+    assert_allclose(found_x, X, rtol=0, atol=1e-9)
+    assert_allclose(found_z, Z, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_refinement_finds_what_rotations_about_one_axis_leave_open(seed):
+    robot = mc.load_robot("scara_600")
+    q, _, B, _, _ = cell(robot, 20, seed)
+    found = place(robot.mdh, q * robot.sign, robot.prismatic, B, LENGTH)
+    assert found.identified == 11  # heights of base and tool cannot be told apart
+    poses = found.x.poses(q * robot.sign, robot.prismatic)
+    assert_allclose(poses, B, rtol=0, atol=1e-9)
+
+
+def test_mdh_pose_fit_finds_the_true_robot(robot, clean):
+    found = mdh_pose(robot, clean.data)
+    assert found.status == "converged"
+    assert found.identified == 30
+    q = random_poses(robot, 50, np.random.default_rng(9))
+    assert_allclose(found.predict(q), clean.cell.predict(q), rtol=0, atol=1e-9)
+
+
+def test_splits_part_the_poses():
+    shared("fanuc_r2000")
+    for case in methods.cases(quick=False):
+        joints = [methods.divided(case, split, 3, SHARED)[1:] for split in range(case.splits)]
+        for train, held in joints:
+            assert train.poses == case.train
+            both = np.concatenate([train.q, held.q])
+            assert len(np.unique(both, axis=0)) == len(both)
+        if case.folds:
+            every = np.concatenate([held.q for _, held in joints])
+            assert len(np.unique(every, axis=0)) == len(every) == train.poses + held.poses

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from experiments.driven_arms import drawn_arm
 from experiments.motion_blind import (
     BEYOND,
     PAIR,
@@ -33,7 +34,23 @@ from experiments.motion_cases import (
     some_arm,
     sound,
 )
+from experiments.motion_gap import Case as GapCase
+from experiments.motion_gap import Closed, Judged, closed_table, real_table
+from experiments.motion_real import (
+    SIMULATED,
+    Left,
+    names_table,
+    steps_table,
+)
+from experiments.motion_real import (
+    Told as RealTold,
+)
+from experiments.motion_real import (
+    run as run_left,
+)
 from minimax_cal.dynamics.laws import LAWS
+
+# ---- motion blind --------------------------------------------------------------------------------
 
 
 def test_two_generators_agree_where_friction_is_no_matter_of_taste():
@@ -116,7 +133,7 @@ def told(condition: str, truth: str, verdict: str, *main: str, **more: object) -
     }
     given |= more
     return Told(Case(condition, OWN, causes, 0), verdict, (pair(truth),) if truth else (),
-                tuple(map(pair, main)), **given)  # type: ignore[arg-type]  # fmt: skip
+                tuple(map(pair, main)), **given)  # fmt: skip
 
 
 def test_answers_are_judged_by_the_truth():
@@ -175,8 +192,65 @@ def test_the_plan_holds_every_cause_by_both_generators():
     assert place_of("cable", 5, 4) == ("cable", "J2")
 
 
-def test_a_rotor_that_nobody_told_is_named():
-    answer = run(Case(SINGLE, OWN, (("armature", 2),), 11))
-    assert answer.truth == (("armature", "J3"),)
-    assert answer.right
-    assert 0.0 < answer.seconds < 20.0
+# ---- motion real ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def left_out() -> RealTold:
+    return run_left(Left(SIMULATED, 0, 0))
+
+
+def test_withheld_effects_are_named_and_help_on_a_run_that_no_fit_saw(left_out):
+    assert {"load_friction J2", "armature J3"} <= set(left_out.confirmed)
+    before = left_out.reached[left_out.steps.index("usual friction refitted")]
+    assert np.all(left_out.reached[-1, 1:] < 0.5 * before[1:])
+    assert np.all(left_out.reached[-1] <= left_out.whole[-1])  # rows at rest only add
+
+
+def test_boosting_takes_little_where_all_has_a_name(left_out):
+    moving, whole = left_out.boosted
+    assert np.all(moving > 0.85 * left_out.reached[-1])
+    assert np.all(whole > 0.85 * left_out.whole[-1])
+
+
+def test_tables_count_runs_and_compare_with_the_claim(left_out):
+    table = steps_table(SIMULATED, [left_out, left_out])
+    last = dict(zip((row[0] for row in table.rows), table.rows, strict=True))
+    assert last["all effects"][1:] == pytest.approx(left_out.reached[-1])
+    assert last["claimed over reached"][1:] == pytest.approx(
+        left_out.claimed[-1] / left_out.reached[-1]
+    )
+    assert all(row[1:] == (2, 2) for row in names_table(SIMULATED, [left_out, left_out]).rows)
+
+
+# ---- motion gap ----------------------------------------------------------------------------------
+
+
+def test_an_arm_lacks_what_is_asked_for_and_repeats_by_its_seed():
+    pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
+    arm, again = (drawn_arm("scara_600", 2, ("friction", "payload")) for _ in range(2))
+    assert arm.withheld.payload == again.withheld.payload > 0.0
+    assert (arm.withheld.friction > 0.0).all()
+    assert not arm.withheld.share.any()
+    assert not arm.withheld.armature.any()
+    real = arm.real()
+    assert real.body_mass[-1] == pytest.approx(arm.known.body_mass[-1] + arm.withheld.payload)
+
+
+def test_tables_count_what_remains():
+    one = Closed(10.0, 1.0, 0.1, np.array([0.1, 0.2]), np.array([0.01, 0.02]))
+    case = GapCase("ur10", ("friction",), 1)
+    *_, last = closed_table([case, case], [one, one]).rows
+    assert last == ("median", 10.0, pytest.approx(10.0), pytest.approx(20.0),
+                    pytest.approx(1.0), pytest.approx(2.0))  # fmt: skip
+    low = np.array([0.05, 0.06])
+    run = Judged(
+        "a", np.array([2.0, 2.0]), np.array([0.3, 0.4]), np.array([0.1, 0.2]), low, 0.5 * low
+    )
+    assert [row[1:] for row in real_table([run, run]).rows] == [
+        (pytest.approx(2.0), pytest.approx(2.0)),
+        (pytest.approx(0.3), pytest.approx(0.4)),
+        (pytest.approx(0.1), pytest.approx(0.2)),
+        (pytest.approx(0.05), pytest.approx(0.06)),
+        (pytest.approx(0.025), pytest.approx(0.03)),
+    ]

@@ -127,15 +127,6 @@ def test_starts_moved_by_rounding_stand_beside_the_same_starts():
     assert m.minimum[0] == m.minimum[1]
 
 
-def test_regions_of_the_joint_space_are_its_clusters():
-    rng = np.random.default_rng(0)
-    centres = 10.0 * rng.normal(size=(splits.REGIONS, 6))
-    q = np.repeat(centres, 8, axis=0) + 0.1 * rng.normal(size=(8 * splits.REGIONS, 6))
-    label = splits.regions(q, 3).reshape(splits.REGIONS, 8)
-    assert (label == label[:, :1]).all()
-    assert len(set(label[:, 0])) == splits.REGIONS
-
-
 def test_splits_hold_every_region_out_once_and_tell_their_spread():
     data = splits.ROBOTS["irb2600"][1](0)
     jobs = [splits.Job("irb2600", "by groups", region, 100, 0) for region in range(splits.REGIONS)]

@@ -1,4 +1,5 @@
 import hashlib
+import importlib.util
 import json
 import math
 import os
@@ -8,7 +9,11 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,7 +22,9 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from numpy.testing import assert_allclose, assert_array_equal
 
+import minimax_cal as mc
 from experiments import __main__ as studies
 from experiments import sweep as module
 from experiments.index import tables_of
@@ -26,6 +33,9 @@ from experiments.sweep import Study, study_options, sweep
 from minimax_cal.ground import parallel
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Table
+
+# ---- sweep ---------------------------------------------------------------------------------------
+
 
 HERE = Path(__file__).parent  # which workers import too, where there is no conftest
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(HERE.parents[1]), str(HERE)])}
@@ -366,6 +376,137 @@ def test_studies_are_listed_and_run_by_name(monkeypatch, capsys, tmp_path):
         studies.main(["good", "--out", str(tmp_path), "--json", str(tmp_path / "good.json")])
     assert ended.value.code == 0
     assert (tmp_path / "fake_good.md").exists()
+
+
+# ---- cluster -------------------------------------------------------------------------------------
+
+
+@contextmanager
+def dask(folder: Path, *worker: str, **more: Any) -> Iterator[tuple[str, list[Any]]]:
+    """A real Dask scheduler on loopback and its worker, as their address and processes."""
+    if importlib.util.find_spec("distributed") is None:
+        pytest.skip("distributed is not installed: pip install 'minimax-cal[distributed]'")
+    file, here = folder / "scheduler.json", ["--dashboard-address", "127.0.0.1:0"]
+    quiet = {"cwd": folder, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    start = partial(subprocess.Popen, env=ENVIRONMENT | more, **quiet)
+    command = [sys.executable, "-m", "dask"]
+    place = ["--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file)]
+    running = [start([*command, "scheduler", *place, *here])]
+    try:
+        wait_for(lambda: file.exists() and file.stat().st_size)
+        address = json.loads(file.read_text())["address"]
+        running.append(start([*command, "worker", address, *worker, *here]))
+        yield address, running
+    finally:
+        for process in reversed(running):  # workers first: they sign off at the scheduler
+            process.terminate()
+            try:
+                process.wait(10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A cluster of two worker processes."""
+    size = ("--nworkers", "2", "--nthreads", "1")
+    failures = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+    folder = tmp_path_factory.mktemp("cluster")
+    patched = pytest.MonkeyPatch.context()
+    with dask(folder, *size, **failures) as (address, _), patched as patch:
+        patch.setattr(parallel, "PATIENCE", 60.0)  # a loaded machine answers late
+        yield address
+
+
+def test_a_cluster_gives_the_same_results(cluster, tmp_path):
+    expected = [work(job) for job in JOBS]
+    found = sweep(work, JOBS, name="dask", cluster=cluster, folder=tmp_path)
+    assert same(found, expected)
+    processes = {each.process for each in found}
+    assert len(processes) == 2
+    assert os.getpid() not in processes
+    again = sweep(work, JOBS, name="dask", folder=tmp_path)  # kept: no matter where it ran
+    assert same(again, expected)
+    assert {each.process for each in again} == processes
+
+
+def test_calibrate_many_is_what_one_process_finds(cluster):
+    sheets = [mc.simulate("irb120", 30, 1, seed).data for seed in range(2)]
+    broken = sheets[0].take(np.arange(2))
+    found = mc.calibrate_many("irb120", [sheets[0], broken, sheets[1]], cluster=cluster)
+    assert isinstance(found[1], mc.CalibrationError)
+    for fit, sheet in zip(found[::2], sheets, strict=True):
+        assert isinstance(fit, mc.Fit)
+        assert_array_equal(fit.robot.mdh, mc.calibrate("irb120", sheet).robot.mdh)
+
+
+@pytest.mark.slow
+def test_a_diagnosis_is_what_one_process_finds(cluster):
+    data = mc.simulate("irb120", 60, 1, 1, truth=mc.Truth(compliance=3e-6)).data
+    alone, found = mc.diagnose("irb120", data), mc.diagnose("irb120", data, cluster=cluster)
+    assert found.verdict == alone.verdict
+    assert [f.term.text for f in found.effects] == [f.term.text for f in alone.effects]
+    assert_allclose(found.beyond.typical_mm, alone.beyond.typical_mm, rtol=1e-12)
+
+
+def test_a_fleet_is_what_one_process_finds(cluster, tmp_path, says):
+    cells = tmp_path / "cells.toml"
+    lines = ['[defaults]\nrobot = "irb120"\nobjective = "sum"\ntolerance = "rms 0.5"']
+    for name in ("0", "1"):
+        sheet = mc.simulate("irb120", 30, 1, int(name)).data
+        mc.write_measurements(tmp_path / f"{name}.csv", sheet)
+        lines.append(f'[[cells]]\nname = "{name}"\ndata = "{name}.csv"')
+    lines.append('[[cells]]\nname = "none"\ndata = "none.csv"')
+    cells.write_text("\n".join(lines))
+    told = json.loads(says("fleet", cells, "--cluster", cluster, "--json", code=1).out)
+    assert [row["status"] for row in told["rows"]] == ["converged", "converged", "failed"]
+    assert told == mc.fleet(cells, processes=1).to_dict()
+
+
+def test_a_cluster_with_other_code_is_refused(cluster, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "fingerprint", lambda function: "other")
+    with pytest.raises(OptionError, match="other code"):
+        sweep(work, JOBS, name="other", cluster=cluster, folder=tmp_path)
+
+
+def test_a_cluster_without_the_study_is_refused(cluster, tmp_path, monkeypatch):
+    (tmp_path / "only_here.py").write_text("def work(job):\n    return job\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    import only_here
+
+    with pytest.raises(OptionError, match="no module 'only_here'"):
+        sweep(only_here.work, [1, 2], name="lost", cluster=cluster, folder=tmp_path)
+
+
+def test_errors_of_a_job_come_back_from_a_cluster(cluster, tmp_path):
+    with pytest.raises(ModuleNotFoundError, match="no extra for"):
+        sweep(missing, [1, 2], name="error", cluster=cluster, folder=tmp_path)
+
+
+def test_a_job_that_kills_its_worker_ends_the_sweep(cluster, tmp_path):
+    with pytest.raises(click.ClickException, match="worker"):  # joblib's backend waits for ever
+        sweep(kill_worker, [0, 1], name="killed", cluster=cluster, folder=tmp_path)
+
+
+@pytest.mark.parametrize("dead", ["worker", "scheduler"])
+def test_a_deserted_cluster_is_not_waited_for(dead, tmp_path, monkeypatch):
+    monkeypatch.setattr(parallel, "PATIENCE", 60.0)
+    monkeypatch.setattr(parallel, "DESERTED", 1.0)
+    monkeypatch.setattr(parallel, "WATCH", 0.2)
+    jobs = [Job(seed, str(tmp_path / "log"), 0.3) for seed in range(100)]
+    with dask(tmp_path, "--no-nanny", "--nthreads", "1") as (address, running):
+
+        def end() -> None:
+            wait_for(lambda: any(tmp_path.glob("deserted/*.part")))
+            running[dead == "worker"].kill()
+
+        with ThreadPoolExecutor(1) as other:
+            ending = other.submit(end)
+            with pytest.raises(click.ClickException, match="tcp://"):
+                sweep(work, jobs, name="deserted", cluster=address, folder=tmp_path)
+        ending.result()
+    assert len(list(tmp_path.glob("deserted/*.part"))) >= 1  # what arrived is kept
 
 
 def test_a_study_starts_under_its_own_name(monkeypatch):

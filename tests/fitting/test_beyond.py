@@ -1,34 +1,49 @@
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, cast
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from scipy import stats
 
 import minimax_cal as mc
 from minimax_cal.fitting import beyond
 from minimax_cal.fitting.beyond import (
-    RESOLUTION,
     needed,
     one_step,
     step_without,
     unidentified,
     without,
 )
+from minimax_cal.fitting.crossed import MIN_HELD_POSES
+from minimax_cal.fitting.intervals import (
+    Interval,
+    chance_of_larger,
+    max_interval,
+    rms_interval,
+    told,
+    top_of_normal,
+)
 from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import plain
+from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import parts
 from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.model import moved
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 
+# ---- beyond --------------------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize("objective", ["sum", "smr:2"])
 def test_a_part_is_judged_by_a_fit_without_it(robot, noisy, objective):
     fit = mc.calibrate(robot, noisy.data, objective, holdout=0.0)
-    fold = fit.beyond.folds[0]
+    found = fit.beyond
+    fold = found.folds[0]
     part = next(p for p in parts(fit.data) if p.name == fold.where)
     labels = np.where(part.rows, "holdout", "train")
     columns = {**noisy.data.columns, "split": labels}
@@ -36,6 +51,11 @@ def test_a_part_is_judged_by_a_fit_without_it(robot, noisy, objective):
     # one step of Gauss and Newton against the whole search
     assert_allclose(fold.rms_mm, fresh.accuracy["holdout"].rms_mm, rtol=5e-3)
     assert fold.poses == part.rows.sum()
+    poses, rms = np.array([(each.poses, each.rms_mm) for each in found.folds]).T
+    assert_allclose(found.typical_mm**2, (poses * rms**2).sum() / poses.sum(), rtol=1e-12)
+    assert found.worst_mm == found.worst.rms_mm == max(rms)
+    assert len(found.spans) == 6
+    assert (found.narrow, plain(found)["plan"]) == ((), None)
 
 
 def test_effects_stand_beside_geometry_alone(robot):
@@ -47,24 +67,6 @@ def test_effects_stand_beside_geometry_alone(robot):
     assert [fold.where for fold in fit.beyond.folds] == list(shared)  # an effect costs no part
     for fold in fit.beyond.folds:
         assert_allclose(fold.geometric_mm, shared[fold.where], rtol=5e-3)
-
-
-def test_typical_is_pooled_and_worst_is_named(robot, noisy):
-    found = mc.calibrate(robot, noisy.data, "sum").beyond
-    assert found.worst is not None
-    assert found.worst_mm == max(fold.rms_mm for fold in found.folds)
-    poses = np.array([fold.poses for fold in found.folds])
-    square = np.array([fold.rms_mm**2 for fold in found.folds])
-    assert_allclose(found.typical_mm**2, (poses * square).sum() / poses.sum(), rtol=1e-12)
-
-
-def test_no_part_can_be_spared_of_few_poses(robot):
-    few = simulate(robot, 12).data
-    found = mc.calibrate(robot, few, "sum", holdout=0.0, fix="beta*").beyond
-    content = plain(found)
-    assert content["typical_mm"] is None or found.folds
-    if not found.folds:
-        assert content["reason"]
 
 
 def test_a_fit_that_extrapolates_badly_says_so(robot):
@@ -110,30 +112,6 @@ def test_parts_that_effects_alone_need_are_judged_as_a_calibration_of_the_rest_w
     assert "40 poses, each judged" in fit.headline()
 
 
-def test_the_search_goes_on_where_one_step_does_not_arrive(robot):
-    data = one_end(robot, 36, half=0.5)
-    effects = ("gear_error:J5:orders=3", "gear_error:J6:orders=3")
-    fit = mc.calibrate(robot, data, "sum", effects=effects)
-    estimator, state = fit.estimator, fit.cell.state
-    poses, far = Poses.of(estimator, state), 0
-    effects_of = np.flatnonzero(estimator.model.active) >= estimator.model.names.geometric
-    for part in (part.rows[~fit.held] for part in parts(fit.data)):
-        near = moved(estimator.model, state, step_without(poses, part))
-        sums = poses.sums_by_part([part])
-        if unidentified(poses, sums.gram[0], effects_of).any():
-            continue
-        if one_step(poses, [part], sums, np.ones(1, dtype=bool)):
-            continue
-        far += 1
-        (found,) = without(estimator, state, [part], 0)
-        assert found is not None
-        there = Poses.of(estimator, found)
-        step, more = step_without(there, part), step_without(Poses.of(estimator, near), part)
-        motion, left = (float(one @ there.normal_matrix @ one) for one in (step, more))
-        assert motion < 1e-6 * left  # a further step leads nowhere
-    assert far
-
-
 def test_parts_that_none_can_judge_are_counted_and_named(robot):
     """Joint 6 stands still but at a few poses, which geometry cannot do without."""
     ideal = simulate(robot, 60, seed=5)
@@ -151,33 +129,6 @@ def test_parts_that_none_can_judge_are_counted_and_named(robot):
     assert found.table().rows[-1][0] == f"{len(found.folds)} of {made} parts"
     assert plain(found)["not_judged"] == list(found.missed)
     assert plain(found)["effects_sought_anew"] is None
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """Poses of two parameters, whose columns are (m, 2), beside a prior of these weights."""
-
-    rows: Array
-    weights: float
-
-    @property
-    def normal_matrix(self) -> Array:
-        return self.gram_of(np.ones(len(self.rows), dtype=bool)) + self.weights * np.eye(2)
-
-    def gram_of(self, part: Array) -> Array:
-        return cast(Array, self.rows[part].T @ self.rows[part])
-
-
-@pytest.mark.parametrize("weight", [0.0, 1e-2 * RESOLUTION**2])
-@pytest.mark.parametrize(
-    ("apart", "lost"),
-    [([1.0, 1.0, 1.0, 1.0], False), ([0.0, 0.0, 0.0, 0.0], False), ([1.0, 0.0, 0.0, 0.0], True)],
-)
-def test_what_no_pose_tells_costs_no_part(apart, lost, weight):
-    """Of two parameters with nearly the same columns: told by all poses, by none, by the first."""
-    rows: Any = np.stack([np.ones(4), 1.0 + np.array(apart) * [1e-2, -1e-2, 1e-2, -1e-2]], axis=1)
-    poses = Rows(rows, weight)
-    assert needed(cast(Poses, poses), np.arange(4) == 0) is lost
 
 
 @pytest.mark.parametrize("seed", [2, 5])
@@ -221,10 +172,7 @@ def rms_mm(arm: mc.Fit, made: Simulation, q: Array) -> float:
 
 @pytest.mark.parametrize(
     ("joints", "degrees", "narrow"),
-    [
-        ((0, 1, 2), 0.0, ["J1", "J2", "J3"]),
-        (range(6), 2.6, ["J1", "J2", "J3", "J4", "J5", "J6"]),
-    ],
+    [((0, 1, 2), 0.0, ["J1", "J2", "J3"]), (range(6), 2.6, ["J1", "J2", "J3", "J4", "J5", "J6"])],
 )
 def test_nothing_is_claimed_outside_what_joints_spanned(robot, joints, degrees, narrow):
     made = with_spans(robot, joints, degrees)
@@ -255,14 +203,6 @@ def test_what_joints_spanned_survives_the_file(robot):
     assert bare.spans == fit.spans
 
 
-def test_joints_that_moved_are_not_named(robot, noisy):
-    found = mc.calibrate(robot, noisy.data, "sum").beyond
-    assert found.worst is not None
-    assert not found.narrow
-    assert len(found.spans) == 6
-    assert plain(found)["plan"] is None
-
-
 def test_a_diagnosis_claims_nothing_outside_either(robot):
     found = mc.diagnose(robot, with_spans(robot, (0, 1, 2), 0.0).data)
     gap = found.to_dict()["gap"]["beyond"]
@@ -287,13 +227,253 @@ def test_the_plan_that_is_offered_mends_it(robot):
     assert rms_mm(mended, made, anywhere) < mended.beyond.worst_mm
 
 
-def test_sums_by_part_are_those_of_each_part(robot, noisy):
-    fit = mc.calibrate(robot, noisy.data, "sum")
-    poses = Poses.of(fit.estimator, fit.cell.state)
-    masks = [np.arange(poses.seen.shape[1]) % 4 == number for number in range(4)]
-    every = poses.sums_by_part(masks)
-    for i, mask in enumerate(masks):
-        gram, pull = poses.sums_of(mask)
-        assert_allclose(every.gram[i], gram, rtol=0, atol=1e-12 * np.abs(gram).max())
-        assert_allclose(every.gradient[i], pull, rtol=0, atol=1e-12 * np.abs(poses.error).sum())
-    assert_allclose(every.square.sum(), poses.estimator.whole.cost(poses.state).sum(), rtol=1e-12)
+# ---- crossed -------------------------------------------------------------------------------------
+
+
+ONE_STEP = 0.02  # of an error's size: a fit without a fold is one Gauss-Newton step away
+
+
+def test_every_pose_is_judged_by_a_fit_without_it(robot, noisy):
+    """One held-out pose each, so that a fold's own fit can be had by `split`."""
+    fit = mc.calibrate(robot, noisy.data, "sum", cv=True, seed=3)
+    held = fit.error_crossed[:, fit.held]
+    assert_allclose(held, fit.errors["holdout"], rtol=0, atol=1e-12)
+    folds = np.random.default_rng(3).permutation(48) % 10
+    for number in (0, 7):
+        rows = np.flatnonzero(~fit.held)[_by_group(fit, folds) == number]
+        label = np.where(np.isin(np.arange(60), rows) | fit.held, "holdout", "train")
+        other = mc.Measurements(**{**vars(noisy.data), "columns": {"split": label}})
+        again = mc.calibrate(robot, other, "sum").cell.error(noisy.data.take(rows))
+        assert_allclose(
+            accuracy(fit.error_crossed[:, rows]).rms_mm, accuracy(again).rms_mm, rtol=ONE_STEP
+        )
+
+
+def _by_group(fit: mc.Fit, folds: np.ndarray) -> np.ndarray:
+    """(training poses,) the fold of each, by the order of its joints."""
+    from minimax_cal.measuring.grouping import clusters
+
+    group = clusters(fit.data)
+    return folds[np.searchsorted(np.unique(group[~fit.held]), group[~fit.held])]
+
+
+def test_few_held_out_poses_are_cross_validated(robot):
+    few, many = (simulate(robot, count, 3, seed=5).data for count in (60, 100))
+    told = mc.calibrate(robot, few, "sum")
+    assert told.accuracy["holdout"].poses < MIN_HELD_POSES
+    assert any("the result is cross-validated" in notice for notice in told.notices)
+    assert "60 poses, each judged by a fit without it" in told.headline()
+    assert_allclose(told.within.after.rms_mm, accuracy(told.error_crossed).rms_mm, rtol=1e-12)
+    plain = mc.calibrate(robot, many, "sum")
+    assert not plain.error_crossed.size
+    assert "20 poses that were not used for the fit" in plain.headline()
+    again = mc.Fit.from_dict(told.to_dict())
+    assert again.within == told.within
+    assert told.to_dict()["accuracy"]["cv"]["poses"] == 60
+    # the truth of a random hold-out stays where it was
+    assert told.to_dict()["accuracy"]["holdout"]["poses"] == 12
+
+
+def test_too_few_poses_are_a_loud_warning(robot):
+    """8 training poses of 3 targets tell 48 numbers, for 33 parameters."""
+    data = simulate(robot, 10, 3, seed=5).data
+    with pytest.warns(mc.CalibrationWarning, match="too few poses: 8 training poses tell 48"):
+        fit = mc.calibrate(robot, data, "sum")
+    said = next(notice for notice in fit.notices if notice.startswith("too few poses"))
+    assert "for 33 free parameters" in said
+    assert "measure at 17 poses or more" in said
+    held, train = fit.accuracy["holdout"].rms_mm, fit.accuracy["train"].rms_mm
+    assert held > 1.5 * train
+
+
+# ---- intervals -----------------------------------------------------------------------------------
+
+
+RUNS = 300
+CHANCE = 3.3 * np.sqrt(0.95 * 0.05 / RUNS)  # one test in a thousand fails by chance
+
+
+def rng_of(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def both(error: Array, seed: int = 0) -> Array:
+    """Ends of both intervals, (4,)."""
+    out = [f(error, rng=rng_of(seed)) for f in (rms_interval, max_interval)]
+    return np.array([end for interval in out for end in (interval.low, interval.high)])
+
+
+@settings(max_examples=40)
+@given(st.integers(3, 40), st.integers(1, 4), st.floats(1e-7, 1e3), st.integers(0, 99))
+def test_intervals_scale_with_the_errors(m, k, size, seed):
+    error = rng_of(seed).normal(size=(k, m, 3))
+    low, high, least, most = both(error)
+    rms = np.sqrt((error**2).sum(-1).mean())
+    assert 0.0 < low < rms < high
+    assert 0.0 < least < most
+    assert_allclose(both(size * error), size * np.array([low, high, least, most]), rtol=1e-9)
+
+
+def test_targets_of_a_pose_are_no_further_poses(rng):
+    error = rng.normal(size=(1, 20, 3))
+    assert_allclose(both(np.repeat(error, 3, axis=0)), both(error), rtol=1e-12)
+
+
+def test_what_was_not_measured_does_not_count(rng):
+    error = rng.normal(size=(3, 20, 3))
+    error[1, ::2] = np.nan
+    padded = np.concatenate([error, np.full((3, 7, 3), np.nan)], axis=1)
+    assert_allclose(both(padded), both(error), rtol=1e-12)
+    turned = error[::-1] @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    assert_allclose(both(turned), both(error), rtol=1e-9)
+
+
+def test_too_few_poses_tell_nothing():
+    for m in range(3):
+        assert np.isnan(both(np.ones((2, m, 3)))).all()
+    assert rms_interval(np.zeros((1, 5, 3)), rng=rng_of()) == Interval(0.0, 0.0)
+    assert max_interval(np.zeros((1, 5, 3)), rng=rng_of()) == Interval(0.0, 0.0)
+
+
+@pytest.mark.parametrize(("m", "zero"), [(12, 6), (7, 6), (400, 399)])
+def test_exact_zeros_are_the_smallest_errors(m, zero):
+    """Bootstrap samples may hold nothing but zeros: no warning, and the ends of tiny errors."""
+    error = rng_of(5).normal(size=(1, m, 3))
+    error[:, :zero] = 0.0
+    found, tiny = (
+        rms_interval(errors, rng=rng_of())
+        for errors in (error, np.where(error == 0.0, 1e-12, error))
+    )
+    rms = np.sqrt((error**2).sum() / m)
+    assert 0.0 < found.low < rms < found.high
+    assert_allclose([found.low, found.high], [tiny.low, tiny.high], rtol=1e-9)
+    assert np.isnan(told(found, rms).high) == (m == zero + 1)  # one pose is all of the error
+
+
+def test_an_upper_end_of_the_law_alone_is_not_told():
+    """Seven poses of which one is nearly all of the error: no sample without it tells anything."""
+    error = np.zeros((1, 7, 3))
+    error[0, :, 0] = [2.09, 0.31, 0.35, 0.4, 0.29, 0.38, 0.33]
+    for interval, seen in ((rms_interval, np.sqrt((error**2).sum() / 7)), (max_interval, 2.09)):
+        found = interval(error, rng=rng_of())
+        assert found.high > 10.0 * seen
+        assert told(found, seen).low == found.low
+        assert np.isnan(told(found, seen).high)
+    for end, said in ((2.0, 2.0), (0.9, 1.0)):  # never below what was seen
+        assert told(Interval(0.5, end), 1.0) == Interval(0.5, said)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(3, 30), st.data())
+def test_exact_poses_count_as_nearly_exact_ones(m, data):
+    """Bootstrap samples of exact poses alone have no logarithm; the limit of small errors does."""
+    exact = data.draw(st.integers(1, m - 1))
+    error = rng_of(m).normal(size=(2, m, 3))
+    error[:, :exact] = 0.0
+    low, high, least, most = found = both(error)
+    assert 0.0 < low <= np.sqrt((error**2).sum(-1).mean()) <= high < np.inf
+    assert 0.0 < least <= most < np.inf
+    error[:, :exact] = 1e-9
+    assert_allclose(both(error), found, rtol=1e-6)
+
+
+def test_many_normal_errors_give_the_chi_square_interval(rng):
+    """3m normal coordinates of one variance: its exact interval, within 10 % of its width."""
+    error = rng.normal(size=(1, 2000, 3))
+    found = rms_interval(error, rng=rng_of())
+    total, free = float((error**2).sum()), 6000
+    exact = np.sqrt(total / stats.chi2.ppf([0.975, 0.025], free) * 3.0)
+    assert_allclose([found.low, found.high], exact, rtol=0, atol=0.1 * np.ptp(exact))
+
+
+def test_a_wider_level_is_wider(rng):
+    error = rng.normal(size=(3, 12, 3))
+    for interval in (rms_interval, max_interval):
+        wide, narrow = (interval(error, level=v, rng=rng_of()) for v in (0.99, 0.8))
+        assert wide.low < narrow.low < narrow.high < wide.high
+
+
+# Known shortfall of each law at these numbers of poses, from 1500 samples each: the method is no
+# better on few skew squares.
+LAWS = {
+    "tracker noise": (lambda rng, n: rng.chisquare(3, n), 3.0, 10, 0.01),
+    "one axis": (lambda rng, n: rng.chisquare(1, n), 1.0, 20, 0.01),
+    "skew": (lambda rng, n: np.exp(0.7 * rng.normal(size=n)), np.exp(0.245), 40, 0.015),
+    "half exact": (lambda rng, n: rng.chisquare(3, n) * rng.integers(0, 2, n), 1.5, 20, 0.01),
+    "very skew": (lambda rng, n: np.exp(rng.normal(size=n)), np.exp(0.5), 20, 0.03),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_the_rms_interval_covers(name):
+    """95 % less the known shortfall, within 3.3 standard deviations of the number of runs."""
+    law, mean, poses, loss = LAWS[name]
+    rng, held = rng_of(1), 0
+    for _ in range(RUNS):
+        error = np.zeros((1, poses, 3))
+        error[0, :, 1] = np.sqrt(law(rng, poses))
+        found = rms_interval(error, rng=rng)
+        held += found.low <= np.sqrt(mean) <= found.high
+    assert 0.95 - loss - CHANCE < held / RUNS < 0.95 + loss + CHANCE
+
+
+@pytest.mark.parametrize(("name", "poses"), [("exact", 10), ("exact", 40), ("tracker", 20)])
+def test_the_largest_of_new_poses_is_covered(name, poses):
+    """Lognormal distances: 95 %.  Lighter tails, as of noise: up to 3 % more."""
+    rng, held = rng_of(2), 0
+    for _ in range(RUNS):
+        if name == "exact":
+            distance = np.exp(0.6 * rng.normal(size=2 * poses))
+        else:
+            distance = np.sqrt(rng.chisquare(3, 2 * poses))
+        error = np.zeros((1, poses, 3))
+        error[0, :, 2] = distance[:poses]
+        found = max_interval(error, rng=rng)
+        held += found.low <= distance[poses:].max() <= found.high
+    more = 0.0 if name == "exact" else 0.03
+    assert 0.95 - CHANCE < held / RUNS < 0.95 + more + CHANCE
+
+
+def test_chance_of_a_larger_error_is_free_of_the_law(rng):
+    """The next of n + 1 is the largest as often as any other; 4 standard deviations."""
+    runs, n = 20000, 14
+    for sample in (rng.standard_cauchy((runs, n + 1)), rng.uniform(size=(runs, n + 1))):
+        share = float(np.mean(sample[:, n] > sample[:, :n].max(axis=1)))
+        p_value = chance_of_larger(n)
+        assert abs(share - p_value) < 4.0 * np.sqrt(p_value / runs)
+
+
+def test_the_search_goes_on_where_one_step_does_not_arrive(robot):
+    data = one_end(robot, 36, half=0.5)
+    effects = ("gear_error:J5:orders=3", "gear_error:J6:orders=3")
+    fit = mc.calibrate(robot, data, "sum", effects=effects)
+    estimator, state = fit.estimator, fit.cell.state
+    poses, far = Poses.of(estimator, state), 0
+    effects_of = np.flatnonzero(estimator.model.active) >= estimator.model.names.geometric
+    for part in (part.rows[~fit.held] for part in parts(fit.data)):
+        near = moved(estimator.model, state, step_without(poses, part))
+        sums = poses.sums_by_part([part])
+        if unidentified(poses, sums.gram[0], effects_of).any():
+            continue
+        if one_step(poses, [part], sums, np.ones(1, dtype=bool)):
+            continue
+        far += 1
+        (found,) = without(estimator, state, [part], 0)
+        assert found is not None
+        there = Poses.of(estimator, found)
+        step, more = step_without(there, part), step_without(Poses.of(estimator, near), part)
+        motion, left = (float(one @ there.normal_matrix @ one) for one in (step, more))
+        assert motion < 1e-6 * left  # a further step leads nowhere
+    assert far
+
+
+def test_the_largest_of_normal_samples_follow_their_law():
+    """The largest of n has the distribution Phi^n; all of n sorted are a normal sample."""
+    top = top_of_normal(12, 5, rng_of(3))
+    assert np.all(np.diff(top, axis=1) < 0.0)
+    assert stats.kstest(stats.norm.cdf(top[:, 0]) ** 12, "uniform").pvalue > 1e-3
+    fifth = stats.beta(12 - 4, 5)  # the fifth largest of 12 uniform numbers
+    assert stats.kstest(fifth.cdf(stats.norm.cdf(top[:, 4])), "uniform").pvalue > 1e-3
+    every = top_of_normal(6, 6, rng_of(4)).reshape(-1)
+    assert abs(every.mean()) < 4.0 / np.sqrt(len(every))
+    assert abs(every.var() - 1.0) < 4.0 * np.sqrt(2.0 / len(every))

@@ -1,22 +1,23 @@
+from __future__ import annotations
+
+import dataclasses
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import qpsolvers
+import threadpoolctl
+from conftest import shared
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.modelling.simulate import Truth, simulate
+from qp_backends import Solution
 
-
-def test_true_robot_is_found_without_noise(robot, clean):
-    fit = mc.calibrate(robot, clean.data, "sum")
-    assert fit.status == "converged"
-    assert fit.accuracy["holdout"].max_mm < 1e-8
-    assert fit.accuracy["nominal"].rms_mm > 0.5
-    new = np.random.default_rng(0).uniform(-2, 2, (50, 6))
-    assert_allclose(fit.predict(new), clean.cell.predict(new), rtol=0, atol=1e-10)
+# ---- calibrate -----------------------------------------------------------------------------------
 
 
 def test_each_accuracy_is_of_its_own_rows(robot, noisy):
@@ -147,14 +148,6 @@ def test_fixing_every_link_leaves_base_and_targets(robot, noisy):
     assert_allclose(fit.accuracy["train"].rms_mm, fit.accuracy["nominal_train"].rms_mm, rtol=1e-9)
 
 
-def test_parameters_that_are_not_identified_keep_their_value():
-    for name in ("scara_600", "irb2600"):
-        robot = mc.load_robot(name)
-        fit = mc.calibrate(robot, simulate(robot, 60, 3, seed=4).data, free=["d1"])
-        for p in fit.parameters:
-            assert p.identifiable or p.value == p.nominal
-
-
 def test_priors_help_when_poses_are_few(robot):
     made = simulate(robot, 60, 1, seed=12, truth=Truth(compliance=0, noise=2e-4))
     few = made.data.take(np.arange(11))
@@ -181,22 +174,15 @@ def test_targets_that_follow_weigh_no_prior(robot, noisy):
 
 
 def test_a_tight_prior_pins_and_a_wide_one_does_nothing(robot, noisy):
-    plain = mc.calibrate(robot, noisy.data, "sum", holdout=0.0)
-    wide = mc.calibrate(robot, noisy.data, "sum", holdout=0.0, priors={"a2": 1e3})
-    tight = mc.calibrate(robot, noisy.data, "sum", holdout=0.0, priors={"a2": 1e-9})
-    value = {
-        key: next(p for p in fit.parameters if p.name == "a2")
-        for key, fit in (("plain", plain), ("wide", wide), ("tight", tight))
-    }
-    assert_allclose(value["wide"].value, value["plain"].value, atol=1e-10)
-    assert_allclose(value["tight"].value, 0.9, atol=1e-9)
-    assert value["tight"].sigma < 1e-3 * value["plain"].sigma
-
-
-def test_minimax_takes_priors_too(robot, noisy):
-    fit = mc.calibrate(robot, noisy.data, "minimax", priors={"a2": 1e-9})
-    assert fit.status == "converged"
-    assert_allclose(next(p.value for p in fit.parameters if p.name == "a2"), 0.9, atol=1e-8)
+    plain, wide, tight, worst = (
+        mc.calibrate(robot, noisy.data, objective, holdout=0.0, priors=priors).parameters["a2"]
+        for objective, priors in (
+            ("sum", {}), ("sum", {"a2": 1e3}), ("sum", {"a2": 1e-9}), ("minimax", {"a2": 1e-9})
+        )
+    )  # fmt: skip
+    assert_allclose(wide.value, plain.value, atol=1e-10)
+    assert_allclose([tight.value, worst.value], 0.9, atol=1e-8)
+    assert tight.sigma < 1e-3 * plain.sigma
 
 
 def test_u95_weights_the_fit(robot):
@@ -219,28 +205,13 @@ def test_u95_weights_the_fit(robot):
 def test_saved_fit_comes_back(robot, noisy, tmp_path):
     fit = mc.calibrate(robot, noisy.data)
     fit.save(tmp_path / "fit.json")
-    cell = mc.load_cell(tmp_path / "fit.json")
-    again = mc.evaluate(cell, noisy.data)
+    again = mc.evaluate(mc.load_cell(tmp_path / "fit.json"), noisy.data)
     assert_allclose(again.rms_mm, mc.evaluate(fit.cell, noisy.data).rms_mm, rtol=1e-9)
     # the calibrated robot is a robot: usable wherever one is
     assert_allclose(mc.load_robot(tmp_path / "fit.json").mdh, fit.robot.mdh, atol=1e-15)
-    content = json.loads((tmp_path / "fit.json").read_text())
-    assert content["schema"] == 1
-    assert {"robot", "objective", "qp", "status", "iterations", "seconds"} <= set(content)
-    for p in content["parameters"]:
-        assert {"name", "value", "nominal", "sigma", "unit", "identifiable"} <= set(p)
+    for p in json.loads((tmp_path / "fit.json").read_text())["parameters"]:
         assert (p["sigma"] is None) == (not p["identifiable"])
-        if not p["identifiable"]:
-            assert p["value"] == pytest.approx(p["nominal"], abs=1e-12)
-    assert set(content["accuracy"]) == {
-        "nominal",
-        "train",
-        "holdout",
-        "nominal_train",
-        "holdout_trusted",
-        "beyond",
-        "cv",
-    }
+        assert p["identifiable"] or p["value"] == pytest.approx(p["nominal"], abs=1e-12)
 
 
 def test_no_holdout_is_said(robot, noisy):
@@ -283,12 +254,14 @@ def test_collinear_targets_are_a_notice(robot):
         ({"method": "newton"}, "no method 'newton'"),
         ({"hessian": "exact"}, "no hessian 'exact'"),
         ({"distance": "cubed"}, "no distance form 'cubed'"),
+        ({"holdout": 0.995}, r"\b60\b"),
+        ({"priors": {"a2": "1e-300mm"}}, r"\ba2\b.*sigma"),
+        ({"priors": {"a2": "1e300mm"}}, r"\ba2\b.*sigma"),
     ],
 )
-def test_wrong_choices_are_refused(options, say, robot, noisy):  # type: ignore[type-arg]
-    with pytest.raises(mc.CalibrationError) as caught:
+def test_wrong_choices_are_refused(options, say, robot, noisy):
+    with pytest.raises(mc.CalibrationError, match=say):
         mc.calibrate(robot, noisy.data, **options)
-    assert say in str(caught.value)
 
 
 def test_pose_after_a_search_over_base_rotations(robot, noisy):
@@ -299,16 +272,14 @@ def test_pose_after_a_search_over_base_rotations(robot, noisy):
     assert fit.accuracy["holdout"].rms_mm < fit.accuracy["nominal"].rms_mm
 
 
-def test_a_holdout_that_leaves_nothing_is_refused(robot, noisy):
-    with pytest.raises(mc.OptionError, match=r"\b60\b"):
-        mc.calibrate(robot, noisy.data, holdout=0.995)
-
-
 @pytest.mark.parametrize("objective", ["sum", "minimax", "point", "pose"])
-def test_exact_data_are_a_success(objective, robot, clean):
+def test_exact_data_are_a_success(objective, robot, clean, rng):
     fit = mc.calibrate(robot, clean.data, objective)
     assert fit.status == "converged"
-    assert fit.accuracy["holdout"].max_mm < 1e-6
+    assert fit.accuracy["holdout"].max_mm < (1e-8 if objective == "sum" else 1e-6)
+    assert fit.accuracy["nominal"].rms_mm > 0.5
+    new = rng.uniform(-2, 2, (50, 6))
+    assert_allclose(fit.predict(new), clean.cell.predict(new), rtol=0, atol=1e-8)
 
 
 def test_only_offsets_leave_the_rest_as_drawn(noisy, robot):
@@ -325,7 +296,219 @@ def test_only_offsets_leave_the_rest_as_drawn(noisy, robot):
         mc.calibrate(robot, noisy.data, only="lengths")
 
 
-@pytest.mark.parametrize("sigma", ["1e-300mm", "1e300mm"])
-def test_a_prior_that_says_nothing_is_refused(robot, noisy, sigma):
-    with pytest.raises(mc.OptionError, match=r"\ba2\b.*sigma"):
-        mc.calibrate(robot, noisy.data, priors={"a2": sigma})
+# ---- default path --------------------------------------------------------------------------------
+
+
+def test_the_default_is_separable_squares_then_warm_started_qps_through_qpsolvers(
+    robot, noisy, monkeypatch
+):
+    seen: list[np.ndarray | None] = []
+    found: list[np.ndarray] = []
+    plain = qpsolvers.solve_problem
+
+    def listen(qp, solver, initvals=None, **settings):
+        answer = plain(qp, solver, initvals=initvals, **settings)
+        seen.append(initvals)
+        found.append(answer.x)
+        assert solver == "daqp"
+        return answer
+
+    monkeypatch.setattr(qpsolvers, "solve_problem", listen)
+    fit = mc.calibrate(robot, noisy.data)
+    assert fit.work.least_squares == "snlgn"
+    assert fit.work.steps > 0
+    assert fit.answered == {"daqp": len(seen)}
+    assert fit.work.qps == len(seen)
+    assert fit.work.warm_starts == len(seen) - 1 > 0
+    assert seen[0] is None
+    for start, last in zip(seen[1:], found, strict=False):
+        assert start is not None
+        np.testing.assert_array_equal(start, last)
+
+
+def test_the_fast_choices_end_at_the_same_optimum(robot, noisy):
+    usual = mc.calibrate(robot, noisy.data)
+    fast = mc.calibrate(robot, noisy.data, method="joint", qp="daqp:direct")
+    assert fast.work.least_squares == "nlgn"
+    assert set(fast.answered) == {"daqp:direct"}
+    assert usual.minimax is not None
+    assert fast.minimax is not None
+    assert_allclose(fast.minimax.size.max(), usual.minimax.size.max(), rtol=1e-9)
+
+
+def test_result_file_and_headline_say_who_answered(robot, noisy, monkeypatch):
+    fit = mc.calibrate(robot, noisy.data)
+    content = fit.to_dict()
+    assert content["answered"] == dict(fit.answered)
+    assert content["work"] == dataclasses.asdict(fit.work)
+    assert content["qp"] == "daqp"
+    again = mc.Fit.from_dict(content) if hasattr(mc, "Fit") else type(fit).from_dict(content)
+    assert (again.answered, again.work) == (fit.answered, fit.work)
+    count = fit.answered["daqp"]
+    assert f"QPs: {count} by daqp ({count - 1} warm-started)" in fit.summary()
+    assert "QPs" not in mc.calibrate(robot, noisy.data, "sum").headline()
+
+
+def test_a_function_of_the_user_is_named(robot, noisy):
+    from qp_backends import Problem
+    from qp_backends import solve as solve_qp
+
+    def mine(problem: Problem) -> Solution:
+        return dataclasses.replace(solve_qp(problem, "daqp"), backend="")
+
+    fit = mc.calibrate(robot, noisy.data, qp=mine)
+    assert list(fit.answered) == ["function mine"]
+    assert fit.work.warm_starts == 0
+
+
+@pytest.mark.parametrize(("method", "least"), [("eliminated", 1e-5), ("raw", 1e-3)])
+@pytest.mark.parametrize("arm", ["irb2600", "irb120", "ur5e"])
+def test_the_papers_subgradient_answers_by_itself(arm, method, least):
+    """RMSE(phi) over the optimum; it is no success unless it is one, and says how far it came."""
+    drawn = mc.load_robot(arm)
+    data = mc.simulate(drawn, 60, 3, seed=0).data
+    best, found = (mc.calibrate(drawn, data, qp=qp) for qp in ("daqp", f"subgradient:{method}"))
+    assert found.answered == {f"subgradient:{method}": found.work.qps}
+    assert found.work.qp_residual > 1e-8
+    assert found.work.warm_starts == 0
+    assert best.minimax is not None
+    assert found.minimax is not None
+    over = np.sqrt(found.minimax.size.max() / best.minimax.size.max()) - 1.0
+    assert over <= least
+    told = [n for n in found.notices if n.startswith("QP: to first order the largest function may")]
+    if found.status == "converged":
+        assert over <= 1e-6
+        assert not told
+    else:
+        assert found.status == "stalled"
+        offered = float(told[0].split(" fall by ")[1].split()[0])
+        assert 200.0 * over <= offered <= 5.0
+    assert f"by subgradient:{method} (used as they are, relative residual up to" in found.headline()
+
+
+def test_small_matrices_get_one_thread(robot):
+    """Two of them wait for each other: a fit took twice as long, its starts thirty times."""
+    seen: list[int] = []
+
+    def threads(_: object = None) -> list[int]:
+        found = threadpoolctl.threadpool_info()
+        return [each["num_threads"] for each in found if each["user_api"] == "blas"]
+
+    with threadpoolctl.threadpool_limits(2, "blas"):
+        before = threads()
+        mc.calibrate(robot, mc.simulate(robot, 30, 2, seed=1).data, "sum",
+                     progress=lambda _: seen.extend(threads()))  # fmt: skip
+        assert threads() == before
+    assert set(seen) == {1}
+
+
+# ---- real data -----------------------------------------------------------------------------------
+
+
+SEEDS = range(10)
+ARMS = ("simulated", "irb120")  # what must hold of both is tested where real data are absent, too
+
+
+def arm_of(name: str) -> tuple[mc.Robot, mc.Measurements]:
+    """A real arm with its measurements, or one like it."""
+    if name != "simulated":
+        robot, path = shared(name)
+        return mc.load_robot(robot), mc.read_measurements(path)
+    robot = mc.load_robot("irb120")
+    return robot, simulate(robot, 70, 3, seed=11).data
+
+
+def medians(name: str, holdout: float) -> tuple[float, float]:
+    robot, data = mc.load_robot(shared(name)[0]), mc.read_measurements(shared(name)[1])
+    fits = [mc.calibrate(robot, data, "sum", holdout=holdout, seed=seed) for seed in SEEDS]
+    assert all(fit.status == "converged" for fit in fits)
+    before, after = ([fit.accuracy[key].rms_mm for fit in fits] for key in ("nominal", "holdout"))
+    return float(np.median(before)), float(np.median(after))
+
+
+@pytest.mark.parametrize(
+    ("name", "holdout", "nominal", "most"),
+    [
+        ("irb120", 0.3, 0.85, 0.33),
+        ("qkm_hl6", 0.2, 3.0, 0.40),
+        ("ur10_b", 0.2, 1.1, 0.50),
+        ("meca500_r", 0.2, 0.09, 0.065),
+    ],
+)
+def test_held_out_accuracy(name, holdout, nominal, most):
+    before, after = medians(name, holdout)
+    assert before == pytest.approx(nominal, rel=0.2)
+    assert after <= most
+
+
+def test_fanuc_leave_one_pose_out():
+    robot, data = (
+        mc.load_robot(shared("fanuc_r2000")[0]),
+        mc.read_measurements(shared("fanuc_r2000")[1]),
+    )
+    before, after = [], []
+    for j in range(data.poses):
+        rest = np.arange(data.poses) != j
+        fit = mc.calibrate(robot, data.take(rest), "sum", holdout=0.0)
+        after.append(mc.evaluate(fit.cell, data.take(~rest)).rms_mm)
+        before.append(mc.evaluate(fit.nominal, data.take(~rest)).rms_mm)
+    assert np.sqrt(np.mean(np.square(before))) == pytest.approx(0.8, rel=0.2)
+    assert np.sqrt(np.mean(np.square(after))) <= 0.52
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("backend", ["quadprog", "clarabel", "osqp", "proxqp"])
+def test_backends_agree(backend, name):
+    robot, data = arm_of(name)
+    best = [
+        max(mc.calibrate(robot, data, qp=qp, holdout=0.3).accuracy["train"].sse_mm2)
+        for qp in ("daqp", backend)
+    ]
+    assert best[1] == pytest.approx(best[0], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("times", "name"),
+    [(2, "simulated"), (3, "irb120"), pytest.param(200, "irb120", marks=pytest.mark.slow)],
+)
+def test_turning_and_moving_the_frame(times, name):
+    nominal, data = arm_of(name)
+    rng = np.random.default_rng(0)
+    total = mc.calibrate(nominal, data, "sum")
+    worst = mc.calibrate(nominal, data, "minimax")
+    for _ in range(times):
+        turn = Rotation.random(rng=rng).as_matrix()
+        moved = data.with_y(data.y @ turn.T + rng.uniform(-5, 5, 3))
+        again = mc.calibrate(nominal, moved, "sum")
+        for key in ("train", "holdout"):
+            length = np.linalg.norm(again.errors[key], axis=-1)
+            np.testing.assert_allclose(
+                length, np.linalg.norm(total.errors[key], axis=-1), rtol=0, atol=1e-9
+            )  # 1e-6 mm
+        other = mc.calibrate(nominal, moved, "minimax")
+        assert max(other.accuracy["train"].sse_mm2) == pytest.approx(
+            max(worst.accuracy["train"].sse_mm2), rel=1e-8
+        )
+
+
+def test_a_part_of_few_poses_is_judged_by_a_fit_that_has_arrived(monkeypatch):
+    """One step from the whole fit says 258 mm at an end of joint 6; files without it say 0.14."""
+    robot, path = shared("fanuc_r2000")
+    effects = ("joint_compliance:all", "gear_error:J6:orders=3")
+    fit = mc.calibrate(robot, path, effects=effects)
+    plain = mc.calibrate(robot, path)
+    assert mc.calibrate(robot, path).beyond.reason.startswith("joint 1 spans")
+    monkeypatch.setattr(
+        "minimax_cal.fitting.beyond.narrow", lambda spans: ()
+    )  # claimed all the same
+    assert [f.where for f in fit.beyond.folds] == [f.where for f in plain.beyond.folds]
+    assert fit.beyond.missed == plain.beyond.missed
+    end = next(f for f in fit.beyond.folds if f.where == "joint 6 at its high end")
+    assert end.rms_mm == pytest.approx(0.144, rel=0.05)
+    assert fit.within.missed == 0
+    assert fit.within.after.poses == 36
+    # the pose that stands out judges outside the measured region as well, and in no fit
+    worst = next(f for f in plain.beyond.folds if f.where == "joint 2 at its high end")
+    assert worst.poses == 4
+    assert plain.beyond.trusted is not None
+    assert plain.beyond.trusted.worst_mm < 0.6 * plain.beyond.worst_mm

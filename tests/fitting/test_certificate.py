@@ -10,22 +10,30 @@ from problems_fit import solve
 import minimax_cal as mc
 from experiments.speed import identified
 from minimax_cal.fitting.certificate import PointCones, certify
+from minimax_cal.fitting.found import Parameter
 from minimax_cal.fitting.minimax_problem import (
     Distances,
     MinimaxProblem,
     measured_distances,
     minimax_problem,
 )
+from minimax_cal.fitting.solve import AT_BOUND
 from minimax_cal.ground import files
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.model import Model, Prior
+from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.effects.table import Fitted, terms
+from minimax_cal.modelling.model import Model, Prior, SumOfSquares
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import Simulation, simulate
+from minimax_cal.robots.gravity import tubes
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.dual_bound import Rows
 from minimax_cal.solvers.minimax import Optimum, Sqp
 from minimax_cal.solvers.status import Status
 from qp_backends import solve as solve_qp
+
+# ---- certificate ---------------------------------------------------------------------------------
+
 
 QP = partial(solve_qp, name="daqp", tolerance=1e-10)
 
@@ -43,7 +51,7 @@ class Setup:
         return minimax_problem(self.model, self.start, self.distances, self.form, "point")
 
     def sqp(self, **settings: object) -> Optimum[State]:
-        return minimax.solve(self.worst, self.start, QP, Sqp(**settings))  # type: ignore[arg-type]
+        return minimax.solve(self.worst, self.start, QP, Sqp(**settings))
 
     def value(self) -> float:
         """The largest distance by the SQP on squared distances [m]."""
@@ -135,18 +143,6 @@ def test_derivatives(name, robot, noisy):
         along = np.einsum("nw,nwp,p->n", rows.r, rows.J, e) / rows.norms
         assert_allclose(along, jacobian, rtol=1e-6, atol=1e-6)
         assert_allclose(rows.C @ e, (plus.c - minus.c) / (2 * step), rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_norms_are_the_sqps_functions(name, robot, noisy):
-    here = CASES[name](robot, noisy)
-    rows = PointCones.of(here.worst).linearise(here.start)
-    f, c = here.worst.evaluate(here.start)
-    assert_allclose(rows.norms**2, f, rtol=1e-12)
-    assert_allclose(rows.c, c, rtol=1e-12)
-    # whitened: the mean of J'J is the identity
-    assert_allclose(np.einsum("nwp,nwq->pq", rows.J, rows.J) / len(f), np.eye(rows.J.shape[2]),
-                    atol=1e-8)  # fmt: skip
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -250,3 +246,75 @@ def test_thousands_of_points(robot):
     points = PointCones.of(many.worst)
     _, optimum = linear_optimum(points.linearise(many.sqp().x), points.lower, points.upper)
     assert_allclose(optimum * np.sqrt(many.worst.size), proof.value, rtol=1e-7)
+
+
+# ---- bounds of effects ---------------------------------------------------------------------------
+
+
+EFFECTS = ("joint_compliance:J2", "joint_compliance:J3", "encoder_gain:J1")
+RISES = "joint_compliance:J3"
+IRB = mc.load_robot("irb2600")
+MASS, COM = tubes(IRB.mdh)
+ARM = replace(IRB, mass=np.maximum(MASS, 1.0), com=COM)  # told: each joint has one compliance
+ALIKE, ROUGHLY = 1e-9, 3e-6  # least squares; what ends by a KKT residual
+OBJECTIVES = ("sum", "minimax", "point", "pose")
+
+
+def measured(compliance: float, seed: int = 0) -> mc.Measurements:
+    """An arm whose third joint gives way so much [rad/(N m)], or rises where that is negative."""
+    rng = np.random.default_rng(seed)
+    plain = mc.simulate(ARM, 60, seed=seed, truth=mc.Truth(compliance=0.0, noise=0.0))
+    scene = plain.cell.scene(with_history(plain.data))
+    found = terms(scene, EFFECTS)
+    values = (np.array([1e-6]), np.array([compliance]), np.array([3e-4]))
+    y = replace(plain.cell, effects=Fitted(found, values)).predict(plain.data.q)
+    return mc.measurements(plain.data.q, y + 15e-6 * rng.normal(size=y.shape))
+
+
+def of(fit: mc.Fit, effect: str) -> list[Parameter]:
+    return [p for p in fit.parameters if p.name.startswith(effect)]
+
+
+@pytest.mark.parametrize("loss", ["square", "huber"])
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_a_compliance_that_would_be_negative_rests_at_0(objective, loss):
+    data = measured(-1e-6)
+    fit = mc.calibrate(ARM, data, objective, effects=EFFECTS, loss=loss)
+    (rests,) = of(fit, RISES)
+    assert rests.value == 0.0
+    assert np.isnan(rests.sigma)
+    assert (rests.identifiable, rests.reason) == (False, AT_BOUND)
+    (soft,) = of(fit, "joint_compliance:J2")
+    assert soft.value > 0.0
+    assert soft.sigma > 0.0
+    assert AT_BOUND in fit.summary(width=200)
+    if loss != "square":  # its scale counts the parameter that rests
+        return
+    without = mc.calibrate(ARM, data, objective, effects=EFFECTS[::2])
+    alike = ALIKE if objective == "sum" else ROUGHLY
+    assert_allclose(fit.robot.mdh, without.robot.mdh, rtol=0, atol=alike)
+    assert_allclose(soft.value, of(without, "joint_compliance:J2")[0].value, rtol=1e-3)
+    assert fit.accuracy["train"].rms_mm == pytest.approx(without.accuracy["train"].rms_mm, rel=1e-5)
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_what_is_positive_is_found_as_without_bounds(objective):
+    fit = mc.calibrate(ARM, measured(2e-6), objective, effects=EFFECTS)
+    (found,) = of(fit, RISES)
+    assert abs(found.value - 2e-6) < 5.0 * found.sigma
+    assert not of(fit, RISES)[0].reason
+
+
+def test_a_fit_at_its_bounds_is_the_best_between_them():
+    """Its slope pulls no parameter that is free, and those at a bound beyond it."""
+    data = measured(-1e-6)
+    fit = mc.calibrate(ARM, data, "sum", effects=EFFECTS)
+    model = fit.estimator.model
+    rests = model.names.geometric + 1
+    assert not model.active[rests]
+    every = model.only(model.active | (np.arange(model.names.count) == rests))
+    _, slope, gram = SumOfSquares(every).normal(fit.cell.state)
+    slope = slope / np.sqrt(np.diag(gram))
+    here = np.flatnonzero(every.active) == rests
+    assert slope[here] < -1e-5
+    assert np.abs(slope[~here]).max() < 1e-7

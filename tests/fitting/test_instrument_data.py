@@ -1,19 +1,33 @@
 """Files of lengths, closures and poses: read as meant, or one line says why not."""
 
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
+from experiments.relative import NOISE, SPOT, Arm, inside, position_errors
+from minimax_cal.fitting.several import RelativeCalibration, relative
+from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments import (
     Instrument,
+    Surface,
     closures,
+    contacts,
     distances,
     flange_poses,
     read_relative,
     write_relative,
 )
+from minimax_cal.instruments.closing import reach
+from minimax_cal.robots.sampling import random_poses
+
+# ---- instrument data -----------------------------------------------------------------------------
+
 
 JOINTS = "q1_rad,q2_rad,q3_rad"
 
@@ -109,10 +123,7 @@ def test_columns_that_nothing_uses_are_named(tmp_path):
     rows = [f"{i / 10},0,0,{500 + i},7,0.02" for i in range(6)]
     path.write_text("\n".join([f"{JOINTS},wire1_mm,operator,u95_mm", *rows]))
     notices = read_relative(path).at.notices
-    assert notices == (
-        f"{path}: column operator is not used",
-        f"{path}: column u95_mm is not used",
-    )
+    assert notices == (f"{path}: column operator is not used", f"{path}: column u95_mm is not used")
 
 
 GOOD = {
@@ -184,14 +195,6 @@ def test_bad_columns_are_one_line_with_place_and_mend(header, cells, place, word
     assert "\n" not in message
 
 
-@pytest.mark.parametrize("header", list(GOOD))
-def test_the_good_columns_are_good(header, tmp_path):
-    path = tmp_path / "good.csv"
-    rows = [f"0.{i},0.2,-0.{i},{cell}" for i, cell in enumerate(GOOD[header])]
-    path.write_text("\n".join([f"{JOINTS},{header}", *rows]))
-    assert read_relative(path).poses == 6
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -235,9 +238,200 @@ def test_bad_arrays():
         distances(q[0], np.ones(6))
 
 
-def test_points_beside_wires_are_said_not_to_be_used(tmp_path):
-    rows = "\n".join(f"{0.1 * i},{0.2 * i},{1000 + i},{i},2,3" for i in range(8))
-    path = tmp_path / "wires.csv"
-    path.write_text(f"q1_rad,q2_rad,wire1_mm,smr1_x_mm,smr1_y_mm,smr1_z_mm\n{rows}\n")
-    said = read_relative(path).at.notices
-    assert any("column smr1_x_mm is not used" in notice for notice in said)
+# ---- contacts ------------------------------------------------------------------------------------
+
+
+BALL, RADIUS, HALF = 0.01, 0.02, 0.1  # of the probe, of spheres, of the cube's edge [m]
+FACES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], dtype=float)
+Places = Callable[[int, np.random.Generator], tuple[Array, Array]]  # where, and the normals there
+
+
+def touched(arm: Arm, rng: np.random.Generator, places: Places, count: int, noise: float) -> Array:
+    """Joints (count, n) at which the true arm's ball is at places of a surface."""
+    q = np.zeros((0, arm.robot.joints))
+    while len(q) < count:
+        goal, normal = places(4 * count, rng)
+        goal = goal + noise * rng.normal(size=(len(goal), 1)) * normal
+        found, gap = reach(arm.real, SPOT, goal, random_poses(arm.robot, len(goal), rng), 30)
+        q = np.concatenate([q, found[(gap < 1e-9) & inside(arm.robot, found)]])[:count]
+    return q
+
+
+def board(normal: Array, centre: Array, half: float) -> Places:
+    """A square patch of a plane; the ball's centre is off it by its radius."""
+    n = np.asarray(normal) / np.linalg.norm(normal)
+    across = np.linalg.svd(n[None])[2][1:]
+
+    def places(count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        p = centre + rng.uniform(-half, half, (count, 2)) @ across + BALL * n
+        return p, np.broadcast_to(n, p.shape)
+
+    return places
+
+
+def dome(centre: Array) -> Places:
+    def places(count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        n = rng.normal(size=(count, 3))
+        n[:, 2] = np.abs(n[:, 2])
+        n /= np.linalg.norm(n, axis=1)[:, None]
+        return centre + (RADIUS + BALL) * n, n
+
+    return places
+
+
+def contacts_with(
+    arm: Arm, rng: np.random.Generator, shapes: list[tuple[Surface, Places]], noise: float,
+    ball: float = np.nan,
+) -> Instrument:  # fmt: skip
+    q = [touched(arm, rng, places, 30, noise) for _, places in shapes]
+    labels = np.repeat([surface.label for surface, _ in shapes], 30)
+    return contacts(np.concatenate(q), labels, [surface for surface, _ in shapes], ball)
+
+
+def planes(arm: Arm, seed: int, noise: float) -> Instrument:
+    size, rng = arm.robot.reach(), np.random.default_rng([seed, 3])
+    specs = [([0, 0, 1], [0.45, 0, 0.1]), ([-1, 0.1, 0], [0.6, 0, 0.4]),
+             ([0, 1, 0.2], [0.3, -0.4, 0.35]), ([0.5, 0.5, 0.7], [-0.1, 0.4, 0.3])]  # fmt: skip
+    boards = [board(np.array(n), size * np.array(c), 0.2) for n, c in specs]
+    return contacts_with(arm, rng, [(Surface(f"B{i}"), b) for i, b in enumerate(boards)], noise)
+
+
+def spheres(arm: Arm, seed: int, noise: float, *, known: bool = True) -> Instrument:
+    size, rng = arm.robot.reach(), np.random.default_rng([seed, 4])
+    centres = size * np.array([[0.45, 0.1, 0.25], [0.1, 0.5, 0.4], [-0.3, -0.4, 0.2]])
+    radius, ball = (RADIUS, BALL) if known else (np.nan, np.nan)
+    shapes = [(Surface(f"K{i}", "sphere", radius), dome(c)) for i, c in enumerate(centres)]
+    return contacts_with(arm, rng, shapes, noise, ball)
+
+
+def cube(arm: Arm, seed: int, noise: float) -> Instrument:
+    rng, turn = np.random.default_rng([seed, 5]), Rotation.from_rotvec([0.2, -0.1, 0.5]).as_matrix()
+    origin = arm.robot.reach() * np.array([0.45, 0.1, 0.3])
+    shapes = [
+        (Surface(f"F{i}", "plane", HALF, n), board(turn @ n, origin + HALF * turn @ n, HALF))
+        for i, n in enumerate(FACES)
+    ]
+    return contacts_with(arm, rng, shapes, noise, BALL)
+
+
+MAKERS = {"planes": planes, "spheres": spheres, "cube": cube}
+
+
+@cache
+def fitted(kind: str, name: str, seed: int, noise: float) -> tuple[Arm, RelativeCalibration]:
+    arm = Arm.of(name, seed, 0.0)
+    return arm, relative(arm.robot, MAKERS[kind](arm, seed, noise))
+
+
+def off(arm: Arm, fit: RelativeCalibration, *, scaled: bool) -> float:
+    """RMS error of fresh positions after the best rigid motion, or similarity [mm]."""
+    spot = 1e-3 * np.array(fit.instrument["target_mm"])
+    q = random_poses(arm.robot, 300, np.random.default_rng(8))
+    return float(
+        1e3 * np.sqrt(np.mean(position_errors(arm, fit.robot, spot, q, scaled=scaled) ** 2))
+    )
+
+
+# ---- the rows ----------------------------------------------------------------------------------
+
+
+# ---- what the fit finds ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["irb2600", "ur10"])
+@pytest.mark.parametrize("kind", list(MAKERS))
+def test_without_noise_the_true_arm_is_found(kind, name):
+    arm, fit = fitted(kind, name, 1, 0.0)
+    assert fit.status == "converged"
+    assert fit.accuracy["nominal"].rms_mm > 0.3
+    assert fit.accuracy["holdout"].max_mm < 1e-6
+    # of the arm and the ball, and of four planes, three spheres, one body
+    assert fit.identified == {"planes": 20 + 12, "spheres": 21 + 9, "cube": 21 + 6}[kind]
+    # planes have no length: the arm is found but for its scale
+    assert off(arm, fit, scaled=kind == "planes") < 1e-5
+    assert any("scale is not identifiable from contacts" in n for n in fit.notices) == (
+        kind == "planes"
+    )
+
+
+@pytest.mark.parametrize("kind", list(MAKERS))
+def test_errors_are_what_the_sigmas_say(kind):
+    ratios = []
+    for name in ("irb2600", "ur10"):
+        for seed in range(4):
+            arm, fit = fitted(kind, name, seed, NOISE)
+            assert fit.accuracy["holdout"].rms_mm < 3e3 * NOISE
+            assert np.isnan(fit.position_sigma) == (kind == "planes")  # which know no length
+            ratios.append(off(arm, fit, scaled=False) / (1e3 * fit.position_sigma))
+    if kind == "planes":
+        return
+    assert 0.45 < np.sqrt(np.mean(np.square(ratios))) < 1.3
+    assert max(ratios) < 3.0
+
+
+def test_what_was_touched_is_where_it_is_said_to_be():
+    _, fit = fitted("cube", "irb2600", 1, NOISE)
+    found = fit.instrument["surfaces"]
+    normals = np.array([found[f"F{i}"]["normal"] for i in range(5)])
+    assert_allclose(normals @ normals.T, FACES @ FACES.T, atol=1e-9)  # a cube
+    sizes = [found[f"F{i}"]["offset_mm"] for i in range(4)]
+    assert_allclose([sizes[0] + sizes[1], sizes[2] + sizes[3]], 2e3 * HALF, atol=1e-6)
+    names = {p.name for p in fit.parameters}
+    assert {"body_x", "body_rz"} <= names
+    assert "ball_radius" not in names  # given
+    assert "surface_F0_offset" not in names
+
+
+def test_unknown_radii_of_ball_and_spheres_are_said_to_be_one():
+    arm = Arm.of("ur10", 2, 0.0)
+    fit = relative(arm.robot, spheres(arm, 2, NOISE, known=False))
+    told = {p.name: p for p in fit.parameters}
+    assert not told["ball_radius"].identifiable
+    assert "all surfaces moved together" in told["ball_radius"].reason
+    sums = [fit.instrument["surfaces"][f"K{i}"]["radius_mm"] for i in range(3)]
+    assert_allclose(sums, 1e3 * (RADIUS + BALL), rtol=2e-3)  # by the scale of the drawing
+
+
+def test_contacts_join_a_tracker():
+    arm, rng = Arm.of("irb2600", 0, 0.0), np.random.default_rng(1)
+    q = random_poses(arm.robot, 20, rng)
+    seen = mc.measurements(q, arm.place(q) + NOISE * rng.normal(size=(20, 3)))
+    fit = relative(arm.robot, [planes(arm, 0, NOISE), seen])
+    assert [one.name for one in fit.instruments] == ["contacts", "points"]
+    assert not any("scale" in notice for notice in fit.notices)
+    assert fit.instruments[1].directions_alone == 1  # the scale
+    spot = 1e-3 * np.array(fit.instruments[0].instrument["target_mm"])
+    checks = random_poses(arm.robot, 300, np.random.default_rng(8))
+    error = position_errors(arm, fit.robot, spot, checks, scaled=False)
+    assert np.sqrt(np.mean(error**2)) < 1.6 * fit.position_sigma < 40e-6
+
+
+# ---- slips and files ---------------------------------------------------------------------------
+
+
+def test_slips_are_named():
+    arm = Arm.of("irb2600", 1, 0.0)
+    data = planes(arm, 1, NOISE)
+    turned = replace(data, at=replace(data.at, q=data.at.q * [1, 1, -1, 1, 1, 1]))
+    with pytest.raises(mc.DataError, match="the sign of joint 3 looks reversed"):
+        relative(arm.robot, turned)
+    balls = spheres(arm, 1, NOISE)
+    small = tuple(replace(s, size=1e-3 * s.size) for s in balls.surfaces)
+    with pytest.raises(mc.DataError, match=r"has a radius of .* mm, not 0.02 mm; check radius_mm"):
+        relative(arm.robot, replace(balls, surfaces=small))
+
+
+@pytest.mark.parametrize("kind", list(MAKERS))
+def test_contacts_that_are_written_are_read_back(kind, tmp_path):
+    data = MAKERS[kind](Arm.of("ur10", 0, 0.0), 0, NOISE)
+    path = tmp_path / "contacts.csv"
+    write_relative(path, data)
+    found = read_relative(path)
+    assert found.kind == "contacts"
+    assert found.at.notices == ()
+    assert found.surface.tolist() == data.surface.tolist()
+    assert_allclose(found.ball_radius, data.ball_radius, rtol=0, atol=1e-12)
+    for one, other in zip(found.surfaces, data.surfaces, strict=True):
+        assert (one.label, one.kind) == (other.label, other.kind)
+        assert_allclose(one.size, other.size, rtol=0, atol=1e-12)
+        assert_allclose(one.normal, other.normal, rtol=0, atol=1e-12)

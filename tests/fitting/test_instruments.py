@@ -1,5 +1,6 @@
 """Calibration without coordinates, against simulation with known truth and plain models."""
 
+import json
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
@@ -8,11 +9,13 @@ import numpy as np
 import pytest
 from conftest import SHARED, shared
 from numpy.testing import assert_allclose
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 import minimax_cal.instruments as mc_instruments
 from experiments.relative import (
+    NOISE,
     SIMULATORS,
     SPOT,
     Arm,
@@ -21,16 +24,25 @@ from experiments.relative import (
     place,
     position_errors,
     rank_of,
+    rms_mm,
     run_real,
     seen_from,
     spot_of,
+    true_errors,
 )
 from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.several import RelativeCalibration, relative
 from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.fitting.several.stack import Block, Stack, own_state
 from minimax_cal.ground.arrays import Array
-from minimax_cal.instruments import closures, distances, flange_poses, poses_as_targets
+from minimax_cal.instruments import (
+    Surface,
+    closures,
+    contacts,
+    distances,
+    flange_poses,
+    poses_as_targets,
+)
 from minimax_cal.instruments.closing import closing_poses, reach
 from minimax_cal.instruments.instrument import Words, bare
 from minimax_cal.instruments.options import known_of
@@ -43,7 +55,7 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.sampling import random_poses
 from minimax_cal.solvers.status import Status
 
-NOISE = 15e-6
+# ---- instruments ---------------------------------------------------------------------------------
 
 
 @cache
@@ -97,6 +109,15 @@ def seen(robot: mc.Robot, rng: np.random.Generator) -> tuple[Stack, State]:
     return Stack.of(robot, [replace(tracker, at=at)], ["t"]), x
 
 
+def touches(robot: mc.Robot, rng: np.random.Generator) -> tuple[Stack, State]:
+    surfaces = [Surface("A"), Surface("B", "sphere"), Surface("C", "plane", 0.1, np.eye(3)[0])]
+    surfaces += [Surface("D", "plane", np.nan, np.eye(3)[1]), Surface("E", "sphere", 0.3)]
+    made = contacts(random_poses(robot, 40, rng), [s.label for s in surfaces] * 8, surfaces)
+    probe = made.ready(robot, RelativeOptions())
+    x = own_state(robot.mdh, 0.5 * rng.normal(size=len(probe.names)))
+    return Stack.of(robot, [probe], ["c"]), x
+
+
 def several(robot: mc.Robot, rng: np.random.Generator) -> tuple[Stack, State]:
     made = [make(robot, rng) for make in (seen, wires, sockets)]
     stack = Stack.of(robot, [one.instruments[0] for one, _ in made], ["t", "w", "s"])
@@ -105,7 +126,7 @@ def several(robot: mc.Robot, rng: np.random.Generator) -> tuple[Stack, State]:
     )
 
 
-MAKERS = [seen, wires, sockets, several]
+MAKERS = [seen, wires, sockets, touches, several]
 
 
 @pytest.mark.parametrize("name", ["irb2600", "scara_600"])
@@ -113,7 +134,7 @@ MAKERS = [seen, wires, sockets, several]
 def test_slopes_are_the_derivative_of_the_rows(name, make, rng):
     robot = mc.load_robot(name)
     robot = robot.with_mdh(robot.mdh + 0.05 * rng.normal(size=robot.mdh.shape))
-    stack, x = make(robot, rng)  # type: ignore[operator]
+    stack, x = make(robot, rng)
     count = stack.names.count
     every = stack.movable  # the base is the frame
     _, jacobians = stack.rows(x, every)
@@ -127,7 +148,7 @@ def test_slopes_are_the_derivative_of_the_rows(name, make, rng):
 
 @pytest.mark.parametrize("make", MAKERS)
 def test_rows_of_a_batch_are_those_of_its_members(robot, make, rng):
-    stack, x = make(robot, rng)  # type: ignore[operator]
+    stack, x = make(robot, rng)
     some = stack.movable & (rng.uniform(size=stack.names.count) < 0.7)
     batch = x.repeat(3)
     batch = batch.step(1e-2 * rng.normal(size=(3, stack.names.count)) * some)
@@ -229,13 +250,6 @@ def test_identified_is_the_rank_by_finite_differences(name, kind):
     assert fit.identified == rank_of(arm, seen)
 
 
-def test_counts_by_kind(robot):
-    # 21 of the arm itself; 3 more for each anchor; 6 of the base and 3 of the tool's turn
-    expected = {"poses": 30, "wires_4": 33, "wires_3": 30, "wires_1": 24, "ball_bar": 30}
-    expected |= {"closures": 20, "closures_known": 21, "plate_known": 21}
-    assert {kind: fitted("irb2600", kind)[1].identified for kind in SIMULATORS} == expected
-
-
 def slid(name: str, sizes: tuple[float, float]) -> tuple[Arm, np.random.Generator]:
     rng = np.random.default_rng(4)
     robot = mc.load_robot(name)
@@ -293,17 +307,6 @@ def test_an_offset_that_is_there_and_not_fitted_shows():
     for name, value in (("offset1", 0.002), ("offset2", 0.0), ("offset3", -0.003)):
         assert abs(told[name].value - value) < 4.0 * told[name].sigma
         assert told[name].sigma > NOISE / np.sqrt(80)  # weaker than the mean of the lengths
-
-
-def test_reach_closes_and_says_where_it_cannot(robot):
-    rng = np.random.default_rng(1)
-    q = random_poses(robot, 20, rng)
-    goal = place(robot, random_poses(robot, 20, rng), SPOT)
-    goal[0] = [9.0, 0.0, 0.0]
-    found, gap = reach(robot, SPOT, goal, q)
-    assert_allclose(np.linalg.norm(place(robot, found, SPOT) - goal, axis=1), gap, atol=1e-12)
-    assert gap[0] > 5.0
-    assert np.count_nonzero(gap < 1e-9) >= 17
 
 
 # ---- what the numbers say --------------------------------------------------------------------
@@ -488,7 +491,7 @@ def test_fix_and_free():
 def test_bad_options_are_one_line(kind, options, words):
     arm, seen = measured("irb2600", kind)
     with pytest.raises(mc.OptionError) as caught:
-        relative(arm.robot, seen.data, **options)  # type: ignore[arg-type]
+        relative(arm.robot, seen.data, **options)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -742,3 +745,69 @@ def test_an_instrument_may_read_the_flange_itself(robot):
     assert mc.relative(arm.robot, level, holdout=0.0).positions_open
     with pytest.raises(mc.OptionError, match="level: reads more than points of its own"):
         mc.diagnose_relative(arm.robot, [points, level])
+
+
+# ---- open positions ------------------------------------------------------------------------------
+
+
+SCALE = {"irb2600": "d4", "ur10": "a2"}  # the longest length, kept as drawn where none is known
+
+
+def calibrated(name: str, kind: str, seed: int, **options) -> tuple[RelativeCalibration, float]:
+    """The result, and the true error of positions over its sigma."""
+    arm = Arm.of(name, seed, 0.0)
+    seen = SIMULATORS[kind](arm, np.random.default_rng([seed, 6]), 100, NOISE)
+    fit = relative(arm.robot, seen.data, known_distances=seen.known, **options)
+    q = random_poses(arm.robot, 300, np.random.default_rng(1))
+    plain, _ = true_errors(arm, fit.robot, spot_of(fit), q)
+    return fit, rms_mm(plain) / (1e3 * fit.position_sigma)
+
+
+@pytest.mark.parametrize("kind", ["poses", "wires_3", "wires_1", "ball_bar", "closures_known"])
+@pytest.mark.parametrize("name", SCALE)
+def test_where_nothing_is_open_the_sigma_holds_the_truth(name, kind):
+    for seed in range(2):
+        fit, ratio = calibrated(name, kind, seed)
+        assert fit.positions_open == ()
+        assert ratio < 3.0
+        assert "By the parameters' sigmas alone" in fit.headline()
+
+
+@pytest.mark.parametrize("name", SCALE)
+def test_closures_without_a_length_leave_one_length_open(name):
+    for seed in range(3):
+        fit, _ = calibrated(name, "closures", seed)
+        assert fit.positions_open == (SCALE[name],)
+        assert np.isnan(fit.position_sigma)  # no sigma holds what is kept as drawn
+    assert f"do not determine {SCALE[name]}" in fit.headline()
+    content = json.loads(fit.json())
+    assert content["positions_open"] == [SCALE[name]]
+    assert content["position_sigma_mm"] is None
+    assert RelativeCalibration.from_dict(content).headline() == fit.headline()
+
+
+def test_what_the_user_fixes_is_not_open():
+    fit, _ = calibrated("ur10", "closures", 1, fix="a2")
+    assert fit.positions_open == ()
+
+
+@pytest.mark.parametrize("name", ["irb2600", "ur10"])
+@pytest.mark.parametrize("on_axis", [True, False])
+def test_one_reflector_on_the_last_axis_does_not_speak_for_the_tool(name, on_axis):
+    """True errors of another point of the tool, whose offset and base are fitted by scipy."""
+    arm, rng = Arm.of(name, 1, 0.0), np.random.default_rng(1)
+    spot = np.array([0.0, 0.0, 0.1]) if on_axis else SPOT
+    q, new = (random_poses(arm.robot, count, rng) for count in (80, 200))
+    y = place(arm.real, q, spot) + NOISE * rng.normal(size=(80, 3))
+    fit = mc.calibrate(arm.robot, mc.measurements(q, y[:, None]), objective="sum")
+    said = [notice for notice in fit.notices if "other points of the tool" in notice]
+    other = np.array([0.1, -0.05, 0.05])
+    true = place(arm.real, new, other)
+
+    def missed(x: Array) -> Array:
+        here = place(fit.robot, new, x[6:])
+        return (here @ Rotation.from_rotvec(x[:3]).as_matrix().T + x[3:6] - true).ravel()
+
+    left = least_squares(missed, np.append(np.zeros(6), other)).fun.reshape(-1, 3)
+    off_mm = rms_mm(np.linalg.norm(left, axis=1))
+    assert bool(said) == on_axis == (off_mm > 3.0 * fit.accuracy["holdout"].rms_mm)

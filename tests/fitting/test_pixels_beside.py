@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,22 +14,27 @@ import minimax_cal as mc
 from experiments.pixel_cells import (
     NOISE,
     Cell,
+    View,
     arm_error,
     board_points,
+    camera_text,
     data_of,
     make_cell,
     write_cell,
 )
+from minimax_cal.fitting.pixels.camera import read_camera
+from minimax_cal.fitting.pixels.data import read_pixels
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.several.cameras import as_instrument, detected
-from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.fitting.several.pixel_calibration import fitted
-from minimax_cal.fitting.several.stack import Block, own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots.kinematics import rotation
 from minimax_cal.robots.sampling import random_joints
 from minimax_cal.solvers.status import Status
+
+# ---- pixels beside -------------------------------------------------------------------------------
+
 
 SPOTS = np.array([[0.1, 0.0, 0.03], [-0.05, 0.08, 0.03], [-0.05, -0.08, 0.05]])  # [m]
 
@@ -38,7 +42,7 @@ SPOTS = np.array([[0.1, 0.0, 0.03], [-0.05, 0.08, 0.03], [-0.05, -0.08, 0.05]]) 
 def cell_of(seed: int, **more: object) -> Cell:
     """A small cell, the camera on the flange or the ground by turns."""
     given = {"points": board_points((6, 5), 0.04), "poses": 20, "on_flange": bool(seed % 2)}
-    return make_cell(np.random.default_rng(seed), **given | more)  # type: ignore[arg-type]
+    return make_cell(np.random.default_rng(seed), **given | more)
 
 
 def tracked(
@@ -59,7 +63,7 @@ def tracked(
 
 @pytest.mark.parametrize(("poses", "noise"), [(16, 3e-5), (24, 1e-4)])
 @pytest.mark.filterwarnings("ignore:too few poses")
-def test_both_are_never_worse_than_either(poses: int, noise: float) -> None:
+def test_both_are_never_worse_than_either(poses, noise):
     errors = []
     for seed in range(4):
         cell = cell_of(seed)
@@ -87,35 +91,7 @@ def both_depths(cell: Cell) -> Array:
     return np.asarray((np.linalg.inv(view) @ flange @ cell.place)[:, 2, 3])
 
 
-@pytest.mark.parametrize("board", [True, False], ids=["board", "tags"])
-def test_rows_are_the_derivatives(board: bool) -> None:
-    cell = cell_of(1, points=board_points((3, 2), 0.08), poses=12)
-    data = data_of(cell, board=board)
-    images = as_instrument(data).ready(cell.drawn, RelativeOptions(camera_on="flange"))
-    block = Block.of(cell.drawn, images)
-    rng = np.random.default_rng(0)
-    own = images.starts(block.arm.at(cell.drawn.mdh), np.ones(0, dtype=bool))[0]
-    own = own + 1e-2 * rng.normal(size=own.size)
-    active = np.ones(len(images.model.names.all), dtype=bool)
-    active[5 * cell.drawn.joints : images.model.names.geometric] = False
-    mdh = cell.drawn.mdh + 1e-3 * rng.normal(size=cell.drawn.mdh.shape)
-    _, slope = block.rows(own_state(mdh, own), active)
-    assert slope.shape == (active.sum(), len(block.read(own_state(mdh, own)).weights))
-    step, count = 1e-6, 5 * cell.drawn.joints
-    for i, which in enumerate(np.flatnonzero(active)):
-        move = np.zeros(len(active))
-        move[which] = step
-        ends = []
-        for sign in (1.0, -1.0):
-            links = mdh + sign * move[:count].reshape(5, -1).T
-            state = own_state(links, own + sign * move[images.model.names.geometric :])
-            ends.append(block.rows(state, active)[0])
-        size = max(float(np.abs(slope[i]).max()), 1e-9)
-        found = (ends[1] - ends[0]) / (2.0 * step)
-        assert_allclose(slope[i] / size, found / size, rtol=0, atol=1e-4)
-
-
-def test_what_only_the_camera_determines_is_said() -> None:
+def test_what_only_the_camera_determines_is_said():
     """The tracker sees an arm whose wrist stays: joints 4 to 6 are told by the camera alone."""
     cell = cell_of(1)
     data = tracked(cell, 1, 30, 3e-5, wrist=np.array([0.3, -0.8, 0.5]))
@@ -132,7 +108,7 @@ def test_what_only_the_camera_determines_is_said() -> None:
     assert (units["fx"], units["x"], units["rx"], units["k1"]) == ("px", "m", "rad", "")
 
 
-def test_wrong_pixels_do_not_count() -> None:
+def test_wrong_pixels_do_not_count():
     cell, rng = cell_of(2), np.random.default_rng(1)
     data = data_of(cell)
     wrong = rng.random(data.count) < 0.03
@@ -143,9 +119,12 @@ def test_wrong_pixels_do_not_count() -> None:
     assert both.instruments[1].accuracy["train"].max_mm < 0.5
 
 
-def test_lenses_that_are_held_stay() -> None:
+@pytest.mark.parametrize("board", [True, False], ids=["board", "tags"])
+def test_lenses_that_are_held_stay(board):
     cell = cell_of(2)
-    given = [tracked(cell, 2, 24, 3e-5), as_instrument(data_of(cell))]
+    data = data_of(cell, board=board)
+    data = data.some((data.pose > 0) | (data.target < 5))  # one image shows little
+    given = [tracked(cell, 2, 24, 3e-5), as_instrument(data)]
     both = mc.relative(cell.drawn, given, fix_camera=True)
     lens = [p for p in both.parameters if p.name.endswith(("fx", "k1"))]
     assert len(lens) == 2
@@ -153,13 +132,13 @@ def test_lenses_that_are_held_stay() -> None:
     assert lens[0].value == lens[0].nominal == 2500.0
 
 
-def test_pixels_alone_have_a_command_of_their_own() -> None:
+def test_pixels_alone_have_a_command_of_their_own():
     cell = cell_of(2)
     with pytest.raises(mc.DataError, match="pixels alone: give it to calibrate"):
         mc.relative(cell.drawn, [as_instrument(data_of(cell))])
 
 
-def test_from_files_to_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_files_to_a_report(tmp_path, answered, refuses):
     cell = cell_of(1)
     files, points, result = (
         write_cell(cell, tmp_path),
@@ -167,8 +146,7 @@ def test_from_files_to_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[st
         tmp_path / "r.json",
     )
     mc.write_measurements(points, tracked(cell, 1, 24, 3e-5))
-    assert run("relative", "ur5", points, *files, "--json", "-o", result) == 0
-    content = json.loads(capsys.readouterr().out)
+    content = answered("relative ur5", points, *files, "-o", result)
     assert [one["name"] for one in content["instruments"]] == ["tracker", "detections"]
     assert [one["kind"] for one in content["instruments"]] == ["points", "pixels"]
     assert {"alone", "directions_alone", "file", "noise", "unit"} <= set(content["instruments"][1])
@@ -180,5 +158,174 @@ def test_from_files_to_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[st
     )
     again = mc.relative("ur5", [points, images], camera_on="flange")
     assert_allclose(again.robot.mdh, mc.load_robot(result).mdh, rtol=0, atol=1e-9)
-    assert run("relative", "ur5", points, *files[:2]) == 2
-    assert "cameras need all three" in capsys.readouterr().err
+    refuses("cameras need all three", "relative ur5", points, *files[:2])
+
+
+# ---- pixel files ---------------------------------------------------------------------------------
+
+
+K, D = (2500.0, 2510.0, 1223.5, 1023.5), (-0.12, 0.08, 2e-4, -3e-4, 1e-05)
+OPENCV = camera_text(View(np.eye(4), K, D))
+MATRIX = "[2500.0, 0.0, 1223.5, 0.0, 2510.0, 1023.5, 0.0, 0.0, 1.0]"
+ROS = f"""image_width: 2448
+image_height: 2048
+camera_name: left
+camera_matrix: {{rows: 3, cols: 3, data: {MATRIX}}}
+distortion_model: plumb_bob
+distortion_coefficients: {{rows: 1, cols: 5, data: [-0.12, 0.08, 2.0e-4, -0.0003, 1e-05]}}
+"""
+VECTOR = f"""%YAML 1.2
+---
+image_width: 2448
+image_height: 2048
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: {MATRIX}
+distortion_coefficients: !!opencv-nd-matrix
+   sizes: [ 5 ]
+   dt: d
+   data: [ -0.12, 0.08,
+       0.0002, -0.0003, 1e-05 ]
+"""  # OpenCV 5, of a distortion that is no matrix
+MESSAGE = f"""height: 2048
+width: 2448
+distortion_model: plumb_bob
+d: [-0.12, 0.08, 0.0002, -0.0003, 1.0e-05]
+k: {MATRIX}
+"""
+SHORT = "K: [[2500, 0, 1223.5], [0, 2510, 1023.5], [0, 0, 1]]\nD: [-0.12, 0.08, 0.0002, -0.0003]\n"
+JOINTS = ["pose,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad"]
+JOINTS += [f"P{i},0.1,{i / 10},0.3,0.4,0.5,0.6" for i in range(6)]
+ROWS = ["pose,camera,target,u_px,v_px"]
+ROWS += [f"P{i},left,t{j},{100 + i + 50 * j},{200 + j}" for i in range(6) for j in range(4)]
+BOARD = ["target,x_mm,y_mm,z_mm", "t0,0,0,0", "t1,50,0,0", "t2,0,50,0", "t3,50,50,0"]
+
+
+def folder_of(
+    path: Path, rows: list[str] = ROWS, joints: list[str] = JOINTS, board: list[str] = BOARD
+) -> Path:
+    """The files of a cell in a folder."""
+    (path / "detections.csv").write_text("\n".join(rows) + "\n")
+    (path / "joints.csv").write_text("\n".join(joints) + "\n")
+    (path / "board.csv").write_text("\n".join(board) + "\n")
+    (path / "left.yaml").write_text(ROS)
+    return path
+
+
+def read(path: Path, names: tuple[str, ...] = ("left",), board: bool = True) -> None:
+    cameras = [read_camera(name, path / "left.yaml") for name in names]
+    read_pixels(
+        path / "detections.csv", path / "joints.csv", cameras, path / "board.csv" if board else None
+    )
+
+
+def test_files_of_a_cell_in_german(tmp_path):
+    german = {
+        "rows": ["Pose;Kamera;Ziel;u [px];v [px]", *ROWS[1:]],
+        "joints": ["Pose;" + ";".join(f"Achse {i} [rad]" for i in range(1, 7)), *JOINTS[1:]],
+        "board": ["Ziel;X [mm];Y [mm];Z [mm]", *BOARD[1:]],
+    }
+    there = folder_of(
+        tmp_path, **{k: [row.replace(",", ";").replace(".", ",") for row in v]
+                     for k, v in german.items()}
+    )  # fmt: skip
+    camera = read_camera("left", there / "left.yaml")
+    data = read_pixels(
+        there / "detections.csv", there / "joints.csv", [camera], there / "board.csv"
+    )
+    assert data.pixel[1].tolist() == [150.0, 201.0]
+    assert data.at.q[3].tolist() == [0.1, 0.3, 0.3, 0.4, 0.5, 0.6]
+    assert data.board[1].tolist() == [0.05, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "count", "size"),
+    [*((text, 12, (2448, 2048)) for text in (OPENCV, VECTOR, ROS, MESSAGE)), (SHORT, 4, (0, 0))],
+    ids=["OpenCV", "vector", "ROS", "message", "short"],
+)
+def test_cameras_of_opencv_and_ros_are_one(text, count, size, tmp_path):
+    (tmp_path / "camera.yaml").write_text(text)
+    camera = read_camera("left", tmp_path / "camera.yaml")
+    known = 4 + min(count, len(D))
+    assert camera.intrinsic.tolist() == [*K, *D, *np.zeros(7)][:known] + [0.0] * (16 - known)
+    assert camera.size == size
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<opencv_storage/>", "is XML"),
+        ("- 1\n", "holds no camera"),
+        ("D: [0, 0, 0, 0]\n", "camera_matrix is missing"),
+        (f"K: {MATRIX}\n", "distortion_coefficients is missing; give zeros"),
+        (f"K: {MATRIX}\nD: [0, 0, 0]\n", "has 3 numbers; OpenCV has 4, 5, 8 or 12"),
+        (f"K: {MATRIX}\nD: [0, 0, x, 0]\n", "D|d is no matrix of numbers"),
+        ("K: [1, 2, 3]\nD: [0, 0, 0, 0]\n", "has 3 numbers, not 9"),
+        (f"K: {MATRIX}\nD: [0, 0, .nan, 0]\n", "not finite"),
+        ("K: [2500, 0, 0, 0, 2500, 0, 1200, 1000, 1]\nD: [0, 0, 0, 0]\n", "is it row by row"),
+        ("K: [0.9, 0, 0.5, 0, 0.9, 0.5, 0, 0, 1]\nD: [0, 0, 0, 0]\n", "must be pixels"),
+        (f"K: {MATRIX}\nD: [0, 0, 0, 0]\ndistortion_model: equidistant\n", "'equidistant' is not"),
+        (f"K: {MATRIX}\nD: [{', '.join(['0'] * 12)}, 0.1, 0]\n", "tilts the sensor"),
+        (f"K: {MATRIX}\nD: [0, 0, 0, 0]\nimage_width: wide\n", "is no number of pixels"),
+        ("K: [1\n", "cannot be parsed"),
+    ],
+)
+def test_a_file_that_is_no_camera_is_refused(text, said, tmp_path):
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(mc.DataError, match=said) as error:
+        read_camera("left", tmp_path / "camera.yaml")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        (ROWS[:1], "holds a header but no rows"),
+        (["pose,camera,target,u,v_px", *ROWS[1:]], r"detections.csv:1: column u_px is missing"),
+        ([*ROWS, "P1,right,t0,1,2"], r":26: camera 'right' has no file"),
+        ([*ROWS, "P9,left,t0,1,2"], r":26: pose 'P9' has no joint values in .*joints.csv"),
+        ([*ROWS, "P1,left,t9,1,2"], r":26: target 't9' has no place in .*board.csv"),
+        ([*ROWS, "P1,left,t0,1,2"], r":26: target 't0' of pose 'P1' stands on line 6 too"),
+        ([*ROWS[:-1], "P5,left,t3,nan,2"], r":25: column u_px: nan is not a finite number"),
+        ([*ROWS[:-1], "P5,left,t3,,2"], r":25: column u_px: is empty"),
+        ([*ROWS[:-1], "P5,left,t3,2500,2"], r":25: \(2500, 2\) px is outside the image of camera"),
+        (ROWS[:9], r"camera 'left' has 2 images with detections; take at least 4"),
+    ],
+)
+def test_wrong_detections_are_refused(rows, said, tmp_path):
+    with pytest.raises(mc.DataError, match=said) as error:
+        read(folder_of(tmp_path, rows))
+    assert "\n" not in str(error.value)
+
+
+def test_wrong_joints_cameras_and_boards_are_refused(tmp_path):
+    for joints, said in (
+        ([*JOINTS, JOINTS[1]], r"joints.csv:8: pose 'P0' stands on line 2 too"),
+        ([*JOINTS, JOINTS[1].replace("P0", "")], r"joints.csv:8: column pose is empty"),
+        ([line.partition(",")[2] for line in JOINTS], "column pose is missing"),
+    ):
+        with pytest.raises(mc.DataError, match=said):
+            read(folder_of(tmp_path, joints=joints))
+    for board, said in (
+        ([*BOARD, "t1,9,9,9"], r"board.csv:6: target 't1' stands twice"),
+        ([*BOARD, "t4,50,50,0"], r"board.csv:6: target 't4' is where 't3' is"),
+        (BOARD[:3], "has 2 targets"),
+        ([*BOARD[:3], "t2,99,0,0", "t3,20,0,0"], "lie on one line"),
+    ):
+        with pytest.raises(mc.DataError, match=said):
+            read(folder_of(tmp_path, board=board))
+    with pytest.raises(mc.DataError, match="camera 'right' sees nothing"):
+        read(folder_of(tmp_path), ("left", "right"))
+
+
+def test_tags_seen_once_are_left_out(tmp_path):
+    path = folder_of(tmp_path, [*ROWS, "P1,left,t9,1,2"])
+    cameras = [read_camera("left", path / "left.yaml")]
+    data = read_pixels(path / "detections.csv", path / "joints.csv", cameras)
+    assert data.targets == ("t0", "t1", "t2", "t3")
+    assert any("seen once only and left out: t9" in notice for notice in data.notices)
+    folder_of(tmp_path)
+    same = read_pixels(path / "detections.csv", path / "joints.csv", cameras)
+    assert (same.targets, same.notices) == (data.targets, ())

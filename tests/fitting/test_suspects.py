@@ -1,5 +1,6 @@
 """Points that stand out: leverage in closed form, chances by simulation, lists by brute force."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,27 +8,29 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from problems_robust import EVEN, NOISE, Case, fit, misread, shifted, state_of
+from problems_robust import NOISE, Case, fit, misread, shifted, state_of
 from scipy import stats
 
 import minimax_cal as mc
+from minimax_cal.fitting.second_visits import contradictions, nearest
 from minimax_cal.fitting.suspects import (
     FALSE_DISCOVERY_RATE,
     Scores,
     Spread,
-    Suspect,
     fit_log_scale,
     scores,
     spread_of,
-    suspects_of,
-    table_of,
     unlikely,
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import plain
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import Prior
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.solvers.scalar import least_between
+
+# ---- suspects ------------------------------------------------------------------------------------
+
 
 # ---- leverage --------------------------------------------------------------------------------
 
@@ -62,20 +65,6 @@ def test_covariance_is_that_of_the_whole_hat_matrix(robot):
     full = found.directions.reshape(-1) == 3
     assert full.mean() > 0.9
     assert_allclose(found.square.reshape(-1)[full], expected[full], rtol=1e-7)
-
-
-def test_a_point_is_judged_as_if_it_were_not_in_the_fit(robot):
-    """e'(I - H)^-1 e from the fit is e'(I + H)^-1 e from the fit without the point."""
-    case = shifted(robot, 0.05, 2e-4, poses=30)
-    plain = plain_scores(case)
-    for target, pose in np.argwhere(case.bad | (np.arange(30) == 7)):
-        weights = case.model.seen.astype(float)
-        weights[target, pose] = 0.0
-        model = replace(case.model, weight=case.model.weight * weights)
-        without = state_of(fit(model, state_of(case.found))[1])
-        own = scores(case.model, without, weights).square[target, pose]
-        # the errors of half a millimetre in the arm make the fit nonlinear by parts in ten thousand
-        assert own == pytest.approx(plain.square[target, pose], rel=5e-3)
 
 
 def test_directions_that_the_fit_follows_are_not_judged(robot):
@@ -166,14 +155,6 @@ def test_scale_and_tails_are_found_beside_outliers(rng, tail):
         assert (listed & ~wrong).sum() <= 0.03 * max(int(listed.sum()), 1) + 1
 
 
-def test_heavy_tails_make_the_list_short(rng):
-    """What a Gaussian would call unlikely is what a model that lacks an effect leaves."""
-    found = Scores(drawn(rng, 1000, 3.0), np.full((1, 1000), 3))
-    gaussian = Spread(spread_of(found, 3000.0).scale, 3000.0)
-    assert unlikely(gaussian.p_value(found)).sum() > 30
-    assert unlikely(spread_of(found, 3000.0).p_value(found)).sum() <= 3
-
-
 def test_points_without_error_are_no_suspects(robot):
     """Rounding has tails too; no instrument tells less than a tenth of a micrometre."""
     exact = Truth(compliance=0.0, noise=0.0, noise_per_metre=0.0)
@@ -240,31 +221,182 @@ def test_a_list_tells_where_and_how_far(robot):
     assert "\n" not in found.notices[0]
 
 
-def test_the_table_has_a_row_a_suspect():
-    one = Suspect(7, "smr2", 1.2e-3, 40.0, 1e-30, together=True)
-    data = simulate("irb120", 10, seed=1).data
-    table = table_of([one], data)
-    assert table.rows == (
-        (data.called(7), "smr2", pytest.approx(1.2), 40.0, 1e-30, "training", "all targets"),
+# ---- second visits -------------------------------------------------------------------------------
+
+
+VISIT_NOISE = 0.02e-3  # [m]
+
+
+def visited(robot: mc.Robot, *, twice: int = 12, seed: int = 0) -> tuple[Measurements, Array]:
+    """40 poses of which some stand twice in the file, and the errors of the true arm (k, m, 3)."""
+    data = simulate(robot, 40, 2, seed, Truth(compliance=0.0, noise=0.0, noise_per_metre=0.0)).data
+    rows = np.r_[0:40, 0:twice]
+    data = data.take(rows)
+    data = replace(data, line=np.arange(2, 2 + len(rows)), columns={})
+    noise = np.random.default_rng(seed).normal(0.0, VISIT_NOISE, data.y.shape)
+    return data.with_y(data.y + noise), np.moveaxis(noise, 1, 0)
+
+
+def moved(data: Measurements, error: Array, row: int, off: float) -> tuple[Measurements, Array]:
+    """The same, a point of the first target elsewhere [m]."""
+    y, error = data.y.copy(), error.copy()
+    y[row, 0, 2] += off
+    error[0, row, 2] += off
+    return data.with_y(y), error
+
+
+def test_the_nearest_other_visit_by_brute_force():
+    rng = np.random.default_rng(4)
+    points, group = rng.normal(size=(2, 9, 3)), np.array([0, 1, 0, 2, 0, 1, 3, 4, 4])
+    points[1, 8] = np.nan
+    apart, other, amid = nearest(points, group)
+    for target in range(2):
+        for row in range(9):
+            rest = [i for i in np.flatnonzero(group == group[row]) if i != row]
+            far = [np.linalg.norm(points[target, row] - points[target, i]) for i in rest]
+            if not rest or np.isnan(far).all():
+                assert np.isnan(apart[target, row])
+            else:
+                assert_allclose(apart[target, row], np.nanmin(far), rtol=1e-12)
+                assert_allclose(amid[target, row], np.nanmedian(far), rtol=1e-12)
+                assert other[target, row] == rest[int(np.nanargmin(far))]
+
+
+def test_a_point_that_its_own_second_visit_contradicts(robot):
+    """Whichever of both is wrong, the fit tells; far less than a fit alone would find."""
+    for row, right in ((3, 43), (43, 3)):
+        (text,) = contradictions(*moved(*visited(robot), row, 20.0 * VISIT_NOISE))
+        assert f"line {row + 2} smr1 is " in text
+        assert f"from line {right + 2}, which fits" in text
+        assert text.count("smr") == 1
+
+
+def test_a_fit_that_does_not_know_does_not_say_which(robot):
+    data, error = moved(*visited(robot), 3, 20.0 * VISIT_NOISE)
+    field = 1e-3 * np.ones(3)  # what the model lacks at both visits
+    (text,) = contradictions(data, error + field)
+    assert "smr1" in text
+    assert "which fits" not in text
+
+
+def test_three_visits_tell_without_a_fit(robot):
+    data, error = visited(robot)
+    rows = np.r_[0:52, 0:12]
+    data = replace(data.take(rows), line=np.arange(2, 66))
+    fresh = np.random.default_rng(9).normal(0.0, VISIT_NOISE, (12, *data.y.shape[1:]))
+    y = data.y.copy()
+    y[52:] += fresh
+    error = error[:, rows] + 1e-3
+    error[:, 52:] += np.moveaxis(fresh, 1, 0)
+    (text,) = contradictions(*moved(data.with_y(y), error, 43, 30.0 * VISIT_NOISE))
+    assert "line 45 smr1" in text or "from line 45" in text
+    assert text.count("smr") == 1
+
+
+def test_sound_visits_and_few_visits_say_nothing(robot):
+    """A distance of four times that of 95 % of all is one of eight sigmas."""
+    assert not any(list(contradictions(*visited(robot, seed=seed))) for seed in range(60))
+    assert not list(contradictions(*moved(*visited(robot, twice=4), 3, 1e-3)))
+    assert not list(contradictions(*moved(*visited(robot, twice=0), 3, 1e-3)))
+
+
+def test_calibrate_and_diagnose_tell(robot):
+    data, _ = moved(*visited(robot), 3, 20.0 * VISIT_NOISE)
+    for notices in (
+        mc.calibrate(robot, data, objective="sum").notices,
+        mc.diagnose(robot, data, quick=True).notices,
+    ):
+        (text,) = [one for one in notices if "contradict each other" in one]
+        assert "line 5 smr1" in text or "from line 5" in text
+
+
+def test_the_same_pose_under_another_load_contradicts_nothing(robot):
+    data, error = visited(robot)
+    for row in (40, 41, 42):
+        data, error = moved(data, error, row, 25.0 * VISIT_NOISE)
+    assert list(contradictions(data, error))
+    load = np.where(np.isin(np.arange(data.poses), (40, 41, 42)), 20.0, 0.0)
+    assert not list(contradictions(replace(data, columns={"payload": load}), error))
+
+
+# ---- claims --------------------------------------------------------------------------------------
+
+
+def mirrored(data: Measurements) -> Measurements:
+    """One coordinate of one target with the wrong sign."""
+    y = data.y.copy()
+    y[:, 1, 0] *= -1.0
+    return data.with_y(y)
+
+
+def stuck(robot: mc.Robot, data: Measurements) -> tuple[Measurements, np.ndarray]:
+    """A joint that was not read anew for some of the held-out rows, and those rows."""
+    rows = np.flatnonzero(mc.calibrate(robot, data, "sum").held)[:5]
+    q = data.q.copy()
+    q[rows, 2] = q[rows[0], 2]
+    return replace(data, q=q), rows[1:]
+
+
+def test_a_fit_that_contradicts_its_data_has_failed_and_writes_no_robot(robot, tmp_path, says):
+    data, out = tmp_path / "d.csv", tmp_path / "fit.json"
+    mc.write_measurements(data, mirrored(simulate(robot, 110, 2, seed=5).data))
+    fit = mc.Fit.from_dict(
+        json.loads(
+            says("calibrate irb2600", data, "--objective", "sum", "--json", "-o", out, code=1).out
+        )
     )
-    assert plain(one) == {
-        "line": 7, "target": "smr2", "distance_mm": pytest.approx(1.2), "score": 40.0,
-        "chance": 1e-30, "together": True, "held": False,
-    }  # fmt: skip
-    assert table_of([], data).rows == ()
+    assert not out.exists()
+    assert fit.status == "failed"
+    assert "no calibration of this arm" in fit.notices[-1]
+    with pytest.raises(mc.OptionError, match="contradicts its own data"):
+        mc.export(fit, "json")
 
 
-def test_the_list_is_the_least_likely_first(robot):
-    case = shifted(robot, 0.1, 1e-3)
-    found = plain_scores(case)
-    state = state_of(case.found)
-    listed = suspects_of(case.model, state, found, Spread(NOISE, 1e4), case.data.line)
-    assert [one.p_value for one in listed] == sorted(one.p_value for one in listed)
+def test_bad_rows_that_are_held_out_are_told(robot, noisy):
+    data, wrong = stuck(robot, noisy.data)
+    fit = mc.calibrate(robot, data, "sum")
+    assert fit.status == "converged"
+    assert {one.line for one in fit.suspects if one.held} >= set(data.line[wrong].tolist())
+    assert any("outliers among the held-out points" in text for text in fit.notices)
+    assert fit.accuracy["holdout"].rms_mm > 20.0
+    clean = mc.calibrate(robot, noisy.data, "sum")
+    # the same arm judged by the rows that are left
+    assert_allclose(fit.trusted.rms_mm, clean.accuracy["holdout"].rms_mm, rtol=0.15)
+    assert fit.beyond.worst_mm > 20.0  # they judge outside the measured region as well
+    assert fit.beyond.trusted is not None
+    assert_allclose(fit.beyond.trusted.worst_mm, clean.beyond.worst_mm, rtol=0.3)
+    assert "without outliers worst part" in fit.headline()
 
 
-def test_lines_are_those_of_the_file(robot):
-    case = shifted(robot, 0.02, 1e-3, truth=EVEN)
-    moved = replace(case, data=replace(case.data, line=case.data.line + 100))
-    lines = [[one.line for one in each.robust().suspects] for each in (case, moved)]
-    assert lines[0]
-    assert_allclose(lines[1], np.array(lines[0]) + 100)
+def test_sound_held_out_rows_are_no_suspects(robot):
+    named = [
+        one
+        for seed in range(6)
+        for one in mc.calibrate(robot, simulate(robot, 80, seed=seed).data, "sum").suspects
+        if one.held
+    ]
+    assert not named  # errors of the model are larger at new poses, and no fault of the rows
+
+
+def test_suspects_of_a_file_come_back(robot, noisy, tmp_path):
+    data, _ = stuck(robot, noisy.data)
+    fit = mc.calibrate(robot, data, "sum")
+    fit.save(tmp_path / "fit.json")
+    again = mc.load_fit(tmp_path / "fit.json")
+    keys = [[(s.line, s.target, s.held) for s in one.suspects] for one in (fit, again)]
+    assert keys[0] == keys[1]
+    assert plain(again.beyond) == plain(fit.beyond)
+    assert again.trusted.rms_mm == pytest.approx(fit.trusted.rms_mm, rel=1e-9)
+
+
+def test_a_wrong_point_of_the_fit_is_set_aside_where_its_part_judges(robot):
+    """As beyond as measured without it: the loss gives it no weight, its part would tell it."""
+    data = mc.simulate(robot, 100, 3, seed=4).data
+    clean = mc.calibrate(robot, data, "sum", loss="tukey")
+    y = data.y.copy()
+    y[np.flatnonzero(~clean.held)[3], 1] += [5e-3, 0.0, 0.0]
+    fit = mc.calibrate(robot, data.with_y(y), "sum", loss="tukey")
+    assert [one.held for one in fit.suspects] == [False]
+    assert fit.beyond.trusted is not None
+    assert fit.beyond.worst_mm > 1.5 * clean.beyond.worst_mm
+    assert fit.beyond.trusted.worst_mm == pytest.approx(clean.beyond.worst_mm, rel=0.02)

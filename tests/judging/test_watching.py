@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,10 +14,21 @@ import minimax_cal as mc
 from experiments import one_session
 from experiments.one_session import Job
 from minimax_cal.judging.watching import moved
+from minimax_cal.judging.watching.both import (
+    NEW,
+    OLD,
+    Both,
+    Part,
+    fit_variances,
+)
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects import EFFECTS
 from minimax_cal.modelling.simulate import Simulation, Truth, gravity, simulate
 from minimax_cal.robots.robot import robot_from_dict
 from minimax_cal.robots.sampling import random_poses
+
+# ---- watching ------------------------------------------------------------------------------------
+
 
 TRUTH = Truth(compliance=0.0)
 SIGMAS = 4.0  # that an estimate may be off: one of 16 000 is
@@ -32,7 +44,7 @@ def fit(made: Simulation) -> mc.Fit:
     return mc.calibrate("irb2600", made.data, "sum")
 
 
-def poses(made: Simulation, count: int, joint: int = 0, by: float = 0.0, seed: int = 1):  # type: ignore[no-untyped-def]
+def poses(made: Simulation, count: int, joint: int = 0, by: float = 0.0, seed: int = 1):
     """Poses of the arm with the zero of a joint, counted from 1, shifted; the tracker anew."""
     rng = np.random.default_rng(seed)
     q = random_poses(made.cell.robot, count, rng)
@@ -40,7 +52,7 @@ def poses(made: Simulation, count: int, joint: int = 0, by: float = 0.0, seed: i
 
 
 @pytest.fixture(scope="module")
-def knocked(fit: mc.Fit, made: Simulation):  # type: ignore[no-untyped-def]
+def knocked(fit: mc.Fit, made: Simulation):
     return mc.check(fit, poses(made, 10, 3, SHIFT), "rms 0.5")
 
 
@@ -64,7 +76,7 @@ def test_rates_are_those_promised():
     assert np.mean([bool(r.alarms) for r in results]) < 0.01
 
 
-def test_the_size_of_the_shift_is_told(knocked):  # type: ignore[no-untyped-def]
+def test_the_size_of_the_shift_is_told(knocked):
     (moved,) = knocked.moved
     assert moved.parameter == "theta3"
     assert abs(moved.by - SHIFT) < SIGMAS * moved.sigma
@@ -77,7 +89,7 @@ def test_the_size_of_the_shift_is_told(knocked):  # type: ignore[no-untyped-def]
     }
 
 
-def test_the_refit_is_a_calibration_that_holds(knocked, fit, made, tmp_path):  # type: ignore[no-untyped-def]
+def test_the_refit_is_a_calibration_that_holds(knocked, fit, made, tmp_path):
     knocked.save(tmp_path / "refit.json")
     again = mc.load_fit(tmp_path / "refit.json")
     change = again.robot.mdh - fit.robot.mdh
@@ -179,7 +191,7 @@ def test_a_foot_that_tells_less_than_the_instrument_names_nothing(made):
 
 
 @pytest.fixture(scope="module")
-def giving_way():  # type: ignore[no-untyped-def]
+def giving_way():
     """An IRB 120 that misses by 0.4 mm, reflectors on its foot: its fit, ten poses, and many."""
     truth, rng = Truth(compliance=1e-5), np.random.default_rng(0)
     made = simulate("irb120", 80, 3, 3, truth)
@@ -199,7 +211,7 @@ def rms(fit: mc.Fit, data: mc.Measurements) -> float:
     return float(np.sqrt(np.square(fit.cell.error(data)).sum(axis=-1).mean()))
 
 
-def test_a_refit_of_an_arm_that_did_not_move_is_as_good_as_its_fit(giving_way):  # type: ignore[no-untyped-def]
+def test_a_refit_of_an_arm_that_did_not_move_is_as_good_as_its_fit(giving_way):
     fit, seen = giving_way
     many = seen(150)
     before, own, after = [], [], []
@@ -214,7 +226,7 @@ def test_a_refit_of_an_arm_that_did_not_move_is_as_good_as_its_fit(giving_way): 
     assert np.mean(after) < 1.1 * rms(fit, many)
 
 
-def test_a_correction_helps_the_poses_that_it_is_made_from(giving_way):  # type: ignore[no-untyped-def]
+def test_a_correction_helps_the_poses_that_it_is_made_from(giving_way):
     fit, seen = giving_way
     for joint in (1, 2, 4):
         ten = seen(10, joint, 4e-3)
@@ -224,7 +236,7 @@ def test_a_correction_helps_the_poses_that_it_is_made_from(giving_way):  # type:
         assert rms(found.fit, ten) < rms(fit, ten)
 
 
-def test_one_rms_is_told(giving_way):  # type: ignore[no-untyped-def]
+def test_one_rms_is_told(giving_way):
     fit, seen = giving_way
     found = mc.check(fit, seen(10, 2, 4e-3), "rms 1")
     (verdict,) = found.verdicts
@@ -293,19 +305,17 @@ def test_few_poses_suffice(fit, made):
     assert few.asked > 3 or few.enough == 3
 
 
-def test_the_command_says_what_the_function_says(fit, made, tmp_path, capsys):
+def test_the_command_says_what_the_function_says(fit, made, tmp_path, answered, says):
     fit.save(tmp_path / "fit.json")
     mc.write_measurements(tmp_path / "new.csv", poses(made, 10, 3, SHIFT))
     words = ["check", tmp_path / "fit.json", tmp_path / "new.csv", "--tolerance"]
-    assert run(*words, "rms 0.5", "--json", "-o", tmp_path / "refit.json") == 0
-    told = json.loads(capsys.readouterr().out)
+    told = answered(*words, "rms 0.5", "-o", tmp_path / "refit.json")
     assert told["valid"] is True
     assert [m["parameter"] for m in told["moved"]] == ["theta3"]
     assert told["moved"][0]["unit"] == "rad"
     kept = json.loads((tmp_path / "refit.json").read_text())
     assert kept["check"]["moved"] == kept["moved"] == told["moved"]
-    assert run(*words, "rms 0.05") == 1
-    out, err = capsys.readouterr()
+    out, err = says(*words, "rms 0.05", code=1)
     assert "not valid" in out
     (line,) = [line for line in err.splitlines() if line.startswith("error: ")]
     assert "not valid" in line
@@ -321,11 +331,10 @@ def test_the_command_says_what_the_function_says(fit, made, tmp_path, capsys):
         ([], "Missing option"),
     ],
 )
-def test_a_wrong_option_is_one_line(fit, made, tmp_path, capsys, options, said):
+def test_a_wrong_option_is_one_line(fit, made, tmp_path, says, options, said):
     fit.save(tmp_path / "fit.json")
     mc.write_measurements(tmp_path / "new.csv", poses(made, 10))
-    assert run("check", tmp_path / "fit.json", tmp_path / "new.csv", *options) == 2
-    err = capsys.readouterr().err
+    err = says("check", tmp_path / "fit.json", tmp_path / "new.csv", *options, code=2).err
     assert said in err
     assert len(err.splitlines()) == 1
 
@@ -378,18 +387,17 @@ def test_which_parameters_were_kept_does_not_matter(made, fit):
     assert mc.compare(usual, odd).notices
 
 
-def test_compare_command(fit, repaired, tmp_path, capsys):
+def test_compare_command(fit, repaired, tmp_path, answered, says):
     fit.save(tmp_path / "a.json")
     repaired.save(tmp_path / "b.json")
-    assert run("compare", tmp_path / "a.json", tmp_path / "b.json", "--json") == 0
-    told = json.loads(capsys.readouterr().out)
+    told = answered("compare", tmp_path / "a.json", tmp_path / "b.json")
     assert [c["joint"] for c in told["changed"]] == ["J4"]
-    assert run("compare", tmp_path / "a.json", tmp_path / "b.json") == 0
-    assert "J4 changed" in capsys.readouterr().out
+    assert "J4 changed" in says("compare", tmp_path / "a.json", tmp_path / "b.json").out
     (tmp_path / "c.json").write_text("{}")
     for name in ("c.json", "none.json"):
-        assert run("compare", tmp_path / "a.json", tmp_path / name) == 2
-        assert len(capsys.readouterr().err.splitlines()) == 1
+        assert (
+            len(says("compare", tmp_path / "a.json", tmp_path / name, code=2).err.splitlines()) == 1
+        )
     ur10 = mc.calibrate("scara_600", mc.simulate("scara_600", 30).data, "sum")
     with pytest.raises(mc.OptionError, match="compare calibrations of one arm"):
         mc.compare(fit, ur10)
@@ -411,3 +419,153 @@ def test_the_pick_explains_most_and_zero_positions_go_first():
 def test_laws_of_the_session_end_with_it():
     ended = {name for name, effect in EFFECTS.items() if effect.of_session}
     assert ended == {"frame_drift", "session_jump", "target_shift", "target_reseat"}
+
+
+# ---- counting all --------------------------------------------------------------------------------
+
+
+PLAIN_TRUTH = Truth(noise=20e-6, noise_per_metre=0.0, compliance=0.0)
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Simulation]:
+    """A calibration, and the arm that it is of."""
+    folder = tmp_path_factory.mktemp("arm")
+    sim = simulate("irb120", 150, 3, seed=4, truth=PLAIN_TRUTH)
+    mc.calibrate("irb120", sim.data, "sum").save(folder / "fit.json")
+    return folder, sim
+
+
+def later(sim: Simulation, poses: int = 30) -> Measurements:
+    """New measurements of the same arm in its place, with one pose 1 mm off."""
+    data = simulate("irb120", poses, 3, seed=77, truth=PLAIN_TRUTH).data
+    y = sim.cell.predict(data.q) + PLAIN_TRUTH.noise * np.random.default_rng(5).normal(
+        size=data.y.shape
+    )
+    y[6] += [0.6e-3, 0.0, 0.8e-3]
+    return replace(data.with_y(y), simulated=False, line=np.arange(poses) + 2)
+
+
+def test_evaluate_counts_with_them(arm, capsys, answered):
+    folder, sim = arm
+    data = later(sim)
+    mc.write_measurements(folder / "new.csv", data)
+    left = f"--leave-out={data.line[6]}=looks odd"
+    assert run("import", folder / "new.csv", left, "-o", folder / "some.csv", "--quiet") == 0
+    capsys.readouterr()
+    whole, some = (
+        answered("evaluate", folder / "fit.json", folder / f"{name}.csv")
+        for name in ("new", "some")
+    )
+    assert whole["set_aside"] == []
+    assert "holdout_with_them" not in whole["accuracy"]
+    assert [(p["target"], p["why"], p["by"]) for p in some["set_aside"]] == [
+        (name, "looks odd", "user") for name in data.target_names
+    ]
+    assert {(p["row"], p["pose"]) for p in some["set_aside"]} == {(8, 7)}
+    assert some["accuracy"]["max_mm"] < 0.3
+    for key in ("rms_mm", "max_mm", "mean_mm", "poses"):
+        assert_allclose(some["accuracy"]["holdout_with_them"][key], whole["accuracy"][key],
+                        rtol=1e-9)  # fmt: skip
+
+
+def test_check_counts_with_them(arm):
+    folder, sim = arm
+    data = later(sim)
+    cells = np.where(np.arange(data.poses) == 6, "looks odd", "")
+    path = folder / "checked.csv"
+    mc.write_measurements(path, replace(data, columns={**data.columns, "set_aside": cells}))
+    found = mc.check(folder / "fit.json", path, "rms 0.2")
+    assert found.valid
+    content = found.to_dict()
+    assert {(p["row"], p["by"]) for p in content["set_aside"]} == {(8, "user")}
+    assert content["accuracy"]["max_mm"] < 0.3
+    assert_allclose(content["accuracy"]["holdout_with_them"]["max_mm"], 1.0, rtol=0.15)
+    assert "3 points set aside by the user; with them RMS" in found.headline()
+    assert found.fit.set_aside == found.set_aside
+    assert "holdout_with_them" not in found.fit.to_dict()["accuracy"]  # none is held out
+
+
+def test_a_reseat_is_told_by_check_and_import(arm, says):
+    folder, sim = arm
+    data = later(sim, 40)
+    spots = sim.cell.target_positions + np.array([[0, 0, 0], [3e-3, 4e-3, 0], [0, 0, 0]])
+    y = data.y.copy()
+    y[20:, 1] = replace(sim.cell, target_positions=spots).predict(data.q[20:])[:, 1]
+    path = folder / "reseated.csv"
+    mc.write_measurements(path, replace(data.with_y(y), columns={}))
+    said = "smr2 was re-seated, or exchanged for one of another radius, by 4.99 mm or more"
+    assert f"{said} before line 22" in says("import", path).err
+    found = mc.check(folder / "fit.json", path, "rms 0.2")
+    assert any(said in notice for notice in found.notices)
+
+
+# ---- both ----------------------------------------------------------------------------------------
+
+
+FREE, RANDOM, ASKED = 6, 40, 3
+ROWS, PARTS = 60, 8
+NOISE, FACTOR = 0.5, 4.0
+
+
+def drawn(rng: np.random.Generator, noise: float = NOISE) -> tuple[Both, list[np.ndarray]]:
+    """Both sessions with lack of fit of a known size, and the rows that they are made of."""
+    u, x = np.sqrt(FACTOR) * rng.normal(size=RANDOM), rng.normal(size=FREE)
+    parts, rows = [], []
+    for number in range(PARTS):
+        new = number >= PARTS // 2
+        columns = rng.normal(size=(ROWS, FREE + RANDOM + ASKED))
+        columns[:, -ASKED:] *= new
+        sigma = np.sqrt(noise if new else NOISE)
+        error = columns[:, : FREE + RANDOM] @ np.append(x, u) + sigma * rng.normal(size=ROWS)
+        rows.append(np.column_stack([columns, error]))
+        parts.append(Part(rows[-1].T @ rows[-1], ROWS, NEW if new else OLD))
+    asked = np.arange(ASKED)
+    component = np.zeros(RANDOM, dtype=int)
+    return Both(tuple(parts), FREE, RANDOM, component, asked, asked < 1, np.ones(0)), rows
+
+
+def test_variances_are_those_that_were_drawn():
+    rng = np.random.default_rng(0)
+    found = [fit_variances(drawn(rng)[0]) for _ in range(20)]
+    assert np.mean([v.noise[OLD] for v in found]) == pytest.approx(NOISE, rel=0.05)
+    assert np.mean([v.factor[0] for v in found]) == pytest.approx(FACTOR, rel=0.2)
+
+
+def test_new_poses_may_be_noisier():
+    rng = np.random.default_rng(1)
+    found = [drawn(rng, 9.0 * NOISE)[0].noise_ratio for _ in range(20)]
+    assert np.mean(found) == pytest.approx(3.0, rel=0.1)
+    quiet = drawn(rng, NOISE / 9.0)[0]
+    assert quiet.noise_ratio == 1.0
+
+
+def test_scores_spread_as_their_sigmas_say():
+    rng, none = np.random.default_rng(2), np.zeros(0, dtype=int)
+    z = []
+    for _ in range(40):
+        by, sigma, dof = drawn(rng)[0].scores(none)
+        z.append(by / sigma)
+        assert np.all(dof > PARTS - 2)
+    assert abs(np.sqrt(np.mean(np.square(z))) - 1.0) < 4.0 / np.sqrt(2 * np.size(z))
+
+
+def test_a_part_left_out_is_judged_by_a_fit_of_the_others():
+    both, rows = drawn(np.random.default_rng(3))
+    noise = both.variances.noise
+    fitted = both.fitted(np.array([1]))
+    left = PARTS - 1
+    scaled = [part / np.sqrt(noise[p.source]) for part, p in zip(rows, both.parts, strict=True)]
+    rest = np.concatenate([part for number, part in enumerate(scaled) if number != left])
+    prior = np.diag(np.sqrt(both.ridge(fitted)))
+    matrix = np.concatenate([rest[:, fitted], prior])
+    value = np.linalg.lstsq(matrix, np.append(rest[:, -1], np.zeros(len(prior))))[0]
+    error = scaled[left][:, -1] - scaled[left][:, fitted] @ value
+    assert_allclose(both.square(both.parts[left], fitted), error @ error, rtol=1e-6)
+
+
+def test_folds_scatter_as_the_estimate_does():
+    rng, none = np.random.default_rng(4), np.zeros(0, dtype=int)
+    found = [drawn(rng)[0] for _ in range(40)]
+    ratio = [both.scatter(none, 1) / both.scores(none)[1][1] for both in found]
+    assert np.sqrt(np.mean(np.square(ratio))) == pytest.approx(1.0, abs=0.3)

@@ -3,7 +3,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.modelling import model
 from minimax_cal.modelling.model import Prior, SumOfSquares, model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
@@ -26,48 +25,12 @@ def somewhere(robot: mc.Robot, rng: np.random.Generator) -> State:
     )
 
 
-def test_normal_equations_are_those_of_the_explicit_jacobian(robot, rng, monkeypatch):
-    monkeypatch.setattr(model, "BLOCK", 32)  # several blocks
-    this = model_of(robot, gappy(rng))
-    x = somewhere(robot, rng)
-    active = rng.uniform(size=this.names.count) < 0.7
-    found = this.normal(x, active)
-    jacobian = this.jacobian(x)[..., active]
-    error = np.nan_to_num(this.error(x))
-    weight = this.weight
-    assert_allclose(found.cost, np.einsum("km,kmc,kmc->k", weight, error, error), rtol=1e-13)
-    assert_allclose(this.cost(x), found.cost, rtol=1e-13)
-    gradient = np.einsum("km,kmcp,kmc->kp", weight, jacobian, error)
-    assert_allclose(found.gradient, gradient, rtol=0, atol=1e-12 * np.abs(gradient).max())
-    gram = np.einsum("km,kmcp,kmcq->kpq", weight, jacobian, jacobian)
-    assert_allclose(found.gram, gram, rtol=0, atol=1e-12 * np.abs(gram).max())
-
-
 def test_weights_come_from_u95(robot, rng):
     data = gappy(rng)
     this = model_of(robot, data)
     u95 = data.columns["u95"]
     assert_allclose(this.weight[0], (np.median(u95) / u95) ** 2, rtol=1e-14)
     assert np.all(this.weight[1][~data.seen[:, 1]] == 0.0)
-
-
-def test_projected_lengths_are_the_linear_least_squares_ones(robot, rng):
-    this = model_of(robot, gappy(rng))
-    linear = this.names.linear
-    chosen = np.zeros(this.names.count, dtype=bool)
-    for name in ("a1", "a2", "d4", "base_x", "base_y", "base_z", "smr1_x", "smr2_y", "theta3"):
-        chosen[this.names.index(name)] = True
-    x = somewhere(robot, rng)
-    y, *_ = SumOfSquares(this.only(chosen)).reduced(x.batch(), full=False)
-    root = np.sqrt(this.weight)[..., None]
-    matrix = (root[..., None] * this.jacobian(x))[..., chosen & linear].reshape(-1, 8)
-    right = (root * np.nan_to_num(this.error(x))).reshape(-1)
-    step = np.zeros(this.names.count)
-    step[chosen & linear] = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    best = x.step(step)
-    assert_allclose(y.mdh[0], best.mdh, rtol=0, atol=1e-12)
-    assert_allclose(y.origin[0], best.origin, rtol=0, atol=1e-12)
-    assert_allclose(y.target_positions[0], best.target_positions, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["even", "weighted", "poses"])
@@ -173,25 +136,3 @@ def test_a_pose_without_all_targets_weighs_nothing(rng):
     weight = pose_weights(mc.measurements(rng.uniform(-2, 2, (30, 6)), y), 0.3)
     assert np.all(weight[4] == 0.0)
     assert np.all(np.delete(weight, 4, axis=0).any(axis=(1, 2)))
-
-
-def test_mixed_normal_equations_are_explicit_ones(robot, rng):
-    from minimax_cal.modelling.model import pose_weights, with_poses
-
-    data = mc.measurements(rng.uniform(-2, 2, (30, 6)), rng.normal(size=(30, 3, 3)))
-    plain = model_of(robot, data)
-    weight = pose_weights(data, 0.3)
-    mixed = with_poses(plain, weight)
-    x = somewhere(robot, rng)
-    every = np.ones(plain.names.count, dtype=bool)
-    found = mixed.normal(x, every)
-    jacobian = np.einsum("ab,kmbp->kmap", x.rotation, plain.jacobian(x))
-    flat = np.moveaxis(jacobian, 0, 1).reshape(30, 9, -1)
-    error = np.moveaxis(plain.error(x) @ x.rotation.T, 0, 1).reshape(30, 9)
-    gram = np.einsum("map,mab,mbq->pq", flat, weight, flat)
-    assert_allclose(found.gram.sum(0), gram, rtol=0, atol=1e-11 * np.abs(gram).max())
-    gradient = np.einsum("map,mab,mb->p", flat, weight, error)
-    assert_allclose(found.gradient.sum(0), gradient, rtol=0, atol=1e-11 * np.abs(gradient).max())
-    assert_allclose(found.cost.sum(), np.einsum("ma,mab,mb", error, weight, error), rtol=1e-12)
-    batch = mixed.normal(x.repeat(3), every)
-    assert_allclose(batch.gram[1].sum(0), gram, rtol=0, atol=1e-11 * np.abs(gram).max())

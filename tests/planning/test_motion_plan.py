@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from conftest import run
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
@@ -68,17 +66,6 @@ def test_the_motion_stays_within_its_limits(loaded):
     assert np.median(peaks) > 0.1
 
 
-def test_the_search_finds_more_than_it_drew(loaded):
-    robot = mc.load_robot(ARM)
-    options = module.MotionOptions(10.0, SPEED, ACCELERATION)
-    bounds, _ = module.bounds_of(robot, options, module.PlanOptions(volume=BOX))
-    rng = np.random.default_rng(0)
-    drawn = [module.free_series(bounds, module.HARMONICS, 10.0, rng) for _ in range(6)]
-    model = module.model_of(robot, drawn)
-    worth = [module.information(model, series) for series in drawn]
-    assert module.information(model, loaded.parts[0].series) > max(worth)
-
-
 def test_a_payload_tells_drive_gains(loaded, short):
     alone = mc.plan_motion(ARM, duration=10.0)
     assert any("without a known payload" in text for text in alone.notices)
@@ -136,16 +123,14 @@ def test_the_file_is_read_again_once_torques_are_in_it(loaded, tmp_path):
     assert [one.notices for one in runs] == [()] * 3
 
 
-def test_the_command(tmp_path, capsys, short):
+def test_the_command(tmp_path, answered, says, short):
     motion, points = tmp_path / "m.csv", tmp_path / "w.csv"
     words = ("plan", ARM, "--motion", "--duration", 6, "--payload", 1)
-    assert run(*words, "-o", motion, "--waypoints", points) == 0
-    said = capsys.readouterr()
+    said = says(*words, "-o", motion, "--waypoints", points)
     assert "42 s of motion (fast 6 s, slow 30 s, loaded 6 s)" in said.out
     assert len(motion.read_text().splitlines()) == 1 + 601 + 3001 + 601
     assert "qd6_deg_s" in points.read_text().partition("\n")[0]
-    assert run(*words, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
+    told = answered(*words)
     assert told["kind"] == "motion_plan"
     assert [part["payload_kg"] for part in told["parts"]] == [0.0, 0.0, 1.0]
     assert len(told["tells"]) == 24
@@ -165,6 +150,5 @@ def test_the_command(tmp_path, capsys, short):
         (("--motion", "--unit", "grad"), "no unit 'grad'"),
     ],
 )
-def test_mistakes(capsys, words, message):
-    assert run("plan", ARM, *words) == 2
-    assert message in capsys.readouterr().err
+def test_mistakes(refuses, words, message):
+    refuses(message, "plan", ARM, *words)

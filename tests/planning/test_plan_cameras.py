@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 from dataclasses import replace
@@ -31,9 +30,7 @@ from minimax_cal.fitting.pixels.determined import determined
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.several.pixel_calibration import fitted
 from minimax_cal.ground.arrays import Array
-from minimax_cal.planning.camera_options import frame
 from minimax_cal.planning.result import Plan
-from minimax_cal.robots.frames import Frame
 from minimax_cal.robots.transforms import inverse
 
 ROOT = Path(__file__).parents[2]
@@ -57,7 +54,7 @@ def planned(cell: Cell, folder: Path, **more: object) -> Plan:
         "pixel_noise": NOISE, "candidates": 200,
     }  # fmt: skip
     cameras = {f"cam{i}": folder / f"cam{i}.yaml" for i in range(len(cell.views))}
-    return mc.plan_cameras(cell.drawn, POSES, cameras, folder / "board.csv", **given | more)  # type: ignore[arg-type]
+    return mc.plan_cameras(cell.drawn, POSES, cameras, folder / "board.csv", **given | more)
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["eye in hand", "eye to hand"])
@@ -94,7 +91,7 @@ def check_seen(cell: Cell, plan: Plan, share: float = 0.8) -> None:
         assert (-(board[:, :3, 3] * board[:, :3, 2]).sum(axis=1) >= away * np.cos(INCIDENCE)).all()
 
 
-def test_planned_poses_see_the_board(cell: Cell, plan: Plan) -> None:
+def test_planned_poses_see_the_board(cell, plan):
     check_seen(cell, plan)
     assert (plan.q >= np.maximum(cell.drawn.lower, -np.pi)).all()
     assert plan.efficiency > 0.8
@@ -103,9 +100,7 @@ def test_planned_poses_see_the_board(cell: Cell, plan: Plan) -> None:
     assert plan.still == ("board" if cell.on_flange else "camera")
 
 
-def test_planned_poses_reach_the_predicted_sigma_and_beat_random_ones(
-    cell: Cell, plan: Plan
-) -> None:
+def test_planned_poses_reach_the_predicted_sigma_and_beat_random_ones(cell, plan):
     rng, here = np.random.default_rng(5), plan.here
     assert here.mean[0] < 0.75 * here.mean[1]
     random = plan.candidates.q[: plan.candidates.drawn]
@@ -122,7 +117,7 @@ def test_planned_poses_reach_the_predicted_sigma_and_beat_random_ones(
     assert own < 0.85 * others
 
 
-def test_information_is_that_of_the_fit(cell: Cell, tmp_path: Path) -> None:
+def test_information_is_that_of_the_fit(cell, tmp_path):
     """The predicted covariance of all parameters is that by the noise of a calibration."""
     on = "flange" if cell.on_flange else "ground"
     true = planned(replace(cell, drawn=cell.true), tmp_path)
@@ -135,12 +130,12 @@ def test_information_is_that_of_the_fit(cell: Cell, tmp_path: Path) -> None:
     assert_allclose(own, theirs, rtol=0.1)  # `taken` has no corners at the edge of an image
 
 
-def test_jitter_tells_less(cell: Cell, plan: Plan, tmp_path: Path) -> None:
+def test_jitter_tells_less(cell, plan, tmp_path):
     shaken = planned(cell, tmp_path, jitter=1e-4)
     assert shaken.here.mean[0] > 1.5 * plan.here.mean[0]
 
 
-def test_two_cameras_are_planned_together(tmp_path: Path) -> None:
+def test_two_cameras_are_planned_together(tmp_path):
     points = board_points((4, 3), 0.06)
     cell = make_cell(np.random.default_rng(3), points=points, poses=4, views=TWO)
     both = planned(cell, tmp_path, criterion="D")
@@ -152,21 +147,7 @@ def test_two_cameras_are_planned_together(tmp_path: Path) -> None:
 # ---- the command -----------------------------------------------------------------------------
 
 
-def pose_text(pose: Array) -> str:
-    """A pose as the command takes it."""
-    told = Frame.of(pose)
-    return ",".join(f"{value:.6f}" for value in (*told.xyz_mm, *told.abc_deg))
-
-
-def test_frames_are_read_as_they_are_told(cell: Cell) -> None:
-    assert_allclose(frame(pose_text(cell.place), "board_at"), cell.place, rtol=0, atol=1e-7)
-    with pytest.raises(mc.OptionError, match="give X,Y,Z in mm and A,B,C in deg"):
-        frame("1,2,3", "board_at")
-
-
-def test_the_command_of_the_page_runs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_of_the_page_runs(tmp_path, says, monkeypatch):
     cell = make_cell(np.random.default_rng(2), points=board_points((4, 3), 0.06), poses=4)
     write_cell(cell, tmp_path)
     (tmp_path / "cam0.yaml").rename(tmp_path / "camera.yaml")
@@ -176,8 +157,7 @@ def test_the_command_of_the_page_runs(
     assert line is not None
     picture = tmp_path / "plan.svg"
     command = shlex.split(line[1])
-    assert run(*command, "--candidates", 100, "--figure", picture) == 0
-    said, told = capsys.readouterr()
+    said, told = says(*command, "--candidates", 100, "--figure", picture)
     assert "Predicted sigma of a position" in said
     assert "noise of a pixel 0.1 px" in told
     written = Path(command[command.index("-o") + 1]).read_text()
@@ -186,22 +166,23 @@ def test_the_command_of_the_page_runs(
     assert picture.exists()
 
 
-def test_a_calibration_places_cameras_and_board(
-    cell: Cell, plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_calibration_places_cameras_and_board(cell, plan, tmp_path, answered, refuses):
     fit = tmp_path / "fit.json"
     files = write_cell(taken(cell, plan.q, np.random.default_rng(1)), tmp_path)
     see = ["--camera", f"cam0={tmp_path / 'cam0.yaml'}", "--board", tmp_path / "board.csv",
            "--print-looks", "z", "--candidates", 80, "--fit", fit]  # fmt: skip
-    assert run("calibrate", "ur5", *files, "-o", fit) == 0
-    capsys.readouterr()
-    assert run("plan", "ur5", "--poses", 12, *see, "--json") == 0
-    content = json.loads(capsys.readouterr().out)
+    assert run("calibrate ur5", *files, "-o", fit) == 0
+    content = answered("plan ur5 --poses 12", *see)
     assert content["cameras"] == ["cam0"]
     assert content["settings"]["camera_on"] == ("flange" if cell.on_flange else "ground")
     assert_allclose(content["settings"]["board_at"], cell.place, rtol=0, atol=3e-3)
-    assert run("plan", "ur5", "--poses", 12, *see, "--board-at", "0,0,0,0,0,0") == 2
-    assert "leave --camera-at and --board-at out" in capsys.readouterr().err
+    refuses(
+        "leave --camera-at and --board-at out",
+        "plan ur5 --poses 12",
+        *see,
+        "--board-at",
+        "0,0,0,0,0,0",
+    )
 
 
 @pytest.mark.parametrize(
@@ -221,18 +202,15 @@ def test_a_calibration_places_cameras_and_board(
         (("--camera", "a=b", "--board", "c", "--print-looks", "x"), "--print-looks"),
     ],
 )
-def test_wrong_input_is_one_line(
-    given: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_input_is_one_line(given, said, says):
     at = ("--camera-at", "0,0,80,0,0,0", "--board-at", "500,0,0,0,0,0")
     more = at if {"--share", "--print-looks"} & set(given) else ()
-    assert run("plan", "ur5", "--poses", 12, *given, *more) == 2
-    err = capsys.readouterr().err
+    err = says("plan ur5 --poses 12", *given, *more, code=2).err
     assert said in err
     assert len(err.strip().splitlines()) == 1
 
 
-def test_a_board_that_nothing_sees_is_said(cell: Cell, tmp_path: Path) -> None:
+def test_a_board_that_nothing_sees_is_said(cell, tmp_path):
     far = cell.place.copy()
     far[:3, 3] += 10.0
     with pytest.raises(mc.OptionError, match="can be taken and seen"):

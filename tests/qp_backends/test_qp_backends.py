@@ -38,11 +38,7 @@ CLOSED_FORMS = {
     "no rows": (Problem(np.diag([1.0, 4.0]), [-1.0, 4.0], np.zeros((0, 2)), [], []), [1, -1], []),
     "no curvature": (  # a linear program: max x + 2y on a triangle
         Problem(
-            np.zeros((2, 2)),
-            [-1.0, -2.0],
-            [[1, 1], [1, 0], [0, 1]],
-            [-INF, 0, 0],
-            [1, INF, INF],
+            np.zeros((2, 2)), [-1.0, -2.0], [[1, 1], [1, 0], [0, 1]], [-INF, 0, 0], [1, INF, INF]
         ),
         [0.0, 1.0],
         [2.0, -1.0, 0.0],

@@ -1,22 +1,33 @@
 """The page to sign: which number, which verdict, what limits it; facts from a TOML."""
 
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import run
+from dynamics.motions import simulated, three_joints
 from test_report import WORDING, Seen
 
 import minimax_cal as mc
 from minimax_cal.diagnosing.result import load_diagnosis
-from minimax_cal.judging.tolerance import limits_of
+from minimax_cal.dynamics.regressor import Motion
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Table
+from minimax_cal.judging.tolerance import NOT_PASSED, NOT_STATED, PASSED, limits_of
 from minimax_cal.measuring.floor import AT_MOST, Floor
+from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.reporting import report
-from minimax_cal.reporting.html import compose, page, read_sources
+from minimax_cal.reporting.html import Figure, compose, page, read_sources
 from minimax_cal.reporting.html.document import Wording
 from minimax_cal.reporting.html.facts import FACTS
-from minimax_cal.reporting.html.first_page import left_now, limits_now, signed
+from minimax_cal.reporting.html.first_page import Signed, left_now, limits_now, signed
+from minimax_cal.reporting.html.motion import compose_motion, motion_of
 from minimax_cal.reporting.html.sources import Sources
+
+# ---- first page ----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -42,13 +53,12 @@ def rows(seen: Seen) -> dict[str, list[str]]:
     }
 
 
-def test_requirement_result_and_verdict(whole, tmp_path, capsys):
+def test_requirement_result_and_verdict(whole, tmp_path, says):
     fit, out = mc.load_fit(whole), tmp_path / "report.html"
     high = 1e3 * fit.within.rms.high
     for size, verdict in ((1.1 * high, "passed"), (0.5 * fit.within.after.rms_mm, "not passed")):
         told = ("report", whole, "--tolerance", f"rms {size:.6f}", "-o", out)
-        assert run(*told) == 0
-        stdout, stderr = capsys.readouterr()
+        stdout, stderr = says(*told)
         assert stdout.splitlines()[0] == verdict
         assert f"written: {out}" in stderr
         seen = Seen(out.read_text())
@@ -60,30 +70,26 @@ def test_requirement_result_and_verdict(whole, tmp_path, capsys):
         assert verdict.capitalize() in seen.text["verdict"]
 
 
-def test_beyond_is_asked_of_the_worst_part(whole, tmp_path, capsys):
+def test_beyond_is_asked_of_the_worst_part(whole, tmp_path, refuses, says):
     fit = mc.load_fit(whole)
     out = tmp_path / "report.html"
     size = 0.5 * (fit.within.rms.high * 1e3 + fit.beyond.rms_high_mm)
     assert 1e3 * fit.within.rms.high < size < fit.beyond.rms_high_mm
     told = ("report", whole, "--tolerance", f"rms {size:.6f}", "-o", out, "-q")
-    assert run(*told) == 0
-    assert capsys.readouterr().out.startswith("passed")
-    assert run(*told, "--tolerance-for", "outside") == 0
-    assert capsys.readouterr().out.startswith("not passed")
+    assert says(*told).out.startswith("passed")
+    assert says(*told, "--tolerance-for", "outside").out.startswith("not passed")
     assert rows(Seen(out.read_text()))["RMS, outside, worst part"][-1] == "not passed"
-    assert run(*told, "--tolerance-for", "above") == 2
-    assert "choose inside or outside" in capsys.readouterr().err
+    refuses("choose inside or outside", *told, "--tolerance-for", "above")
 
 
-def test_an_arm_of_half_its_lengths_is_not_signed_unseen(robot, tmp_path, capsys):
+def test_an_arm_of_half_its_lengths_is_not_signed_unseen(robot, tmp_path, says):
     """Points that are scaled by half give links of half their length: told on the sheet itself."""
     made = mc.simulate(robot, 60, seed=4)
     for factor, told in ((0.5, True), (1.0, False)):
         fit = mc.calibrate(robot, made.data.with_y(factor * made.data.y))
         fit.save(tmp_path / "fit.json")
         page = tmp_path / "report.html"
-        assert run("report", tmp_path / "fit.json", "--tolerance", "rms 5", "-o", page, "-q") == 0
-        said = capsys.readouterr().out
+        said = says("report", tmp_path / "fit.json", "--tolerance", "rms 5", "-o", page, "-q").out
         assert said.startswith("not passed" if told else "passed")  # it has failed
         assert ("Implausibly large changes: a1 by" in said) == told
         assert ("another arm's" in Seen(page.read_text()).text["verdict"]) == told
@@ -165,7 +171,7 @@ def test_too_few_poses_leave_a_maximum_open(robot, tmp_path):
     assert "9 poses are too few for a maximum: at least 19 are needed" in text
 
 
-def test_facts_are_of_the_file_or_to_be_filled_in(results, tmp_path, capsys):
+def test_facts_are_of_the_file_or_to_be_filled_in(results, tmp_path, refuses):
     toml, out = tmp_path / "cell.toml", tmp_path / "report.html"
     toml.write_text('serial_number = "26-104711"\npayload = 12\ncustomer = "<b>Example</b>"\n')
     assert run("report", results / "fit.json", "--facts", toml, "-o", out) == 0
@@ -180,8 +186,7 @@ def test_facts_are_of_the_file_or_to_be_filled_in(results, tmp_path, capsys):
         ("[tool]\na = 1", "tool must be a text or a number"),
     ):
         toml.write_text(content)
-        assert run("report", results / "fit.json", "--facts", toml, "-o", out) == 2
-        assert words in capsys.readouterr().err
+        refuses(words, "report", results / "fit.json", "--facts", toml, "-o", out)
 
 
 @pytest.mark.usefixtures("browser")
@@ -194,3 +199,214 @@ def test_paper_and_picture_by_the_ending(results, tmp_path, monkeypatch):
     ((text, path),) = printed
     assert path == tmp_path / "page.pdf"
     assert "accuracy" in Seen(text).text
+
+
+# ---- deliver -------------------------------------------------------------------------------------
+
+
+EFFECTS = "joint_compliance:all"
+
+
+@pytest.fixture(scope="module")
+def fit() -> mc.Fit:
+    """Compliance, and a drift that ends with the session."""
+    made = simulate("irb2600", 120, 3, seed=4, truth=Truth(compliance=3e-6))
+    return mc.calibrate("irb2600", made.data, "sum", effects=f"{EFFECTS},frame_drift:frame")
+
+
+@pytest.fixture(scope="module")
+def between(fit: mc.Fit) -> str:
+    """A requirement that corrected targets keep, and geometry alone does not."""
+    low, high = (mc.deliver(fit, to).figures.rms for to in ("compensate", "urdf"))
+    assert 3.0 * low < high
+    return f"rms {0.5 * (low + high):.4f}"
+
+
+def judged(fit: mc.Fit, limits: str, *deliver: str) -> Signed:
+    return signed(read_sources([fit]), limits_of(limits), "inside", None, deliver)
+
+
+def test_a_file_is_judged_by_what_it_reaches(fit, between):
+    """The same fit passes for corrected targets and not for a URDF."""
+    for names, verdict, of in (
+        ((), PASSED, "compensate"),
+        (("compensate",), PASSED, "compensate"),
+        (("urdf",), NOT_PASSED, "urdf"),
+        (("mjcf", "json"), NOT_PASSED, "json"),
+        (("mjcf", "compensate"), PASSED, "mjcf"),
+    ):
+        found = judged(fit, between, *names)
+        assert found.verdict == verdict
+        assert found.row
+        own = mc.deliver(fit, of)
+        assert found.row.delivered.format == of
+        assert found.claims[0].rms.value == pytest.approx(own.figures.rms, rel=1e-9)
+        told = [row.delivered.format for row in found.rows]
+        assert told == list(names or ("compensate", "urdf"))
+    rows = judged(fit, between).rows
+    assert [row.verdict for row in rows] == [PASSED, NOT_PASSED]
+    assert "frame_drift:frame" in rows[0].delivered.not_carried
+
+
+def test_geometry_alone_is_its_own_deliverable(between):
+    made = simulate("irb2600", 120, 3, seed=4)
+    plain = mc.calibrate("irb2600", made.data, "sum")
+    alone = judged(plain, between)
+    assert alone.row is None
+    named = judged(plain, between, "urdf")
+    assert named.row
+    assert named.claims == alone.claims
+    assert named.verdict == alone.verdict
+
+
+def test_without_measurements_nothing_is_stated(fit, between, tmp_path):
+    fit.save(tmp_path / "fit.json", poses=False)
+    found = judged(mc.load_fit(tmp_path / "fit.json"), between, "urdf")
+    assert found.verdict == NOT_STATED
+    assert "holds no measurements" in found.judged[0].why
+
+
+def test_the_page_and_the_command_say_for_which_file(fit, between, tmp_path, refuses, says):
+    fit.save(tmp_path / "fit.json")
+    asked = ("report", tmp_path / "fit.json", "--tolerance", between, "-o", tmp_path / "page.html")
+    first, *rest = says(*asked).out.splitlines()
+    assert first == PASSED
+    assert any(
+        "hold for joint targets corrected by minimax-cal compensate" in line for line in rest
+    )
+    assert any(line.startswith("urdf: not passed: urdf holds geometry alone") for line in rest)
+    page = (tmp_path / "page.html").read_text()
+    assert "Files and corrected targets" in page
+    first, *rest = says(*asked, "--deliver", "urdf", "--deliver", "ros-yaml").out.splitlines()
+    assert first == NOT_PASSED
+    assert any(
+        "hold for the urdf file of minimax-cal export (geometry alone)" in line for line in rest
+    )
+    assert sum(line.startswith(("urdf: ", "ros-yaml: ")) for line in rest) == 2
+    refuses("no such format; choose one of urdf", *asked, "--deliver", "step")
+
+
+# ---- report set aside ----------------------------------------------------------------------------
+
+
+BAD = 5
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """poses.csv with 2 % of the poses off by 1 mm; used.csv with these unticked, as on the page."""
+    folder = tmp_path_factory.mktemp("aside")
+    truth = Truth(noise=20e-6, noise_per_metre=0.0, compliance=0.0)
+    data = simulate("irb120", 250, 2, seed=3, truth=truth).data
+    rng = np.random.default_rng(0)
+    rows = rng.choice(250, BAD, replace=False)
+    by = rng.normal(size=(BAD, 1, 3))
+    y = data.y.copy()
+    y[rows] += 1e-3 * by / np.linalg.norm(by, axis=-1, keepdims=True)
+    mc.write_measurements(folder / "poses.csv", data.with_y(y))
+    points = ",".join(str(line) for line in data.line[rows])
+    left = f"--leave-out={points}=looks odd"
+    assert run("import", folder / "poses.csv", left, "-o", folder / "used.csv", "--quiet") == 0
+    for name in ("poses", "used"):
+        mc.calibrate("irb120", folder / f"{name}.csv", "sum").save(folder / f"{name}.json")
+    mc.diagnose("irb120", folder / "used.csv", quick=True).save(folder / "gap.json")
+    return folder
+
+
+def test_passed_only_without_them_is_said_in_the_verdict_line(files, says):
+    fit, out = mc.load_fit(files / "used.json"), files / "report.html"
+    counted = fit.accuracy["holdout_with_them"].rms_mm
+    first, *others = says(
+        "report", files / "used.json", "--tolerance", "rms 0.1", "-o", out
+    ).out.splitlines()
+    said = f"without {2 * BAD} points set aside by the user; with them RMS {counted:.3f} mm"
+    assert first == f"{PASSED} {said}: {NOT_PASSED}"
+    assert any("Why: looks odd (10)" in line for line in others)
+    verdict = Seen(out.read_text()).text["verdict"]
+    assert f"Passed {said}: {NOT_PASSED}" in verdict
+    assert f"RMS, inside, with {2 * BAD} points set aside" in verdict
+    assert "Why: looks odd (10)" in verdict
+
+
+def test_with_room_enough_it_is_passed_with_them_too(files):
+    found = signed(read_sources([files / "used.json"]), limits_of("rms 2"), "inside", None)
+    assert found.sentence == found.verdict == PASSED
+    assert found.lines()[2].startswith(f"{2 * BAD} points set aside by the user; with them RMS")
+
+
+def test_a_diagnosis_alone_says_it_as_well(files):
+    found = signed(read_sources([files / "gap.json"]), limits_of("rms 0.1"), "inside", None)
+    assert found.verdict == PASSED
+    assert found.sentence.startswith(f"{PASSED} without {2 * BAD} points set aside by the user")
+
+
+def test_without_any_the_page_says_so(files):
+    sources = read_sources([files / "poses.json"])
+    found = signed(sources, limits_of("rms 2"), "inside", None)
+    assert (found.set_aside, found.judged_with) == ((), ())
+    assert "No measured point was set aside." in page.render(compose(sources, WORDING))
+
+
+# ---- report motion -------------------------------------------------------------------------------
+
+
+MOTION_WORDING = Wording("2026-11-25", author="A. Smith")
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A motion diagnosis that names the rotor of joint 3."""
+
+    def rotor(motion: Motion, rigid: Array, time: Array) -> Array:
+        return np.stack([0.0 * time, 0.0 * time, 0.3 * motion.qdd[:, 2]], axis=1)
+
+    path = tmp_path_factory.mktemp("motion") / "motion.json"
+    mc.diagnose_motion(three_joints(), simulated(rotor, seed=3)).save(path)
+    return path
+
+
+def test_sections_hold_the_budget_the_curves_and_the_run_left_out(saved):
+    source = motion_of([saved])
+    assert source
+    page = compose_motion(source, MOTION_WORDING)
+    blocks = {section.name: section.blocks for section in page.sections}
+    budget = [one for one in blocks["budget"] if isinstance(one, Table)]
+    last = source.found.budget[-1]
+    assert budget[0].rows[-1] == (last.name, *last.holdout_rms)
+    assert budget[1].rows[-1] == (last.name, *last.holdout_rms_moving)
+    figures = [one for one in blocks["torques"] if isinstance(one, Figure)]
+    assert [one.name for one in figures] == ["joint-1", "joint-2", "joint-3"]
+    measured, predicted, band, curve = figures[2].traces
+    assert measured["y"] == pytest.approx(source.found.held_run.measured[2], rel=1e-5)
+    assert predicted["y"] == pytest.approx(source.found.held_run.predicted[2], rel=1e-5)
+    assert len(band["y"]) == 2 * len(curve["y"])
+    assert f"{last.holdout_rms_moving[2]:.3g} N m" in figures[2].says
+    assert blocks["provenance"][0].rows[0][2] == source.file.digest
+
+
+def test_the_command_writes_one_page(saved, says):
+    page = saved.with_name("report.html")
+    said = says("report", saved, "-o", page, "--author", "A. Smith", "--date", "2026-11-25").out
+    assert "rotor inertia at J3" in said
+    html = page.read_text()
+    assert re.search(r'class="kind">\s*Motion diagnosis', html)
+    assert "rotor inertia at J3" in html
+    assert html.count('id="figure-joint-') == 3
+
+
+def test_what_is_of_positions_is_refused_and_it_stands_alone(saved, refuses):
+    refuses(
+        "is of positions",
+        "report",
+        saved,
+        "--tolerance",
+        "rms 0.2",
+        "-o",
+        saved.with_name("a.html"),
+    )
+    refuses("report it alone", "report", saved, saved, "-o", saved.with_name("a.html"))
+    other = saved.with_name("other.json")
+    other.write_text(json.dumps({**json.loads(saved.read_text()), "schema": 2}))
+    refuses(
+        "is of schema 2, this version knows 1", "report", other, "-o", saved.with_name("a.html")
+    )

@@ -79,12 +79,11 @@ def test_processes_say_what_one_says(folder):
     assert one == two
 
 
-def test_the_command_goes_on_after_a_failed_cell(folder, tmp_path, capsys):
+def test_the_command_goes_on_after_a_failed_cell(folder, tmp_path, says):
     text = (folder / "cells.toml").read_text().split("[[cells]]")
     short = folder / "short.toml"
     short.write_text("\n[[cells]]".join([text[0], text[-1], text[3]]))
-    assert run("fleet", short, "--jobs", "1", "--json") == 1
-    both = capsys.readouterr()
+    both = says("fleet", short, "--jobs", "1", "--json", code=1)
     told = json.loads(both.out)
     assert told["failed"] == 1
     assert [row["status"] for row in told["rows"]] == ["failed", "converged"]
@@ -115,20 +114,17 @@ def test_what_cells_say_is_escaped():
         ("[[cells]", "is not TOML"),
     ],
 )  # fmt: skip
-def test_a_wrong_file_is_one_line(text, said, tmp_path, capsys):
+def test_a_wrong_file_is_one_line(text, said, tmp_path, says):
     (tmp_path / "cells.toml").write_text(text)
-    assert run("fleet", tmp_path / "cells.toml") == 2
-    err = capsys.readouterr().err
+    err = says("fleet", tmp_path / "cells.toml", code=2).err
     assert said in err
     assert len(err.splitlines()) == 1
 
 
-def test_a_wrong_place_is_one_line(folder, capsys):
+def test_a_wrong_place_is_one_line(folder, says):
     cells = folder / "cells.toml"
-    assert run("fleet", cells, "--jobs", "0") == 2
-    assert run("fleet", cells, "--page", folder / "page.png") == 2
-    assert run("fleet", folder / "none.toml") == 2
-    assert len(capsys.readouterr().err.splitlines()) == 3
+    for wrong in ((cells, "--jobs", 0), (cells, "--page", "page.png"), (folder / "none.toml",)):
+        assert len(says("fleet", *wrong, code=2).err.splitlines()) == 1
 
 
 def test_what_a_calibration_says_is_in_its_row(folder, tmp_path, capsys):

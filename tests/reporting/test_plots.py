@@ -134,15 +134,6 @@ def test_errors_are_those_of_the_ladder():
     assert_allclose(np.sqrt(np.mean(rms[found.held] ** 2)), found.ladder[-1].holdout.rms_mm)
 
 
-def test_visits_are_in_their_order():
-    found = diagnosed("backlash")
-    order = found.data.columns["order"][::-1].copy()
-    turned = replace(found, data=replace(found.data, columns={
-        **with_history(found.data).columns, "order": order}))  # fmt: skip
-    curve = curves.order_curve(turned.leftover())
-    assert_allclose(curve.x, np.arange(60, 0, -1))
-
-
 @pytest.mark.parametrize("name", list(EFFECTS))
 def test_every_effect_has_something_to_be_drawn_against(name):
     """With its unit, one number for each pose."""
@@ -169,11 +160,3 @@ def test_powers_on_a_logarithmic_axis_are_set_as_mathematics(tmp_path):
     labels = [*axes.get_xticklabels(), *axes.get_yticklabels()]
     assert len(labels) >= 4
     assert all(label.get_parse_math() for label in labels)
-
-
-def test_workspaces_are_shown_in_millimetres():
-    axes = figures.new_figure(4, 4).subplots()
-    axes.set(xlim=(-1.0, 1.0), ylim=(0.0, 0.5))
-    figures.in_millimetres(axes)
-    assert axes.xaxis.get_major_formatter()(0.25, None) == "250"
-    assert axes.yaxis.get_major_formatter()(-1.0, None) == "-1000"

@@ -27,12 +27,9 @@ from plotly.offline import get_plotlyjs
 
 import minimax_cal as mc
 from minimax_cal.cli.report import report_command
-from minimax_cal.evidence.noise import Noise
-from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.words import visible
 from minimax_cal.modelling.effects.words import name_effect, name_step
-from minimax_cal.modelling.parameters import Names
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.reporting.html import (
     Figure,
@@ -47,7 +44,6 @@ from minimax_cal.reporting.html import (
 from minimax_cal.reporting.html.charts import PALETTE
 from minimax_cal.reporting.html.content import label, some
 from minimax_cal.reporting.html.error_charts import box, cumulative, histogram, trend
-from minimax_cal.reporting.html.more_charts import correlations
 from minimax_cal.reporting.html.page import script_json
 from minimax_cal.reporting.html.projection import flat
 from minimax_cal.reporting.html.scene import inside, magnification, skeleton, space_of
@@ -247,7 +243,7 @@ def test_provenance_has_the_digests_of_the_files(results, seen):
                        ("measurements", "poses.csv")):  # fmt: skip
         raw = (results / name).read_bytes()
         assert files[kind] == [name, hashlib.sha256(raw).hexdigest()]
-    chosen = dict(seen.tables["Settings of the calibration"][1:])  # type: ignore[arg-type]
+    chosen = dict(seen.tables["Settings of the calibration"][1:])
     assert chosen["seed"] == "0"
     assert chosen["holdout"] == "0.2"
 
@@ -367,35 +363,6 @@ def test_boxes_are_quartiles(rng):
     assert_allclose(parts, np.nanpercentile(values[:2], [0, 25, 50, 75, 100], axis=1), rtol=1e-5)
 
 
-def test_trend_is_a_running_median():
-    x = np.arange(60.0)[::-1]
-    at, middle = trend(x, 3.0 * x)
-    assert len(at) == 12
-    assert_allclose(middle, 3.0 * at)
-    assert np.all(np.diff(at) > 0)
-
-
-def test_correlations_of_a_known_covariance():
-    names = Names(1, (), ())
-    covariance = np.full((names.count,) * 2, np.nan)
-    covariance[:3, :3] = [[4, 3, 0], [3, 9, 0], [0, 0, 0]]
-    noise = Noise(0.0, 1.0, 0.0)
-    known = Uncertainty(names, ("m",) * names.count, covariance, lambda: noise, 9.0, "poses")
-    told, found = correlations(known)
-    assert told == names.all[:3]
-    assert_allclose(found[:2, :2], [[1.0, 0.5], [0.5, 1.0]])
-    assert np.isnan(found[2]).all()  # what does not vary goes with nothing
-
-
-@given(st.lists(st.floats(0, 1e3), max_size=60), st.integers(4, 20))
-def test_some_keeps_the_largest(size, most):
-    chosen = some(np.array(size), most)
-    assert len(chosen) == min(most, len(size))
-    assert np.all(np.diff(chosen) > 0)
-    if size:
-        assert max(size) == max(size[i] for i in chosen)
-
-
 # ---- the workspace -----------------------------------------------------------------------------
 
 
@@ -431,14 +398,6 @@ def test_arrows_lead_from_prediction_to_measurement(sources):
     times = magnification(space, space.after)
     sizes = times * np.linalg.norm(space.after, axis=-1)
     assert 0.03 < np.percentile(sizes, 90) / space.radius < 0.13
-
-
-def test_still_is_a_parallel_projection():
-    right, up, depth = flat(np.eye(3)).T[0], -flat(np.eye(3)).T[1], np.zeros(3)
-    depth = np.cross(right, up)
-    assert_allclose(np.stack([right, up, depth]) @ np.stack([right, up, depth]).T, np.eye(3),
-                    atol=1e-12)  # fmt: skip
-    assert up[2] > 0.5  # z stays upright
 
 
 def test_view_holds_every_arrow_once(sections, fit):
@@ -677,11 +636,10 @@ BROKEN: dict[str, Callable[[dict[str, Any]], object]] = {
 
 
 @pytest.mark.parametrize("how", BROKEN)
-def test_a_broken_file_is_one_line(how, tmp_path, fit, capsys):
+def test_a_broken_file_is_one_line(how, tmp_path, fit, says):
     BROKEN[how](fit)
     path = write(tmp_path / "fit.json", fit)
-    assert run("report", path, "-o", tmp_path / "report.html") == 2
-    out, err = capsys.readouterr()
+    out, err = says("report", path, "-o", tmp_path / "report.html", code=2)
     assert out == ""
     assert err.count("\n") == 1
     assert err.startswith(f"error: {path}: ")
@@ -691,11 +649,10 @@ def test_a_broken_file_is_one_line(how, tmp_path, fit, capsys):
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", "NaN", '{"a": NaN}', "[" * 100_000, "\xff", "7" * 5000]
 )
-def test_what_is_no_json_is_said(text, tmp_path, capsys):
+def test_what_is_no_json_is_said(text, tmp_path, says):
     path = tmp_path / "fit.json"
     path.write_bytes(text.encode("latin-1"))
-    assert run("report", path, "-o", tmp_path / "report.html") == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    assert says("report", path, "-o", tmp_path / "report.html", code=2).err.count("\n") == 1
 
 
 @pytest.mark.parametrize("slips", [20, pytest.param(300, marks=pytest.mark.slow)])
@@ -751,3 +708,28 @@ def test_real_arm_in_three_commands(tmp_path, capsys):
     assert f"{shown['rms_mm']:.3f}" in seen.text["verdict"]
     assert hashlib.sha256(data.read_bytes()).hexdigest() in seen.text["provenance"]
     assert list(seen.text) == [SECTIONS[0], "signatures", *SECTIONS[1:]]
+
+
+def test_trend_is_a_running_median():
+    x = np.arange(60.0)[::-1]
+    at, middle = trend(x, 3.0 * x)
+    assert len(at) == 12
+    assert_allclose(middle, 3.0 * at)
+    assert np.all(np.diff(at) > 0)
+
+
+def test_still_is_a_parallel_projection():
+    right, up, depth = flat(np.eye(3)).T[0], -flat(np.eye(3)).T[1], np.zeros(3)
+    depth = np.cross(right, up)
+    assert_allclose(np.stack([right, up, depth]) @ np.stack([right, up, depth]).T, np.eye(3),
+                    atol=1e-12)  # fmt: skip
+    assert up[2] > 0.5  # z stays upright
+
+
+@given(st.lists(st.floats(0, 1e3), max_size=60), st.integers(4, 20))
+def test_some_keeps_the_largest(size, most):
+    chosen = some(np.array(size), most)
+    assert len(chosen) == min(most, len(size))
+    assert np.all(np.diff(chosen) > 0)
+    if size:
+        assert max(size) == max(size[i] for i in chosen)

@@ -1,12 +1,26 @@
+from dataclasses import replace
+from types import ModuleType
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.cell import still
+from minimax_cal.modelling.effects.table import Fitted, Term
+from minimax_cal.modelling.model import Model, arrays_of, model_of
 from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.reach import arm_of
+from minimax_cal.modelling.reach import bent as reached_at
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.gravity import G, torques
+from minimax_cal.robots.frames import CONVENTION, Frame, frames_tables
+from minimax_cal.robots.kernels import choice, plain, sums
+from minimax_cal.robots.sampling import random_poses
+from minimax_cal.robots.transforms import transform
+
+# ---- kinematics ----------------------------------------------------------------------------------
+
 
 TARGETS = np.array([[0.1, 0.0, 0.05], [-0.05, 0.08, 0.05], [0.0, -0.09, 0.02]])
 
@@ -37,7 +51,7 @@ def test_jacobian_is_the_complex_step_derivative(name, rng):
         assert_allclose(analytic[..., i], slope, rtol=0, atol=1e-14, err_msg=model.names.all[i])
 
 
-def pinocchio_model(robot: mc.Robot):  # type: ignore[no-untyped-def]
+def pinocchio_model(robot: mc.Robot):
     """The same arm in Pinocchio: frame i-1 to joint i is the rest of link i-1."""
     pin = pytest.importorskip("pinocchio", reason="Pinocchio (pip install pin) is not installed")
 
@@ -88,22 +102,317 @@ def test_rotation_is_scipys(size, rng):
     assert_allclose(kinematics.rotation(w), expected, rtol=0, atol=1e-15)
 
 
-def test_gravity_torque_is_the_slope_of_potential_energy(rng):
-    robot = mc.load_robot("irb2600")
-    mass, com = rng.uniform(1, 50, 6), rng.normal(size=(6, 3)) * 0.2
-    up = rng.normal(size=3)
-    up /= np.linalg.norm(up)
-    q = rng.uniform(-3, 3, (5, 6))
+# ---- kernels -------------------------------------------------------------------------------------
 
-    def energy(q: np.ndarray) -> np.ndarray:
-        total = 0.0
-        for i in range(6):  # each link alone, as a target on a shorter arm
-            links = kinematics.chain(robot.mdh[: i + 1], q[:, : i + 1], robot.prismatic[: i + 1])
-            point = kinematics.points(links, com[i][None])[0]
-            total = total + mass[i] * G * (up @ point)
-        return np.asarray(total)
 
-    found = torques(kinematics.chain(robot.mdh, q, robot.prismatic), mass, com, up)
-    for i in range(6):
-        step = 1e-30j * np.eye(6)[i]
-        assert_allclose(found[i], -energy(q + step).imag / 1e-30, rtol=0, atol=1e-10)
+Arrays = tuple[np.ndarray, ...]
+ALIKE = 1e-12  # relative to the largest entry
+POSES = 210  # more than a block of the compiled kernels
+
+
+@pytest.fixture
+def fast() -> ModuleType:
+    pytest.importorskip("numba", reason="numba is not installed: pip install 'minimax-cal[fast]'")
+    from minimax_cal.robots.kernels import fast
+
+    return fast
+
+
+def cell(name: str, robots: int, effects: int, rng: np.random.Generator) -> tuple[Model, State]:
+    """An arm amid measurements with holes and weights, and a batch of states near the truth."""
+    sim = mc.simulate(mc.load_robot(name), POSES, 2, 0)
+    y = sim.data.y.copy()
+    y[rng.random(y.shape[:2]) < 0.2] = np.nan
+    model = model_of(sim.cell.robot, sim.data.with_y(y))
+    fields, moved = (
+        1e-3 * rng.normal(size=(effects, *model.y.shape)),
+        1e-4 * rng.normal(size=model.y.shape),
+    )
+    weight = model.weight * rng.uniform(0.5, 2.0, model.weight.shape)
+    names = replace(model.names, effects=tuple(f"e{i}" for i in range(effects)))
+    model = replace(
+        model, names=names, weight=weight, active=np.ones(names.count, dtype=bool),
+        fields=fields if effects else model.fields, moved=moved if effects else model.moved,
+    )  # fmt: skip
+    begin = replace(sim.cell.state, effects=np.zeros(effects)).repeat(robots)
+    return model, begin.step(1e-3 * rng.normal(size=(robots, names.count)))
+
+
+CELLS = [("irb120", 1, 0), ("irb2600", 3, 2), ("scara_600", 2, 0), ("scara_600", 1, 3)]
+
+
+def near(found: Arrays, wanted: Arrays, alike: float = ALIKE) -> None:
+    for mine, other in zip(found, wanted, strict=True):
+        assert mine.shape == other.shape
+        assert_allclose(mine, other, rtol=0, atol=alike * np.abs(other).max(initial=0.0))
+
+
+@pytest.mark.parametrize(("name", "robots", "effects"), CELLS)
+def test_pairs(name, robots, effects, fast, rng):
+    model, state = cell(name, robots, effects, rng)
+    at, seen = arrays_of(state), model.sight
+    (mdh, *place), (q, prismatic, *_) = at, seen
+    near(fast.chain(mdh, q, prismatic), plain.chain(mdh, q, prismatic))
+    arm = plain.unwound(mdh, q, prismatic, 20, 90)
+    near((fast.unwound(mdh, q, prismatic, 20, 90),), (arm,))
+    near(fast.sighted(arm, *place, *seen[2:], 20), plain.sighted(arm, *place, *seen[2:], 20))
+    near((sums.cost(fast, at, seen),), (sums.cost(plain, at, seen),))
+    one = tuple(part[:1] for part in at)
+    for share in (1.0, 0.6):
+        which = np.flatnonzero(rng.random(model.names.count) < share)
+        step = 1e-2 * rng.normal(size=len(which))
+        near(sums.normal(fast, at, seen, which), sums.normal(plain, at, seen, which))
+        near(sums.rows(fast, one, seen, which, 20, 90), sums.rows(plain, one, seen, which, 20, 90))
+        near(sums.squares(fast, one, seen, which), sums.squares(plain, one, seen, which))
+        near(fast.stepped(*one, which, step), plain.stepped(*one, which, step))
+
+
+def test_a_system_that_is_not_definite_is_told(fast, rng):
+    """And one that is has its solution; the last row repeats the first."""
+    rows = rng.normal(size=(1, 3, 20, 6))
+    right, off, hold = rng.normal(size=(1, 3, 6)), rng.normal(size=6), np.zeros(6)
+    for hold in (np.zeros(6), rng.uniform(size=6)):
+        gram = np.swapaxes(rows, 2, 3) @ rows
+        given = rng.uniform(size=(1, 3)), right, gram, off, hold
+        found, wanted = fast.solved(*given), plain.solved(*given)
+        assert_allclose(found[0], wanted[0], rtol=1e-11)
+        assert_allclose(found[1:3], wanted[1:3], rtol=1e-11)
+        assert found[3]
+        assert wanted[3]
+        total = gram[0].sum(axis=0) + np.diag(hold)
+        assert_allclose(total @ wanted[0], right[0].sum(axis=0) + hold * off, rtol=1e-9)
+    rows[..., -1] = rows[..., 0]
+    given = given[0], right, np.swapaxes(rows, 2, 3) @ rows, off, np.zeros(6)
+    assert not fast.solved(*given)[3]
+    assert not plain.solved(*given)[3]
+
+
+@pytest.mark.parametrize(("name", "robots", "effects"), CELLS)
+def test_rows_make_the_normal_equations(name, robots, effects, rng):
+    model, state = cell(name, 1, effects, rng)
+    which = np.flatnonzero(rng.random(model.names.count) < 0.8)
+    given = plain, arrays_of(state), model.sight, which
+    error, J = sums.rows(*given, 0, POSES)
+    cost, gradient, gram = sums.normal(*given)
+    made = (
+        (error**2).sum(axis=(1, 2)),
+        np.einsum("kpic,kic->kp", J, error),
+        np.einsum("kpic,kqic->kpq", J, J),
+    )
+    near(made, (cost[0], gradient[0], gram[0]))
+    f, slope = sums.squares(*given)
+    near((f.sum(axis=1), slope.sum(axis=1)), (cost[0], -2.0 * gradient[0]))
+
+
+@pytest.mark.parametrize(("name", "robots", "effects"), CELLS)
+def test_normal_equations_are_those_of_the_jacobian(name, robots, effects, rng):
+    model, state = cell(name, robots, effects, rng)
+    which = np.flatnonzero(rng.random(model.names.count) < 0.8)
+    cost, gradient, gram = sums.normal(plain, arrays_of(state), model.sight, which)
+    error, J = np.nan_to_num(model.error(state)), model.jacobian(state)[..., which]
+    weight = model.weight[..., None]
+    near(
+        (cost, gradient, gram),
+        (
+            (weight * error**2).sum(axis=(-1, -2)),
+            np.einsum("km,bkmi,bkmip->bkp", model.weight, error, J),
+            np.einsum("km,bkmip,bkmiq->bkpq", model.weight, J, J),
+        ),
+    )
+    near((sums.cost(plain, arrays_of(state), model.sight),), (cost,))
+
+
+@pytest.mark.parametrize(("name", "effects"), [("irb120", 0), ("irb2600", 2)])
+def test_plain_steps_end_alike(name, effects, fast, rng):
+    model, state = cell(name, 1, effects, rng)
+    names = ("a1", "a2", "a3", "theta2", "theta3", "theta4", "theta5")
+    told = [model.names.index(one) for one in names]  # by any poses
+    which = np.array([*told, *range(5 * model.names.joints, model.names.count)])
+    prior = np.full(len(which), 1e-3), np.where(which < 5 * model.names.joints, 1e-3, 0.0)
+    ends = [
+        sums.descend(module, arrays_of(state), model.sight, which, prior, 1e-12, 15)
+        for module in (fast, plain)
+    ]
+    assert ends[0][-1]
+    assert ends[1][-1]
+    near(ends[0][0], ends[1][0], alike=1e-10)  # systems of a condition of 1e4
+    near(ends[0][1:2], ends[1][1:2], alike=1e-10)
+
+
+def test_polish(fast, rng):
+    truth = Rotation.random(rng=rng).as_matrix()
+    matrix = rng.normal(size=(10, 9))
+    right = matrix @ truth.reshape(9) + 1e-3 * rng.normal(size=10)
+    starts = np.stack([truth @ plain.turned(0.5 * rng.normal(size=3)) for _ in range(8)])
+    ends = [module.polish(matrix, right, starts) for module in (fast, plain)]
+    assert ends[0][1].min() < 1e-5
+    near(ends[0], ends[1], alike=1e-9)
+    best = ends[1][0][np.argmin(ends[1][1])]
+    assert_allclose(best @ best.T, np.eye(3), rtol=0, atol=1e-14)
+    assert_allclose(best, truth, rtol=0, atol=5e-3)
+
+
+def test_choice(monkeypatch, fast):
+    choice.best.cache_clear()
+    monkeypatch.setenv(choice.SWITCH, "plain")
+    assert choice.kernels() is plain
+    choice.best.cache_clear()
+    monkeypatch.delenv(choice.SWITCH)
+    assert choice.kernels() is fast
+    with choice.work(brief=True):
+        assert choice.kernels() is plain
+        with choice.work(brief=False):
+            assert choice.kernels() is fast
+    assert choice.kernels() is fast
+
+
+def test_without_numba_numpy_answers(monkeypatch):
+    choice.best.cache_clear()
+    monkeypatch.delenv(choice.SWITCH, raising=False)
+    monkeypatch.setattr(choice.util, "find_spec", lambda name: None)
+    assert choice.kernels() is plain
+    choice.best.cache_clear()
+
+
+@pytest.mark.parametrize("name", ["plain", "fast"])
+def test_targets_alone_may_be_free(name, request, rng):
+    own = plain if name == "plain" else request.getfixturevalue(name)
+    model, state = cell("irb120", 1, 0, rng)
+    given = plain, arrays_of(state), model.sight
+    first, every = 5 * 6 + 6, np.arange(model.names.count)
+    whole = sums.normal(*given, every)
+    cost, gradient, gram = sums.normal(own, *given[1:], every[first:])
+    near((cost, gradient, gram), (whole[0], whole[1][..., first:], whole[2][..., first:, first:]))
+
+
+# ---- inverse -------------------------------------------------------------------------------------
+
+
+THERE = 1e-7  # of a pose [m, and what turns a point at the lever so far]
+
+
+def test_every_robot_comes_back_to_its_pose(rng):
+    for name in mc.builtin_robots():
+        robot = mc.load_robot(name)
+        q = random_poses(robot, 20, rng, 0.9 * np.pi)
+        near = np.clip(q + 0.05 * rng.normal(size=q.shape), robot.lower, robot.upper)
+        if robot.joints < 6:  # a start away from it may choose another of fewer ways
+            near = q + 1e-3
+        pose = robot.pose(q)
+        assert_allclose(robot.pose(robot.inverse(pose, near=near)), pose, rtol=0, atol=THERE)
+
+
+def test_a_regular_pose_gives_the_joints_near_by(robot):
+    q = np.array([0.3, 0.2, 0.1, 0.5, 0.8, -0.4])
+    assert_allclose(robot.inverse(robot.pose(q), near=q + 0.05), q, rtol=0, atol=1e-9)
+
+
+def test_batches_have_the_shape_of_their_poses(robot, rng):
+    q = np.array([0.3, 0.2, 0.1, 0.5, 0.8, -0.4]) + 0.1 * rng.normal(size=(2, 3, 6))
+    pose = robot.pose(q)
+    assert robot.inverse(pose, near=q).shape == (2, 3, 6)
+    assert robot.inverse(pose, near=q[0, 0]).shape == (2, 3, 6)
+    assert robot.inverse(pose[0, 0], near=q[0, 0]).shape == (6,)
+    assert robot.inverse(pose[:0], near=q[0, 0]).shape == (0, 3, 6)
+
+
+def test_without_a_start_any_way_is_found(robot, rng):
+    pose = robot.pose(random_poses(robot, 30, rng))
+    q = robot.inverse(pose)
+    assert_allclose(robot.pose(q), pose, rtol=0, atol=1e-6)
+    assert (q >= robot.lower).all()
+    assert (q <= robot.upper).all()
+
+
+def test_what_is_out_of_reach_is_said(robot):
+    pose = np.eye(4)
+    pose[0, 3] = 9.0
+    with pytest.warns(mc.CalibrationWarning, match="1 of 1 poses are not reached"):
+        robot.inverse(pose, near=np.zeros(6))
+
+
+@pytest.mark.parametrize(
+    ("pose", "near", "said"),
+    [
+        (np.eye(3), None, "shape"),
+        (2.0 * np.eye(4), None, "rotation"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), None, "rotation"),
+        (np.full((4, 4), np.nan), None, "finite"),
+        (np.eye(4), np.zeros(5), "near"),
+        (np.eye(4), [np.inf] * 6, "near"),
+        ("here", None, "numbers"),
+    ],
+)
+def test_no_pose_is_one_line(robot, pose, near, said):
+    with pytest.raises(mc.RobotError, match=said):
+        robot.inverse(pose, near=near)
+
+
+def test_a_fit_counts_its_effects(noisy, rng):
+    """The flange with its compliance, by the law itself, is at the pose."""
+    fit = mc.calibrate("irb2600", noisy.data, "sum", effects="joint_compliance:all")
+    arm, robot = arm_of(fit.cell), fit.cell.robot
+    q = random_poses(robot, 10, rng)
+    turn, moved = reached_at(arm, still(q, arm.target_names, robot))
+    assert np.abs(turn).max() > 1e-4
+    pose = moved @ robot.pose(q + turn * robot.sign)
+    found = fit.inverse(pose, near=q + 1e-3)
+    turn, moved = reached_at(arm, still(found, arm.target_names, robot))
+    assert_allclose(moved @ robot.pose(found + turn * robot.sign), pose, rtol=0, atol=THERE)
+    assert np.abs(robot.pose(robot.inverse(pose, near=q)) - pose).max() < THERE
+    assert np.abs(found - robot.inverse(pose, near=found)).max() > 1e-5  # the effects' share
+
+
+def test_what_only_the_tracker_sees_moves_no_flange(clean):
+    cell, q = clean.cell, np.array([0.3, 0.2, 0.1, 0.5, 0.8, -0.4])
+    drift = Fitted((Term("target_offset", "smr1", {}),), (np.array([1e-3]),))
+    pose = cell.robot.pose(q)
+    assert_allclose(replace(cell, effects=drift).inverse(pose, near=q), q, rtol=0, atol=1e-9)
+
+
+# ---- frames --------------------------------------------------------------------------------------
+
+
+TURNS = Rotation.random(50, random_state=3).as_matrix()
+SPECIAL = Rotation.from_euler(
+    "ZYX",
+    [[0, 0, 0], [180, 0, 0], [0, 0, 180], [10, 90, 0], [-30, -90, 0], [180, 90, 0], [90, 0, -90]],
+    degrees=True,
+).as_matrix()
+
+
+@pytest.mark.parametrize("turn", [*TURNS, *SPECIAL])
+def test_a_frame_is_what_scipy_says(turn):
+    pose = transform(turn, np.array([0.1, -2.0, 3.0]))
+    frame = Frame.of(pose)
+    assert_allclose(frame.pose, pose, rtol=0, atol=1e-14)
+    assert_allclose(frame.xyz_mm, [100.0, -2000.0, 3000.0], rtol=1e-15)
+    back = Rotation.from_euler("ZYX", frame.abc_deg, degrees=True).as_matrix()
+    assert_allclose(back, turn, rtol=0, atol=1e-14)
+    assert abs(frame.abc_deg[1]) < 90.0 + 1e-12
+    assert_allclose(np.linalg.norm(frame.quaternion_wxyz), 1.0, rtol=1e-15)
+    assert frame.quaternion_wxyz[0] >= 0.0
+    of_quaternion = Rotation.from_quat(frame.quaternion_wxyz, scalar_first=True).as_matrix()
+    assert_allclose(of_quaternion, turn, rtol=0, atol=1e-14)
+    of_vector = Rotation.from_rotvec(frame.rotation_vector_rad).as_matrix()
+    assert_allclose(of_vector, turn, rtol=0, atol=1e-14)
+
+
+def test_a_turns_about_z_b_about_y_c_about_x():
+    """Each angle alone, by hand: what KUKA calls A, B, C."""
+    quarter = {"A": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "C": [[1, 0, 0], [0, 0, -1], [0, 1, 0]]}
+    for name, turn in quarter.items():
+        found = Frame.of(transform(np.array(turn, dtype=float), np.zeros(3))).abc_deg
+        assert_allclose(found, np.array([90.0, 0.0, 0.0] if name == "A" else [0.0, 0.0, 90.0]))
+    tilt = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], dtype=float)
+    assert_allclose(Frame.of(transform(tilt, np.zeros(3))).abc_deg, [0.0, 90.0, 0.0], atol=1e-12)
+    assert "Rz(A) Ry(B) Rx(C)" in CONVENTION
+
+
+def test_tables_hold_every_digit_and_say_the_order():
+    frame = Frame.of(transform(TURNS[0], np.array([0.1, -2.0, 3.0])))
+    places, turns = frames_tables({"base": frame}, "frames")
+    assert places.rows == (("base", *frame.xyz_mm, *frame.abc_deg),)
+    assert turns.rows == (("base", *frame.quaternion_wxyz, *frame.rotation_vector_rad),)
+    assert CONVENTION in places.title
+    assert frame.distance_mm == pytest.approx(np.linalg.norm(frame.xyz_mm), rel=1e-15)

@@ -229,9 +229,7 @@ def six_of(side: str, y: float) -> str:
     return f'<body name="{side}_base" pos="0 {y} .5">{inside}</body>'
 
 
-def test_an_arm_of_a_cell_is_corrected_by_the_command_that_is_printed(
-    tmp_path, monkeypatch, capsys
-):
+def test_an_arm_of_a_cell_is_corrected_by_the_command_that_is_printed(tmp_path, monkeypatch, says):
     monkeypatch.chdir(tmp_path)
     motors = "".join(
         f'<position joint="{side}_j{i}" kp="2000" kv="100"/>'
@@ -244,8 +242,7 @@ def test_an_arm_of_a_cell_is_corrected_by_the_command_that_is_printed(
     arm = "cell.xml#left_base:left_flange"
     command = f"simulate {arm} --poses 50 --seed 1 --compliance 0 --truth true.json -o poses.csv"
     assert run(*command.split()) == 0
-    assert run("calibrate", arm, "poses.csv", "-o", "fit.json") == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = says("calibrate", arm, "poses.csv", "-o", "fit.json").out.splitlines()
     (line,) = (each for each in lines if "minimax-cal export" in each)
     assert run(*line.split()[1:]) == 0
     before, after = (mujoco.MjModel.from_xml_path(f) for f in ("cell.xml", "calibrated.xml"))

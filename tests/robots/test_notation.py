@@ -202,12 +202,6 @@ def test_options_and_tables_speak_of_the_files_rows(rng):
     assert rows[2][1:4] == pytest.approx((432.0, 149.0, 0.0))
 
 
-def test_craigs_table_read_as_standard_is_another_arm(rng):
-    standard = robot_from_dict({**CRAIG, "convention": "standard"})
-    q = driven(standard, rng, 5)
-    assert np.abs(standard.pose(q) - robot_from_dict(CRAIG).pose(q)).max() > 0.1
-
-
 def test_joints_that_bring_a_linked_arm_to_a_pose(rng):
     for content in (LINKED, PALLETISER, CRAIG):
         robot = robot_from_dict(content)

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.robots.robot import robot_from_dict
-from minimax_cal.robots.transforms import from_rpy, link, link_to, to_rpy
+from minimax_cal.robots.transforms import from_rpy, to_rpy
 from minimax_cal.robots.urdf import random_joints, tip_poses, to_robot
 from minimax_cal.robots.urdf_file import edited, origin_edit, parse_urdf
 
@@ -119,17 +119,6 @@ def test_rpy_comes_back_near_what_stood_there(rng):
         assert_allclose(from_rpy(np.zeros(3), again), pose, rtol=0, atol=1e-14)
         if abs(np.cos(rpy[1])) > 1e-3:
             assert_allclose(again, rpy, rtol=0, atol=1e-9)
-
-
-def test_a_link_reaches_any_line(rng):
-    for size in (1.0, 0.05, 1e-3, 1e-9, 0.0):
-        axis = np.array([*(size * rng.normal(size=2)), 1.0])
-        axis /= np.linalg.norm(axis)
-        point = rng.normal(size=3)
-        pose = link(link_to(point, axis))
-        assert_allclose(pose[:3, 2], axis, rtol=0, atol=1e-12)
-        off = pose[:3, 3] - point
-        assert_allclose(off - (off @ axis) * axis, 0, rtol=0, atol=1e-12)
 
 
 def test_load_robot_takes_a_urdf_and_a_tip(tmp_path):

@@ -94,7 +94,7 @@ def standing(here: Linear, mu: Array, lower: Array, upper: Array) -> Iterate[Arr
 
 def plan(d: list[float], mu: list[float], lam: list[float] | None = None, **more: object) -> Plan:
     said = {"usable": True, "backend": "", "notes": ()} | more
-    return Plan(np.array(d), np.array(mu), np.array(lam or []), **said)  # type: ignore[arg-type]
+    return Plan(np.array(d), np.array(mu), np.array(lam or []), **said)
 
 
 # ---- how far from optimal ----------------------------------------------------------------------
@@ -283,7 +283,7 @@ class Plane:
 )
 def test_what_is_no_number_ends_in_a_status(problem):
     asked: list[Problem] = []
-    found = solve(problem, np.zeros(1), from_nothing(asked.append))  # type: ignore[arg-type]
+    found = solve(problem, np.zeros(1), from_nothing(asked.append))
     assert found.status is Status.FAILED
     assert asked == []
 

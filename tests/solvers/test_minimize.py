@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from problems import CLASSICS, Classic
-from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, approx_fprime, linprog
+from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, linprog
 from scipy.sparse import csr_array
 
 import minimax_cal as mc
@@ -17,6 +17,7 @@ from minimax_cal.solvers.minimize import (
     differences,
     lengths,
 )
+from minimax_cal.solvers.status import Status
 from qp_backends import Problem, Solution
 from qp_backends import Status as QpStatus
 from qp_backends import solve as solve_qp
@@ -38,7 +39,7 @@ def test_complex_step_is_the_gradient(name):
         assert_allclose(exact[:, i], jacobian, rtol=0, atol=1e-7 * scale)
 
 
-def solve(classic: Classic, unit: object = 1.0, **more: object):  # type: ignore[no-untyped-def]
+def solve(classic: Classic, unit: object = 1.0, **more: object):
     """The classic in variables times a unit, one for all or (n,)."""
     unit = np.broadcast_to(np.asarray(unit, dtype=float), len(classic.start))
     box = classic.bounds
@@ -48,7 +49,7 @@ def solve(classic: Classic, unit: object = 1.0, **more: object):  # type: ignore
         jac="cs",
         bounds=box and Bounds(box.lb * unit, box.ub * unit),
         constraints=[LinearConstraint(c.A / unit, c.lb, c.ub) for c in classic.constraints],
-        **more,  # type: ignore[arg-type]
+        **more,
     )
 
 
@@ -133,11 +134,12 @@ def test_constraints_scale_along(unit):
         bounds=Bounds(np.array([-np.inf, -0.5]) * unit, np.inf),
         constraints=[
             LinearConstraint(np.array([[1.0, -1.0]]) / unit, 0.4, np.inf),
-            NonlinearConstraint(lambda x: ((x / unit) ** 2).sum(), 1.0, 1.0),
+            NonlinearConstraint(lambda x: ((x / unit) ** 2).sum(), 1.0, 1.0, jac="cs"),
         ],
     )
     assert found.success
     assert_allclose(found.x / unit, [np.sqrt(0.75), -0.5], atol=1e-8)
+    assert found.violation < 1e-8
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
@@ -186,23 +188,6 @@ def test_user_jacobian_arguments_and_callback():
 def test_finite_differences_are_the_default():
     found = mc.minimize_max(CLASSICS["CB2"].fun, (2, 2), tol=1e-6)
     assert_allclose(found.fun, 1.9522245, rtol=1e-6)
-
-
-def test_linear_and_nonlinear_constraints_with_bounds():
-    """min max(x, y) with x^2 + y^2 = 1, x - y >= 0.4, y >= -0.5: y = -0.5 is active at a corner."""
-    found = mc.minimize_max(
-        lambda x: x,
-        [1.0, -0.1],
-        jac="cs",
-        bounds=Bounds([-np.inf, -0.5], [np.inf, np.inf]),
-        constraints=[
-            LinearConstraint([[1.0, -1.0]], 0.4, np.inf),
-            NonlinearConstraint(lambda x: x[0] ** 2 + x[1] ** 2, 1.0, 1.0, jac="cs"),
-        ],
-    )
-    assert found.success
-    assert_allclose(found.x, [np.sqrt(0.75), -0.5], atol=1e-8)
-    assert found.violation < 1e-8
 
 
 def test_dictionaries_of_constraints_are_scipys():
@@ -261,12 +246,8 @@ def test_no_feasible_point_is_said():
     )
     assert not found.success
     assert found.status == "infeasible"
+    assert "contradict" in Status(found.status).advice
     assert found.violation == pytest.approx(1.0, abs=1e-6)
-
-
-def test_unbounded_problem_does_not_claim_success():
-    found = mc.minimize_max(lambda x: -x, [1.0], jac=lambda x: -np.eye(1), maxiter=30)
-    assert not found.success
 
 
 @pytest.mark.parametrize(
@@ -284,29 +265,16 @@ def test_unbounded_problem_does_not_claim_success():
         ({"bounds": Bounds([1.0], [0.0])}, "above"),
     ],
 )
-def test_wrong_arguments_are_refused(options, say):  # type: ignore[type-arg]
+def test_wrong_arguments_are_refused(options, say):
     arguments = {"fun": lambda x: x, "x0": [1.0], **options}
     with pytest.raises(mc.OptionError, match=say):
         mc.minimize_max(**arguments)
 
 
-def test_a_wrong_gradient_is_not_called_optimal():
-    """The KKT test trusts jac; with a wrong one the line search must stop, not claim success."""
-    found = mc.minimize_max(
-        lambda x: np.array([x @ x]), [1.0, 1.0], jac=lambda x: -np.array([2 * x])
-    )
-    assert not found.success
-    assert approx_fprime(found.x, lambda x: float(x @ x)) @ found.x >= 0
-
-
 @pytest.mark.parametrize("factor", [1e-12, 1e-9, 1e-3, 1e6])
 def test_the_unit_of_the_functions_does_not_matter(factor):
     """CB2 in another unit: the same point, to 1e-6."""
-
-    def cb2(x: np.ndarray) -> np.ndarray:
-        a, b = x
-        return np.array([a**2 + b**4, (2 - a) ** 2 + (2 - b) ** 2, 2 * np.exp(b - a)])
-
+    cb2 = CLASSICS["CB2"].fun
     found = mc.minimize_max(lambda x: factor * cb2(x), [2.0, 2.0], jac="cs")
     assert found.success
     assert_allclose(found.fun / factor, 1.9522245, rtol=1e-7)
@@ -422,10 +390,10 @@ def test_the_way_down_from_a_flat_point_is_the_steepest(unit):
         return np.array([1.0 - a**2 - 3.0 * b**2 - 1e3 * b**3, -(a**2) - 1.0])
 
     down = below(scaled(top, nowhere), nowhere)
-    assert_allclose(down, [0.0, 1e-3 * np.sqrt(1.0 / 6.0) * unit], rtol=1e-4)  # type: ignore[arg-type]
+    assert_allclose(down, [0.0, 1e-3 * np.sqrt(1.0 / 6.0) * unit], rtol=1e-4)
     only = Rows.of(np.ones(2), Bounds([-unit, -unit], [unit, 0.0]), [])
     other = below(scaled(top, nowhere, only), nowhere)  # the cubic is against it there
-    assert_allclose(other, [1e-3 * np.sqrt(1.0 / 2.0) * unit, 0.0], rtol=1e-4)  # type: ignore[arg-type]
+    assert_allclose(other, [1e-3 * np.sqrt(1.0 / 2.0) * unit, 0.0], rtol=1e-4)
     for flat in (
         lambda x: np.array([1.0 + 0.0 * x[0]]),
         lambda x: np.array([1.0 + x[0] ** 2 + x[1] ** 2]),
@@ -434,13 +402,7 @@ def test_the_way_down_from_a_flat_point_is_the_steepest(unit):
         assert below(scaled(flat, nowhere), nowhere) is None
 
 
-@pytest.mark.parametrize("most", [1, 3])
-def test_a_limit_is_the_number_of_programs(most):
-    found = mc.minimize_max(CLASSICS["CB2"].fun, (2, 2), jac="cs", maxiter=most)
-    assert (found.status, found.nit) == ("iteration_limit", most)
-
-
-def two(x):  # type: ignore[no-untyped-def]
+def two(x):
     return np.array([(x[0] - 1.0) ** 2, (x[0] + 1.0) ** 2 + 1.0])
 
 
@@ -454,7 +416,7 @@ def two(x):  # type: ignore[no-untyped-def]
     ],
     ids=["zero", "the other sign", "zero for one", "zero near the answer"],
 )
-def test_a_wrong_gradient_is_no_success(jac, function):  # type: ignore[no-untyped-def]
+def test_a_wrong_gradient_is_no_success(jac, function):
     found = mc.minimize_max(two, [3.0], jac=jac)
     assert not found.success
     assert found.status == "wrong_gradient"
@@ -470,12 +432,12 @@ def test_a_gradient_at_a_kink_is_not_called_wrong():
     assert found.status != "wrong_gradient"
 
 
-def powell_badly_scaled(x):  # type: ignore[no-untyped-def]
+def powell_badly_scaled(x):
     both = np.array([1e4 * x[0] * x[1] - 1.0, np.exp(-x[0]) + np.exp(-x[1]) - 1.0001])
     return np.concatenate([both, -both])
 
 
-def powell_singular(x):  # type: ignore[no-untyped-def]
+def powell_singular(x):
     every = np.array([
         x[0] + 10.0 * x[1],
         np.sqrt(5.0) * (x[2] - x[3]),
@@ -486,12 +448,25 @@ def powell_singular(x):  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.parametrize(
-    ("fun", "start"),
-    [(powell_badly_scaled, (0.0, 1.0)), (powell_singular, (3.0, -1.0, 0.0, 1.0))],
+    ("fun", "start"), [(powell_badly_scaled, (0.0, 1.0)), (powell_singular, (3.0, -1.0, 0.0, 1.0))]
 )
 @pytest.mark.parametrize("jac", ["cs", "2-point"])
-def test_an_optimum_of_zero_is_found_where_gradients_flatten(fun, start, jac):  # type: ignore[no-untyped-def]
+def test_an_optimum_of_zero_is_found_where_gradients_flatten(fun, start, jac):
     """Their least is 0; along a valley the gradient falls to the tolerance long before."""
     found = mc.minimize_max(fun, start, jac=jac)
     assert found.success
     assert found.fun < 1e-6
+
+
+def test_the_maratos_problem_takes_full_steps():
+    """Curved constraint x'x = 1, start on it: without correction every unit step is refused."""
+    circle = NonlinearConstraint(lambda x: x @ x, 1.0, 1.0, jac="cs")
+    found = mc.minimize_max(
+        lambda x: np.array([2 * (x @ x - 1) - x[0]]),
+        [np.cos(1.2), np.sin(1.2)],
+        jac="cs",
+        constraints=circle,
+    )
+    assert found.success
+    assert_allclose(found.x, [1.0, 0.0], atol=1e-6)
+    assert found.nit < 15
