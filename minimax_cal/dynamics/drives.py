@@ -1,0 +1,412 @@
+"""What position drives do with their commands: gains, delay and limits, from logs of both.
+
+    torque = kp (c(t - d) - q) - kv (qd - s c'(t - d)) + what carries gravity
+
+of a command c, linear in kp, kv and kv s for every delay d.  Rows where a limit acts say nothing of
+gains.  Rows err together over a stretch of BLOCK_S: each is left out in turn [jackknife].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy
+
+from minimax_cal.dynamics.regressor import PER_LINK, Motion, inverse_dynamics
+from minimax_cal.dynamics.rows import SLOWEST, UNFITTED_S, Logs, prepare
+from minimax_cal.dynamics.run import Run
+from minimax_cal.dynamics.scene import Arm, sense_of
+from minimax_cal.ground.arrays import Array
+
+LATEST, LOOK = 0.1, 0.004  # the latest command that is looked for, and how closely [s]
+BLOCK_S = 1.0  # rows that err together
+LIMIT = 0.9  # of the largest torque and speed: rows beyond may be at a limit
+BEYOND, CLEAR = 1.05, 0.95  # of a limit: where it acts for sure, and where it does not
+LEAST_ROWS, LEAST_BLOCKS = 10, 3  # of a log, at a limit; and stretches of time
+STANDS = 3.5  # standard deviations by which a number is another
+PREDICTS = 2.5  # the same, by which stretches of a run left out are predicted better
+STEPS, CLOSE_S = 20, 1e-9  # of a fit, and the step that ends it [s]
+AHEAD, INERTIA, FRICTION = "ahead", "inertia", "friction"  # what is fitted beside if it is there
+GAINS, DELAY, TORQUE_LIMIT, SPEED_LIMIT = KINDS = (
+    "servo_gain",
+    "command_delay",
+    "torque_limit",
+    "speed_limit",
+)
+FIELDS = {  # of a drive, that belong to an effect, and their units
+    GAINS: {"stiffness": "N m/rad", "damper": "N m s/rad", "ahead": "1"},
+    DELAY: {"delay": "s"},
+    TORQUE_LIMIT: {"torque": "N m"},
+    SPEED_LIMIT: {"speed": "rad/s"},
+}
+FITTED = ("stiffness", "damper", "ahead", "delay")
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A joint's.  stiffness: kp [N m/rad].  damper: kv [N m s/rad].  ahead: share s of kv that the
+    commanded speed has.  delay: d [s].  torque, speed: limits [N m, rad/s], infinite for none.
+    """
+
+    stiffness: float
+    damper: float
+    ahead: float = 0.0
+    delay: float = 0.0
+    torque: float = math.inf
+    speed: float = math.inf
+
+    def taking(self, other: Drive, kind: str) -> Drive:
+        """With the numbers of an effect that another has."""
+        return replace(self, **{name: getattr(other, name) for name in FIELDS[kind]})
+
+
+@dataclass(frozen=True, eq=False)
+class DriveFit:
+    """What logs say of a joint's drive.
+
+    change: (G, 4) by which each stretch (G,), left out, changes FITTED.  limits: standard
+    deviations of torque and speed.  rows: that said it.
+    """
+
+    drive: Drive
+    change: Array
+    stretch: Array
+    limits: tuple[float, float]
+    rows: int
+
+    @property
+    def covariance(self) -> Array:
+        """(4, 4) of FITTED [jackknife over stretches]."""
+        count = len(self.change)
+        return np.asarray((count - 1.0) / count * self.change.T @ self.change)
+
+    @property
+    def sigma(self) -> dict[str, float]:
+        """Standard deviations by name."""
+        own = np.sqrt(np.diag(self.covariance)).tolist()
+        return dict(zip((*FITTED, "torque", "speed"), (*own, *self.limits), strict=True))
+
+
+def command_of(run: Run) -> Array:
+    """(m, n) commands of a run that has some."""
+    assert run.command is not None
+    return run.command
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """Runs with their commands, and what arms of a model weigh along them, all in N m.
+
+    logs: of the runs; the rows that are used are those clear of gaps.  told: of the commands in the
+    place of torques.  carried: (M, n) torque that the drives add against gravity.  sense: (M, n) of
+    the speed.  gain: (n,) torque per unit of the log.
+    """
+
+    runs: tuple[Run, ...]
+    logs: Logs
+    told: Logs
+    carried: Array
+    sense: Array
+    gain: Array
+
+    @property
+    def lagging(self) -> tuple[str, ...]:
+        """What is fitted in any case: speeds that were not logged may be those of another time."""
+        return () if all(run.qd is not None for run in self.runs) else (INERTIA,)
+
+    @staticmethod
+    def of(runs: Sequence[Run], arm: Arm, share: float) -> Followed:
+        """share: of gravity that drives carry besides."""
+        logs = prepare(runs)
+        told = prepare([replace(run, torque=command_of(run)) for run in runs])
+        carried = np.zeros_like(logs.torque)
+        if share:
+            still = Motion(logs.motion.q, *np.zeros((2, *carried.shape)))
+            carried = share * inverse_dynamics(arm.robot, still, arm.drawn.reshape(-1, PER_LINK))
+        sense = sense_of(logs.motion.qd, arm.soft)
+        return Followed(tuple(runs), logs, told, carried, sense, arm.gain)
+
+    def joint(self, j: int) -> Rows:
+        """The rows of a joint."""
+        logs = self.logs
+        at = logs.picked[~logs.gap[logs.picked]]
+        ends = list(zip(logs.start[:-1], logs.start[1:], strict=True))
+        run = np.searchsorted(logs.start, at, side="right") - 1
+        stretch = run * 10**6 + (logs.since[at] / BLOCK_S).astype(int)
+        curves = [
+            scipy.interpolate.CubicSpline(logs.since[a:b], self.told.torque[a:b, j])
+            for a, b in ends
+        ]
+        torque = logs.torque[:, j] * self.gain[j] - self.carried[:, j]
+        q, qd, qdd = (one[at, j] for one in (logs.motion.q, logs.motion.qd, logs.motion.qdd))
+        return Rows(torque[at], q, qd, qdd, self.sense[at, j], logs.since[at], run, stretch,
+                    tuple(curves))  # fmt: skip
+
+    def clear(self, j: int, torque: float, speed: float) -> Rows:
+        """The rows of a joint that no larger torque and speed is near."""
+        every, seen = self.joint(j), self.samples(j, Drive(0.0, 0.0))
+        beyond = (np.abs(seen.torque) > torque) | (np.abs(seen.qd) > speed)
+        return every.at(seen.away(every, beyond))
+
+    def samples(self, j: int, drive: Drive) -> Samples:
+        """Every row of the logs as logged, at a joint: torque, and what a drive would ask for."""
+        out: list[Array] = []
+        for number, run in enumerate(self.runs):
+            rows = slice(self.logs.start[number], self.logs.start[number + 1])
+            time, grid = run.time - run.time[0], self.logs.since[rows]
+            qd = np.interp(time, grid, self.logs.motion.qd[rows, j])
+            carried = np.interp(time, grid, self.carried[rows, j])
+            command = command_of(run)[:, j]
+            late = np.interp(time - drive.delay, time, command)
+            rate = np.interp(time - drive.delay, time, np.gradient(command, time))
+            asked = drive.stiffness * (late - run.q[:, j])
+            asked -= drive.damper * (qd - drive.ahead * rate)
+            torque = run.torque[:, j] * self.gain[j]
+            stretch = number * 10**6 + (time / BLOCK_S).astype(int)
+            out.append(np.array([torque, asked + carried, qd, time, 0 * time + number, stretch]))
+        torque, asked, qd, since, of, stretch = np.concatenate(out, axis=1)
+        return Samples(torque, asked, qd, since, of, stretch)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """(m,) each of a joint: torque measured and asked for [N m], speed, time, run, stretch."""
+
+    torque: Array
+    asked: Array
+    qd: Array
+    since: Array
+    run: Array
+    stretch: Array
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of torque that the drive does not explain, whatever the limits."""
+        return 1.4826 * float(np.median(np.abs(self.torque - self.asked)))
+
+    def away(self, rows: Rows, at_limit: Array) -> Array:
+        """(R,) True for rows that no sample at a limit is near.  at_limit: (m,)."""
+        out = np.ones(len(rows.q), dtype=bool)
+        for number in np.unique(rows.run):
+            mine, here = rows.run == number, self.run == number
+            time = self.since[here]
+            count = np.concatenate([[0], np.cumsum(at_limit[here])])
+            ends = [np.searchsorted(time, rows.since[mine] + side * UNFITTED_S) for side in (-1, 1)]
+            out[mine] = count[ends[1]] == count[ends[0]]
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """(R,) each of a joint: torque less what carries gravity [N m], joint value, speed, its
+    derivative and sense, time, run, and the stretch that errs together.  curves: of each run's
+    command.
+    """
+
+    torque: Array
+    q: Array
+    qd: Array
+    qdd: Array
+    sense: Array
+    since: Array
+    run: Array
+    stretch: Array
+    curves: tuple[Any, ...]
+
+    def at(self, rows: Array) -> Rows:
+        """Some rows.  rows: (R,) mask."""
+        names = ("torque", "q", "qd", "qdd", "sense", "since", "run", "stretch")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+    def command(self, late: float, order: int = 0) -> Array:
+        """(R,) the command or its derivative, so late [s]."""
+        out = np.empty(len(self.q))
+        for number, curve in enumerate(self.curves):
+            mine = self.run == number
+            out[mine] = curve(self.since[mine] - late, order)
+        return out
+
+    def columns(self, late: float, given: Drive, beside: Sequence[str]) -> Array:
+        """(R, 2 + k) torque per stiffness, per damper, and of what else is fitted."""
+        rate = self.command(late, 1)
+        speed = -self.qd if AHEAD in beside else given.ahead * rate - self.qd
+        more = {AHEAD: rate, INERTIA: -self.qdd, FRICTION: -self.sense}
+        return np.stack(
+            [self.command(late) - self.q, speed, *(more[name] for name in beside)], axis=1
+        )
+
+    def rest(self, drive: Drive) -> Array:
+        """(R,) torque that a drive does not explain."""
+        value = [drive.stiffness, drive.damper]
+        return np.asarray(self.torque - self.columns(drive.delay, drive, ()) @ value)
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Least squares: a drive, what was fitted beside it, and how (G, 4 + k) each stretch, left out,
+    changes FITTED and that.
+    """
+
+    drive: Drive
+    beside: dict[str, float]
+    change: Array
+
+    @property
+    def covariance(self) -> Array:
+        """Of the changes [jackknife]."""
+        count = len(self.change)
+        return np.asarray((count - 1.0) / count * self.change.T @ self.change)
+
+    def rest(self, rows: Rows) -> Array:
+        """(R,) torque of some rows that it does not explain."""
+        d = self.drive
+        beside = [name for name in self.beside if name != AHEAD]
+        value = [d.stiffness, d.damper, *(self.beside[name] for name in beside)]
+        return np.asarray(rows.torque - rows.columns(d.delay, d, beside) @ value)
+
+    def told(self, name: str, given: Drive) -> bool:
+        """Whether something that was fitted beside is there for sure."""
+        at = 2 if name == AHEAD else len(FITTED) + list(self.beside).index(name)
+        off = self.drive.ahead - given.ahead if name == AHEAD else self.beside[name]
+        return abs(off) > STANDS * float(np.sqrt(self.covariance[at, at]))
+
+
+def solve(rows: Rows, given: Drive, beside: Sequence[str]) -> Solved:
+    """Gains and delay by least squares, with what is fitted beside them."""
+
+    def linear(late: float) -> tuple[Array, Array, float]:
+        matrix = rows.columns(late, given, beside)
+        value = np.linalg.lstsq(matrix, rows.torque, rcond=None)[0]
+        return matrix, value, float(((rows.torque - matrix @ value) ** 2).sum())
+
+    late = min(np.arange(0.0, LATEST, LOOK), key=lambda one: linear(one)[2])
+    ahead = 2 + list(beside).index(AHEAD) if AHEAD in beside else -1
+    for _ in range(STEPS):
+        matrix, value, _ = linear(late)
+        speed = value[ahead] if ahead > 0 else value[1] * given.ahead
+        by_time = -value[0] * rows.command(late, 1) - speed * rows.command(late, 2)
+        whole = np.column_stack([matrix, by_time])
+        rest = rows.torque - matrix @ value
+        step = float(np.clip(np.linalg.lstsq(whole, rest, rcond=None)[0][-1], -LOOK, LOOK))
+        late = float(np.clip(late + step, -LATEST, LATEST))
+        if abs(step) < CLOSE_S:
+            break
+    change = left_out(whole, rest, rows.stretch)
+    own = np.zeros((len(change), len(FITTED)))
+    own[:, [0, 1, 3]] = change[:, [0, 1, -1]]
+    share = given.ahead
+    if ahead > 0:
+        share = float(value[ahead] / value[1])
+        own[:, 2] = (change[:, ahead] - share * change[:, 1]) / value[1]
+    drive = replace(given, stiffness=float(value[0]), damper=float(value[1]), ahead=share,
+                    delay=late)  # fmt: skip
+    named = dict(zip(beside, value[2:].tolist(), strict=True))
+    return Solved(drive, named, np.hstack([own, change[:, 2:-1]]))
+
+
+def solve_plainly(rows: Rows, held: Rows, given: Drive, always: Sequence[str]) -> Solved:
+    """The same with no more beside than is there for sure, and predicts rows held out.
+
+    always: what is fitted in any case.
+    """
+    beside = [AHEAD, INERTIA, FRICTION]
+    found = solve(rows, given, beside)
+    for name in reversed([one for one in beside if one not in always]):
+        less = solve(rows, given, [one for one in found.beside if one != name])
+        if not (found.told(name, given) and predicts(held, found.rest(held), less.rest(held))):
+            found = less
+    return found
+
+
+def left_out(matrix: Array, rest: Array, stretch: Array) -> Array:
+    """(G, p) change of a solution without each stretch of rows, to first order."""
+    scale = np.sqrt((matrix**2).sum(axis=0)) + 1e-300
+    matrix = matrix / scale
+    whole, out = matrix.T @ matrix, []
+    for one in np.unique(stretch):
+        mine = stretch == one
+        part = matrix[mine]
+        less = whole - part.T @ part
+        out.append(-np.linalg.lstsq(less, part.T @ rest[mine], rcond=1e-12)[0] / scale)
+    return np.array(out)
+
+
+def fit_drive(learnt: Followed, judged: Followed, j: int, given: Drive) -> DriveFit | None:
+    """The drive of a joint by its logs; None where these hold too few rows clear of limits.
+
+    judged: runs that are held out.  given: the drive of the model.
+    """
+    seen = learnt.samples(j, given)
+    torque, speed = (LIMIT * float(np.abs(one).max()) for one in (seen.torque, seen.qd))
+    rows = learnt.clear(j, torque, speed)
+    for _ in range(2):  # clear of what may be a limit, then of what is one
+        if len(np.unique(rows.stretch)) < 2 * LEAST_BLOCKS or np.abs(rows.qd).max() < SLOWEST:
+            return None
+        held = judged.clear(j, torque, speed)
+        found = solve_plainly(rows, held, given, learnt.lagging)
+        seen = learnt.samples(j, found.drive)
+        torque, slack = torque_limit(seen)
+        speed, off = speed_limit(seen, torque)
+        used, rows = rows, learnt.clear(j, CLEAR * torque, LIMIT * speed)
+    gains = found.drive.stiffness, math.sqrt(found.covariance[0, 0])
+    if not (gains[0] > STANDS * gains[1] and found.drive.damper >= 0.0):
+        return None
+    limit = given.torque if not np.isfinite(torque) else torque
+    if np.isfinite(given.torque) and np.quantile(np.abs(seen.torque), 0.999) > BEYOND * limit:
+        limit = float(np.abs(seen.torque).max())
+    drive = replace(found.drive, torque=float(limit), speed=float(min(speed, given.speed)))
+    change, stretch = found.change[:, : len(FITTED)], np.unique(used.stretch)
+    return DriveFit(drive, change, stretch, (slack, off), len(used.q))
+
+
+def torque_limit(seen: Samples) -> tuple[float, float]:
+    """A torque that is not exceeded where more is asked for, and its deviation [N m].
+
+    Infinite where there is none.
+    """
+    size, noise = np.abs(seen.torque), seen.noise
+    limit = float(np.quantile(size, 1.0 - LEAST_ROWS / len(size)))
+    for _ in range(STEPS):
+        at_limit = (np.abs(seen.asked) > BEYOND * limit + STANDS * noise) & (size > LIMIT * limit)
+        at_limit &= seen.torque * seen.asked > 0.0
+        if not stands(at_limit, seen.stretch):
+            return math.inf, 0.0
+        before, limit = limit, float(np.median(size[at_limit]))
+        if limit == before:
+            break
+    spread = float(np.std(size[at_limit])) + 1e-300
+    if spread > (BEYOND - 1.0) * limit + STANDS * noise:
+        return math.inf, 0.0
+    return limit, spread / math.sqrt(len(np.unique(seen.stretch[at_limit])))
+
+
+def speed_limit(seen: Samples, torque: float) -> tuple[float, float]:
+    """A speed near which torque falls below what the drive asks for, and its deviation."""
+    asked = np.clip(seen.asked, -torque, torque)
+    slack = STANDS * seen.noise + (BEYOND - 1.0) * float(np.abs(seen.torque).max())
+    falls = np.sign(seen.qd) * (asked - seen.torque) > slack
+    fast = np.abs(seen.qd) > LIMIT * np.abs(seen.qd).max()
+    if not stands(falls & fast, seen.stretch):
+        return math.inf, 0.0
+    found = np.abs(seen.qd[falls & fast])
+    count = len(np.unique(seen.stretch[falls & fast]))
+    return float(np.median(found)), float(np.std(found)) / math.sqrt(count)
+
+
+def stands(rows: Array, stretch: Array) -> bool:
+    """Whether rows are enough, in enough stretches of time, to be a limit."""
+    return int(rows.sum()) >= LEAST_ROWS and len(np.unique(stretch[rows])) >= LEAST_BLOCKS
+
+
+def predicts(rows: Rows | Samples, rest: Array, before: Array) -> bool:
+    """Whether less is left of rows held out (R,), stretch by stretch, than before (R,)."""
+    index = np.unique(rows.stretch, return_inverse=True)[1].reshape(-1)
+    squares = (np.bincount(index, one**2) + 1e-300 for one in (before, rest))
+    gain = np.subtract(*map(np.log, squares))
+    if len(gain) < LEAST_BLOCKS:
+        return False
+    return float(gain.mean()) > PREDICTS * float(gain.std(ddof=1)) / math.sqrt(len(gain))
