@@ -86,7 +86,7 @@ def gap_command(model: Path, data: tuple[Path, ...], to: Output, **chosen: Any) 
     if are_logs(data):
         del chosen["seed"]
         moved = to.work(motion_gap, model, data, **chosen)
-        to.wrote(chosen["write"], moved.module)
+        to.wrote(moved.written, moved.module)
         said = (*moved.notices, *moved.sentences())
         return to.finish(moved, notices=said, draw=save_motion_gap)
     if len(data) > 1:

@@ -164,7 +164,7 @@ class Bench:
         """The model with numbers in it."""
         document = self.opened.given.document.copy()
         write_numbers(document, self.opened.chain, self.study.given, numbers)
-        if self.opened.new:
+        if self.opened.new and not self.judge.commanded:
             stiffen(document.root, self.opened.chain, numbers)
         return self.opened.again(document)
 
@@ -196,7 +196,8 @@ def asked_of(found: MotionDiagnosis, bench: Bench) -> tuple[Asked, tuple[Term, .
                  if e.effect in ("payload", "link_inertia") and e.worth), -1)  # fmt: skip
     late = found.models[-1].delay
     late += sum(float(term.value[0]) for term in terms if term.effect == "delay")
-    if abs(late) < SHORTEST * float(model.opt.timestep):
+    of_command = late < 0.0 and bench.judge.commanded  # which the commands themselves show
+    if abs(late) < SHORTEST * float(model.opt.timestep) or of_command:
         late = 0.0
     chain = bench.opened.chain
     motors = [is_driven(model, joint) and chain.servo(joint) < 0 for joint in chain.joints]
@@ -345,20 +346,20 @@ def law_worths(bench: Bench, plain: Candidate, full: Candidate) -> Iterator[Writ
         yield WrittenElement(WORDS[effect], "module", f"at {where}", worth)
 
 
-def lost(made: Corrected) -> Iterator[str]:
-    """What other simulators leave out of the file, for people."""
+def lost(made: Corrected, *, late: bool) -> Iterator[str]:
+    """What other simulators leave out of the file, for people.  late: whether commands are."""
     numbers, elements = made.plain.numbers, made.plain.asked.elements
     held = {
         LEVELLED: numbers.damping[:, 1:].any(),
         SPRINGS: numbers.stiffness[:, 1:].any(),
-        DELAY: DELAY in elements,
+        DELAY: DELAY in elements or late,
         BRISTLES: numbers.bristles.any(),
         MODULE: made.full.module,
     }
     for name, is_there in held.items():
         if is_there:
             yield f"{LOST[name][1]} leave out {LOST[name][0]} ({name}); see plain="
-    if DELAY in elements and numbers.late < 0.0:
+    if late or (DELAY in elements and numbers.late < 0.0):
         yield "MuJoCo begins with 0 in the history of delayed commands: call mj_initCtrlHistory"
 
 

@@ -10,8 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.dynamics.diagnose import diagnose_motion
+from minimax_cal.dynamics.drives import DELAY as COMMAND_DELAY
+from minimax_cal.dynamics.drives import KINDS
 from minimax_cal.dynamics.given import MotionKnown, Payload, read_logs, runs_of
-from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
+from minimax_cal.dynamics.laws import WORDS
+from minimax_cal.dynamics.result import MotionDiagnosis, MotionEffect, load_motion
 from minimax_cal.dynamics.run import CURRENT, Run
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.ground.errors import OptionError
@@ -24,12 +27,26 @@ from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.robots.urdf import MODELS
 from minimax_cal.simulators.given import largest_inertia
 from minimax_cal.simulators.motion.bristles import has_bristles
-from minimax_cal.simulators.motion.correct import Bench, correct, lost
+from minimax_cal.simulators.motion.correct import (
+    STAYS,
+    Bench,
+    asked_of,
+    correct,
+    lost,
+    mean_log,
+)
+from minimax_cal.simulators.motion.drives import (
+    can_write,
+    effects_of,
+    kept,
+    serve,
+    with_drives,
+)
 from minimax_cal.simulators.motion.fit import Study
-from minimax_cal.simulators.motion.judge import Judge
+from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge
 from minimax_cal.simulators.motion.module import ENDING
 from minimax_cal.simulators.motion.opened import Opened, calibrated, open_model
-from minimax_cal.simulators.motion.result import MotionGap
+from minimax_cal.simulators.motion.result import MotionGap, MotionRung
 
 MOTOR = "dcmotor"  # what holds friction beside a constraint
 
@@ -101,7 +118,8 @@ def motion_gap(
     opened = open_model(model, runs[0].joints if runs else 0, tip)
     runs = runs_of(model, opened.chain.robot, runs)
     with one_thread():
-        judge = Judge.of(opened, runs, known)
+        commanded = driven and all(run.command is not None for run in runs)
+        judge = Judge.of(opened, runs, known, fastest=commanded)
         judge = judge.driving(opened, gains) if driven else judge
         first, notices = [judge.rung("as given", opened.chain)], tuple[str, ...]()
         if fit is not None:
@@ -111,23 +129,28 @@ def motion_gap(
         found = told_or_found(judge, opened, diagnosis, known.payload, progress)
         judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
                                            soft=found.arm.soft))  # fmt: skip
-        bench = bench_of(judge, opened, found)
-        bench = replace(bench, bristled=friction == MOTOR, plain=plain)
+        own = replace(bench_of(judge, opened, found), bristled=friction == MOTOR, plain=plain)
+        bench, rungs, effects = by_commands(own, found, progress)
         made = correct(bench, found, progress)
-    path = None if write is None else Path(write)
+        first += rungs
+    rungs = (*first, *made.rungs)
+    nothing = judge.commanded and not improves(rungs)
+    path = None if write is None or nothing else Path(write)
     beside = path.with_name(path.stem + ENDING) if path and made.full.module else None
     if path is not None:
         write_whole(path, made.plain.opened.content(path))
     if beside is not None:
         write_whole(beside, made.full.module)
     told = (text for run in runs for text in run.notices)
-    said = (*told, *notices, *made.notices, *(lost(made) if path else ()))
+    late = any(one.effect == COMMAND_DELAY for one in effects)
+    said = (*told, *notices, *made.notices, *(lost(made, late=late) if path else ()))
     return MotionGap(
         model=str(model),
         robot=opened.chain.robot.name,
         unit=judge.held.unit,
-        rungs=(*first, *made.rungs),
-        elements=made.elements,
+        rungs=rungs[:1] if nothing else rungs,
+        effects=() if nothing else effects,
+        elements=() if nothing else made.elements,
         left_out=made.left_out,
         drives=judge.drives,
         held_out=judge.held.names,
@@ -136,6 +159,41 @@ def motion_gap(
         module="" if beside is None else str(beside),
         seconds=time.perf_counter() - began,
     )
+
+
+def by_commands(
+    bench: Bench, found: MotionDiagnosis, progress: Progress
+) -> tuple[Bench, tuple[MotionRung, ...], tuple[MotionEffect, ...]]:
+    """The model with the drives that logged commands show, a step for each effect, and these."""
+    judge, opened = bench.judge, bench.opened
+    if judge.drives != OWN_SERVOS or not can_write(opened):
+        return bench, (), ()
+    progress("fitting the drives to their commands")
+    served = serve(judge, opened, plain=bench.plain)
+    if not served.changes:
+        return bench, (), ()
+    whole, _ = asked_of(found, bench)
+    beside = bench_in(bench, with_drives(opened, served), found).candidate(whole).opened
+    served = kept(served, judge, beside)
+    effects = tuple(effects_of(served, judge, beside))
+    off, rungs = judge.torque(opened.chain), list[MotionRung]()
+    for number, kind in enumerate(KINDS):
+        if kind in {effect.effect for effect in effects}:
+            now = with_drives(opened, served, KINDS[: number + 1])
+            rungs.append(judge.rung(f"+ {WORDS[kind]}", now.chain, missed=off))
+    return bench_in(bench, with_drives(opened, served), found), tuple(rungs), effects
+
+
+def bench_in(bench: Bench, opened: Opened, found: MotionDiagnosis) -> Bench:
+    """Where corrections of another model of the arm are fitted and judged."""
+    new = bench_of(bench.judge, opened, found)
+    return replace(new, bristled=bench.bristled, plain=bench.plain)
+
+
+def improves(rungs: Sequence[MotionRung]) -> bool:
+    """Whether the joint error falls from the first step to the last."""
+    first, last = (mean_log(np.array(rungs[k].tracking_rms_mrad)) for k in (0, -1))
+    return last < first - STAYS
 
 
 def told_or_found(

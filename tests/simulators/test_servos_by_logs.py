@@ -1,0 +1,187 @@
+"""Drives of a model corrected by logs with commands: MuJoCo with known gains is the judge."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from minimax_cal.dynamics.drives import Drive
+from minimax_cal.dynamics.run import TORQUE, Run
+from tests.conftest import run
+from tests.dynamics.motions import three_joints
+
+mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
+
+from experiments.driven_arms import (  # noqa: E402
+    DrivenArm,
+    Withheld,
+    commands,
+    served,
+    with_motors,
+)
+from minimax_cal.simulators.motion.drives import (  # noqa: E402
+    Served,
+    can_write,
+    own_drives,
+    with_drives,
+)
+from minimax_cal.simulators.motion.opened import open_model  # noqa: E402
+from minimax_cal.simulators.motion.result import MotionGap  # noqa: E402
+
+pytestmark = pytest.mark.skipif(
+    not hasattr(mujoco, "mj_initCtrlHistory"), reason="no delays in this MuJoCo"
+)
+STEP, SECONDS = 0.001, 8.0
+KP, KV = np.array([2000.0, 2500.0, 600.0]), np.array([200.0, 250.0, 60.0])
+REAL_KP, REAL_KV, LATE = KP * [0.6, 1.6, 1.3], KV * [1.4, 0.8, 1.7], 0.0115
+LACKS = Withheld(np.array([4.0, 3.0, 1.5]), np.array([3.0, 4.0, 1.0]), np.array([0.4, 0.5, 0.3]),
+                 np.zeros(3))  # fmt: skip
+
+
+def driven(arm: DrivenArm, model: object, number: int, speed: float, late: float) -> Run:
+    """A log of the arm, whose controller takes its commands late."""
+    at, data = commands(arm, number, speed), mujoco.MjData(model)
+    time = STEP * np.arange(round((SECONDS + 1.0) / STEP))
+    wanted, told = at(time - late)[0], at(time)[0]
+    data.qpos[:3] = wanted[0]
+    rows = []
+    for k in range(len(time)):
+        data.ctrl[:3] = wanted[k]
+        q, qd = data.qpos[:3].copy(), data.qvel[:3].copy()
+        mujoco.mj_step(model, data)
+        rows.append([q, qd, data.qfrc_actuator[:3].copy(), told[k]])
+    q, qd, torque, command = np.moveaxis(np.array(rows)[1000::4], 1, 0)
+    return Run(f"run{number}", "log.csv", time[1000::4] - 1.0, q, qd, None, torque, TORQUE,
+               command=command)  # fmt: skip
+
+
+def arm_with(kp: np.ndarray, kv: np.ndarray, limit: float = np.inf) -> tuple[DrivenArm, object]:
+    """An arm as its file is, and what it is really."""
+    arm = DrivenArm(three_joints(), with_motors(three_joints()), LACKS, 3, STEP)
+    real = replace(arm, xml=served(arm.xml, kp, kv)).real()
+    if np.isfinite(limit):
+        real.actuator_forcelimited[:], real.actuator_forcerange[:] = 1, [-limit, limit]
+    return arm, real
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """An arm with other gains and late commands, and the model that `gap` corrects."""
+    folder = tmp_path_factory.mktemp("drives")
+    arm, real = arm_with(REAL_KP, REAL_KV)
+    path, out = folder / "arm.xml", folder / "corrected.xml"
+    path.write_bytes(served(arm.xml, KP, KV))
+    runs = [driven(arm, real, k, speed, LATE) for k, speed in enumerate((0.4, 1.2, 0.8))]
+    gap = mc.motion_gap(path, runs, write=out)
+    return SimpleNamespace(arm=arm, real=real, path=path, out=out, runs=runs, gap=gap)
+
+
+def test_the_file_has_the_gains_and_the_delay_of_the_arm(made):
+    model = mujoco.MjModel.from_xml_path(str(made.out))
+    assert_allclose(model.actuator_gainprm[:3, 0], REAL_KP, rtol=5e-3)
+    assert_allclose(-model.actuator_biasprm[:3, 2], REAL_KV, rtol=5e-3)
+    assert_allclose(model.actuator_delay[:3], LATE, atol=2e-4)
+    assert_allclose(model.dof_frictionloss, LACKS.friction, rtol=0.1)
+
+
+def test_it_follows_commands_that_no_log_holds(made):
+    """In MuJoCo alone, with ctrl the command and the history filled: 3 % of the error is left."""
+    truth = driven(made.arm, made.real, 77, 1.3, LATE)
+
+    def missed(path: Path) -> float:
+        model = mujoco.MjModel.from_xml_path(str(path))
+        data, step = mujoco.MjData(model), model.opt.timestep
+        time = step * np.arange(round(SECONDS / step))
+        wanted = np.stack([np.interp(time, truth.time, c) for c in truth.command.T], axis=1)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = truth.q[0], truth.qd[0], wanted[0]
+        for k in np.flatnonzero(model.actuator_history[:, 0]):
+            count = model.actuator_history[k, 0]
+            mujoco.mj_initCtrlHistory(model, data, k, None, np.full(count, data.ctrl[k]))
+        out = np.empty((len(time), 3))
+        for k in range(len(time)):
+            out[k], data.ctrl[:] = data.qpos, wanted[k]
+            mujoco.mj_step(model, data)
+        real = np.stack([np.interp(time, truth.time, c) for c in truth.q.T], axis=1)
+        return float(np.sqrt(((out - real)[500:] ** 2).mean()))
+
+    assert missed(made.out) < 0.03 * missed(made.path)
+
+
+def test_the_fastest_run_judges_and_every_effect_has_its_worth(made):
+    gap = made.gap
+    assert gap.held_out == ("run1",)
+    names = {(one.effect, one.place) for one in gap.effects}
+    assert names == {(kind, f"J{j}") for kind in ("servo_gain", "command_delay") for j in (1, 2, 3)}
+    for one in gap.effects:
+        assert max(before / after for before, after in one.worth.values()) > 1.5
+    assert [rung.name for rung in gap.rungs][:3] == [
+        "as given", "+ gains of the drive", "+ delay of the command"]  # fmt: skip
+    assert MotionGap.from_dict(json.loads(json.dumps(gap.to_dict()))).to_dict() == gap.to_dict()
+    assert any("delay" in text and "MJX" in text for text in gap.notices)
+    assert any(text.startswith("corrected gains of the drive") for text in gap.sentences())
+
+
+def test_sound_drives_are_not_accused(made, tmp_path):
+    arm, real = arm_with(KP, KV)
+    runs = [driven(arm, real, k, speed, 0.0) for k, speed in enumerate((0.4, 1.2, 0.8))]
+    gap = mc.motion_gap(made.path, runs, write=tmp_path / "out.xml")
+    assert gap.effects == ()
+    assert {one.name for one in gap.elements} >= {"friction"}
+
+
+def test_what_nothing_improves_is_not_written(tmp_path):
+    nothing = Withheld(*np.zeros((4, 3)))
+    arm, _ = arm_with(KP, KV)
+    real = replace(arm, withheld=nothing, xml=served(arm.xml, KP, KV)).real()
+    path, out, files = tmp_path / "arm.xml", tmp_path / "out.xml", []
+    path.write_bytes(served(arm.xml, KP, KV))
+    for k, speed in enumerate((0.4, 1.2)):
+        one = driven(arm, real, k, speed, 0.0)
+        header = ["t_s", *(f"{kind}_{unit}" for kind, unit in (
+            *((f"q{j}", "rad") for j in (1, 2, 3)), *((f"tau{j}", "Nm") for j in (1, 2, 3)),
+            *((f"q{j}_cmd", "rad") for j in (1, 2, 3))))]  # fmt: skip
+        rows = np.column_stack([one.time, one.q, one.torque, one.command])
+        files.append(tmp_path / f"log{k}.csv")
+        text = "\n".join(",".join(f"{v:.9g}" for v in row) for row in rows)
+        files[-1].write_text(",".join(header) + "\n" + text + "\n")
+    assert run("gap", path, *files, "--write", out, "-o", tmp_path / "gap.json", "-q") == 0
+    content = json.loads((tmp_path / "gap.json").read_text())
+    assert content["effects"] == content["elements"] == []
+    assert content["written"] == ""
+    assert not out.exists()
+    said = MotionGap.from_dict(content).headline()
+    assert said.startswith("No correction lowers the joint error")
+    assert said.endswith("nothing is written.")
+
+
+def test_a_torque_limit_is_found_and_written(made, tmp_path):
+    most = 0.6 * np.abs(np.concatenate([one.torque for one in made.runs])).max(axis=0)
+    arm, real = arm_with(KP, KV)
+    real.actuator_forcelimited[1], real.actuator_forcerange[1] = 1, [-most[1], most[1]]
+    runs = [driven(arm, real, k, speed, 0.0) for k, speed in enumerate((0.9, 1.2, 1.0))]
+    gap = mc.motion_gap(made.path, runs, write=tmp_path / "out.xml")
+    assert ("torque_limit", "J2") in {(one.effect, one.place) for one in gap.effects}
+    assert not {"servo_gain", "command_delay"} & {one.effect for one in gap.effects}
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    assert model.actuator_forcerange[1, 1] == pytest.approx(most[1], rel=0.01)
+
+
+def test_every_number_of_a_drive_is_read_back_from_the_file(made):
+    opened = open_model(made.path, 3)
+    assert can_write(opened)
+    given = own_drives(opened.chain)
+    assert_allclose([drive.stiffness for drive in given], KP)
+    wanted = (Drive(900.0, 80.0, 0.25, 0.013, 55.0), given[1], Drive(700.0, 50.0))
+    fits = tuple(SimpleNamespace(drive=drive) for drive in wanted)
+    told = tuple((kind, j) for kind in ("servo_gain", "command_delay", "torque_limit")
+                 for j in range(3))  # fmt: skip
+    new = with_drives(opened, Served(given, fits, told, (0.0, 0.0)))
+    for drive, again in zip(wanted, own_drives(new.chain), strict=True):
+        assert_allclose(list(vars(again).values()), list(vars(drive).values()), rtol=1e-12)
+    back = with_drives(new, Served(given, (), (), (0.0, 0.0)))
+    assert own_drives(back.chain) == given
