@@ -142,13 +142,8 @@ def test_what_nothing_improves_is_not_written(tmp_path):
     path.write_bytes(served(arm.xml, KP, KV))
     for k, speed in enumerate((0.4, 1.2)):
         one = driven(arm, real, k, speed, 0.0)
-        header = ["t_s", *(f"{kind}_{unit}" for kind, unit in (
-            *((f"q{j}", "rad") for j in (1, 2, 3)), *((f"tau{j}", "Nm") for j in (1, 2, 3)),
-            *((f"q{j}_cmd", "rad") for j in (1, 2, 3))))]  # fmt: skip
-        rows = np.column_stack([one.time, one.q, one.torque, one.command])
         files.append(tmp_path / f"log{k}.csv")
-        text = "\n".join(",".join(f"{v:.9g}" for v in row) for row in rows)
-        files[-1].write_text(",".join(header) + "\n" + text + "\n")
+        files[-1].write_text(as_csv(one))
     assert run("gap", path, *files, "--write", out, "-o", tmp_path / "gap.json", "-q") == 0
     content = json.loads((tmp_path / "gap.json").read_text())
     assert content["effects"] == content["elements"] == []
@@ -185,3 +180,52 @@ def test_every_number_of_a_drive_is_read_back_from_the_file(made):
         assert_allclose(list(vars(again).values()), list(vars(drive).values()), rtol=1e-12)
     back = with_drives(new, Served(given, (), (), (0.0, 0.0)))
     assert own_drives(back.chain) == given
+
+
+def test_actuators_and_ranges_say_what_was_written(made, tmp_path):
+    table, code, ranges = (tmp_path / name for name in ("a.json", "a.py", "r.json"))
+    mc.motion_gap(made.path, made.runs, write=tmp_path / "out.xml", actuators=("json", table),
+                  randomize=ranges)  # fmt: skip
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    joints = json.loads(table.read_text())["joints"]
+    assert [one["joint"] for one in joints] == ["joint1", "joint2", "joint3"]
+    assert_allclose([one["stiffness"] for one in joints], model.actuator_gainprm[:3, 0])
+    assert_allclose([one["friction"] for one in joints], model.dof_frictionloss)
+    assert_allclose([one["armature"] for one in joints], model.dof_armature)
+    assert {one["delay_steps"] for one in joints} == {round(LATE / model.opt.timestep)}
+    assert all(one["effort_limit"] is None for one in joints)
+    content = json.loads(ranges.read_text())
+    names = [(one["name"], one["joint"]) for one in content["parameters"]]
+    kinds = ("stiffness", "damper", "delay", "friction", "damping", "armature")
+    assert set(names) >= {(kind, f"joint{j}") for kind in kinds for j in (1, 2, 3)} - {
+        ("armature", "joint1")}  # fmt: skip
+    whole = np.array(content["covariance"])
+    assert whole.shape == (len(names),) * 2
+    assert np.linalg.eigvalsh(whole / np.sqrt(np.outer(*[np.diag(whole)] * 2)))[0] > -1e-9
+    assert_allclose([one["sigma"] ** 2 for one in content["parameters"]], np.diag(whole))
+    kp = [one for one in content["parameters"] if one["name"] == "stiffness"]
+    assert all(abs(one["mean"] - real) < 4.0 * one["sigma"] + 1e-3 * real
+               for one, real in zip(kp, REAL_KP, strict=True))  # fmt: skip
+    assert all(0.0 < one["between_runs"] < 0.05 * one["mean"] for one in kp)
+    files = [str(tmp_path / name) for name in ("log0.csv", "log1.csv", "log2.csv")]
+    for path, one in zip(files, made.runs, strict=True):
+        Path(path).write_text(as_csv(one))
+    assert run("gap", made.path, *files, "--actuators", "isaac", code, "-q",
+               "-o", tmp_path / "gap.json") == 0  # fmt: skip
+    made_of = {}
+    source = code.read_text().replace("from isaaclab.actuators import DelayedPDActuatorCfg", "")
+    exec(source, {"DelayedPDActuatorCfg": lambda **fields: fields}, made_of)
+    (group,) = made_of["ACTUATORS"].values()
+    assert group["joint_names_expr"] == ["joint1", "joint2", "joint3"]
+    assert group["min_delay"] == group["max_delay"] == joints[0]["delay_steps"]
+    assert group["effort_limit"] is None
+    assert_allclose(list(group["damping"].values()), REAL_KV, rtol=0.01)
+
+
+def as_csv(one: Run) -> str:
+    """A log in the house's columns."""
+    names = [f"{kind}{j}{end}" for kind, end in (("q", "_rad"), ("tau", "_Nm"), ("q", "_cmd_rad"))
+             for j in (1, 2, 3)]  # fmt: skip
+    rows = np.column_stack([one.time, one.q, one.torque, one.command])
+    lines = [",".join(["t_s", *names]), *(",".join(f"{v:.9g}" for v in row) for row in rows)]
+    return "\n".join(lines) + "\n"

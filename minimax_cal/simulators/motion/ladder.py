@@ -26,6 +26,7 @@ from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.robots.urdf import MODELS
 from minimax_cal.simulators.given import largest_inertia
+from minimax_cal.simulators.motion.actuators import check_files, write_actuators, write_ranges
 from minimax_cal.simulators.motion.bristles import has_bristles
 from minimax_cal.simulators.motion.correct import (
     STAYS,
@@ -36,6 +37,7 @@ from minimax_cal.simulators.motion.correct import (
     mean_log,
 )
 from minimax_cal.simulators.motion.drives import (
+    Served,
     can_write,
     effects_of,
     kept,
@@ -64,6 +66,8 @@ def motion_gap(
     gains: tuple[Sequence[float], Sequence[float]] | None = None,
     friction: str | None = None,
     plain: bool = False,
+    actuators: tuple[str, Path | str] | None = None,
+    randomize: Path | str | None = None,
     driven: bool = True,
     progress: Progress = silent,
 ) -> MotionGap:
@@ -93,6 +97,10 @@ def motion_gap(
     plain
         Whether the file is fitted without what other simulators leave out of it: damping and
         stiffness of higher powers, delay, and the module.
+    actuators
+        `isaac` or `json`, and where the actuators of the corrected model go.
+    randomize
+        Where mean, covariance and spread between runs of what was fitted go (JSON).
     driven
         Whether drives move the arm along the held-out runs as well.
     progress
@@ -113,6 +121,7 @@ def motion_gap(
     """
     began = time.perf_counter()
     check_request(write, friction, plain=plain)
+    check_files(actuators, randomize)
     progress("reading the model and the logs")
     runs = read_logs(model, logs)
     opened = open_model(model, runs[0].joints if runs else 0, tip)
@@ -130,7 +139,7 @@ def motion_gap(
         judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
                                            soft=found.arm.soft))  # fmt: skip
         own = replace(bench_of(judge, opened, found), bristled=friction == MOTOR, plain=plain)
-        bench, rungs, effects = by_commands(own, found, progress)
+        bench, served, rungs, effects = by_commands(own, found, progress)
         made = correct(bench, found, progress)
         first += rungs
     rungs = (*first, *made.rungs)
@@ -139,6 +148,11 @@ def motion_gap(
     beside = path.with_name(path.stem + ENDING) if path and made.full.module else None
     if path is not None:
         write_whole(path, made.plain.opened.content(path))
+    if actuators is not None and not nothing:
+        write_actuators(actuators, made.plain.opened.chain, served, opened.chain.robot.name)
+    if randomize is not None and not nothing:
+        count = len(judge.learning_runs)
+        write_ranges(randomize, made.plain, bench.study, served, count)
     if beside is not None:
         write_whole(beside, made.full.module)
     told = (text for run in runs for text in run.notices)
@@ -163,15 +177,17 @@ def motion_gap(
 
 def by_commands(
     bench: Bench, found: MotionDiagnosis, progress: Progress
-) -> tuple[Bench, tuple[MotionRung, ...], tuple[MotionEffect, ...]]:
-    """The model with the drives that logged commands show, a step for each effect, and these."""
+) -> tuple[Bench, Served | None, tuple[MotionRung, ...], tuple[MotionEffect, ...]]:
+    """The model with the drives that logged commands show, these, a step for each effect, and what
+    each is worth.
+    """
     judge, opened = bench.judge, bench.opened
     if judge.drives != OWN_SERVOS or not can_write(opened):
-        return bench, (), ()
+        return bench, None, (), ()
     progress("fitting the drives to their commands")
     served = serve(judge, opened, plain=bench.plain)
     if not served.changes:
-        return bench, (), ()
+        return bench, served, (), ()
     whole, _ = asked_of(found, bench)
     beside = bench_in(bench, with_drives(opened, served), found).candidate(whole).opened
     served = kept(served, judge, beside)
@@ -181,7 +197,7 @@ def by_commands(
         if kind in {effect.effect for effect in effects}:
             now = with_drives(opened, served, KINDS[: number + 1])
             rungs.append(judge.rung(f"+ {WORDS[kind]}", now.chain, missed=off))
-    return bench_in(bench, with_drives(opened, served), found), tuple(rungs), effects
+    return bench_in(bench, with_drives(opened, served), found), served, tuple(rungs), effects
 
 
 def bench_in(bench: Bench, opened: Opened, found: MotionDiagnosis) -> Bench:

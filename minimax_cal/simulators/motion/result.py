@@ -110,9 +110,14 @@ class MotionGap(Result):
         """Whether logged commands drove the model."""
         return self.drives.endswith(COMMANDS)
 
+    @property
+    def kept(self) -> bool:
+        """Whether something was kept, where commands drove the model."""
+        return not self.commanded or len(self.rungs) > 1
+
     def headline(self) -> str:
         """The result in a sentence or two."""
-        if self.commanded and len(self.rungs) == 1:
+        if not self.kept:
             error = float(np.linalg.norm(self.rungs[0].tracking_rms_mrad))
             return (
                 f"No correction lowers the joint error under {self.drives} on held-out motion "

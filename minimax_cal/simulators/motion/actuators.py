@@ -1,0 +1,198 @@
+"""What simulators of learned policies take beside a model: its actuators, and ranges of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from minimax_cal.dynamics.drives import FIELDS, FITTED
+from minimax_cal.dynamics.laws import ARMATURE, FRICTION
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import check_writable, json_text, plain, write_whole
+from minimax_cal.simulators.chain import Chain
+from minimax_cal.simulators.motion.correct import Candidate
+from minimax_cal.simulators.motion.drives import Served, own_drives
+from minimax_cal.simulators.motion.fit import Study, fit_numbers
+from minimax_cal.simulators.motion.numbers import Numbers
+
+UNITS = {name: unit for fields in FIELDS.values() for name, unit in fields.items()}
+ELEMENTS = {  # of the body, their names and units, and how they stand in `Numbers`
+    FRICTION: (("friction", "N m"), ("damping", "N m s/rad")),
+    ARMATURE: (("armature", "kg m^2"),),
+}
+ISAAC = '''"""Actuators of {name} for a physics step of {step} s, as Isaac Lab's articulations take them.
+
+A drive whose feed_forward is s wants s times the commanded speed as its velocity target.
+feed_forward = {ahead}
+"""
+
+from isaaclab.actuators import DelayedPDActuatorCfg
+
+ACTUATORS = {{
+{entries}}}
+'''
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """A joint's, in SI, limits None where there are none.  delay_steps: of the model's timestep."""
+
+    joint: str
+    stiffness: float
+    damping: float
+    feed_forward: float
+    armature: float
+    friction: float
+    viscous_friction: float
+    effort_limit: float | None
+    velocity_limit: float | None
+    delay: float
+    delay_steps: int
+
+
+def actuators_of(chain: Chain, served: Served | None) -> Iterator[Actuator]:
+    """Of a model as it is written.  served: what its logs say of speeds that no model holds."""
+    model = chain.model
+    fits = served.fits if served else (None,) * len(chain.joints)
+    for name, dof, drive, fit in zip(chain.names, chain.dofs, own_drives(chain), fits, strict=True):
+        speed = fit.drive.speed if fit else math.inf
+        yield Actuator(
+            name, drive.stiffness, drive.damper, drive.ahead, float(model.dof_armature[dof]),
+            float(model.dof_frictionloss[dof]), float(model.dof_damping[dof]),
+            finite(drive.torque), finite(speed), drive.delay,
+            round(drive.delay / float(model.opt.timestep)),
+        )  # fmt: skip
+
+
+def finite(limit: float) -> float | None:
+    """A limit, None where there is none."""
+    return limit if math.isfinite(limit) else None
+
+
+def actuators_text(found: list[Actuator], step: float, name: str) -> dict[str, str]:
+    """The files that can be written, by their format."""
+    content = {"schema": 1, "kind": "actuators", "model": name, "timestep": step,
+               "joints": [plain(one) for one in found]}  # fmt: skip
+    entries = ""
+    for late in sorted({one.delay_steps for one in found}):
+        some = [one for one in found if one.delay_steps == late]
+        fields: dict[str, Any] = {"joint_names_expr": [one.joint for one in some]}
+        for of in ("stiffness", "damping", "armature", "friction", "viscous_friction",
+                   "effort_limit", "velocity_limit"):  # fmt: skip
+            values = {one.joint: getattr(one, of) for one in some}
+            fields[of] = {joint: v for joint, v in values.items() if v is not None} or None
+        fields |= {"dynamic_friction": fields["friction"], "min_delay": late, "max_delay": late}
+        entries += f'    "delay_{late}": DelayedPDActuatorCfg(\n'
+        entries += "".join(f"        {key}={value!r},\n" for key, value in fields.items())
+        entries += "    ),\n"
+    ahead = {one.joint: one.feed_forward for one in found}
+    isaac = ISAAC.format(name=name, step=step, ahead=ahead, entries=entries)
+    return {"json": json_text(content), "isaac": isaac}
+
+
+def check_files(actuators: tuple[str, Path | str] | None, ranges: Path | str | None) -> None:
+    """Raise CalibrationError for a format that is none, and for files that cannot be written."""
+    if actuators is not None:
+        if actuators[0] not in ("isaac", "json"):
+            raise OptionError(f"actuators={actuators[0]!r}: give isaac or json, and a file")
+        check_writable(Path(actuators[1]))
+    if ranges is not None:
+        check_writable(Path(ranges))
+
+
+def write_actuators(
+    to: tuple[str, Path | str], chain: Chain, served: Served | None, name: str
+) -> None:
+    """Write the actuators of a model in a format that simulators take."""
+    step, found = float(chain.model.opt.timestep), list(actuators_of(chain, served))
+    write_whole(Path(to[1]), actuators_text(found, step, name)[to[0]])
+
+
+# ---- ranges ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Ranged:
+    """Numbers of a kind, with their covariance (p, p) and their spread between runs (p,)."""
+
+    names: tuple[tuple[str, str, str], ...]
+    mean: Array
+    covariance: Array
+    between: Array
+
+
+def of_drives(served: Served, joints: tuple[str, ...], count: int) -> Ranged:
+    """Gains and delays, by stretches of the runs left out in turn.  count: of the runs."""
+    names, mean, changes = list[tuple[str, str, str]](), list[float](), list[dict[int, float]]()
+    for joint, fit, drive in zip(joints, served.fits, served.drives(), strict=True):
+        for k, name in enumerate(FITTED):
+            if fit and (fit.change[:, k] != 0.0).any():
+                names.append((name, joint, UNITS[name]))
+                mean.append(getattr(drive, name))
+                changes.append(dict(zip(fit.stretch.tolist(), fit.change[:, k], strict=True)))
+    every = sorted({stretch for change in changes for stretch in change})
+    change = np.array([[one.get(stretch, 0.0) for one in changes] for stretch in every])
+    change = change.reshape(len(every), len(changes))
+    run = np.array(every, dtype=int) // 10**6
+    by_run = np.array([change[run == number].sum(axis=0) for number in range(count)])
+    covariance = (len(every) - 1.0) / max(len(every), 1) * change.T @ change
+    return Ranged(tuple(names), np.array(mean), covariance, spread(by_run))
+
+
+def spread(change: Array) -> Array:
+    """(p,) between runs, of the changes (r, p) without each; NaN of a single run."""
+    if len(change) < 2:
+        return np.full(change.shape[1:], np.nan)
+    return np.asarray((len(change) - 1.0) * np.std(change, axis=0, ddof=1))
+
+
+def of_body(made: Candidate, study: Study, joints: tuple[str, ...]) -> Ranged:
+    """Friction, damping and armature that were fitted, each run left out in turn."""
+    kinds = [one for one in ELEMENTS if one in made.asked.elements]
+    names = tuple((name, joint, unit) for kind in kinds for name, unit in ELEMENTS[kind]
+                  for joint in joints)  # fmt: skip
+
+    def values(numbers: Numbers) -> Array:
+        held = {"friction": numbers.friction, "damping": numbers.damping[:, 0],
+                "armature": numbers.armature}  # fmt: skip
+        return np.array([held[name][joints.index(joint)] for name, joint, _ in names])
+
+    mean, logs = values(made.numbers), study.scene.logs
+    count = len(logs.names) if names else 0
+    rest = [[r for r in range(count) if r != out] for out in range(count)] if count > 1 else []
+    asked = replace(made.asked, behind=())
+    change = [values(fit_numbers(study.only(some), asked)) - mean for some in rest]
+    changes = np.array(change).reshape(len(rest), len(names))
+    whole = (count - 1.0) / max(count, 1) * changes.T @ changes
+    between = spread(changes) if rest else np.full(len(names), np.nan)
+    return Ranged(names, mean, whole, between)
+
+
+def write_ranges(
+    path: Path | str, made: Candidate, study: Study, served: Served | None, count: int
+) -> None:
+    """Write mean, deviation and spread of what was fitted, and the covariance of all of it.
+
+    count: of the runs that drives were fitted to.
+    """
+    joints = study.chain.names
+    parts = [of_drives(served, joints, count)] if served else []
+    parts.append(of_body(made, study, joints))
+    whole = block_diag(*(part.covariance for part in parts))
+    sigma = iter(np.sqrt(np.diag(whole)).tolist())
+    parameters = [
+        {"name": name, "joint": joint, "mean": float(mean), "sigma": next(sigma),
+         "between_runs": float(between), "unit": unit}
+        for part in parts
+        for (name, joint, unit), mean, between in zip(part.names, part.mean, part.between,
+                                                      strict=True)
+    ]  # fmt: skip
+    content = {"schema": 1, "kind": "ranges", "parameters": parameters, "covariance": whole}
+    write_whole(Path(path), json_text(plain(content)))
