@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from experiments import sweep
 from experiments.driven_arms import DrivenArm, Motion, commands, drawn_arm, served
 from experiments.sweep import Study, study_options
 from minimax_cal.dynamics.given import MotionKnown
-from minimax_cal.dynamics.run import TORQUE, Run
+from minimax_cal.dynamics.run import NOTHING, TORQUE, Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.robots.mjcf import mujoco, numbers
@@ -118,9 +118,12 @@ class Servoed:
                            command=at(SETTLED + time)[0]))  # fmt: skip
         return out
 
-    def missed(self, model: Any, real: Array) -> float:
-        """RMS joint error of a model on the run that no log holds [rad]."""
-        at = commands(self.arm, UNSEEN, UNSEEN_SPEED)
+    def missed(self, xml: bytes, real: Array) -> float:
+        """RMS joint error of a file on the run that no log holds [rad]."""
+        at, model = (
+            commands(self.arm, UNSEEN, UNSEEN_SPEED),
+            mujoco().MjModel.from_xml_string(xml.decode()),
+        )
         q = self.follow(model, at)[0]
         return float(np.sqrt(((q - real) ** 2).mean()))
 
@@ -180,12 +183,13 @@ class Case:
 
 @dataclass(frozen=True)
 class Closed:
-    """Joint error on the unseen run before and after [mrad]; errors of stiffness, damper and
-    delay over their deviations; what is said of drives.
+    """Joint error on the unseen run before, after, and by logs without torques [mrad]; errors of
+    stiffness, damper and delay over their deviations; what is said of drives.
     """
 
     before: float
     after: float
+    alone: float
     off: tuple[list[float], list[float], list[float]]
     effects: tuple[str, ...]
 
@@ -193,14 +197,18 @@ class Closed:
 def run(case: Case) -> Closed:
     """Correct the file of an arm by its logs, and let it follow commands that these do not hold."""
     one = drawn(case.arm, case.seed, elastic=case.elastic, sound=case.sound)
+    runs, at = one.logs(), commands(one.arm, UNSEEN, UNSEEN_SPEED)
+    real = one.follow(one.real, at, one.delay)[0]
+    ends = [1e3 * one.missed(one.xml, real)]
     with tempfile.TemporaryDirectory() as folder:
-        path, out = Path(folder) / "arm.xml", Path(folder) / "corrected.xml"
+        path, out, other = (Path(folder) / name for name in ("arm.xml", "out.xml", "alone.xml"))
         path.write_bytes(one.xml)
-        gap = mc.motion_gap(path, one.logs(), write=out)
-        last = out if gap.written else path
-        models = [mujoco().MjModel.from_xml_path(str(file)) for file in (path, last)]
-    real = one.follow(one.real, commands(one.arm, UNSEEN, UNSEEN_SPEED), one.delay)[0]
-    before, after = (1e3 * one.missed(model, real) for model in models)
+        gap = mc.motion_gap(path, runs, write=out)
+        bare = [replace(log, torque=0.0 * log.torque, unit=NOTHING) for log in runs]
+        alone = mc.motion_gap(path, bare, write=other)
+        for file, found in ((out, gap), (other, alone)):
+            text = file.read_bytes() if found.written else one.xml
+            ends.append(1e3 * one.missed(text, real))
     kp, kv = one.gain * [one.stiffness, one.damper]
     off: tuple[list[float], list[float], list[float]] = ([], [], [])
     for each in gap.effects:
@@ -209,7 +217,9 @@ def run(case: Case) -> Closed:
         for p in each.parameters:
             if p.name in truth:
                 off[list(truth).index(p.name)].append((p.value - truth[p.name]) / p.sigma)
-    return Closed(before, after, off, tuple(f"{e.effect}:{e.place}" for e in gap.effects))
+    return Closed(
+        ends[0], ends[1], ends[2], off, tuple(f"{e.effect}:{e.place}" for e in gap.effects)
+    )
 
 
 def accused(case: Case) -> tuple[str, ...]:
@@ -235,20 +245,18 @@ def drawn_cases(count: int, seed: int, *, sound: bool = False) -> list[Case]:
 def closed_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
     """What remains on the unseen run, arm by arm, and how often intervals hold."""
     rows: list[tuple[Cell, ...]] = []
-    for case, one in zip(cases, found, strict=True):
+    each = np.array([[one.before, 100.0 * one.after / one.before, 100.0 * one.alone / one.before]
+                     for one in found])  # fmt: skip
+    for case, one, ends in zip(cases, found, each.tolist(), strict=True):
         kind = "elastic" if case.elastic else "stiff"
-        held = [share_inside([numbers]) for numbers in one.off]
-        rows.append((f"{case.arm} {case.seed}, {kind}", one.before, one.after,
-                     100.0 * one.after / one.before, *held))  # fmt: skip
-    ends = [[one.before for one in found], [one.after for one in found],
-            [100.0 * one.after / one.before for one in found]]  # fmt: skip
-    held = [share_inside([one.off[k] for one in found]) for k in range(3)]
-    rows.append(("median; intervals of all", *(float(np.median(end)) for end in ends), *held))
+        rows.append((f"{case.arm} {case.seed}, {kind}", *ends, *map(share_inside, zip(one.off))))
+    held = (share_inside([one.off[k] for one in found]) for k in range(3))
+    rows.append(("median; intervals of all", *np.median(each, axis=0).tolist(), *held))
     title = "Simulated arms on a fast run that no log holds, after gap --write"
     return Table.made(
         title,
         rows,
-        "arm | joint error as given mrad .3g | corrected mrad .3g | remains % .3g | "
+        "arm | joint error as given mrad .3g | remains % .3g | without torques % .3g | "
         "intervals of kp that hold % .3g | of kv % .3g | of the delay % .3g",
     )
 
@@ -271,7 +279,8 @@ def main(study: Study) -> None:
               Table.made("Sound drives", rows, "arms | accused | of")]  # fmt: skip
     content = {
         "cases": [{"arm": case.arm, "seed": case.seed, "elastic": case.elastic,
-                   "before_mrad": one.before, "after_mrad": one.after, "off": one.off,
+                   "before_mrad": one.before, "after_mrad": one.after, "alone_mrad": one.alone,
+                   "off": one.off,
                    "effects": list(one.effects)}
                   for case, one in zip(cases, found, strict=True)],
         "accused": [list(one) for one in wrongly],

@@ -9,8 +9,9 @@ gains.  Rows err together over a stretch of BLOCK_S: each is left out in turn [j
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ import scipy
 
 from minimax_cal.dynamics.regressor import PER_LINK, Motion, inverse_dynamics
 from minimax_cal.dynamics.rows import SLOWEST, UNFITTED_S, Logs, prepare
-from minimax_cal.dynamics.run import Run
+from minimax_cal.dynamics.run import NOTHING, Run
 from minimax_cal.dynamics.scene import Arm, sense_of
 from minimax_cal.ground.arrays import Array
 
@@ -43,6 +44,7 @@ FIELDS = {  # of a drive, that belong to an effect, and their units
     TORQUE_LIMIT: {"torque": "N m"},
     SPEED_LIMIT: {"speed": "rad/s"},
 }
+NO_LIMITS = (math.inf, 0.0), (math.inf, 0.0)
 FITTED = ("stiffness", "damper", "ahead", "delay")
 
 
@@ -69,20 +71,19 @@ class DriveFit:
     """What logs say of a joint's drive.
 
     change: (G, 4) by which each stretch (G,), left out, changes FITTED.  limits: standard
-    deviations of torque and speed.  rows: that said it.
+    deviations of torque and speed.  beside: what was fitted with it.
     """
 
     drive: Drive
     change: Array
     stretch: Array
     limits: tuple[float, float]
-    rows: int
+    beside: dict[str, float]
 
     @property
     def covariance(self) -> Array:
-        """(4, 4) of FITTED [jackknife over stretches]."""
-        count = len(self.change)
-        return np.asarray((count - 1.0) / count * self.change.T @ self.change)
+        """(4, 4) of FITTED."""
+        return covariance_of(self.change)
 
     @property
     def sigma(self) -> dict[str, float]:
@@ -114,26 +115,44 @@ class Followed:
     gain: Array
 
     @property
-    def lagging(self) -> tuple[str, ...]:
-        """What is fitted in any case: speeds that were not logged may be those of another time."""
+    def measured(self) -> bool:
+        """Whether torques were; else they are those of the model's masses."""
+        return self.logs.unit != NOTHING
+
+    @property
+    def beside(self) -> tuple[str, ...]:
+        """What is fitted in any case: speeds that were not logged may be those of another time.
+
+        Without torques rotors and friction stand between the drive and the masses of the model.
+        """
+        if not self.measured:
+            return INERTIA, FRICTION
         return () if all(run.qd is not None for run in self.runs) else (INERTIA,)
+
+    @cached_property
+    def slides(self) -> Array:
+        """(M, n) True where friction is that of a joint that slides."""
+        return self.logs.away(UNFITTED_S)
 
     @staticmethod
     def of(runs: Sequence[Run], arm: Arm, share: float) -> Followed:
         """share: of gravity that drives carry besides."""
-        logs = prepare(runs)
+        logs, drawn = prepare(runs), arm.drawn.reshape(-1, PER_LINK)
+        if logs.unit == NOTHING:
+            logs = replace(logs, torque=inverse_dynamics(arm.robot, logs.motion, drawn))
         told = prepare([replace(run, torque=command_of(run)) for run in runs])
         carried = np.zeros_like(logs.torque)
         if share:
             still = Motion(logs.motion.q, *np.zeros((2, *carried.shape)))
-            carried = share * inverse_dynamics(arm.robot, still, arm.drawn.reshape(-1, PER_LINK))
+            carried = share * inverse_dynamics(arm.robot, still, drawn)
         sense = sense_of(logs.motion.qd, arm.soft)
         return Followed(tuple(runs), logs, told, carried, sense, arm.gain)
 
     def joint(self, j: int) -> Rows:
         """The rows of a joint."""
         logs = self.logs
-        at = logs.picked[~logs.gap[logs.picked]]
+        used = ~logs.gap & (self.measured | self.slides[:, j])
+        at = logs.picked[used[logs.picked]]
         ends = list(zip(logs.start[:-1], logs.start[1:], strict=True))
         run = np.searchsorted(logs.start, at, side="right") - 1
         stretch = run * 10**6 + (logs.since[at] / BLOCK_S).astype(int)
@@ -166,6 +185,8 @@ class Followed:
             asked = drive.stiffness * (late - run.q[:, j])
             asked -= drive.damper * (qd - drive.ahead * rate)
             torque = run.torque[:, j] * self.gain[j]
+            if not self.measured:
+                torque = np.interp(time, grid, self.logs.torque[rows, j])
             stretch = number * 10**6 + (time / BLOCK_S).astype(int)
             out.append(np.array([torque, asked + carried, qd, time, 0 * time + number, stretch]))
         torque, asked, qd, since, of, stretch = np.concatenate(out, axis=1)
@@ -239,10 +260,10 @@ class Rows:
             [self.command(late) - self.q, speed, *(more[name] for name in beside)], axis=1
         )
 
-    def rest(self, drive: Drive) -> Array:
-        """(R,) torque that a drive does not explain."""
-        value = [drive.stiffness, drive.damper]
-        return np.asarray(self.torque - self.columns(drive.delay, drive, ()) @ value)
+    def rest(self, drive: Drive, beside: Mapping[str, float]) -> Array:
+        """(R,) torque that a drive, and what was fitted beside it, do not explain."""
+        value = [drive.stiffness, drive.damper, *beside.values()]
+        return np.asarray(self.torque - self.columns(drive.delay, drive, list(beside)) @ value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,24 +276,15 @@ class Solved:
     beside: dict[str, float]
     change: Array
 
-    @property
-    def covariance(self) -> Array:
-        """Of the changes [jackknife]."""
-        count = len(self.change)
-        return np.asarray((count - 1.0) / count * self.change.T @ self.change)
-
     def rest(self, rows: Rows) -> Array:
         """(R,) torque of some rows that it does not explain."""
-        d = self.drive
-        beside = [name for name in self.beside if name != AHEAD]
-        value = [d.stiffness, d.damper, *(self.beside[name] for name in beside)]
-        return np.asarray(rows.torque - rows.columns(d.delay, d, beside) @ value)
+        return rows.rest(self.drive, {k: v for k, v in self.beside.items() if k != AHEAD})
 
     def told(self, name: str, given: Drive) -> bool:
         """Whether something that was fitted beside is there for sure."""
         at = 2 if name == AHEAD else len(FITTED) + list(self.beside).index(name)
         off = self.drive.ahead - given.ahead if name == AHEAD else self.beside[name]
-        return abs(off) > STANDS * float(np.sqrt(self.covariance[at, at]))
+        return abs(off) > STANDS * float(np.sqrt(covariance_of(self.change)[at, at]))
 
 
 def solve(rows: Rows, given: Drive, beside: Sequence[str]) -> Solved:
@@ -322,6 +334,19 @@ def solve_plainly(rows: Rows, held: Rows, given: Drive, always: Sequence[str]) -
     return found
 
 
+def covariance_of(change: Array) -> Array:
+    """(p, p) of numbers that change so (G, p) without each stretch [jackknife].
+
+    Wider by as much as Student's t is than the normal law, at 95 %, for as few stretches as matter
+    [Satterthwaite 1946, kurtosis of a normal law].
+    """
+    count, squares = len(change), (change**2).sum(axis=0)
+    few = 3.0 * squares**2 / ((change**4).sum(axis=0) + 1e-300)
+    few = np.clip(few, 2.0, max(count - len(FITTED), 2.0))
+    sigma = scipy.special.stdtrit(few, 0.975) / scipy.special.ndtri(0.975)
+    return np.asarray((count - 1.0) / count * change.T @ change * np.outer(sigma, sigma))
+
+
 def left_out(matrix: Array, rest: Array, stretch: Array) -> Array:
     """(G, p) change of a solution without each stretch of rows, to first order."""
     scale = np.sqrt((matrix**2).sum(axis=0)) + 1e-300
@@ -347,20 +372,27 @@ def fit_drive(learnt: Followed, judged: Followed, j: int, given: Drive) -> Drive
         if len(np.unique(rows.stretch)) < 2 * LEAST_BLOCKS or np.abs(rows.qd).max() < SLOWEST:
             return None
         held = judged.clear(j, torque, speed)
-        found = solve_plainly(rows, held, given, learnt.lagging)
+        found = solve_plainly(rows, held, given, learnt.beside)
         seen = learnt.samples(j, found.drive)
-        torque, slack = torque_limit(seen)
-        speed, off = speed_limit(seen, torque)
+        (torque, slack), (speed, off) = limits_of(seen) if learnt.measured else NO_LIMITS
         used, rows = rows, learnt.clear(j, CLEAR * torque, LIMIT * speed)
-    gains = found.drive.stiffness, math.sqrt(found.covariance[0, 0])
+    gains = found.drive.stiffness, math.sqrt(covariance_of(found.change)[0, 0])
     if not (gains[0] > STANDS * gains[1] and found.drive.damper >= 0.0):
         return None
     limit = given.torque if not np.isfinite(torque) else torque
-    if np.isfinite(given.torque) and np.quantile(np.abs(seen.torque), 0.999) > BEYOND * limit:
+    known = learnt.measured and np.isfinite(given.torque)
+    if known and np.quantile(np.abs(seen.torque), 0.999) > BEYOND * limit:
         limit = float(np.abs(seen.torque).max())
     drive = replace(found.drive, torque=float(limit), speed=float(min(speed, given.speed)))
     change, stretch = found.change[:, : len(FITTED)], np.unique(used.stretch)
-    return DriveFit(drive, change, stretch, (slack, off), len(used.q))
+    beside = {name: value for name, value in found.beside.items() if name != AHEAD}
+    return DriveFit(drive, change, stretch, (slack, off), beside)
+
+
+def limits_of(seen: Samples) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Limits of torque and speed, each with its deviation."""
+    most = torque_limit(seen)
+    return most, speed_limit(seen, most[0])
 
 
 def torque_limit(seen: Samples) -> tuple[float, float]:

@@ -132,6 +132,6 @@ def test_a_joint_without_motion_tells_nothing():
 
 def test_stretches_decide_whether_rows_are_predicted_better():
     rows = followed(logged(0, REAL)).joint(1)
-    rest, rng = rows.rest(REAL), np.random.default_rng(0)
-    assert predicts(rows, rest, rows.rest(GIVEN))
+    rest, rng = rows.rest(REAL, {}), np.random.default_rng(0)
+    assert predicts(rows, rest, rows.rest(GIVEN, {}))
     assert not predicts(rows, rest, rest + 1e-6 * rng.normal(size=rest.shape))

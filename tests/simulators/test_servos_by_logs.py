@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.dynamics.drives import Drive
-from minimax_cal.dynamics.run import TORQUE, Run
+from minimax_cal.dynamics.run import NOTHING, TORQUE, Run
 from tests.conftest import run
 from tests.dynamics.motions import three_joints
 
@@ -175,10 +176,10 @@ def test_every_number_of_a_drive_is_read_back_from_the_file(made):
     fits = tuple(SimpleNamespace(drive=drive) for drive in wanted)
     told = tuple((kind, j) for kind in ("servo_gain", "command_delay", "torque_limit")
                  for j in range(3))  # fmt: skip
-    new = with_drives(opened, Served(given, fits, told, (0.0, 0.0)))
+    new = with_drives(opened, Served(given, fits, told, (0.0, 0.0), np.zeros(3)))
     for drive, again in zip(wanted, own_drives(new.chain), strict=True):
         assert_allclose(list(vars(again).values()), list(vars(drive).values()), rtol=1e-12)
-    back = with_drives(new, Served(given, (), (), (0.0, 0.0)))
+    back = with_drives(new, Served(given, (), (), (0.0, 0.0), np.zeros(3)))
     assert own_drives(back.chain) == given
 
 
@@ -229,3 +230,71 @@ def as_csv(one: Run) -> str:
     rows = np.column_stack([one.time, one.q, one.torque, one.command])
     lines = [",".join(["t_s", *names]), *(",".join(f"{v:.9g}" for v in row) for row in rows)]
     return "\n".join(lines) + "\n"
+
+
+def test_commands_and_positions_alone_give_drives_by_the_masses_of_the_model(made, tmp_path):
+    """Without torques: all but one common scale, which the model's masses set."""
+    out, text, files = tmp_path / "out.xml", tmp_path / "gap.json", []
+    for one in made.runs:
+        files.append(tmp_path / f"{one.name}.csv")
+        files[-1].write_text(without_torques(as_csv(one)))
+    assert run("gap", made.path, *files, "--write", out, "-o", text, "-q") == 0
+    gap = MotionGap.from_dict(json.loads(text.read_text()))
+    assert any("masses" in said and "k times" in said for said in gap.notices)
+    assert {one.name for one in gap.elements} == {"friction", "armature"}
+    first, last = (np.linalg.norm(gap.rungs[k].tracking_rms_mrad) for k in (0, -1))
+    assert last < 0.1 * first
+    model = mujoco.MjModel.from_xml_path(str(out))
+    assert_allclose(model.actuator_delay[:3], LATE, atol=1.5e-3)
+    assert_allclose(model.actuator_gainprm[:3, 0], REAL_KP, rtol=0.15)
+    whole = -model.actuator_biasprm[:3, 2] + model.dof_damping
+    assert_allclose(whole, REAL_KV + LACKS.damping, rtol=0.15)
+    assert run("torques", three_joints_file(tmp_path), *files, "-q") == 2
+    assert run("gap", made.path, *files, "--figure", tmp_path / "gap.png", "-q",
+               "--actuators", "json", tmp_path / "a.json",
+               "--randomize", tmp_path / "r.json") == 0  # fmt: skip
+    names = {one["name"] for one in json.loads((tmp_path / "r.json").read_text())["parameters"]}
+    assert names == {"stiffness", "damper", "delay"}
+
+
+def test_a_model_of_motors_needs_torques(made, tmp_path):
+    path, logs = tmp_path / "motors.xml", [tmp_path / "log1.csv", tmp_path / "log2.csv"]
+    path.write_bytes(made.arm.xml)
+    for log, one in zip(logs, made.runs, strict=False):
+        log.write_text(without_torques(as_csv(one)))
+    with pytest.raises(mc.CalibrationError, match="the model position servos"):
+        mc.motion_gap(path, logs)
+
+
+def three_joints_file(folder: Path) -> Path:
+    """The robot of the logs."""
+    path = folder / "robot.json"
+    path.write_text(json.dumps(three_joints().to_dict()))
+    return path
+
+
+def without_torques(text: str) -> str:
+    """A log without its columns of torque."""
+    rows = [line.split(",") for line in text.splitlines()]
+    kept = [i for i, name in enumerate(rows[0]) if not name.startswith("tau")]
+    return "\n".join(",".join(row[i] for i in kept) for row in rows) + "\n"
+
+
+def test_masses_set_the_one_scale_that_positions_do_not_tell(made, tmp_path):
+    """With all masses 1.5 times as large, gains, friction and rotors are, and positions are not."""
+    root = ElementTree.parse(made.path).getroot()
+    for body in root.iter("inertial"):
+        for name in {"mass", "diaginertia", "fullinertia"} & set(body.attrib):
+            body.set(name, " ".join(str(1.5 * float(v)) for v in body.get(name).split()))
+    root.remove(root.find("custom"))  # the robot whole, which would count in place of the bodies
+    heavy = tmp_path / "heavy.xml"
+    heavy.write_bytes(ElementTree.tostring(root))
+    bare = [replace(one, torque=0.0 * one.torque, unit=NOTHING) for one in made.runs]
+    gaps, models = [], []
+    for path, out in ((made.path, tmp_path / "a.xml"), (heavy, tmp_path / "b.xml")):
+        gaps.append(mc.motion_gap(path, bare, write=out))
+        models.append(mujoco.MjModel.from_xml_path(str(out)))
+    light, heavy = ([m.dof_frictionloss, m.dof_armature, m.actuator_gainprm[:, 0]] for m in models)
+    assert_allclose(np.array(heavy), 1.5 * np.array(light), rtol=0.02)
+    ends = [np.linalg.norm(gap.rungs[-1].tracking_rms_mrad) for gap in gaps]
+    assert ends[1] == pytest.approx(ends[0], rel=0.2)

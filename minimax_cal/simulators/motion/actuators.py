@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from minimax_cal.dynamics.drives import FIELDS, FITTED
+from minimax_cal.dynamics.drives import FIELDS, FITTED, covariance_of
 from minimax_cal.dynamics.laws import ARMATURE, FRICTION
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
@@ -27,7 +27,7 @@ ELEMENTS = {  # of the body, their names and units, and how they stand in `Numbe
     FRICTION: (("friction", "N m"), ("damping", "N m s/rad")),
     ARMATURE: (("armature", "kg m^2"),),
 }
-ISAAC = '''"""Actuators of {name} for a physics step of {step} s, as Isaac Lab's articulations take them.
+ISAAC = '''"""Actuators of {name} for Isaac Lab, whose physics steps are of {step} s.
 
 A drive whose feed_forward is s wants s times the commanded speed as its velocity target.
 feed_forward = {ahead}
@@ -142,7 +142,7 @@ def of_drives(served: Served, joints: tuple[str, ...], count: int) -> Ranged:
     change = change.reshape(len(every), len(changes))
     run = np.array(every, dtype=int) // 10**6
     by_run = np.array([change[run == number].sum(axis=0) for number in range(count)])
-    covariance = (len(every) - 1.0) / max(len(every), 1) * change.T @ change
+    covariance = covariance_of(change) if every else np.zeros((0, 0))
     return Ranged(tuple(names), np.array(mean), covariance, spread(by_run))
 
 
@@ -176,15 +176,18 @@ def of_body(made: Candidate, study: Study, joints: tuple[str, ...]) -> Ranged:
 
 
 def write_ranges(
-    path: Path | str, made: Candidate, study: Study, served: Served | None, count: int
+    path: Path | str,
+    fitted: tuple[Candidate, Study] | None,
+    served: Served | None,
+    joints: tuple[str, ...],
+    count: int,
 ) -> None:
     """Write mean, deviation and spread of what was fitted, and the covariance of all of it.
 
-    count: of the runs that drives were fitted to.
+    fitted: numbers of the body and the logs that told them.  count: of the runs to learn from.
     """
-    joints = study.chain.names
     parts = [of_drives(served, joints, count)] if served else []
-    parts.append(of_body(made, study, joints))
+    parts += [of_body(*fitted, joints)] if fitted else []
     whole = block_diag(*(part.covariance for part in parts))
     sigma = iter(np.sqrt(np.diag(whole)).tolist())
     parameters = [

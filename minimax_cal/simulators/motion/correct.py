@@ -62,6 +62,7 @@ LOST = {  # of an element, what readers of the file leave out, and which
     BRISTLES: ("`dcmotor`, with which MJX loads no file", "USD and SDF"),
     MODULE: ("what no element holds", "all simulators but MuJoCo"),
 }
+HISTORY_FIRST = "MuJoCo begins with 0 in the history of delayed commands: call mj_initCtrlHistory"
 BESIDE = 0.01  # the same, for a module beside the file, and of all rows for friction at rest
 
 
@@ -346,21 +347,26 @@ def law_worths(bench: Bench, plain: Candidate, full: Candidate) -> Iterator[Writ
         yield WrittenElement(WORDS[effect], "module", f"at {where}", worth)
 
 
-def lost(made: Corrected, *, late: bool) -> Iterator[str]:
-    """What other simulators leave out of the file, for people.  late: whether commands are."""
+def lost(made: Corrected) -> Iterator[str]:
+    """What other simulators leave out of the file, for people."""
     numbers, elements = made.plain.numbers, made.plain.asked.elements
     held = {
         LEVELLED: numbers.damping[:, 1:].any(),
         SPRINGS: numbers.stiffness[:, 1:].any(),
-        DELAY: DELAY in elements or late,
+        DELAY: DELAY in elements,
         BRISTLES: numbers.bristles.any(),
         MODULE: made.full.module,
     }
     for name, is_there in held.items():
         if is_there:
-            yield f"{LOST[name][1]} leave out {LOST[name][0]} ({name}); see plain="
-    if late or (DELAY in elements and numbers.late < 0.0):
-        yield "MuJoCo begins with 0 in the history of delayed commands: call mj_initCtrlHistory"
+            yield left_out_by(name)
+    if DELAY in elements and numbers.late < 0.0:
+        yield HISTORY_FIRST
+
+
+def left_out_by(element: str) -> str:
+    """Which readers of a file leave out an element."""
+    return f"{LOST[element][1]} leave out {LOST[element][0]} ({element}); see plain="
 
 
 def left_out(found: MotionDiagnosis, geared: Sequence[int]) -> Iterator[str]:

@@ -26,7 +26,11 @@ from minimax_cal.dynamics.drives import (
     predicts,
     speed_limit,
 )
+from minimax_cal.dynamics.laws import DELAY as LATE_IN_FILE
+from minimax_cal.dynamics.laws import WORDS
 from minimax_cal.dynamics.result import MotionEffect, changed_joints
+from minimax_cal.dynamics.run import NOTHING
+from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
 from minimax_cal.measuring.faults import Amount
 from minimax_cal.robots.document import Document
@@ -34,7 +38,7 @@ from minimax_cal.robots.mjcf import numbers
 from minimax_cal.simulators.chain import Chain
 from minimax_cal.simulators.elements import known, section, tune
 from minimax_cal.simulators.given import IMPLICIT, elements_of
-from minimax_cal.simulators.motion.correct import mean_log
+from minimax_cal.simulators.motion.correct import HISTORY_FIRST, left_out_by, mean_log
 from minimax_cal.simulators.motion.driven import ahead_of
 from minimax_cal.simulators.motion.judge import Judge
 from minimax_cal.simulators.motion.opened import Opened
@@ -53,19 +57,23 @@ class Served:
 
     given: (n) of the model.  fits: (n), None where the logs tell nothing.  told: effects that are
     another than the model's.  share: of gravity that drives carry, of the model and of the arm.
+    damping: (n,) of the joints, that is part of the fitted dampers where no torque tells them
+    apart.
     """
 
     given: tuple[Drive, ...]
     fits: tuple[DriveFit | None, ...]
     told: tuple[Told, ...]
     share: tuple[float, float]
+    damping: Array
 
     def drives(self, kinds: Sequence[str] = KINDS) -> tuple[Drive, ...]:
         """(n) the model's with what is told of some kinds."""
         out = list(self.given)
         for kind, j in self.told:
             if kind in kinds and (fit := self.fits[j]):
-                out[j] = out[j].taking(fit.drive, kind)
+                servo = max(fit.drive.damper - float(self.damping[j]), 0.0)
+                out[j] = out[j].taking(replace(fit.drive, damper=servo), kind)
         return tuple(out)
 
     def without(self, one: Told) -> Served:
@@ -105,7 +113,10 @@ def serve(judge: Judge, opened: Opened, *, plain: bool = False) -> Served:
     plain: without delays, which other simulators do not read.
     """
     chain = opened.chain
-    given = own_drives(chain)
+    own, damping = own_drives(chain), np.zeros(len(chain.dofs))
+    if judge.held.unit == NOTHING:
+        damping = np.array(chain.model.dof_damping[chain.dofs])
+    given = [replace(one, damper=one.damper + by) for one, by in zip(own, damping, strict=True)]
     first = float(np.mean(chain.model.body_gravcomp[list(chain.bodies)]))
     fits = followed_by(judge, given, first)
     share = first
@@ -120,7 +131,7 @@ def serve(judge: Judge, opened: Opened, *, plain: bool = False) -> Served:
     kinds = [one for one in KINDS if one != DELAY or late]
     told = tuple((kind, j) for kind in kinds for j, fit in enumerate(fits)
                  if fit and is_another(kind, fit, given[j], held, j, step))  # fmt: skip
-    return Served(given, fits, told, (first, share))
+    return Served(own, fits, told, (first, share), damping)
 
 
 def followed_by(judge: Judge, given: Sequence[Drive], share: float) -> tuple[DriveFit | None, ...]:
@@ -135,7 +146,7 @@ def unexplained(
 ) -> float:
     """Mean log of the torque that drives leave of the runs held out."""
     held = Followed.of(judge.runs, judge.arm, share)
-    left = [held.joint(j).rest(fit.drive if fit else drive)
+    left = [held.joint(j).rest(fit.drive, fit.beside) if fit else held.joint(j).rest(drive, {})
             for j, (fit, drive) in enumerate(zip(fits, given, strict=True))]  # fmt: skip
     return mean_log(np.array([np.sqrt((one**2).mean()) for one in left]))
 
@@ -156,7 +167,8 @@ def is_another(kind: str, fit: DriveFit, given: Drive, held: Followed, j: int, s
     if kind == DELAY and off["delay"] < SHORTEST * step:
         return False
     rows = held.clear(j, CLEAR * drive.torque, LIMIT * drive.speed)
-    return predicts(rows, rows.rest(drive), rows.rest(drive.taking(given, kind)))
+    ends = (rows.rest(one, fit.beside) for one in (drive, drive.taking(given, kind)))
+    return predicts(rows, *ends)
 
 
 def kept(served: Served, judge: Judge, opened: Opened) -> Served:
@@ -198,6 +210,22 @@ def effects_of(served: Served, judge: Judge, opened: Opened) -> Iterator[MotionE
             less = judge.tracking(with_drives(opened, served.without((kind, j))).chain)
         place = "all" if j < 0 else f"J{j + 1}"
         yield MotionEffect(kind, place, amounts, changed_joints(1e3 * less, 1e3 * whole))
+
+
+def lost_late(effects: Sequence[MotionEffect]) -> Iterator[str]:
+    """What is to be said where a file has late commands, for people."""
+    if any(one.effect == DELAY for one in effects):
+        yield left_out_by(LATE_IN_FILE)
+        yield HISTORY_FIRST
+
+
+def steps_with(
+    served: Served, effects: Sequence[MotionEffect], opened: Opened
+) -> Iterator[tuple[str, Opened]]:
+    """The model with the drives, a step for each kind of effect, and what it is called."""
+    for number, kind in enumerate(KINDS):
+        if kind in {effect.effect for effect in effects}:
+            yield f"+ {WORDS[kind]}", with_drives(opened, served, KINDS[: number + 1])
 
 
 def with_drives(opened: Opened, served: Served, kinds: Sequence[str] = KINDS) -> Opened:

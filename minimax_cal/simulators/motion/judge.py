@@ -12,7 +12,7 @@ from minimax_cal.dynamics.diagnose import named_runs
 from minimax_cal.dynamics.drives import command_of
 from minimax_cal.dynamics.given import MotionKnown
 from minimax_cal.dynamics.rows import Logs, prepare, rms_by_joint
-from minimax_cal.dynamics.run import Run
+from minimax_cal.dynamics.run import NOTHING, Run
 from minimax_cal.dynamics.scene import Arm, Scene
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
@@ -159,6 +159,8 @@ class Judge:
     def rung(self, name: str, chain: Chain, numbers: Numbers | None = None, module: str = "",
              missed: Missed | None = None) -> MotionRung:  # fmt: skip
         """How far a model misses.  missed: where it is known already."""
+        if self.held.unit == NOTHING:
+            return MotionRung(name, (), (), (), tuple((1e3 * self.tracking(chain)).tolist()))
         with installed(module, chain):
             off = self.torque(chain, numbers) if missed is None else missed
             where = self.tracking(chain, numbers) if self.drives else np.zeros(0)

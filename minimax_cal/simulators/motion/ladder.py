@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from minimax_cal.dynamics.diagnose import diagnose_motion
-from minimax_cal.dynamics.drives import DELAY as COMMAND_DELAY
-from minimax_cal.dynamics.drives import KINDS
 from minimax_cal.dynamics.given import MotionKnown, Payload, read_logs, runs_of
-from minimax_cal.dynamics.laws import WORDS
 from minimax_cal.dynamics.result import MotionDiagnosis, MotionEffect, load_motion
-from minimax_cal.dynamics.run import CURRENT, Run
+from minimax_cal.dynamics.run import CURRENT, NOTHING, Run
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
@@ -31,6 +28,7 @@ from minimax_cal.simulators.motion.bristles import has_bristles
 from minimax_cal.simulators.motion.correct import (
     STAYS,
     Bench,
+    Candidate,
     asked_of,
     correct,
     lost,
@@ -41,14 +39,17 @@ from minimax_cal.simulators.motion.drives import (
     can_write,
     effects_of,
     kept,
+    lost_late,
     serve,
+    steps_with,
     with_drives,
 )
 from minimax_cal.simulators.motion.fit import Study
 from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge
 from minimax_cal.simulators.motion.module import ENDING
 from minimax_cal.simulators.motion.opened import Opened, calibrated, open_model
-from minimax_cal.simulators.motion.result import MotionGap, MotionRung
+from minimax_cal.simulators.motion.positions import SCALE, by_positions
+from minimax_cal.simulators.motion.result import MotionGap, MotionRung, WrittenElement
 
 MOTOR = "dcmotor"  # what holds friction beside a constraint
 
@@ -125,7 +126,7 @@ def motion_gap(
     progress("reading the model and the logs")
     runs = read_logs(model, logs)
     opened = open_model(model, runs[0].joints if runs else 0, tip)
-    runs = runs_of(model, opened.chain.robot, runs)
+    runs = runs_of(model, opened.chain.robot, runs, commands=driven)
     with one_thread():
         commanded = driven and all(run.command is not None for run in runs)
         judge = Judge.of(opened, runs, known, fastest=commanded)
@@ -135,35 +136,35 @@ def motion_gap(
             opened, notices = calibrated(opened, load_fit(fit))
             judge = judge.of_model(opened)
             first.append(judge.rung("calibrated geometry", opened.chain))
-        found = told_or_found(judge, opened, diagnosis, known.payload, progress)
-        judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
-                                           soft=found.arm.soft))  # fmt: skip
-        own = replace(bench_of(judge, opened, found), bristled=friction == MOTOR, plain=plain)
-        bench, served, rungs, effects = by_commands(own, found, progress)
-        made = correct(bench, found, progress)
-        first += rungs
-    rungs = (*first, *made.rungs)
-    nothing = judge.commanded and not improves(rungs)
+        if judge.held.unit == NOTHING:
+            made = alone(judge, opened, plain=plain, progress=progress)
+        else:
+            found = told_or_found(judge, opened, diagnosis, known.payload, progress)
+            judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
+                                               soft=found.arm.soft))  # fmt: skip
+            bench = bench_of(judge, opened, found)
+            bench = replace(bench, bristled=friction == MOTOR, plain=plain)
+            made = by_torques(bench, found, progress)
+    nothing = judge.commanded and not improves((*first, *made.rungs))
     path = None if write is None or nothing else Path(write)
-    beside = path.with_name(path.stem + ENDING) if path and made.full.module else None
+    beside = path.with_name(path.stem + ENDING) if path and made.module else None
     if path is not None:
-        write_whole(path, made.plain.opened.content(path))
+        write_whole(path, made.opened.content(path))
     if actuators is not None and not nothing:
-        write_actuators(actuators, made.plain.opened.chain, served, opened.chain.robot.name)
+        write_actuators(actuators, made.opened.chain, made.served, opened.chain.robot.name)
     if randomize is not None and not nothing:
         count = len(judge.learning_runs)
-        write_ranges(randomize, made.plain, bench.study, served, count)
+        write_ranges(randomize, made.fitted, made.served, opened.chain.names, count)
     if beside is not None:
-        write_whole(beside, made.full.module)
+        write_whole(beside, made.module)
     told = (text for run in runs for text in run.notices)
-    late = any(one.effect == COMMAND_DELAY for one in effects)
-    said = (*told, *notices, *made.notices, *(lost(made, late=late) if path else ()))
+    said = (*told, *notices, *made.notices, *(made.lost if path else ()))
     return MotionGap(
         model=str(model),
         robot=opened.chain.robot.name,
         unit=judge.held.unit,
-        rungs=rungs[:1] if nothing else rungs,
-        effects=() if nothing else effects,
+        rungs=tuple(first[:1] if nothing else (*first, *made.rungs)),
+        effects=() if nothing else made.effects,
         elements=() if nothing else made.elements,
         left_out=made.left_out,
         drives=judge.drives,
@@ -172,6 +173,57 @@ def motion_gap(
         written="" if path is None else str(path),
         module="" if beside is None else str(beside),
         seconds=time.perf_counter() - began,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """A corrected model, and what is said of it.
+
+    fitted: numbers of its body and the logs that told them, None without torques.  lost: what
+    other simulators leave out.
+    """
+
+    opened: Opened
+    served: Served | None
+    rungs: tuple[MotionRung, ...]
+    effects: tuple[MotionEffect, ...]
+    elements: tuple[WrittenElement, ...]
+    fitted: tuple[Candidate, Study] | None = None
+    module: str = ""
+    left_out: tuple[str, ...] = ()
+    notices: tuple[str, ...] = ()
+    lost: tuple[str, ...] = ()
+
+
+def alone(judge: Judge, opened: Opened, *, plain: bool, progress: Progress) -> Answer:
+    """By commands and positions without torques.  Raises OptionError without servos to correct."""
+    if judge.drives != OWN_SERVOS or not can_write(opened):
+        raise OptionError(
+            f"{judge.runs[0].source}: no column of torque or current: then every run needs "
+            "commands of all joints (q1_cmd_rad, ...), and the model position servos"
+        )
+    progress("fitting the drives to their commands")
+    made = by_positions(judge, opened, plain=plain)
+    return Answer(made.opened, made.served, made.rungs, made.effects, made.elements,
+                  notices=(SCALE,), lost=tuple(lost_late(made.effects)))  # fmt: skip
+
+
+def by_torques(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Answer:
+    """By torques, and by commands where they were logged."""
+    bench, served, rungs, effects = by_commands(bench, found, progress)
+    made = correct(bench, found, progress)
+    return Answer(
+        made.plain.opened,
+        served,
+        (*rungs, *made.rungs),
+        effects,
+        made.elements,
+        (made.plain, bench.study),
+        made.full.module,
+        made.left_out,
+        made.notices,
+        (*lost(made), *lost_late(effects)),
     )
 
 
@@ -192,12 +244,10 @@ def by_commands(
     beside = bench_in(bench, with_drives(opened, served), found).candidate(whole).opened
     served = kept(served, judge, beside)
     effects = tuple(effects_of(served, judge, beside))
-    off, rungs = judge.torque(opened.chain), list[MotionRung]()
-    for number, kind in enumerate(KINDS):
-        if kind in {effect.effect for effect in effects}:
-            now = with_drives(opened, served, KINDS[: number + 1])
-            rungs.append(judge.rung(f"+ {WORDS[kind]}", now.chain, missed=off))
-    return bench_in(bench, with_drives(opened, served), found), served, tuple(rungs), effects
+    off = judge.torque(opened.chain)
+    rungs = tuple(judge.rung(name, one.chain, missed=off)
+                  for name, one in steps_with(served, effects, opened))  # fmt: skip
+    return bench_in(bench, with_drives(opened, served), found), served, rungs, effects
 
 
 def bench_in(bench: Bench, opened: Opened, found: MotionDiagnosis) -> Bench:

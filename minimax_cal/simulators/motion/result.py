@@ -124,6 +124,8 @@ class MotionGap(Result):
                 f"({', '.join(self.held_out)}), {error:.3g} mrad: nothing is written."
             )
         first, last = self.rungs[0], self.rungs[-1]
+        if not first.torque_rms:
+            return f"{self.driven().capitalize()}."
         share = np.array(last.torque_rms_moving) / np.maximum(first.torque_rms_moving, 1e-300)
         worst = int(np.argmax(share))
         said = (
@@ -131,12 +133,12 @@ class MotionGap(Result):
             f"{100.0 * np.median(share):.2g} % (median of the joints; worst J{worst + 1}, "
             f"{100.0 * share[worst]:.2g} %)"
         )
-        if first.tracking_rms_mrad:
-            ends = [float(np.linalg.norm(r.tracking_rms_mrad)) for r in (first, last)]
-            said += (
-                f", the joint error under {self.drives} from {ends[0]:.3g} to {ends[1]:.3g} mrad"
-            )
-        return f"{said}."
+        return f"{said}, {self.driven()}." if first.tracking_rms_mrad else f"{said}."
+
+    def driven(self) -> str:
+        """How the joint error changes."""
+        ends = [float(np.linalg.norm(self.rungs[k].tracking_rms_mrad)) for k in (0, -1)]
+        return f"the joint error under {self.drives} from {ends[0]:.3g} to {ends[1]:.3g} mrad"
 
     def sentences(self) -> tuple[str, ...]:
         """What was corrected and its worth, what the file alone lacks, and what nothing holds."""
@@ -159,4 +161,5 @@ class MotionGap(Result):
         """Torques, and joint errors where drives moved the arm."""
         title = f"RMS joint error [mrad] under {self.drives}"
         driven = table_by_joint(title, "model", self.rungs, "tracking_rms_mrad")
-        return (self.table(), driven) if self.drives else (self.table(),)
+        own = (self.table(),) if self.unit else ()
+        return (*own, driven) if self.drives else own
