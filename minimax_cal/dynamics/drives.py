@@ -81,14 +81,9 @@ class DriveFit:
     beside: dict[str, float]
 
     @property
-    def covariance(self) -> Array:
-        """(4, 4) of FITTED."""
-        return covariance_of(self.change)
-
-    @property
     def sigma(self) -> dict[str, float]:
         """Standard deviations by name."""
-        own = np.sqrt(np.diag(self.covariance)).tolist()
+        own = np.sqrt(np.diag(covariance_of(self.change))).tolist()
         return dict(zip((*FITTED, "torque", "speed"), (*own, *self.limits), strict=True))
 
 
@@ -153,12 +148,11 @@ class Followed:
         logs = self.logs
         used = ~logs.gap & (self.measured | self.slides[:, j])
         at = logs.picked[used[logs.picked]]
-        ends = list(zip(logs.start[:-1], logs.start[1:], strict=True))
         run = np.searchsorted(logs.start, at, side="right") - 1
         stretch = run * 10**6 + (logs.since[at] / BLOCK_S).astype(int)
         curves = [
             scipy.interpolate.CubicSpline(logs.since[a:b], self.told.torque[a:b, j])
-            for a, b in ends
+            for a, b in zip(logs.start[:-1], logs.start[1:], strict=True)
         ]
         torque = logs.torque[:, j] * self.gain[j] - self.carried[:, j]
         q, qd, qdd = (one[at, j] for one in (logs.motion.q, logs.motion.qd, logs.motion.qdd))

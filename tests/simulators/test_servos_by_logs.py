@@ -298,3 +298,45 @@ def test_masses_set_the_one_scale_that_positions_do_not_tell(made, tmp_path):
     assert_allclose(np.array(heavy), 1.5 * np.array(light), rtol=0.02)
     ends = [np.linalg.norm(gap.rungs[-1].tracking_rms_mrad) for gap in gaps]
     assert ends[1] == pytest.approx(ends[0], rel=0.2)
+
+
+def test_drives_that_carry_no_gravity_are_told_from_a_model_whose_drives_do(made, tmp_path):
+    root = ElementTree.parse(made.path).getroot()
+    for body in root.iter("body"):
+        body.set("gravcomp", "1")
+    for joint in root.iter("joint"):
+        joint.set("actuatorgravcomp", "true")
+    path, out = tmp_path / "carries.xml", tmp_path / "out.xml"
+    path.write_bytes(ElementTree.tostring(root))
+    gap = mc.motion_gap(path, made.runs, write=out)
+    (share,) = (one for one in gap.effects if one.place == "all")
+    assert [(p.name, p.value) for p in share.parameters] == [("gravity_share", 0.0)]
+    model = mujoco.MjModel.from_xml_path(str(out))
+    assert not model.body_gravcomp.any()
+    assert_allclose(model.actuator_gainprm[:3, 0], REAL_KP, rtol=5e-3)
+
+
+def test_a_damper_too_large_for_an_explicit_step_changes_the_integrator(made):
+    root = ElementTree.fromstring(served(made.arm.xml, KP, 0.02 * KV))
+    root.find("option").set("integrator", "Euler")
+    path = made.path.with_name("euler.xml")
+    path.write_bytes(ElementTree.tostring(root))
+    opened = open_model(path, 3)
+    given = own_drives(opened.chain)
+    for damper, integrator in ((0.03 * KV[0], "mjINT_EULER"), (9.0 * KV[0], "mjINT_IMPLICITFAST")):
+        fits = (SimpleNamespace(drive=replace(given[0], damper=damper)), None, None)
+        new = with_drives(opened, Served(given, fits, (("servo_gain", 0),), (0.0, 0.0),
+                                         np.zeros(3)))  # fmt: skip
+        model = new.chain.model
+        assert mujoco.mjtIntegrator(model.opt.integrator).name == integrator
+
+
+def test_a_new_model_of_a_robot_file_gets_the_drives_of_the_log(made, tmp_path):
+    """A plain file has no delay, and says which runs judged."""
+    out = tmp_path / "new.xml"
+    gap = mc.motion_gap(three_joints_file(tmp_path), made.runs, write=out, plain=True)
+    assert {one.effect for one in gap.effects} == {"servo_gain"}
+    model = mujoco.MjModel.from_xml_path(str(out))
+    assert_allclose(model.actuator_gainprm[:3, 0], REAL_KP, rtol=5e-3)
+    assert not model.actuator_delay.any()
+    assert not any("delay" in text for text in gap.notices)

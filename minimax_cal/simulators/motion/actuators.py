@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -40,61 +39,42 @@ ACTUATORS = {{
 '''
 
 
-@dataclass(frozen=True)
-class Actuator:
-    """A joint's, in SI, limits None where there are none.  delay_steps: of the model's timestep."""
+def actuators_of(chain: Chain, served: Served | None) -> list[dict[str, Any]]:
+    """Of a model as it is written, joint by joint, in SI, limits infinite where there are none.
 
-    joint: str
-    stiffness: float
-    damping: float
-    feed_forward: float
-    armature: float
-    friction: float
-    viscous_friction: float
-    effort_limit: float | None
-    velocity_limit: float | None
-    delay: float
-    delay_steps: int
-
-
-def actuators_of(chain: Chain, served: Served | None) -> Iterator[Actuator]:
-    """Of a model as it is written.  served: what its logs say of speeds that no model holds."""
-    model = chain.model
-    fits = served.fits if served else (None,) * len(chain.joints)
-    for name, dof, drive, fit in zip(chain.names, chain.dofs, own_drives(chain), fits, strict=True):
-        speed = fit.drive.speed if fit else math.inf
-        yield Actuator(
-            name, drive.stiffness, drive.damper, drive.ahead, float(model.dof_armature[dof]),
-            float(model.dof_frictionloss[dof]), float(model.dof_damping[dof]),
-            finite(drive.torque), finite(speed), drive.delay,
-            round(drive.delay / float(model.opt.timestep)),
-        )  # fmt: skip
+    served: what its logs say of speeds that no model holds.
+    """
+    dofs, step = chain.dofs, float(chain.model.opt.timestep)
+    fits = served.fits if served else (None,) * len(dofs)
+    held = ("dof_armature", "dof_frictionloss", "dof_damping")
+    body = np.array([getattr(chain.model, name)[dofs] for name in held]).T.tolist()
+    return [
+        {"joint": name, "stiffness": drive.stiffness, "damping": drive.damper,
+         "feed_forward": drive.ahead, "armature": own[0], "friction": own[1],
+         "viscous_friction": own[2], "effort_limit": drive.torque,
+         "velocity_limit": fit.drive.speed if fit else math.inf, "delay": drive.delay,
+         "delay_steps": round(drive.delay / step)}
+        for name, drive, own, fit in zip(chain.names, own_drives(chain), body, fits, strict=True)
+    ]  # fmt: skip
 
 
-def finite(limit: float) -> float | None:
-    """A limit, None where there is none."""
-    return limit if math.isfinite(limit) else None
-
-
-def actuators_text(found: list[Actuator], step: float, name: str) -> dict[str, str]:
+def actuators_text(found: list[dict[str, Any]], step: float, name: str) -> dict[str, str]:
     """The files that can be written, by their format."""
-    content = {"schema": 1, "kind": "actuators", "model": name, "timestep": step,
-               "joints": [plain(one) for one in found]}  # fmt: skip
+    content = {"schema": 1, "kind": "actuators", "model": name, "timestep": step, "joints": found}
     entries = ""
-    for late in sorted({one.delay_steps for one in found}):
-        some = [one for one in found if one.delay_steps == late]
-        fields: dict[str, Any] = {"joint_names_expr": [one.joint for one in some]}
+    for late in sorted({one["delay_steps"] for one in found}):
+        some = [one for one in found if one["delay_steps"] == late]
+        fields: dict[str, Any] = {"joint_names_expr": [one["joint"] for one in some]}
         for of in ("stiffness", "damping", "armature", "friction", "viscous_friction",
                    "effort_limit", "velocity_limit"):  # fmt: skip
-            values = {one.joint: getattr(one, of) for one in some}
-            fields[of] = {joint: v for joint, v in values.items() if v is not None} or None
+            fields[of] = {o["joint"]: o[of] for o in some if math.isfinite(o[of])} or None
         fields |= {"dynamic_friction": fields["friction"], "min_delay": late, "max_delay": late}
         entries += f'    "delay_{late}": DelayedPDActuatorCfg(\n'
         entries += "".join(f"        {key}={value!r},\n" for key, value in fields.items())
         entries += "    ),\n"
-    ahead = {one.joint: one.feed_forward for one in found}
+    ahead = {one["joint"]: one["feed_forward"] for one in found}
     isaac = ISAAC.format(name=name, step=step, ahead=ahead, entries=entries)
-    return {"json": json_text(content), "isaac": isaac}
+    return {"json": json_text(plain(content)), "isaac": isaac}
 
 
 def check_files(actuators: tuple[str, Path | str] | None, ranges: Path | str | None) -> None:
@@ -111,7 +91,7 @@ def write_actuators(
     to: tuple[str, Path | str], chain: Chain, served: Served | None, name: str
 ) -> None:
     """Write the actuators of a model in a format that simulators take."""
-    step, found = float(chain.model.opt.timestep), list(actuators_of(chain, served))
+    step, found = float(chain.model.opt.timestep), actuators_of(chain, served)
     write_whole(Path(to[1]), actuators_text(found, step, name)[to[0]])
 
 

@@ -107,6 +107,11 @@ def own_drives(chain: Chain) -> tuple[Drive, ...]:
     return tuple(out)
 
 
+def share_of(chain: Chain) -> float:
+    """Of gravity, that the actuators of a model carry."""
+    return float(np.mean(chain.model.body_gravcomp[list(chain.bodies)]))
+
+
 def serve(judge: Judge, opened: Opened, *, plain: bool = False) -> Served:
     """What logs with commands say of a model's drives.
 
@@ -117,13 +122,14 @@ def serve(judge: Judge, opened: Opened, *, plain: bool = False) -> Served:
     if judge.held.unit == NOTHING:
         damping = np.array(chain.model.dof_damping[chain.dofs])
     given = [replace(one, damper=one.damper + by) for one, by in zip(own, damping, strict=True)]
-    first = float(np.mean(chain.model.body_gravcomp[list(chain.bodies)]))
+    first = share_of(chain)
     fits = followed_by(judge, given, first)
     share = first
     for other in {0.0, 1.0} - {first}:
         tried = followed_by(judge, given, other)
-        left = (unexplained(judge, given, *one) for one in ((tried, other), (fits, share)))
-        if next(left) < next(left) - OTHER_SHARE:
+        left, before = unexplained(judge, tried, other), unexplained(judge, fits, share)
+        more = sum(fit is not None for fit in tried) >= max(1, sum(fit is not None for fit in fits))
+        if more and left < before - OTHER_SHARE:
             fits, share = tried, other
     held = Followed.of(judge.runs, judge.arm, share)
     step = float(chain.model.opt.timestep)
@@ -141,14 +147,14 @@ def followed_by(judge: Judge, given: Sequence[Drive], share: float) -> tuple[Dri
     return tuple(fit_drive(learnt, held, j, drive) for j, drive in enumerate(given))
 
 
-def unexplained(
-    judge: Judge, given: Sequence[Drive], fits: Sequence[DriveFit | None], share: float
-) -> float:
-    """Mean log of the torque that drives leave of the runs held out."""
-    held = Followed.of(judge.runs, judge.arm, share)
-    left = [held.joint(j).rest(fit.drive, fit.beside) if fit else held.joint(j).rest(drive, {})
-            for j, (fit, drive) in enumerate(zip(fits, given, strict=True))]  # fmt: skip
-    return mean_log(np.array([np.sqrt((one**2).mean()) for one in left]))
+def unexplained(judge: Judge, fits: Sequence[DriveFit | None], share: float) -> float:
+    """Mean log of the torque that drives leave of the runs held out: all of it, without a fit."""
+    held, left = Followed.of(judge.runs, judge.arm, share), list[float]()
+    for j, fit in enumerate(fits):
+        rows = held.joint(j)
+        rest = rows.rest(fit.drive, fit.beside) if fit else rows.torque
+        left.append(float((rest**2).sum()))
+    return 0.5 * mean_log(np.array(left))
 
 
 def is_another(kind: str, fit: DriveFit, given: Drive, held: Followed, j: int, step: float) -> bool:
@@ -232,7 +238,7 @@ def with_drives(opened: Opened, served: Served, kinds: Sequence[str] = KINDS) ->
     """The model with what is told of its drives, of some kinds."""
     document = opened.given.document.copy()
     write_drives(document, opened.chain, served.drives(kinds))
-    if served.share[0] != served.share[1]:
+    if served.share[1] != share_of(opened.chain):
         write_share(document.root, opened.chain, served.share[1])
     return opened.again(document)
 

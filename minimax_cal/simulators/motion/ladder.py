@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,6 @@ from minimax_cal.simulators.motion.bristles import has_bristles
 from minimax_cal.simulators.motion.correct import (
     STAYS,
     Bench,
-    Candidate,
     asked_of,
     correct,
     lost,
@@ -48,8 +47,8 @@ from minimax_cal.simulators.motion.fit import Study
 from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge
 from minimax_cal.simulators.motion.module import ENDING
 from minimax_cal.simulators.motion.opened import Opened, calibrated, open_model
-from minimax_cal.simulators.motion.positions import SCALE, by_positions
-from minimax_cal.simulators.motion.result import MotionGap, MotionRung, WrittenElement
+from minimax_cal.simulators.motion.positions import Answer, by_positions
+from minimax_cal.simulators.motion.result import MotionGap, MotionRung
 
 MOTOR = "dcmotor"  # what holds friction beside a constraint
 
@@ -137,7 +136,8 @@ def motion_gap(
             judge = judge.of_model(opened)
             first.append(judge.rung("calibrated geometry", opened.chain))
         if judge.held.unit == NOTHING:
-            made = alone(judge, opened, plain=plain, progress=progress)
+            progress("fitting the drives to their commands")
+            made = by_positions(judge, opened, plain=plain)
         else:
             found = told_or_found(judge, opened, diagnosis, known.payload, progress)
             judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
@@ -176,55 +176,13 @@ def motion_gap(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """A corrected model, and what is said of it.
-
-    fitted: numbers of its body and the logs that told them, None without torques.  lost: what
-    other simulators leave out.
-    """
-
-    opened: Opened
-    served: Served | None
-    rungs: tuple[MotionRung, ...]
-    effects: tuple[MotionEffect, ...]
-    elements: tuple[WrittenElement, ...]
-    fitted: tuple[Candidate, Study] | None = None
-    module: str = ""
-    left_out: tuple[str, ...] = ()
-    notices: tuple[str, ...] = ()
-    lost: tuple[str, ...] = ()
-
-
-def alone(judge: Judge, opened: Opened, *, plain: bool, progress: Progress) -> Answer:
-    """By commands and positions without torques.  Raises OptionError without servos to correct."""
-    if judge.drives != OWN_SERVOS or not can_write(opened):
-        raise OptionError(
-            f"{judge.runs[0].source}: no column of torque or current: then every run needs "
-            "commands of all joints (q1_cmd_rad, ...), and the model position servos"
-        )
-    progress("fitting the drives to their commands")
-    made = by_positions(judge, opened, plain=plain)
-    return Answer(made.opened, made.served, made.rungs, made.effects, made.elements,
-                  notices=(SCALE,), lost=tuple(lost_late(made.effects)))  # fmt: skip
-
-
 def by_torques(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Answer:
     """By torques, and by commands where they were logged."""
     bench, served, rungs, effects = by_commands(bench, found, progress)
     made = correct(bench, found, progress)
-    return Answer(
-        made.plain.opened,
-        served,
-        (*rungs, *made.rungs),
-        effects,
-        made.elements,
-        (made.plain, bench.study),
-        made.full.module,
-        made.left_out,
-        made.notices,
-        (*lost(made), *lost_late(effects)),
-    )
+    return Answer(made.plain.opened, served, (*rungs, *made.rungs), effects, made.elements,
+                  (made.plain, bench.study), made.full.module, made.left_out, made.notices,
+                  (*lost(made), *lost_late(effects)))  # fmt: skip
 
 
 def by_commands(

@@ -11,18 +11,23 @@ from minimax_cal.dynamics.drives import FRICTION as FITTED_FRICTION
 from minimax_cal.dynamics.drives import INERTIA
 from minimax_cal.dynamics.laws import ARMATURE, FRICTION
 from minimax_cal.dynamics.result import MotionEffect
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.simulators.motion.bodies import Bodies
+from minimax_cal.simulators.motion.correct import Candidate
 from minimax_cal.simulators.motion.drives import (
     WORTH,
     Served,
+    can_write,
     effects_of,
     joint_error,
     kept,
+    lost_late,
     serve,
     steps_with,
     with_drives,
 )
-from minimax_cal.simulators.motion.judge import Judge
+from minimax_cal.simulators.motion.fit import Study
+from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge
 from minimax_cal.simulators.motion.numbers import given_numbers
 from minimax_cal.simulators.motion.opened import Opened
 from minimax_cal.simulators.motion.result import MotionRung, WrittenElement
@@ -38,18 +43,35 @@ SCALE = (
 
 
 @dataclass(frozen=True, eq=False)
-class ByPositions:
-    """opened: the corrected model.  rungs: after the first."""
+class Answer:
+    """A corrected model, and what is said of it.
+
+    rungs: after the first.  fitted: numbers of its body and the logs that told them, None without
+    torques.  module: text beside it.  lost: what other simulators leave out.
+    """
 
     opened: Opened
-    served: Served
+    served: Served | None
     rungs: tuple[MotionRung, ...]
     effects: tuple[MotionEffect, ...]
     elements: tuple[WrittenElement, ...]
+    fitted: tuple[Candidate, Study] | None
+    module: str
+    left_out: tuple[str, ...]
+    notices: tuple[str, ...]
+    lost: tuple[str, ...]
 
 
-def by_positions(judge: Judge, opened: Opened, *, plain: bool) -> ByPositions:
-    """What lowers the joint error under the logged commands, each step of it."""
+def by_positions(judge: Judge, opened: Opened, *, plain: bool) -> Answer:
+    """What lowers the joint error under the logged commands, each step of it.
+
+    Raises OptionError without servos to correct.
+    """
+    if judge.drives != OWN_SERVOS or not can_write(opened):
+        raise OptionError(
+            f"{judge.runs[0].source}: no column of torque or current: then every run needs "
+            "commands of all joints (q1_cmd_rad, ...), and the model position servos"
+        )
     served, names = serve(judge, opened, plain=plain), tuple(HELD)
     served = kept(served, judge, with_body(opened, served, names))
     for name in reversed(names):
@@ -64,7 +86,8 @@ def by_positions(judge: Judge, opened: Opened, *, plain: bool) -> ByPositions:
               for number, name in enumerate(names)]  # fmt: skip
     rungs = tuple(judge.rung(name, one.chain) for name, one in steps)
     elements = tuple(WrittenElement(name, "file", HELD[name][2], {}) for name in names)
-    return ByPositions(with_body(driven, served, names), served, rungs, effects, elements)
+    return Answer(with_body(driven, served, names), served, rungs, effects, elements, None, "", (),
+                  (SCALE,), tuple(lost_late(effects)))  # fmt: skip
 
 
 def with_body(opened: Opened, served: Served, names: Sequence[str]) -> Opened:
