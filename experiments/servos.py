@@ -223,14 +223,16 @@ def run(case: Case) -> Closed:
 
 
 def accused(case: Case) -> tuple[str, ...]:
-    """What logs say of drives, before the joint error has its say."""
+    """What `gap` says of drives; it is asked where a number is surely another than the file's."""
     one = drawn(case.arm, case.seed, elastic=case.elastic, sound=case.sound)
+    runs = one.logs()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "arm.xml"
         path.write_bytes(one.xml)
         opened = open_model(path, one.arm.robot.joints)
-    judge = Judge.of(opened, one.logs(), MotionKnown(), fastest=True).driving(opened, None)
-    return tuple(f"{kind}:J{j + 1}" for kind, j in serve(judge, opened).told)
+        judge = Judge.of(opened, runs, MotionKnown(), fastest=True).driving(opened, None)
+        effects = mc.motion_gap(path, runs).effects if serve(judge, opened).told else ()
+    return tuple(f"{each.effect}:{each.place}" for each in effects)
 
 
 def drawn_cases(count: int, seed: int, *, sound: bool = False) -> list[Case]:
