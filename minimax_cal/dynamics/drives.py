@@ -9,7 +9,7 @@ gains.  Rows err together over a stretch of BLOCK_S: each is left out in turn [j
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from minimax_cal.dynamics.regressor import PER_LINK, Motion, inverse_dynamics
+from minimax_cal.dynamics.regressor import Motion
 from minimax_cal.dynamics.rows import SLOWEST, UNFITTED_S, Logs, prepare
 from minimax_cal.dynamics.run import NOTHING, Run
 from minimax_cal.dynamics.scene import Arm, sense_of
@@ -45,6 +45,7 @@ FIELDS = {  # of a drive, that belong to an effect, and their units
     SPEED_LIMIT: {"speed": "rad/s"},
 }
 NO_LIMITS = (math.inf, 0.0), (math.inf, 0.0)
+Body = Callable[[Motion], Array]  # torque (m, n) that masses take for a motion [N m]
 FITTED = ("stiffness", "damper", "ahead", "delay")
 
 
@@ -130,16 +131,14 @@ class Followed:
         return self.logs.away(UNFITTED_S)
 
     @staticmethod
-    def of(runs: Sequence[Run], arm: Arm, share: float) -> Followed:
-        """share: of gravity that drives carry besides."""
-        logs, drawn = prepare(runs), arm.drawn.reshape(-1, PER_LINK)
+    def of(runs: Sequence[Run], arm: Arm, share: float, body: Body) -> Followed:
+        """share: of gravity that drives carry besides.  body: torque of the masses of a motion."""
+        logs = prepare(runs)
         if logs.unit == NOTHING:
-            logs = replace(logs, torque=inverse_dynamics(arm.robot, logs.motion, drawn))
+            logs = replace(logs, torque=body(logs.motion))
         told = prepare([replace(run, torque=command_of(run)) for run in runs])
-        carried = np.zeros_like(logs.torque)
-        if share:
-            still = Motion(logs.motion.q, *np.zeros((2, *carried.shape)))
-            carried = share * inverse_dynamics(arm.robot, still, drawn)
+        still = np.zeros((2, *logs.torque.shape))
+        carried = share * body(Motion(logs.motion.q, *still)) if share else still[0]
         sense = sense_of(logs.motion.qd, arm.soft)
         return Followed(tuple(runs), logs, told, carried, sense, arm.gain)
 
@@ -370,14 +369,16 @@ def fit_drive(learnt: Followed, judged: Followed, j: int, given: Drive) -> Drive
         seen = learnt.samples(j, found.drive)
         (torque, slack), (speed, off) = limits_of(seen) if learnt.measured else NO_LIMITS
         used, rows = rows, learnt.clear(j, CLEAR * torque, LIMIT * speed)
-    gains = found.drive.stiffness, math.sqrt(covariance_of(found.change)[0, 0])
-    if not (gains[0] > STANDS * gains[1] and found.drive.damper >= 0.0):
+    gains = np.array([found.drive.stiffness, found.drive.damper])
+    unsure = STANDS * np.sqrt(np.diag(covariance_of(found.change))[:2])
+    if not (gains[0] > unsure[0] and gains[1] > -unsure[1]):
         return None
     limit = given.torque if not np.isfinite(torque) else torque
     known = learnt.measured and np.isfinite(given.torque)
     if known and np.quantile(np.abs(seen.torque), 0.999) > BEYOND * limit:
         limit = float(np.abs(seen.torque).max())
-    drive = replace(found.drive, torque=float(limit), speed=float(min(speed, given.speed)))
+    drive = replace(found.drive, damper=max(found.drive.damper, 0.0), torque=float(limit),
+                    speed=float(min(speed, given.speed)))  # fmt: skip
     change, stretch = found.change[:, : len(FITTED)], np.unique(used.stretch)
     beside = {name: value for name, value in found.beside.items() if name != AHEAD}
     return DriveFit(drive, change, stretch, (slack, off), beside)

@@ -25,6 +25,7 @@ from experiments.driven_arms import (  # noqa: E402
     served,
     with_motors,
 )
+from minimax_cal.simulators.mjcf import text_of  # noqa: E402
 from minimax_cal.simulators.motion.drives import (  # noqa: E402
     Served,
     can_write,
@@ -33,6 +34,7 @@ from minimax_cal.simulators.motion.drives import (  # noqa: E402
 )
 from minimax_cal.simulators.motion.opened import open_model  # noqa: E402
 from minimax_cal.simulators.motion.result import MotionGap  # noqa: E402
+from minimax_cal.simulators.motion.written import new_model  # noqa: E402
 
 pytestmark = pytest.mark.skipif(
     not hasattr(mujoco, "mj_initCtrlHistory"), reason="no delays in this MuJoCo"
@@ -340,3 +342,27 @@ def test_a_new_model_of_a_robot_file_gets_the_drives_of_the_log(made, tmp_path):
     assert_allclose(model.actuator_gainprm[:3, 0], REAL_KP, rtol=5e-3)
     assert not model.actuator_delay.any()
     assert not any("delay" in text for text in gap.notices)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.7])
+def test_a_file_of_ours_whose_joints_hold_the_dampers_of_its_servos(tmp_path, scale):
+    """The file itself made the log, sound or with other gains: its torques lack the dampers."""
+    path, out = tmp_path / "arm.xml", tmp_path / "out.xml"
+    path.write_bytes(text_of(new_model(three_joints()).root))
+    arm = DrivenArm(three_joints(), path.read_bytes(), LACKS, 3, STEP)
+    real = mujoco.MjModel.from_xml_path(str(path))
+    real.opt.timestep = STEP
+    real.actuator_gainprm[:, 0] *= scale
+    real.actuator_biasprm[:, 1] *= scale
+    real.dof_damping[:] *= scale
+    real.dof_frictionloss[:] = LACKS.friction
+    late = LATE * (scale != 1.0)
+    runs = [driven(arm, real, k, speed, late) for k, speed in enumerate((0.4, 1.2, 0.8))]
+    gap = mc.motion_gap(path, runs, write=out)
+    assert {one.effect for one in gap.effects} == (
+        {"servo_gain", "command_delay"} if late else set())  # fmt: skip
+    model = mujoco.MjModel.from_xml_path(str(out))
+    assert_allclose(model.actuator_gainprm[:, 0], real.actuator_gainprm[:, 0], rtol=1e-3)
+    assert_allclose(model.dof_damping, real.dof_damping, rtol=0.05)
+    first, last = (np.linalg.norm(gap.rungs[k].tracking_rms_mrad) for k in (0, -1))
+    assert last < 0.2 * first

@@ -87,12 +87,10 @@ def check_files(actuators: tuple[str, Path | str] | None, ranges: Path | str | N
         check_writable(Path(ranges))
 
 
-def write_actuators(
-    to: tuple[str, Path | str], chain: Chain, served: Served | None, name: str
-) -> None:
+def write_actuators(path: Path | str, form: str, chain: Chain, served: Served | None) -> None:
     """Write the actuators of a model in a format that simulators take."""
     step, found = float(chain.model.opt.timestep), actuators_of(chain, served)
-    write_whole(Path(to[1]), actuators_text(found, step, name)[to[0]])
+    write_whole(Path(path), actuators_text(found, step, chain.robot.name)[form])
 
 
 # ---- ranges ------------------------------------------------------------------------------------
@@ -144,15 +142,15 @@ def of_body(made: Candidate, study: Study, joints: tuple[str, ...]) -> Ranged:
                 "armature": numbers.armature}  # fmt: skip
         return np.array([held[name][joints.index(joint)] for name, joint, _ in names])
 
-    mean, logs = values(made.numbers), study.scene.logs
-    count = len(logs.names) if names else 0
-    rest = [[r for r in range(count) if r != out] for out in range(count)] if count > 1 else []
+    mean, runs = values(made.numbers), range(len(study.scene.logs.names))
+    if len(runs) < 2 or not names:
+        unknown = np.full(len(names), np.nan)
+        return Ranged(names, mean, np.diag(unknown), unknown)
+    studies = (study.only([run for run in runs if run != out]) for out in runs)
     asked = replace(made.asked, behind=())
-    change = [values(fit_numbers(study.only(some), asked)) - mean for some in rest]
-    changes = np.array(change).reshape(len(rest), len(names))
-    whole = (count - 1.0) / max(count, 1) * changes.T @ changes
-    between = spread(changes) if rest else np.full(len(names), np.nan)
-    return Ranged(names, mean, whole, between)
+    change = np.array([values(fit_numbers(one, asked)) - mean for one in studies])
+    whole = (len(runs) - 1.0) / len(runs) * change.T @ change
+    return Ranged(names, mean, whole, spread(change))
 
 
 def write_ranges(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from xml.etree import ElementTree as ET
 
@@ -19,6 +20,7 @@ from minimax_cal.dynamics.drives import (
     SPEED_LIMIT,
     STANDS,
     TORQUE_LIMIT,
+    Body,
     Drive,
     DriveFit,
     Followed,
@@ -28,14 +30,15 @@ from minimax_cal.dynamics.drives import (
 )
 from minimax_cal.dynamics.laws import DELAY as LATE_IN_FILE
 from minimax_cal.dynamics.laws import WORDS
+from minimax_cal.dynamics.regressor import Motion
 from minimax_cal.dynamics.result import MotionEffect, changed_joints
 from minimax_cal.dynamics.run import NOTHING
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
 from minimax_cal.measuring.faults import Amount
 from minimax_cal.robots.document import Document
-from minimax_cal.robots.mjcf import numbers
-from minimax_cal.simulators.chain import Chain
+from minimax_cal.robots.mjcf import mujoco, numbers
+from minimax_cal.simulators.chain import Chain, braked
 from minimax_cal.simulators.elements import known, section, tune
 from minimax_cal.simulators.given import IMPLICIT, elements_of
 from minimax_cal.simulators.motion.correct import HISTORY_FIRST, left_out_by, mean_log
@@ -46,6 +49,7 @@ from minimax_cal.simulators.motion.written import HISTORY, SHORTEST, actuators_o
 
 WORTH = 0.01  # fall of the mean log joint error by which an effect of a drive is kept
 OTHER_SHARE = 0.4  # fall of what is left, as a mean log, by which drives carry gravity otherwise
+NO_DAMPER = 0.25  # of a joint's damping: a drive with less has none
 SHAKES = 0.5  # of the inertia, damper times timestep: more is too much for an explicit step
 Told = tuple[str, int]  # an effect, and at which joint
 ALL: Told = (GAINS, -1)  # the share of gravity that all drives carry
@@ -112,49 +116,87 @@ def share_of(chain: Chain) -> float:
     return float(np.mean(chain.model.body_gravcomp[list(chain.bodies)]))
 
 
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """Fits (n,) of drives that carry a share of gravity, None where the logs tell nothing.
+
+    held: runs held out.  left: mean log of the torque that is left of these, all without a fit.
+    """
+
+    share: float
+    each: tuple[DriveFit | None, ...]
+    held: Followed
+    left: float
+
+    @staticmethod
+    def of(judge: Judge, chain: Chain, given: Sequence[Drive], share: float) -> Fits:
+        """By the runs to learn from."""
+        body, left = body_of(chain), list[float]()
+        learnt, held = (Followed.of(runs, judge.arm, share, body)
+                        for runs in (judge.learning_runs, judge.runs))  # fmt: skip
+        each = tuple(fit_drive(learnt, held, j, drive) for j, drive in enumerate(given))
+        for j, fit in enumerate(each):
+            rows = held.joint(j)
+            rest = rows.rest(fit.drive, fit.beside) if fit else rows.torque
+            left.append(float((rest**2).sum()))
+        return Fits(share, each, held, 0.5 * mean_log(np.array(left)))
+
+    def beaten_by(self, other: Fits) -> bool:
+        """Whether another share leaves far less, and tells of as many drives."""
+        known, more = (sum(fit is not None for fit in one.each) for one in (self, other))
+        return more >= max(known, 1) and other.left < self.left - OTHER_SHARE
+
+
 def serve(judge: Judge, opened: Opened, *, plain: bool = False) -> Served:
     """What logs with commands say of a model's drives.
 
     plain: without delays, which other simulators do not read.
     """
-    chain = opened.chain
-    own, damping = own_drives(chain), np.zeros(len(chain.dofs))
+    chain, step = opened.chain, float(opened.chain.model.opt.timestep)
+    own, damping, first = own_drives(chain), np.zeros(len(chain.dofs)), share_of(chain)
     if judge.held.unit == NOTHING:
         damping = np.array(chain.model.dof_damping[chain.dofs])
     given = [replace(one, damper=one.damper + by) for one, by in zip(own, damping, strict=True)]
-    first = share_of(chain)
-    fits = followed_by(judge, given, first)
-    share = first
+    best = Fits.of(judge, chain, given, first)
     for other in {0.0, 1.0} - {first}:
-        tried = followed_by(judge, given, other)
-        left, before = unexplained(judge, tried, other), unexplained(judge, fits, share)
-        more = sum(fit is not None for fit in tried) >= max(1, sum(fit is not None for fit in fits))
-        if more and left < before - OTHER_SHARE:
-            fits, share = tried, other
-    held = Followed.of(judge.runs, judge.arm, share)
-    step = float(chain.model.opt.timestep)
+        tried = Fits.of(judge, chain, given, other)
+        best = tried if best.beaten_by(tried) else best
     late = hasattr(chain.model, "actuator_delay") and not plain
     kinds = [one for one in KINDS if one != DELAY or late]
-    told = tuple((kind, j) for kind in kinds for j, fit in enumerate(fits)
-                 if fit and is_another(kind, fit, given[j], held, j, step))  # fmt: skip
-    return Served(own, fits, told, (first, share), damping)
+    told = tuple((kind, j) for kind in kinds for j, fit in enumerate(best.each)
+                 if fit and is_another(kind, fit, given[j], best.held, j, step))  # fmt: skip
+    return Served(own, best.each, told, (first, best.share), damping)
 
 
-def followed_by(judge: Judge, given: Sequence[Drive], share: float) -> tuple[DriveFit | None, ...]:
-    """(n) fits of the runs to learn from."""
-    learnt, held = (Followed.of(runs, judge.arm, share)
-                    for runs in (judge.learning_runs, judge.runs))  # fmt: skip
-    return tuple(fit_drive(learnt, held, j, drive) for j, drive in enumerate(given))
+def damped_by_joints(judge: Judge, opened: Opened) -> bool:
+    """Whether logged torques lack the dampers that joints of a file hold for its servos.
+
+    So they do where the same file, simulated, made the log.
+    """
+    chain = opened.chain
+    fits = Fits.of(judge, chain, own_drives(chain), share_of(chain)).each
+    damping, held = chain.model.dof_damping[chain.dofs], braked(chain.model)[list(chain.joints)]
+    parts = [fit.drive.damper / damping[j] for j, fit in enumerate(fits) if fit and held[j]]
+    return bool(parts) and float(np.median(parts)) < NO_DAMPER
 
 
-def unexplained(judge: Judge, fits: Sequence[DriveFit | None], share: float) -> float:
-    """Mean log of the torque that drives leave of the runs held out: all of it, without a fit."""
-    held, left = Followed.of(judge.runs, judge.arm, share), list[float]()
-    for j, fit in enumerate(fits):
-        rows = held.joint(j)
-        rest = rows.rest(fit.drive, fit.beside) if fit else rows.torque
-        left.append(float((rest**2).sum()))
-    return 0.5 * mean_log(np.array(left))
+def body_of(chain: Chain) -> Body:
+    """Torque that the masses of a model alone take for a motion, whatever carries them."""
+    mj, model = mujoco(), copy(chain.model)
+    model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONSTRAINT)
+    for name in ("dof_armature", "dof_damping", "jnt_stiffness", "body_gravcomp"):
+        getattr(model, name)[:] = 0.0
+    data, at, dofs = mj.MjData(model), chain.places, chain.dofs
+
+    def body(motion: Motion) -> Array:
+        out = np.empty(motion.q.shape)
+        for k, row in enumerate(zip(motion.q, motion.qd, motion.qdd, strict=True)):
+            data.qpos[at], data.qvel[dofs], data.qacc[dofs] = row
+            mj.mj_inverse(model, data)
+            out[k] = data.qfrc_inverse[dofs]
+        return out
+
+    return body
 
 
 def is_another(kind: str, fit: DriveFit, given: Drive, held: Followed, j: int, step: float) -> bool:
@@ -206,7 +248,7 @@ def effects_of(served: Served, judge: Judge, opened: Opened) -> Iterator[MotionE
     whole = judge.tracking(with_drives(opened, served).chain)
     shared = [ALL] if served.share[0] != served.share[1] else []
     for kind, j in (*shared, *served.told):
-        amounts: tuple[Amount, ...] = (Amount("gravity_share", served.share[1], "1", 0.0),)
+        amounts: tuple[Amount, ...] = (Amount("gravity_share", served.share[1], "1"),)
         fit = served.fits[j]
         if fit and j >= 0:
             amounts = tuple(Amount(name, getattr(fit.drive, name), unit, fit.sigma[name])

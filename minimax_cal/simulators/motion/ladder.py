@@ -36,6 +36,7 @@ from minimax_cal.simulators.motion.correct import (
 from minimax_cal.simulators.motion.drives import (
     Served,
     can_write,
+    damped_by_joints,
     effects_of,
     kept,
     lost_late,
@@ -128,6 +129,10 @@ def motion_gap(
     runs = runs_of(model, opened.chain.robot, runs, commands=driven)
     with one_thread():
         commanded = driven and all(run.command is not None for run in runs)
+        if commanded:
+            whole = open_model(model, runs[0].joints, tip, freed=False)
+            if damped_by_joints(Judge.of(whole, runs, known, fastest=True), whole):
+                opened = whole
         judge = Judge.of(opened, runs, known, fastest=commanded)
         judge = judge.driving(opened, gains) if driven else judge
         first, notices = [judge.rung("as given", opened.chain)], tuple[str, ...]()
@@ -151,7 +156,7 @@ def motion_gap(
     if path is not None:
         write_whole(path, made.opened.content(path))
     if actuators is not None and not nothing:
-        write_actuators(actuators, made.opened.chain, made.served, opened.chain.robot.name)
+        write_actuators(actuators[1], actuators[0], made.opened.chain, made.served)
     if randomize is not None and not nothing:
         count = len(judge.learning_runs)
         write_ranges(randomize, made.fitted, made.served, opened.chain.names, count)
@@ -215,9 +220,10 @@ def bench_in(bench: Bench, opened: Opened, found: MotionDiagnosis) -> Bench:
 
 
 def improves(rungs: Sequence[MotionRung]) -> bool:
-    """Whether the joint error falls from the first step to the last."""
-    first, last = (mean_log(np.array(rungs[k].tracking_rms_mrad)) for k in (0, -1))
-    return last < first - STAYS
+    """Whether the joint error falls from the first step to the last, joint by joint and in all."""
+    first, last = (np.array(rungs[k].tracking_rms_mrad) for k in (0, -1))
+    falls = np.linalg.norm(last) < np.linalg.norm(first)
+    return bool(falls) and mean_log(last) < mean_log(first) - STAYS
 
 
 def told_or_found(

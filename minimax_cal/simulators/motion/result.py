@@ -60,7 +60,7 @@ def of_drive(one: MotionEffect) -> str:
     """What a drive has that the model's has not, and its worth, for people."""
     amounts = ", ".join(
         f"{p.name.replace('_', ' ')} {p.value:.4g}" + f" ± {p.sigma:.1g}" * (p.sigma > 0.0)
-        + f" {p.unit}" * (p.unit != "1") for p in one.parameters
+        + f" {p.unit}" * (p.unit != "1") for p in one.parameters if p.value or p.sigma
     )  # fmt: skip
     if not one.worth:
         return f"not in the file: {one.words} ({amounts}), for which MuJoCo has no element"
