@@ -230,7 +230,7 @@ def accused(case: Case) -> tuple[str, ...]:
         path = Path(folder) / "arm.xml"
         path.write_bytes(one.xml)
         opened = open_model(path, one.arm.robot.joints)
-        judge = Judge.of(opened, runs, MotionKnown(), fastest=True).driving(opened, None)
+        judge = Judge.of(opened, runs, MotionKnown(), fast=True).driving(opened, None)
         effects = mc.motion_gap(path, runs).effects if serve(judge, opened).told else ()
     return tuple(f"{each.effect}:{each.place}" for each in effects)
 

@@ -170,16 +170,14 @@ class Followed:
         for number, run in enumerate(self.runs):
             rows = slice(self.logs.start[number], self.logs.start[number + 1])
             time, grid = run.time - run.time[0], self.logs.since[rows]
-            qd = np.interp(time, grid, self.logs.motion.qd[rows, j])
-            carried = np.interp(time, grid, self.carried[rows, j])
+            smooth = (self.logs.motion.qd, self.carried, self.logs.torque)
+            qd, carried, torque = (np.interp(time, grid, one[rows, j]) for one in smooth)
             command = command_of(run)[:, j]
             late = np.interp(time - drive.delay, time, command)
             rate = np.interp(time - drive.delay, time, np.gradient(command, time))
             asked = drive.stiffness * (late - run.q[:, j])
             asked -= drive.damper * (qd - drive.ahead * rate)
-            torque = run.torque[:, j] * self.gain[j]
-            if not self.measured:
-                torque = np.interp(time, grid, self.logs.torque[rows, j])
+            torque = run.torque[:, j] * self.gain[j] if self.measured else torque
             stretch = number * 10**6 + (time / BLOCK_S).astype(int)
             out.append(np.array([torque, asked + carried, qd, time, 0 * time + number, stretch]))
         torque, asked, qd, since, of, stretch = np.concatenate(out, axis=1)
@@ -374,8 +372,7 @@ def fit_drive(learnt: Followed, judged: Followed, j: int, given: Drive) -> Drive
     if not (gains[0] > unsure[0] and gains[1] > -unsure[1]):
         return None
     limit = given.torque if not np.isfinite(torque) else torque
-    known = learnt.measured and np.isfinite(given.torque)
-    if known and np.quantile(np.abs(seen.torque), 0.999) > BEYOND * limit:
+    if learnt.measured and np.quantile(np.abs(seen.torque), 0.999) > BEYOND * limit:
         limit = float(np.abs(seen.torque).max())
     drive = replace(found.drive, damper=max(found.drive.damper, 0.0), torque=float(limit),
                     speed=float(min(speed, given.speed)))  # fmt: skip
@@ -437,3 +434,26 @@ def predicts(rows: Rows | Samples, rest: Array, before: Array) -> bool:
     if len(gain) < LEAST_BLOCKS:
         return False
     return float(gain.mean()) > PREDICTS * float(gain.std(ddof=1)) / math.sqrt(len(gain))
+
+
+def is_another(kind: str, fit: DriveFit, given: Drive, held: Followed, j: int, late: float) -> bool:
+    """Whether an effect of a drive is surely not the model's, and shows in runs held out.
+
+    late: shortest delay [s].
+    """
+    drive, sigma = fit.drive, fit.sigma
+    off = {name: abs(getattr(drive, name) - getattr(given, name)) for name in FIELDS[kind]
+           if getattr(drive, name) != getattr(given, name)}  # fmt: skip
+    if not any(size > STANDS * sigma[name] for name, size in off.items()):
+        return False
+    seen = held.samples(j, drive)
+    if kind == SPEED_LIMIT:
+        return bool(np.isfinite(speed_limit(seen, drive.torque)[0]))
+    if kind == TORQUE_LIMIT:
+        ends = (seen.torque - np.clip(seen.asked, -d.torque, d.torque) for d in (drive, given))
+        return predicts(seen, *ends)
+    if kind == DELAY and off["delay"] < late:
+        return False
+    rows = held.clear(j, CLEAR * drive.torque, LIMIT * drive.speed)
+    ends = (rows.rest(one, fit.beside) for one in (drive, drive.taking(given, kind)))
+    return predicts(rows, *ends)

@@ -172,10 +172,8 @@ def runs_of(
                 "log of this arm"
             )
         if run.unit == NOTHING and not commands:
-            raise OptionError(
-                f"{run.source}: no column of torque or current; drive this motion and log tau1_Nm "
-                "(or i1_A), tau2_Nm, ..."
-            )
+            what = "no column of torque or current; log tau1_Nm (or i1_A), tau2_Nm, ..."
+            raise OptionError(f"{run.source}: {what}")
         if run.unit != runs[0].unit:
             raise OptionError(
                 f"{run.source}: is in {run.unit}, {runs[0].source} in {runs[0].unit}; diagnose "

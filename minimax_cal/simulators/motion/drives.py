@@ -11,22 +11,17 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from minimax_cal.dynamics.drives import (
-    CLEAR,
     DELAY,
     FIELDS,
     GAINS,
     KINDS,
-    LIMIT,
     SPEED_LIMIT,
-    STANDS,
-    TORQUE_LIMIT,
     Body,
     Drive,
     DriveFit,
     Followed,
     fit_drive,
-    predicts,
-    speed_limit,
+    is_another,
 )
 from minimax_cal.dynamics.laws import DELAY as LATE_IN_FILE
 from minimax_cal.dynamics.laws import WORDS
@@ -152,7 +147,7 @@ def serve(judge: Judge, opened: Opened, *, plain: bool = False) -> Served:
 
     plain: without delays, which other simulators do not read.
     """
-    chain, step = opened.chain, float(opened.chain.model.opt.timestep)
+    chain, least = opened.chain, SHORTEST * float(opened.chain.model.opt.timestep)
     own, damping, first = own_drives(chain), np.zeros(len(chain.dofs)), share_of(chain)
     if judge.held.unit == NOTHING:
         damping = np.array(chain.model.dof_damping[chain.dofs])
@@ -164,7 +159,7 @@ def serve(judge: Judge, opened: Opened, *, plain: bool = False) -> Served:
     late = hasattr(chain.model, "actuator_delay") and not plain
     kinds = [one for one in KINDS if one != DELAY or late]
     told = tuple((kind, j) for kind in kinds for j, fit in enumerate(best.each)
-                 if fit and is_another(kind, fit, given[j], best.held, j, step))  # fmt: skip
+                 if fit and is_another(kind, fit, given[j], best.held, j, least))  # fmt: skip
     return Served(own, best.each, told, (first, best.share), damping)
 
 
@@ -174,9 +169,11 @@ def damped_by_joints(judge: Judge, opened: Opened) -> bool:
     So they do where the same file, simulated, made the log.
     """
     chain = opened.chain
-    fits = Fits.of(judge, chain, own_drives(chain), share_of(chain)).each
     damping, held = chain.model.dof_damping[chain.dofs], braked(chain.model)[list(chain.joints)]
-    parts = [fit.drive.damper / damping[j] for j, fit in enumerate(fits) if fit and held[j]]
+    if not held.all():
+        return False
+    fits = Fits.of(judge, chain, own_drives(chain), share_of(chain)).each
+    parts = [fit.drive.damper / damping[j] for j, fit in enumerate(fits) if fit]
     return bool(parts) and float(np.median(parts)) < NO_DAMPER
 
 
@@ -197,26 +194,6 @@ def body_of(chain: Chain) -> Body:
         return out
 
     return body
-
-
-def is_another(kind: str, fit: DriveFit, given: Drive, held: Followed, j: int, step: float) -> bool:
-    """Whether an effect of a drive is surely not the model's, and shows in runs held out."""
-    drive, sigma = fit.drive, fit.sigma
-    off = {name: abs(getattr(drive, name) - getattr(given, name)) for name in FIELDS[kind]
-           if getattr(drive, name) != getattr(given, name)}  # fmt: skip
-    if not any(size > STANDS * sigma[name] for name, size in off.items()):
-        return False
-    seen = held.samples(j, drive)
-    if kind == SPEED_LIMIT:
-        return bool(np.isfinite(speed_limit(seen, drive.torque)[0]))
-    if kind == TORQUE_LIMIT:
-        ends = (seen.torque - np.clip(seen.asked, -d.torque, d.torque) for d in (drive, given))
-        return predicts(seen, *ends)
-    if kind == DELAY and off["delay"] < SHORTEST * step:
-        return False
-    rows = held.clear(j, CLEAR * drive.torque, LIMIT * drive.speed)
-    ends = (rows.rest(one, fit.beside) for one in (drive, drive.taking(given, kind)))
-    return predicts(rows, *ends)
 
 
 def kept(served: Served, judge: Judge, opened: Opened) -> Served:
@@ -304,11 +281,9 @@ def write_drives(document: Document, chain: Chain, drives: Sequence[Drive]) -> N
             write_limit(where, what, drive.torque / (1.0 if floating else abs(gear)), limited)
         for actuator in actuators_of(root, name) if regulated or drive.delay != own.delay else ():
             write_late(actuator, drive.delay, step)
-    damper = np.array([drive.damper for drive in drives])
-    if int(model.opt.integrator) not in IMPLICIT:
-        shaken = damper * step * model.dof_invweight0[chain.dofs] > SHAKES
-        if shaken.any():
-            section(root, "option").set("integrator", "implicitfast")
+    shaken = np.array([d.damper for d in drives]) * step * model.dof_invweight0[chain.dofs]
+    if int(model.opt.integrator) not in IMPLICIT and shaken.max() > SHAKES:
+        section(root, "option").set("integrator", "implicitfast")
 
 
 def write_limit(element: ET.Element, what: str, size: float, limited: bool) -> None:

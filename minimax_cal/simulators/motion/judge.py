@@ -67,14 +67,12 @@ class Judge:
     hold: Gains | Chain | None = None
 
     @staticmethod
-    def of(
-        opened: Opened, runs: Sequence[Run], known: MotionKnown, *, fastest: bool = False
-    ) -> Judge:
-        """Of logs of the arm of a model.  fastest: whether fast runs judge.
+    def of(opened: Opened, runs: Sequence[Run], known: MotionKnown, *, fast: bool = False) -> Judge:
+        """Of logs of the arm of a model.  fast: whether fast runs judge.
 
         Raises CalibrationError.
         """
-        if fastest:
+        if fast:
             runs = sorted(runs, key=lambda run: float(speed_of(run)))
         robot = in_its_gravity(opened.chain)
         gains = known.torque_gains(robot, runs)

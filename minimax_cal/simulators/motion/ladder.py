@@ -131,9 +131,9 @@ def motion_gap(
         commanded = driven and all(run.command is not None for run in runs)
         if commanded:
             whole = open_model(model, runs[0].joints, tip, freed=False)
-            if damped_by_joints(Judge.of(whole, runs, known, fastest=True), whole):
+            if damped_by_joints(Judge.of(whole, runs, known, fast=True), whole):
                 opened = whole
-        judge = Judge.of(opened, runs, known, fastest=commanded)
+        judge = Judge.of(opened, runs, known, fast=commanded)
         judge = judge.driving(opened, gains) if driven else judge
         first, notices = [judge.rung("as given", opened.chain)], tuple[str, ...]()
         if fit is not None:
@@ -147,8 +147,7 @@ def motion_gap(
             found = told_or_found(judge, opened, diagnosis, known.payload, progress)
             judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
                                                soft=found.arm.soft))  # fmt: skip
-            bench = bench_of(judge, opened, found)
-            bench = replace(bench, bristled=friction == MOTOR, plain=plain)
+            bench = bench_of(judge, opened, found, (friction == MOTOR, plain))
             made = by_torques(bench, found, progress)
     nothing = judge.commanded and not improves((*first, *made.rungs))
     path = None if write is None or nothing else Path(write)
@@ -197,6 +196,7 @@ def by_commands(
     each is worth.
     """
     judge, opened = bench.judge, bench.opened
+    asked = bench.bristled, bench.plain
     if judge.drives != OWN_SERVOS or not can_write(opened):
         return bench, None, (), ()
     progress("fitting the drives to their commands")
@@ -204,19 +204,13 @@ def by_commands(
     if not served.changes:
         return bench, served, (), ()
     whole, _ = asked_of(found, bench)
-    beside = bench_in(bench, with_drives(opened, served), found).candidate(whole).opened
+    beside = bench_of(judge, with_drives(opened, served), found, asked).candidate(whole).opened
     served = kept(served, judge, beside)
     effects = tuple(effects_of(served, judge, beside))
     off = judge.torque(opened.chain)
     rungs = tuple(judge.rung(name, one.chain, missed=off)
                   for name, one in steps_with(served, effects, opened))  # fmt: skip
-    return bench_in(bench, with_drives(opened, served), found), served, rungs, effects
-
-
-def bench_in(bench: Bench, opened: Opened, found: MotionDiagnosis) -> Bench:
-    """Where corrections of another model of the arm are fitted and judged."""
-    new = bench_of(bench.judge, opened, found)
-    return replace(new, bristled=bench.bristled, plain=bench.plain)
+    return bench_of(judge, with_drives(opened, served), found, asked), served, rungs, effects
 
 
 def improves(rungs: Sequence[MotionRung]) -> bool:
@@ -268,9 +262,11 @@ def check_request(write: Path | str | None, friction: str | None, *, plain: bool
         raise OptionError(f"friction={MOTOR}: this MuJoCo has no motors without input; update it")
 
 
-def bench_of(judge: Judge, opened: Opened, found: MotionDiagnosis) -> Bench:
-    """Where corrections of a model are fitted and judged."""
+def bench_of(
+    judge: Judge, opened: Opened, found: MotionDiagnosis, asked: tuple[bool, bool]
+) -> Bench:
+    """Where corrections of a model are fitted and judged.  asked: its `bristled` and `plain`."""
     assumed = opened.given.assumed or not weighed(opened.chain.robot).all()
     study = Study.of(opened.chain, judge.arm, judge.learning, found.models[-1].terms,
                      largest_inertia(opened.chain), assumed=bool(assumed))  # fmt: skip
-    return Bench(judge, opened, study)
+    return Bench(judge, opened, study, *asked)
