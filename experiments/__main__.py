@@ -100,6 +100,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.motion_gap",
         "Does a simulator's model, corrected by logs, move as the arm does on runs it never saw",
     ),
+    "servos": (
+        "experiments.servos",
+        "Do logs with commands give a model the gains, delays and limits of the arm's drives",
+    ),
     "motion_blind": (
         "experiments.motion_blind",
         "Are causes of torque named rightly: sound arms, causes withheld, laws outside the library",

@@ -12,15 +12,17 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from experiments.simulator_gap import robot_called
 from minimax_cal.dynamics.run import TORQUE, Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.gravity import tubes
-from minimax_cal.robots.mjcf import mujoco
-from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.mjcf import mujoco, numbers
+from minimax_cal.robots.robot import Robot
 from minimax_cal.simulators.mjcf import text_of
 from minimax_cal.simulators.motion.written import new_model
 
@@ -104,7 +106,7 @@ def carry(model: Any, mass: float) -> None:
 
 def heavy(name: str, rng: np.random.Generator) -> Robot:
     """A built-in arm with masses of its own."""
-    robot = load_robot(name)
+    robot = robot_called(name)
     mass, com = tubes(robot.mdh)
     mass = mass * rng.uniform(0.5, 0.9) + HUB
     length = np.maximum(np.hypot(robot.mdh[:, 0], robot.mdh[:, 1]), 0.1)
@@ -134,6 +136,16 @@ def with_motors(robot: Robot) -> bytes:
             servo.tag = "motor"
             servo.attrib.update({"name": name, "joint": name})
     return text_of(root)
+
+
+def served(xml: bytes, stiffness: Array, damper: Array) -> bytes:
+    """A file of motors with position servos in their place."""
+    root = ET.fromstring(xml)
+    motors = [motor for part in root.iter("actuator") for motor in part]
+    for motor, kp, kv in zip(motors, stiffness, damper, strict=True):
+        motor.tag = "position"
+        motor.attrib |= {"kp": numbers([kp]), "kv": numbers([kv])}
+    return bytes(ET.tostring(root))
 
 
 def drawn_arm(name: str, seed: int, effects: tuple[str, ...]) -> DrivenArm:

@@ -172,14 +172,14 @@ PLAIN = {"mm", "deg", "mrad", "um"}  # units
 RUN = [
     "index.md", "tutorial.md", "backends.md", "own_effect.md", "from_matlab.md",
     "several_instruments.md", "own_instrument.md", "mjcf_to_mjcf.md", "controller_pose.md",
-    "hand_eye.md",
+    "hand_eye.md", "learned_policies.md",
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", RUN)
 def test_pages_print_what_they_say(name, tmp_path, monkeypatch, capsys, own_registries):
     pytest.importorskip("matplotlib", reason="pictures need pip install minimax-cal[plot]")
-    if name == "mjcf_to_mjcf.md":
+    if name in ("mjcf_to_mjcf.md", "learned_policies.md"):
         pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")

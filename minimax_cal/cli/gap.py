@@ -29,7 +29,8 @@ from minimax_cal.simulators.ladder import simulator_gap
 from minimax_cal.simulators.motion.ladder import motion_gap
 
 LOGS = "Logs of motion"
-OF_LOGS = ("holdout_run", "payload", "drive_gain", "ratio", "gains", "friction", "plain")
+OF_LOGS = ("holdout_run", "payload", "drive_gain", "ratio", "gains", "friction", "plain",
+           "actuators", "randomize")  # fmt: skip
 
 
 def paired(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -57,6 +58,19 @@ def paired(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
         "Judge on this run alone, which no fit sees.", metavar="NAME", many=tuple, group=LOGS
     ),
     plain=Option("Write only what other simulators read as well.", group=LOGS),
+    actuators=Option(
+        "Write the actuators of the corrected model for Isaac Lab, or as JSON, too.",
+        metavar="isaac|json FILE",
+        values=2,
+        read=tuple,
+        group=LOGS,
+    ),
+    randomize=Option(
+        "Write mean, covariance and spread between runs of what was fitted (JSON).",
+        metavar="FILE",
+        read=Path,
+        group=LOGS,
+    ),
     friction=Option(
         "What holds friction of joints at rest beside `frictionloss`: dcmotor.",
         metavar="ELEMENT",
@@ -86,7 +100,8 @@ def gap_command(model: Path, data: tuple[Path, ...], to: Output, **chosen: Any) 
     if are_logs(data):
         del chosen["seed"]
         moved = to.work(motion_gap, model, data, **chosen)
-        to.wrote(chosen["write"], moved.module)
+        beside = ((chosen["actuators"] or ("", None))[1], chosen["randomize"])
+        to.wrote(moved.written, moved.module, *(path for path in beside if moved.kept))
         said = (*moved.notices, *moved.sentences())
         return to.finish(moved, notices=said, draw=save_motion_gap)
     if len(data) > 1:

@@ -13,7 +13,7 @@ import numpy as np
 from minimax_cal.dynamics.logs import read_runs
 from minimax_cal.dynamics.logs.with_robot import against_robot
 from minimax_cal.dynamics.regressor import link_parameters
-from minimax_cal.dynamics.run import CURRENT, Run
+from minimax_cal.dynamics.run import CURRENT, NOTHING, Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import grouped, number, numbers
@@ -152,11 +152,15 @@ def read_logs(
 
 
 def runs_of(
-    given: Robot | str | Path, robot: Robot, logs: Sequence[Run | str | Path] | str | Path
+    given: Robot | str | Path,
+    robot: Robot,
+    logs: Sequence[Run | str | Path] | str | Path,
+    *,
+    commands: bool = False,
 ) -> tuple[Run, ...]:
     """The runs of this robot and of one unit, with notices of what does not fit the robot.
 
-    Raises CalibrationError.
+    commands: whether these will do without torques.  Raises CalibrationError.
     """
     runs = read_logs(given, logs)
     if not runs:
@@ -167,6 +171,9 @@ def runs_of(
                 f"{run.source}: has {run.joints} joints, {robot.name} has {robot.joints}; give the "
                 "log of this arm"
             )
+        if run.unit == NOTHING and not commands:
+            what = "no column of torque or current; log tau1_Nm (or i1_A), tau2_Nm, ..."
+            raise OptionError(f"{run.source}: {what}")
         if run.unit != runs[0].unit:
             raise OptionError(
                 f"{run.source}: is in {run.unit}, {runs[0].source} in {runs[0].unit}; diagnose "

@@ -317,7 +317,9 @@ LAWS: dict[str, Law] = {law.name: law for law in EVERY}
 BUILT_IN = frozenset(LAWS)
 USUAL = ("coulomb", "viscous")
 WORDS = {"coulomb": "Coulomb friction", "viscous": "viscous friction",
-         "link_inertia": "mass or inertia of a link"}  # fmt: skip
+         "link_inertia": "mass or inertia of a link", "servo_gain": "gains of the drive",
+         "command_delay": "delay of the command", "torque_limit": "torque limit of the drive",
+         "speed_limit": "speed limit of the drive"}  # fmt: skip
 WORDS |= {name: law.words for name, law in LAWS.items()}
 
 

@@ -12,6 +12,7 @@ from minimax_cal.ground.arrays import Array
 
 TORQUE = "N m"  # of a revolute joint; N of one that slides
 CURRENT = "A"
+NOTHING = ""  # where neither was logged, but commands
 ROWS = ("time", "q", "qd", "qdd", "torque", "temperature", "command")  # what has a value a row
 
 
@@ -23,8 +24,8 @@ class Run:
     time: (m,) increasing, evenly spaced or not [s].
     q: (m, n) joint values in the robot file's order, without jumps by whole turns [rad, m].
     qd, qdd: (m, n) the controller's own derivatives, where it logged them [rad/s, rad/s^2].
-    torque: (m, n) measured at the joints or motors [unit].
-    unit: TORQUE or CURRENT.
+    torque: (m, n) measured at the joints or motors [unit]; 0 where it was not.
+    unit: TORQUE, CURRENT or NOTHING.
     payload: mass at the flange, where it was reported [kg].
     temperature: (m, n), or (m,) of the whole arm [C].
     command: (m, n) joint values that were commanded, where all were logged [rad, m].

@@ -125,6 +125,7 @@ FORMATS = (  # tried in this order
             "t": ("timestamp",),
             "q": (rf"observation\.(?:state|position|qpos){INDEX}",),
             "qd": (rf"observation\.(?:velocity|qvel){INDEX}",),
+            "q_cmd": (rf"action{INDEX}",),
             "tau": (rf"observation\.(?:effort|torque){INDEX}",),
             "i": (rf"observation\.current{INDEX}",),
             "run": ("episode_index",),

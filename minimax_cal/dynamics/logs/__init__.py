@@ -135,7 +135,7 @@ def import_logs(
         for log in read_bag(path) if is_bag(path) else [read_table(path, given)]:
             drafts += map(checked, drafts_of(in_order(log, joints), name))
     same_arm(drafts)
-    check_repeats(drafts)
+    check_repeats([draft for draft in drafts if draft.measured])
     return LogFiles(
         runs=tuple(draft.run() for draft in drafts),
         titles=tuple(draft.log.title for draft in drafts),

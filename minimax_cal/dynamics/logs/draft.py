@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.dynamics.logs.table import SHOWN, Log
-from minimax_cal.dynamics.run import CURRENT, TORQUE, Run, rows_of
+from minimax_cal.dynamics.run import CURRENT, NOTHING, TORQUE, Run, rows_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 
 TURN = 2.0 * np.pi
+COMMANDS = "q_cmd"
 SAMPLED = ("row", "time", "q", "qd", "qdd", "torque")  # what has a value a row
 
 
@@ -19,7 +20,8 @@ SAMPLED = ("row", "time", "q", "qd", "qdd", "torque")  # what has a value a row
 class Draft:
     """Rows of one trajectory in SI; fields as those of a Run.
 
-    log: the file's columns.  kind: of its torque columns, tau or i.  row: (m,) rows of the log.
+    log: the file's columns.  kind: of its torque columns, tau or i, else q_cmd.  row: (m,) rows of
+    the log.
     """
 
     log: Log
@@ -32,6 +34,11 @@ class Draft:
     qdd: Array | None
     torque: Array
     notices: tuple[str, ...] = ()
+
+    @property
+    def measured(self) -> bool:
+        """Whether torques or currents were logged; else commands stand in their place."""
+        return self.kind != COMMANDS
 
     def saying(self, *notices: str) -> Draft:
         """With more notices."""
@@ -79,12 +86,12 @@ class Draft:
             q=self.q,
             qd=self.qd,
             qdd=self.qdd,
-            torque=self.torque,
-            unit={"tau": TORQUE, "i": CURRENT}[self.kind],
+            torque=self.torque if self.measured else 0.0 * self.torque,
+            unit={"tau": TORQUE, "i": CURRENT, COMMANDS: NOTHING}[self.kind],
             payload=float(payload[0]) if len(payload) else None,
             temperature=warmth if warmth is not None and np.isfinite(warmth).all() else None,
             notices=self.notices,
-            command=commanded(values.get("q_cmd"), self.q),
+            command=commanded(values.get(COMMANDS), self.q),
         )
 
 
@@ -137,6 +144,8 @@ def torque_kind(log: Log) -> str:
     for kind in ("tau", "i"):
         if kind in log.values and np.isfinite(log.values[kind]).any():
             return kind
+    if COMMANDS in log.values and log.values[COMMANDS].shape == log.values["q"].shape:
+        return COMMANDS
     if log.values.keys() & {"tau_cmd", "i_cmd"}:
         name = next(log.headers[k][0] for k in ("tau_cmd", "i_cmd") if k in log.values)
         raise DataError(

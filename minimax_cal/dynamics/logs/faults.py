@@ -151,7 +151,7 @@ def is_alive(draft: Draft) -> Draft:
     if still.all():
         raise draft.error("no joint moves; log a motion")
     flat = np.ptp(draft.torque, axis=0) == 0.0
-    if flat.any():
+    if draft.measured and flat.any():
         j = int(np.argmax(flat))
         raise draft.error(
             f"column {draft.column(draft.kind, j)} is {draft.torque[0, j]:g} in all rows; the "
@@ -294,13 +294,12 @@ CHECKS: tuple[Callable[[Draft], Draft], ...] = (  # in this order: each relies o
     unwrapped,
     is_alive,
     matches_its_speed,
-    is_measured,
-    is_unclipped,
 )
+OF_TORQUE = (is_measured, is_unclipped)
 
 
 def checked(draft: Draft) -> Draft:
     """The draft without what could be mended, and what is to be said of it.  Raises DataError."""
-    for check in CHECKS:
+    for check in (*CHECKS, *(OF_TORQUE if draft.measured else ())):
         draft = check(draft)
     return draft

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, regressor
-from minimax_cal.dynamics.run import TORQUE, Run
+from minimax_cal.dynamics.run import NOTHING, TORQUE, Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.robot import Robot
@@ -41,7 +41,7 @@ def outside(robot: Robot, run: Run) -> Iterator[str]:
 
 def odd_torque(robot: Robot, run: Run) -> Iterator[str]:
     """A notice where torques are not those that hold the arm's masses: order, sign, size."""
-    if not weighed(robot).all():
+    if run.unit == NOTHING or not weighed(robot).all():
         return
     rows = np.unique(np.linspace(0, len(run.time) - 1, COMPARED).astype(int))
     weight = gravity(robot, run.q[rows])

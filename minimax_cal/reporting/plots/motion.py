@@ -93,7 +93,8 @@ def save_motion_gap(gap: MotionGap, path: Path | str) -> None:
 def motion_gap_figure(gap: MotionGap) -> Figure:
     """Torque and joint error of every joint, from the model as given to the corrected one."""
     names = [textwrap.shorten(rung.name, 40, placeholder="...") for rung in gap.rungs]
-    parts = [(f"torque [{gap.unit}], moving, held out", [r.torque_rms_moving for r in gap.rungs])]
+    moving = [r.torque_rms_moving for r in gap.rungs]
+    parts = [(f"torque [{gap.unit}], moving, held out", moving)] if gap.unit else []
     if gap.rungs[0].tracking_rms_mrad:
         parts.append(("joint error [mrad], driven", [r.tracking_rms_mrad for r in gap.rungs]))
     figure = new_figure(5.5 * len(parts), 2.0 + 0.4 * len(names))

@@ -62,6 +62,7 @@ LOST = {  # of an element, what readers of the file leave out, and which
     BRISTLES: ("`dcmotor`, with which MJX loads no file", "USD and SDF"),
     MODULE: ("what no element holds", "all simulators but MuJoCo"),
 }
+HISTORY_FIRST = "MuJoCo begins with 0 in the history of delayed commands: call mj_initCtrlHistory"
 BESIDE = 0.01  # the same, for a module beside the file, and of all rows for friction at rest
 
 
@@ -164,7 +165,7 @@ class Bench:
         """The model with numbers in it."""
         document = self.opened.given.document.copy()
         write_numbers(document, self.opened.chain, self.study.given, numbers)
-        if self.opened.new:
+        if self.opened.new and not self.judge.commanded:
             stiffen(document.root, self.opened.chain, numbers)
         return self.opened.again(document)
 
@@ -196,7 +197,8 @@ def asked_of(found: MotionDiagnosis, bench: Bench) -> tuple[Asked, tuple[Term, .
                  if e.effect in ("payload", "link_inertia") and e.worth), -1)  # fmt: skip
     late = found.models[-1].delay
     late += sum(float(term.value[0]) for term in terms if term.effect == "delay")
-    if abs(late) < SHORTEST * float(model.opt.timestep):
+    of_command = late < 0.0 and bench.judge.commanded  # which the commands themselves show
+    if abs(late) < SHORTEST * float(model.opt.timestep) or of_command:
         late = 0.0
     chain = bench.opened.chain
     motors = [is_driven(model, joint) and chain.servo(joint) < 0 for joint in chain.joints]
@@ -357,9 +359,14 @@ def lost(made: Corrected) -> Iterator[str]:
     }
     for name, is_there in held.items():
         if is_there:
-            yield f"{LOST[name][1]} leave out {LOST[name][0]} ({name}); see plain="
+            yield left_out_by(name)
     if DELAY in elements and numbers.late < 0.0:
-        yield "MuJoCo begins with 0 in the history of delayed commands: call mj_initCtrlHistory"
+        yield HISTORY_FIRST
+
+
+def left_out_by(element: str) -> str:
+    """Which readers of a file leave out an element."""
+    return f"{LOST[element][1]} leave out {LOST[element][0]} ({element}); see plain="
 
 
 def left_out(found: MotionDiagnosis, geared: Sequence[int]) -> Iterator[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -58,14 +58,24 @@ def follow_commands(chain: Chain, run: Run, commands: Array, source: str) -> Arr
     commands: (m, n) at the times of the run [rad, m].  Raises RobotError for an unstable model.
     """
     servos = np.array([chain.servo(joint) for joint in chain.joints])
+    speeds = ahead_of(chain.model, chain.names)
 
     def drive(data: Any, now: int) -> None:
         data.ctrl[servos] = path[now]
+        data.ctrl[list(speeds)] = rates[now, list(speeds.values())]
         if not now:
             fill_history(chain.model, data)
 
     path = on_steps(run.time, commands, chain)
+    rates = np.gradient(path, float(chain.model.opt.timestep), axis=0)
     return stepped(chain, run, drive, source)
+
+
+def ahead_of(model: Any, names: Sequence[str]) -> dict[int, int]:
+    """Ids of actuators that take the commanded speed of some joints, and of which (from 0)."""
+    mj = mujoco()
+    ids = (mj.mj_name2id(model, mj.mjtObj.mjOBJ_ACTUATOR, f"{name}_ahead") for name in names)
+    return {number: j for j, number in enumerate(ids) if number >= 0}
 
 
 def follow_torques(

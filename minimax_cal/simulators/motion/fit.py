@@ -7,7 +7,7 @@ in its log-Cholesky coordinates, each armature by one of its own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 
@@ -94,7 +94,7 @@ class Study:
     """Logs to learn from, and the arm of a model.
 
     scene: of these logs.  inertia: (n,) largest about each joint [kg m^2].  links: (N, 10 n)
-    whitened rows of the links' parameters.  prior: of the bodies.
+    whitened rows of the links' parameters.  prior: of the bodies.  terms: laws of a diagnosis.
     """
 
     chain: Chain
@@ -105,6 +105,7 @@ class Study:
     links: Array
     inertia: Array
     prior: float
+    terms: tuple[Term, ...]
 
     @staticmethod
     def of(chain: Chain, arm: Arm, logs: Logs, terms: tuple[Term, ...], inertia: Array,
@@ -114,7 +115,12 @@ class Study:
         white = whitening(logs, generous(columns, terms))
         links = white.white(columns.links[white.kept])
         prior = PRIOR_ASSUMED if assumed else PRIOR
-        return Study(chain, bodies, given, columns.scene, white, links, inertia, prior)
+        return Study(chain, bodies, given, columns.scene, white, links, inertia, prior, terms)
+
+    def only(self, runs: Sequence[int]) -> Study:
+        """Of some of the runs."""
+        logs, assumed = self.scene.logs.only(runs), self.prior == PRIOR_ASSUMED
+        return Study.of(self.chain, self.scene.arm, logs, self.terms, self.inertia, assumed=assumed)
 
     def of_file(self, chain: Chain, gain: Array) -> Study:
         """The same logs, for a written model.  gain: (n,) of its drives over those of the logs."""

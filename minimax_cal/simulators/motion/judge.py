@@ -9,9 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from minimax_cal.dynamics.diagnose import named_runs
+from minimax_cal.dynamics.drives import command_of
 from minimax_cal.dynamics.given import MotionKnown
 from minimax_cal.dynamics.rows import Logs, prepare, rms_by_joint
-from minimax_cal.dynamics.run import Run
+from minimax_cal.dynamics.run import NOTHING, Run
 from minimax_cal.dynamics.scene import Arm, Scene
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
@@ -28,12 +29,12 @@ from minimax_cal.simulators.motion.driven import (
 from minimax_cal.simulators.motion.module import installed
 from minimax_cal.simulators.motion.numbers import Numbers
 from minimax_cal.simulators.motion.opened import Opened, in_its_gravity
-from minimax_cal.simulators.motion.result import MotionRung
+from minimax_cal.simulators.motion.result import COMMANDS, MotionRung
 
 Pair = tuple[Sequence[float], Sequence[float]]  # stiffness and damper
 LEAST_HELD = 4.0  # of a single run: length of the end that is held out [s]
-OWN_SERVOS = "its position servos and the logged commands"
-GIVEN_GAINS = "the given gains and the logged commands"
+OWN_SERVOS = f"its position servos and {COMMANDS}"
+GIVEN_GAINS = f"the given gains and {COMMANDS}"
 TORQUES = "the measured torques and drives that hold it to the log"
 
 
@@ -66,8 +67,13 @@ class Judge:
     hold: Gains | Chain | None = None
 
     @staticmethod
-    def of(opened: Opened, runs: Sequence[Run], known: MotionKnown) -> Judge:
-        """Of logs of the arm of a model.  Raises CalibrationError."""
+    def of(opened: Opened, runs: Sequence[Run], known: MotionKnown, *, fast: bool = False) -> Judge:
+        """Of logs of the arm of a model.  fast: whether fast runs judge.
+
+        Raises CalibrationError.
+        """
+        if fast:
+            runs = sorted(runs, key=lambda run: float(speed_of(run)))
         robot = in_its_gravity(opened.chain)
         gains = known.torque_gains(robot, runs)
         learning, held = divided(known.loaded(runs), known.holdout, known.holdout_run)
@@ -82,8 +88,8 @@ class Judge:
         Else measured torques, with usual gains for what these leave.  Raises OptionError.
         """
         chain = opened.chain
-        commanded = all(run.command is not None for run in self.runs)
-        own = not opened.new and all(chain.servo(joint) >= 0 for joint in chain.joints)
+        commanded = all(run.command is not None for run in (*self.runs, *self.learning_runs))
+        own = all(chain.servo(joint) >= 0 for joint in chain.joints)
         hold: Gains | Chain = chain
         if gains is not None:
             try:
@@ -151,6 +157,8 @@ class Judge:
     def rung(self, name: str, chain: Chain, numbers: Numbers | None = None, module: str = "",
              missed: Missed | None = None) -> MotionRung:  # fmt: skip
         """How far a model misses.  missed: where it is known already."""
+        if self.held.unit == NOTHING:
+            return MotionRung(name, (), (), (), tuple((1e3 * self.tracking(chain)).tolist()))
         with installed(module, chain):
             off = self.torque(chain, numbers) if missed is None else missed
             where = self.tracking(chain, numbers) if self.drives else np.zeros(0)
@@ -158,10 +166,9 @@ class Judge:
         return MotionRung(name, *(tuple(size.tolist()) for size in sizes))
 
 
-def command_of(run: Run) -> Array:
-    """The commands of a run that has some."""
-    assert run.command is not None
-    return run.command
+def speed_of(run: Run) -> float:
+    """RMS speed of the joints, hinges and slides alike [rad/s, m/s]."""
+    return float(np.sqrt((np.gradient(run.q, run.time, axis=0) ** 2).mean()))
 
 
 def divided(

@@ -11,8 +11,8 @@ import numpy as np
 
 from minimax_cal.dynamics.diagnose import diagnose_motion
 from minimax_cal.dynamics.given import MotionKnown, Payload, read_logs, runs_of
-from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
-from minimax_cal.dynamics.run import CURRENT, Run
+from minimax_cal.dynamics.result import MotionDiagnosis, MotionEffect, load_motion
+from minimax_cal.dynamics.run import CURRENT, NOTHING, Run
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
@@ -23,13 +23,33 @@ from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.robots.urdf import MODELS
 from minimax_cal.simulators.given import largest_inertia
+from minimax_cal.simulators.motion.actuators import check_files, write_actuators, write_ranges
 from minimax_cal.simulators.motion.bristles import has_bristles
-from minimax_cal.simulators.motion.correct import Bench, correct, lost
+from minimax_cal.simulators.motion.correct import (
+    STAYS,
+    Bench,
+    asked_of,
+    correct,
+    lost,
+    mean_log,
+)
+from minimax_cal.simulators.motion.drives import (
+    Served,
+    can_write,
+    damped_by_joints,
+    effects_of,
+    kept,
+    lost_late,
+    serve,
+    steps_with,
+    with_drives,
+)
 from minimax_cal.simulators.motion.fit import Study
-from minimax_cal.simulators.motion.judge import Judge
+from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge
 from minimax_cal.simulators.motion.module import ENDING
 from minimax_cal.simulators.motion.opened import Opened, calibrated, open_model
-from minimax_cal.simulators.motion.result import MotionGap
+from minimax_cal.simulators.motion.positions import Answer, by_positions
+from minimax_cal.simulators.motion.result import MotionGap, MotionRung
 
 MOTOR = "dcmotor"  # what holds friction beside a constraint
 
@@ -47,6 +67,8 @@ def motion_gap(
     gains: tuple[Sequence[float], Sequence[float]] | None = None,
     friction: str | None = None,
     plain: bool = False,
+    actuators: tuple[str, Path | str] | None = None,
+    randomize: Path | str | None = None,
     driven: bool = True,
     progress: Progress = silent,
 ) -> MotionGap:
@@ -76,6 +98,10 @@ def motion_gap(
     plain
         Whether the file is fitted without what other simulators leave out of it: damping and
         stiffness of higher powers, delay, and the module.
+    actuators
+        `isaac` or `json`, and where the actuators of the corrected model go.
+    randomize
+        Where mean, covariance and spread between runs of what was fitted go (JSON).
     driven
         Whether drives move the arm along the held-out runs as well.
     progress
@@ -96,38 +122,54 @@ def motion_gap(
     """
     began = time.perf_counter()
     check_request(write, friction, plain=plain)
+    check_files(actuators, randomize)
     progress("reading the model and the logs")
     runs = read_logs(model, logs)
     opened = open_model(model, runs[0].joints if runs else 0, tip)
-    runs = runs_of(model, opened.chain.robot, runs)
+    runs = runs_of(model, opened.chain.robot, runs, commands=driven)
     with one_thread():
-        judge = Judge.of(opened, runs, known)
+        commanded = driven and all(run.command is not None for run in runs)
+        if commanded:
+            whole = open_model(model, runs[0].joints, tip, freed=False)
+            if damped_by_joints(Judge.of(whole, runs, known, fast=True), whole):
+                opened = whole
+        judge = Judge.of(opened, runs, known, fast=commanded)
         judge = judge.driving(opened, gains) if driven else judge
         first, notices = [judge.rung("as given", opened.chain)], tuple[str, ...]()
         if fit is not None:
             opened, notices = calibrated(opened, load_fit(fit))
             judge = judge.of_model(opened)
             first.append(judge.rung("calibrated geometry", opened.chain))
-        found = told_or_found(judge, opened, diagnosis, known.payload, progress)
-        judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
-                                           soft=found.arm.soft))  # fmt: skip
-        bench = bench_of(judge, opened, found)
-        bench = replace(bench, bristled=friction == MOTOR, plain=plain)
-        made = correct(bench, found, progress)
-    path = None if write is None else Path(write)
-    beside = path.with_name(path.stem + ENDING) if path and made.full.module else None
+        if judge.held.unit == NOTHING:
+            progress("fitting the drives to their commands")
+            made = by_positions(judge, opened, plain=plain)
+        else:
+            found = told_or_found(judge, opened, diagnosis, known.payload, progress)
+            judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
+                                               soft=found.arm.soft))  # fmt: skip
+            bench = bench_of(judge, opened, found, (friction == MOTOR, plain))
+            made = by_torques(bench, found, progress)
+    nothing = judge.commanded and not improves((*first, *made.rungs))
+    path = None if write is None or nothing else Path(write)
+    beside = path.with_name(path.stem + ENDING) if path and made.module else None
     if path is not None:
-        write_whole(path, made.plain.opened.content(path))
+        write_whole(path, made.opened.content(path))
+    if actuators is not None and not nothing:
+        write_actuators(actuators[1], actuators[0], made.opened.chain, made.served)
+    if randomize is not None and not nothing:
+        count = len(judge.learning_runs)
+        write_ranges(randomize, made.fitted, made.served, opened.chain.names, count)
     if beside is not None:
-        write_whole(beside, made.full.module)
+        write_whole(beside, made.module)
     told = (text for run in runs for text in run.notices)
-    said = (*told, *notices, *made.notices, *(lost(made) if path else ()))
+    said = (*told, *notices, *made.notices, *(made.lost if path else ()))
     return MotionGap(
         model=str(model),
         robot=opened.chain.robot.name,
         unit=judge.held.unit,
-        rungs=(*first, *made.rungs),
-        elements=made.elements,
+        rungs=tuple(first[:1] if nothing else (*first, *made.rungs)),
+        effects=() if nothing else made.effects,
+        elements=() if nothing else made.elements,
         left_out=made.left_out,
         drives=judge.drives,
         held_out=judge.held.names,
@@ -136,6 +178,46 @@ def motion_gap(
         module="" if beside is None else str(beside),
         seconds=time.perf_counter() - began,
     )
+
+
+def by_torques(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Answer:
+    """By torques, and by commands where they were logged."""
+    bench, served, rungs, effects = by_commands(bench, found, progress)
+    made = correct(bench, found, progress)
+    return Answer(made.plain.opened, served, (*rungs, *made.rungs), effects, made.elements,
+                  (made.plain, bench.study), made.full.module, made.left_out, made.notices,
+                  (*lost(made), *lost_late(effects)))  # fmt: skip
+
+
+def by_commands(
+    bench: Bench, found: MotionDiagnosis, progress: Progress
+) -> tuple[Bench, Served | None, tuple[MotionRung, ...], tuple[MotionEffect, ...]]:
+    """The model with the drives that logged commands show, these, a step for each effect, and what
+    each is worth.
+    """
+    judge, opened = bench.judge, bench.opened
+    asked = bench.bristled, bench.plain
+    if judge.drives != OWN_SERVOS or not can_write(opened):
+        return bench, None, (), ()
+    progress("fitting the drives to their commands")
+    served = serve(judge, opened, plain=bench.plain)
+    if not served.changes:
+        return bench, served, (), ()
+    whole, _ = asked_of(found, bench)
+    beside = bench_of(judge, with_drives(opened, served), found, asked).candidate(whole).opened
+    served = kept(served, judge, beside)
+    effects = tuple(effects_of(served, judge, beside))
+    off = judge.torque(opened.chain)
+    rungs = tuple(judge.rung(name, one.chain, missed=off)
+                  for name, one in steps_with(served, effects, opened))  # fmt: skip
+    return bench_of(judge, with_drives(opened, served), found, asked), served, rungs, effects
+
+
+def improves(rungs: Sequence[MotionRung]) -> bool:
+    """Whether the joint error falls from the first step to the last, joint by joint and in all."""
+    first, last = (np.array(rungs[k].tracking_rms_mrad) for k in (0, -1))
+    falls = np.linalg.norm(last) < np.linalg.norm(first)
+    return bool(falls) and mean_log(last) < mean_log(first) - STAYS
 
 
 def told_or_found(
@@ -180,9 +262,11 @@ def check_request(write: Path | str | None, friction: str | None, *, plain: bool
         raise OptionError(f"friction={MOTOR}: this MuJoCo has no motors without input; update it")
 
 
-def bench_of(judge: Judge, opened: Opened, found: MotionDiagnosis) -> Bench:
-    """Where corrections of a model are fitted and judged."""
+def bench_of(
+    judge: Judge, opened: Opened, found: MotionDiagnosis, asked: tuple[bool, bool]
+) -> Bench:
+    """Where corrections of a model are fitted and judged.  asked: its `bristled` and `plain`."""
     assumed = opened.given.assumed or not weighed(opened.chain.robot).all()
     study = Study.of(opened.chain, judge.arm, judge.learning, found.models[-1].terms,
                      largest_inertia(opened.chain), assumed=bool(assumed))  # fmt: skip
-    return Bench(judge, opened, study)
+    return Bench(judge, opened, study, *asked)

@@ -55,22 +55,24 @@ def is_mjcf(model: Path | str) -> bool:
     return path.suffix.lower() in MODELS and not is_urdf(path)
 
 
-def open_model(model: Path | str, joints: int, tip: str = "") -> Opened:
+def open_model(model: Path | str, joints: int, tip: str = "", *, freed: bool = True) -> Opened:
     """The arm of so many joints in a model's file; of a robot file or URDF a new model.
 
-    Raises CalibrationError.
+    freed: whether servos get the dampers that joints hold for them.  Raises CalibrationError.
     """
     mujoco()
     if is_mjcf(model):
         given = read_model(model)
         chain = chain_of(given.compiled(), joints, given.source, tip, unknown=given.assumed)
-        return Opened(given, chain, new=False).with_free_joints()
+        opened = Opened(given, chain, new=False)
+        return opened.with_free_joints() if freed else opened
     robot = load_robot(model)
     if robot.joints != joints:
         raise OptionError(f"{model}: has {robot.joints} joints, the logs have {joints}")
     given = Given(str(model), new_model(robot), Path())
     chain = chain_of(given.compiled(), joints, given.source)
-    return Opened(given, chain, new=True).with_free_joints()
+    opened = Opened(given, chain, new=True)
+    return opened.with_free_joints() if freed else opened
 
 
 def calibrated(opened: Opened, fit: Fit) -> tuple[Opened, tuple[str, ...]]:

@@ -8,11 +8,13 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from minimax_cal.dynamics.result import table_by_joint
+from minimax_cal.dynamics.result import MotionEffect, best_worth, table_by_joint
 from minimax_cal.ground.facts import Fact
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
+
+COMMANDS = "the logged commands"  # that drive a model, as `drives` says at its end
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,19 @@ class WrittenElement:
         return f"{self.name} ({self.attributes}): {size} held out"
 
 
+def of_drive(one: MotionEffect) -> str:
+    """What a drive has that the model's has not, and its worth, for people."""
+    amounts = ", ".join(
+        f"{p.name.replace('_', ' ')} {p.value:.4g}" + f" ± {p.sigma:.1g}" * (p.sigma > 0.0)
+        + f" {p.unit}" * (p.unit != "1") for p in one.parameters if p.value or p.sigma
+    )  # fmt: skip
+    if not one.worth:
+        return f"not in the file: {one.words} ({amounts}), for which MuJoCo has no element"
+    joint, (before, after) = best_worth(one)
+    size = f"joint error at {joint} {before:.3g} to {after:.3g} mrad"
+    return f"corrected {one.words} ({amounts}): {size} held out"
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class MotionGap(Result):
     """The gap between a simulator's model and logs of the arm, measured in the simulator.
@@ -61,6 +76,7 @@ class MotionGap(Result):
     rungs: as given, then with each element.  elements: what was corrected, with its worth.
     left_out: what is in neither file nor module, and what that costs.  drives: what moved the arm.
     held_out: runs that no fit saw, or quarters of one.  written, module: paths, empty if none.
+    effects: of its drives, each with the held-out joint error [mrad] without and with it.
     along: tells its file from that of poses.
     """
 
@@ -78,6 +94,7 @@ class MotionGap(Result):
     written: str
     module: str
     seconds: float
+    effects: tuple[MotionEffect, ...] = ()
     along: Literal["trajectories"] = "trajectories"
 
     def __post_init__(self) -> None:
@@ -88,9 +105,27 @@ class MotionGap(Result):
     def __repr__(self) -> str:
         return f"<MotionGap of {self.model}: {self.headline()}>"
 
+    @property
+    def commanded(self) -> bool:
+        """Whether logged commands drove the model."""
+        return self.drives.endswith(COMMANDS)
+
+    @property
+    def kept(self) -> bool:
+        """Whether something was kept, where commands drove the model."""
+        return not self.commanded or len(self.rungs) > 1
+
     def headline(self) -> str:
         """The result in a sentence or two."""
+        if not self.kept:
+            error = float(np.linalg.norm(self.rungs[0].tracking_rms_mrad))
+            return (
+                f"No correction lowers the joint error under {self.drives} on held-out motion "
+                f"({', '.join(self.held_out)}), {error:.3g} mrad: nothing is written."
+            )
         first, last = self.rungs[0], self.rungs[-1]
+        if not first.torque_rms:
+            return f"{self.driven().capitalize()}."
         share = np.array(last.torque_rms_moving) / np.maximum(first.torque_rms_moving, 1e-300)
         worst = int(np.argmax(share))
         said = (
@@ -98,18 +133,19 @@ class MotionGap(Result):
             f"{100.0 * np.median(share):.2g} % (median of the joints; worst J{worst + 1}, "
             f"{100.0 * share[worst]:.2g} %)"
         )
-        if first.tracking_rms_mrad:
-            ends = [float(np.linalg.norm(r.tracking_rms_mrad)) for r in (first, last)]
-            said += (
-                f", the joint error under {self.drives} from {ends[0]:.3g} to {ends[1]:.3g} mrad"
-            )
-        return f"{said}."
+        return f"{said}, {self.driven()}." if first.tracking_rms_mrad else f"{said}."
+
+    def driven(self) -> str:
+        """How the joint error changes."""
+        ends = [float(np.linalg.norm(self.rungs[k].tracking_rms_mrad)) for k in (0, -1)]
+        return f"the joint error under {self.drives} from {ends[0]:.3g} to {ends[1]:.3g} mrad"
 
     def sentences(self) -> tuple[str, ...]:
         """What was corrected and its worth, what the file alone lacks, and what nothing holds."""
         said = {"file": "corrected", "module": "not in the file, in its module:"}
+        drives = (of_drive(one) for one in self.effects)
         each = (f"{said[one.held_by]} {one.words(self.unit)}" for one in self.elements)
-        return (*each, *(f"not in the model: {text}" for text in self.left_out))
+        return (*drives, *each, *(f"not in the model: {text}" for text in self.left_out))
 
     def short(self) -> dict[str, Any]:
         """What another result says of the file that was written."""
@@ -125,4 +161,5 @@ class MotionGap(Result):
         """Torques, and joint errors where drives moved the arm."""
         title = f"RMS joint error [mrad] under {self.drives}"
         driven = table_by_joint(title, "model", self.rungs, "tracking_rms_mrad")
-        return (self.table(), driven) if self.drives else (self.table(),)
+        own = (self.table(),) if self.unit else ()
+        return (*own, driven) if self.drives else own

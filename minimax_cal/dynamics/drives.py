@@ -1,0 +1,461 @@
+"""What position drives do with their commands: gains, delay and limits, from logs of both.
+
+    torque = kp (c(t - d) - q) - kv (qd - s c'(t - d)) + what carries gravity
+
+of a command c, linear in kp, kv and kv s for every delay d.  Rows where a limit acts say nothing of
+gains.  Rows err together over a stretch of BLOCK_S: each is left out in turn [jackknife].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy
+
+from minimax_cal.dynamics.regressor import Motion
+from minimax_cal.dynamics.rows import SLOWEST, UNFITTED_S, Logs, prepare
+from minimax_cal.dynamics.run import NOTHING, Run
+from minimax_cal.dynamics.scene import Arm, sense_of
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+
+LATEST, LOOK = 0.1, 0.004  # the latest command that is looked for, and how closely [s]
+BLOCK_S = 1.0  # rows that err together
+LIMIT = 0.9  # of the largest torque and speed: rows beyond may be at a limit
+BEYOND, CLEAR = 1.05, 0.95  # of a limit: where it acts for sure, and where it does not
+LEAST_ROWS, LEAST_BLOCKS = 10, 3  # of a log, at a limit; and stretches of time
+STANDS = 3.5  # standard deviations by which a number is another
+PREDICTS = 2.5  # the same, by which stretches of a run left out are predicted better
+STEPS, CLOSE_S = 20, 1e-9  # of a fit, and the step that ends it [s]
+AHEAD, INERTIA, FRICTION = "ahead", "inertia", "friction"  # what is fitted beside if it is there
+GAINS, DELAY, TORQUE_LIMIT, SPEED_LIMIT = KINDS = (
+    "servo_gain",
+    "command_delay",
+    "torque_limit",
+    "speed_limit",
+)
+FIELDS = {  # of a drive, that belong to an effect, and their units
+    GAINS: {"stiffness": "N m/rad", "damper": "N m s/rad", "ahead": "1"},
+    DELAY: {"delay": "s"},
+    TORQUE_LIMIT: {"torque": "N m"},
+    SPEED_LIMIT: {"speed": "rad/s"},
+}
+NO_LIMITS = (math.inf, 0.0), (math.inf, 0.0)
+Body = Callable[[Motion], Array]  # torque (m, n) that masses take for a motion [N m]
+FITTED = ("stiffness", "damper", "ahead", "delay")
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A joint's.  stiffness: kp [N m/rad].  damper: kv [N m s/rad].  ahead: share s of kv that the
+    commanded speed has.  delay: d [s].  torque, speed: limits [N m, rad/s], infinite for none.
+    """
+
+    stiffness: float
+    damper: float
+    ahead: float = 0.0
+    delay: float = 0.0
+    torque: float = math.inf
+    speed: float = math.inf
+
+    def taking(self, other: Drive, kind: str) -> Drive:
+        """With the numbers of an effect that another has."""
+        return replace(self, **{name: getattr(other, name) for name in FIELDS[kind]})
+
+
+@dataclass(frozen=True, eq=False)
+class DriveFit:
+    """What logs say of a joint's drive.
+
+    change: (G, 4) by which each stretch (G,), left out, changes FITTED.  limits: standard
+    deviations of torque and speed.  beside: what was fitted with it.
+    """
+
+    drive: Drive
+    change: Array
+    stretch: Array
+    limits: tuple[float, float]
+    beside: dict[str, float]
+
+    @property
+    def sigma(self) -> dict[str, float]:
+        """Standard deviations by name."""
+        own = np.sqrt(np.diag(covariance_of(self.change))).tolist()
+        return dict(zip((*FITTED, "torque", "speed"), (*own, *self.limits), strict=True))
+
+
+def command_of(run: Run) -> Array:
+    """(m, n) commands of a run.  Raises DataError where it has none."""
+    if run.command is None:
+        raise DataError(f"{run.source}: holds no commands (q1_cmd_rad ...)")
+    return run.command
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """Runs with their commands, and what arms of a model weigh along them, all in N m.
+
+    logs: of the runs; the rows that are used are those clear of gaps.  told: of the commands in the
+    place of torques.  carried: (M, n) torque that the drives add against gravity.  sense: (M, n) of
+    the speed.  gain: (n,) torque per unit of the log.
+    """
+
+    runs: tuple[Run, ...]
+    logs: Logs
+    told: Logs
+    carried: Array
+    sense: Array
+    gain: Array
+
+    @property
+    def measured(self) -> bool:
+        """Whether torques were; else they are those of the model's masses."""
+        return self.logs.unit != NOTHING
+
+    @property
+    def beside(self) -> tuple[str, ...]:
+        """What is fitted in any case: speeds that were not logged may be those of another time.
+
+        Without torques rotors and friction stand between the drive and the masses of the model.
+        """
+        if not self.measured:
+            return INERTIA, FRICTION
+        return () if all(run.qd is not None for run in self.runs) else (INERTIA,)
+
+    @cached_property
+    def slides(self) -> Array:
+        """(M, n) True where friction is that of a joint that slides."""
+        return self.logs.away(UNFITTED_S)
+
+    @staticmethod
+    def of(runs: Sequence[Run], arm: Arm, share: float, body: Body) -> Followed:
+        """share: of gravity that drives carry besides.  body: torque of the masses of a motion."""
+        logs = prepare(runs)
+        if logs.unit == NOTHING:
+            logs = replace(logs, torque=body(logs.motion))
+        told = prepare([replace(run, torque=command_of(run)) for run in runs])
+        still = np.zeros((2, *logs.torque.shape))
+        carried = share * body(Motion(logs.motion.q, *still)) if share else still[0]
+        sense = sense_of(logs.motion.qd, arm.soft)
+        return Followed(tuple(runs), logs, told, carried, sense, arm.gain)
+
+    def joint(self, j: int) -> Rows:
+        """The rows of a joint."""
+        logs = self.logs
+        used = ~logs.gap & (self.measured | self.slides[:, j])
+        at = logs.picked[used[logs.picked]]
+        run = np.searchsorted(logs.start, at, side="right") - 1
+        stretch = run * 10**6 + (logs.since[at] / BLOCK_S).astype(int)
+        curves = [
+            scipy.interpolate.CubicSpline(logs.since[a:b], self.told.torque[a:b, j])
+            for a, b in zip(logs.start[:-1], logs.start[1:], strict=True)
+        ]
+        torque = logs.torque[:, j] * self.gain[j] - self.carried[:, j]
+        q, qd, qdd = (one[at, j] for one in (logs.motion.q, logs.motion.qd, logs.motion.qdd))
+        return Rows(torque[at], q, qd, qdd, self.sense[at, j], logs.since[at], run, stretch,
+                    tuple(curves))  # fmt: skip
+
+    def clear(self, j: int, torque: float, speed: float) -> Rows:
+        """The rows of a joint that no larger torque and speed is near."""
+        every, seen = self.joint(j), self.samples(j, Drive(0.0, 0.0))
+        beyond = (np.abs(seen.torque) > torque) | (np.abs(seen.qd) > speed)
+        return every.at(seen.away(every, beyond))
+
+    def samples(self, j: int, drive: Drive) -> Samples:
+        """Every row of the logs as logged, at a joint: torque, and what a drive would ask for."""
+        out: list[Array] = []
+        for number, run in enumerate(self.runs):
+            rows = slice(self.logs.start[number], self.logs.start[number + 1])
+            time, grid = run.time - run.time[0], self.logs.since[rows]
+            smooth = (self.logs.motion.qd, self.carried, self.logs.torque)
+            qd, carried, torque = (np.interp(time, grid, one[rows, j]) for one in smooth)
+            command = command_of(run)[:, j]
+            late = np.interp(time - drive.delay, time, command)
+            rate = np.interp(time - drive.delay, time, np.gradient(command, time))
+            asked = drive.stiffness * (late - run.q[:, j])
+            asked -= drive.damper * (qd - drive.ahead * rate)
+            torque = run.torque[:, j] * self.gain[j] if self.measured else torque
+            stretch = number * 10**6 + (time / BLOCK_S).astype(int)
+            out.append(np.array([torque, asked + carried, qd, time, 0 * time + number, stretch]))
+        torque, asked, qd, since, of, stretch = np.concatenate(out, axis=1)
+        return Samples(torque, asked, qd, since, of, stretch)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """(m,) each of a joint: torque measured and asked for [N m], speed, time, run, stretch."""
+
+    torque: Array
+    asked: Array
+    qd: Array
+    since: Array
+    run: Array
+    stretch: Array
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of torque that the drive does not explain, whatever the limits."""
+        return 1.4826 * float(np.median(np.abs(self.torque - self.asked)))
+
+    def away(self, rows: Rows, at_limit: Array) -> Array:
+        """(R,) True for rows that no sample at a limit is near.  at_limit: (m,)."""
+        out = np.ones(len(rows.q), dtype=bool)
+        for number in np.unique(rows.run):
+            mine, here = rows.run == number, self.run == number
+            time = self.since[here]
+            count = np.concatenate([[0], np.cumsum(at_limit[here])])
+            ends = [np.searchsorted(time, rows.since[mine] + side * UNFITTED_S) for side in (-1, 1)]
+            out[mine] = count[ends[1]] == count[ends[0]]
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """(R,) each of a joint: torque less what carries gravity [N m], joint value, speed, its
+    derivative and sense, time, run, and the stretch that errs together.  curves: of each run's
+    command.
+    """
+
+    torque: Array
+    q: Array
+    qd: Array
+    qdd: Array
+    sense: Array
+    since: Array
+    run: Array
+    stretch: Array
+    curves: tuple[Any, ...]
+
+    def at(self, rows: Array) -> Rows:
+        """Some rows.  rows: (R,) mask."""
+        names = ("torque", "q", "qd", "qdd", "sense", "since", "run", "stretch")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+    def command(self, late: float, order: int = 0) -> Array:
+        """(R,) the command or its derivative, so late [s]."""
+        out = np.empty(len(self.q))
+        for number, curve in enumerate(self.curves):
+            mine = self.run == number
+            out[mine] = curve(self.since[mine] - late, order)
+        return out
+
+    def columns(self, late: float, given: Drive, beside: Sequence[str]) -> Array:
+        """(R, 2 + k) torque per stiffness, per damper, and of what else is fitted."""
+        rate = self.command(late, 1)
+        speed = -self.qd if AHEAD in beside else given.ahead * rate - self.qd
+        more = {AHEAD: rate, INERTIA: -self.qdd, FRICTION: -self.sense}
+        return np.stack(
+            [self.command(late) - self.q, speed, *(more[name] for name in beside)], axis=1
+        )
+
+    def rest(self, drive: Drive, beside: Mapping[str, float]) -> Array:
+        """(R,) torque that a drive, and what was fitted beside it, do not explain."""
+        value = [drive.stiffness, drive.damper, *beside.values()]
+        return np.asarray(self.torque - self.columns(drive.delay, drive, list(beside)) @ value)
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Least squares: a drive, what was fitted beside it, and how (G, 4 + k) each stretch, left out,
+    changes FITTED and that.
+    """
+
+    drive: Drive
+    beside: dict[str, float]
+    change: Array
+
+    def rest(self, rows: Rows) -> Array:
+        """(R,) torque of some rows that it does not explain."""
+        return rows.rest(self.drive, {k: v for k, v in self.beside.items() if k != AHEAD})
+
+    def told(self, name: str, given: Drive) -> bool:
+        """Whether something that was fitted beside is there for sure."""
+        at = 2 if name == AHEAD else len(FITTED) + list(self.beside).index(name)
+        off = self.drive.ahead - given.ahead if name == AHEAD else self.beside[name]
+        return abs(off) > STANDS * float(np.sqrt(covariance_of(self.change)[at, at]))
+
+
+def solve(rows: Rows, given: Drive, beside: Sequence[str]) -> Solved:
+    """Gains and delay by least squares, with what is fitted beside them."""
+
+    def linear(late: float) -> tuple[Array, Array, float]:
+        matrix = rows.columns(late, given, beside)
+        value = np.linalg.lstsq(matrix, rows.torque, rcond=None)[0]
+        return matrix, value, float(((rows.torque - matrix @ value) ** 2).sum())
+
+    late = min(np.arange(0.0, LATEST, LOOK), key=lambda one: linear(one)[2])
+    ahead = 2 + list(beside).index(AHEAD) if AHEAD in beside else -1
+    for _ in range(STEPS):
+        matrix, value, _ = linear(late)
+        speed = value[ahead] if ahead > 0 else value[1] * given.ahead
+        by_time = -value[0] * rows.command(late, 1) - speed * rows.command(late, 2)
+        whole = np.column_stack([matrix, by_time])
+        rest = rows.torque - matrix @ value
+        step = float(np.clip(np.linalg.lstsq(whole, rest, rcond=None)[0][-1], -LOOK, LOOK))
+        late = float(np.clip(late + step, -LATEST, LATEST))
+        if abs(step) < CLOSE_S:
+            break
+    change = left_out(whole, rest, rows.stretch)
+    own = np.zeros((len(change), len(FITTED)))
+    own[:, [0, 1, 3]] = change[:, [0, 1, -1]]
+    share = given.ahead
+    if ahead > 0:
+        share = float(value[ahead] / value[1])
+        own[:, 2] = (change[:, ahead] - share * change[:, 1]) / value[1]
+    drive = replace(given, stiffness=float(value[0]), damper=float(value[1]), ahead=share,
+                    delay=late)  # fmt: skip
+    named = dict(zip(beside, value[2:].tolist(), strict=True))
+    return Solved(drive, named, np.hstack([own, change[:, 2:-1]]))
+
+
+def solve_plainly(rows: Rows, held: Rows, given: Drive, always: Sequence[str]) -> Solved:
+    """The same with no more beside than is there for sure, and predicts rows held out.
+
+    always: what is fitted in any case.
+    """
+    beside = [AHEAD, INERTIA, FRICTION]
+    found = solve(rows, given, beside)
+    for name in reversed([one for one in beside if one not in always]):
+        less = solve(rows, given, [one for one in found.beside if one != name])
+        if not (found.told(name, given) and predicts(held, found.rest(held), less.rest(held))):
+            found = less
+    return found
+
+
+def covariance_of(change: Array) -> Array:
+    """(p, p) of numbers that change so (G, p) without each stretch [jackknife].
+
+    Wider by as much as Student's t is than the normal law, at 95 %, for as few stretches as matter
+    [Satterthwaite 1946, kurtosis of a normal law].
+    """
+    count, squares = len(change), (change**2).sum(axis=0)
+    few = 3.0 * squares**2 / ((change**4).sum(axis=0) + 1e-300)
+    few = np.clip(few, 2.0, max(count - len(FITTED), 2.0))
+    sigma = scipy.special.stdtrit(few, 0.975) / scipy.special.ndtri(0.975)
+    return np.asarray((count - 1.0) / count * change.T @ change * np.outer(sigma, sigma))
+
+
+def left_out(matrix: Array, rest: Array, stretch: Array) -> Array:
+    """(G, p) change of a solution without each stretch of rows, to first order."""
+    scale = np.sqrt((matrix**2).sum(axis=0)) + 1e-300
+    matrix = matrix / scale
+    whole, out = matrix.T @ matrix, []
+    for one in np.unique(stretch):
+        mine = stretch == one
+        part = matrix[mine]
+        less = whole - part.T @ part
+        out.append(-np.linalg.lstsq(less, part.T @ rest[mine], rcond=1e-12)[0] / scale)
+    return np.array(out)
+
+
+def fit_drive(learnt: Followed, judged: Followed, j: int, given: Drive) -> DriveFit | None:
+    """The drive of a joint by its logs; None where these hold too few rows clear of limits.
+
+    judged: runs that are held out.  given: the drive of the model.
+    """
+    seen = learnt.samples(j, given)
+    torque, speed = (LIMIT * float(np.abs(one).max()) for one in (seen.torque, seen.qd))
+    rows = learnt.clear(j, torque, speed)
+    for _ in range(2):  # clear of what may be a limit, then of what is one
+        if len(np.unique(rows.stretch)) < 2 * LEAST_BLOCKS or np.abs(rows.qd).max() < SLOWEST:
+            return None
+        held = judged.clear(j, torque, speed)
+        found = solve_plainly(rows, held, given, learnt.beside)
+        seen = learnt.samples(j, found.drive)
+        (torque, slack), (speed, off) = limits_of(seen) if learnt.measured else NO_LIMITS
+        used, rows = rows, learnt.clear(j, CLEAR * torque, LIMIT * speed)
+    gains = np.array([found.drive.stiffness, found.drive.damper])
+    unsure = STANDS * np.sqrt(np.diag(covariance_of(found.change))[:2])
+    if not (gains[0] > unsure[0] and gains[1] > -unsure[1]):
+        return None
+    limit = given.torque if not np.isfinite(torque) else torque
+    if learnt.measured and np.quantile(np.abs(seen.torque), 0.999) > BEYOND * limit:
+        limit = float(np.abs(seen.torque).max())
+    drive = replace(found.drive, damper=max(found.drive.damper, 0.0), torque=float(limit),
+                    speed=float(min(speed, given.speed)))  # fmt: skip
+    change, stretch = found.change[:, : len(FITTED)], np.unique(used.stretch)
+    beside = {name: value for name, value in found.beside.items() if name != AHEAD}
+    return DriveFit(drive, change, stretch, (slack, off), beside)
+
+
+def limits_of(seen: Samples) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Limits of torque and speed, each with its deviation."""
+    most = torque_limit(seen)
+    return most, speed_limit(seen, most[0])
+
+
+def torque_limit(seen: Samples) -> tuple[float, float]:
+    """A torque that is not exceeded where more is asked for, and its deviation [N m].
+
+    Infinite where there is none.
+    """
+    size, noise = np.abs(seen.torque), seen.noise
+    limit = float(np.quantile(size, 1.0 - LEAST_ROWS / len(size)))
+    for _ in range(STEPS):
+        at_limit = (np.abs(seen.asked) > BEYOND * limit + STANDS * noise) & (size > LIMIT * limit)
+        at_limit &= seen.torque * seen.asked > 0.0
+        if not stands(at_limit, seen.stretch):
+            return math.inf, 0.0
+        before, limit = limit, float(np.median(size[at_limit]))
+        if limit == before:
+            break
+    spread = float(np.std(size[at_limit])) + 1e-300
+    if spread > (BEYOND - 1.0) * limit + STANDS * noise:
+        return math.inf, 0.0
+    return limit, spread / math.sqrt(len(np.unique(seen.stretch[at_limit])))
+
+
+def speed_limit(seen: Samples, torque: float) -> tuple[float, float]:
+    """A speed near which torque falls below what the drive asks for, and its deviation."""
+    asked = np.clip(seen.asked, -torque, torque)
+    slack = STANDS * seen.noise + (BEYOND - 1.0) * float(np.abs(seen.torque).max())
+    falls = np.sign(seen.qd) * (asked - seen.torque) > slack
+    fast = np.abs(seen.qd) > LIMIT * np.abs(seen.qd).max()
+    if not stands(falls & fast, seen.stretch):
+        return math.inf, 0.0
+    found = np.abs(seen.qd[falls & fast])
+    count = len(np.unique(seen.stretch[falls & fast]))
+    return float(np.median(found)), float(np.std(found)) / math.sqrt(count)
+
+
+def stands(rows: Array, stretch: Array) -> bool:
+    """Whether rows are enough, in enough stretches of time, to be a limit."""
+    return int(rows.sum()) >= LEAST_ROWS and len(np.unique(stretch[rows])) >= LEAST_BLOCKS
+
+
+def predicts(rows: Rows | Samples, rest: Array, before: Array) -> bool:
+    """Whether less is left of rows held out (R,), stretch by stretch, than before (R,)."""
+    index = np.unique(rows.stretch, return_inverse=True)[1].reshape(-1)
+    squares = (np.bincount(index, one**2) + 1e-300 for one in (before, rest))
+    gain = np.subtract(*map(np.log, squares))
+    if len(gain) < LEAST_BLOCKS:
+        return False
+    return float(gain.mean()) > PREDICTS * float(gain.std(ddof=1)) / math.sqrt(len(gain))
+
+
+def is_another(kind: str, fit: DriveFit, given: Drive, held: Followed, j: int, late: float) -> bool:
+    """Whether an effect of a drive is surely not the model's, and shows in runs held out.
+
+    late: shortest delay [s].
+    """
+    drive, sigma = fit.drive, fit.sigma
+    off = {name: abs(getattr(drive, name) - getattr(given, name)) for name in FIELDS[kind]
+           if getattr(drive, name) != getattr(given, name)}  # fmt: skip
+    if not any(size > STANDS * sigma[name] for name, size in off.items()):
+        return False
+    seen = held.samples(j, drive)
+    if kind == SPEED_LIMIT:
+        return bool(np.isfinite(speed_limit(seen, drive.torque)[0]))
+    if kind == TORQUE_LIMIT:
+        ends = (seen.torque - np.clip(seen.asked, -d.torque, d.torque) for d in (drive, given))
+        return predicts(seen, *ends)
+    if kind == DELAY and off["delay"] < late:
+        return False
+    rows = held.clear(j, CLEAR * drive.torque, LIMIT * drive.speed)
+    ends = (rows.rest(one, fit.beside) for one in (drive, drive.taking(given, kind)))
+    return predicts(rows, *ends)
