@@ -49,13 +49,13 @@ for title, one in (("with the true cause", found), ("without it", without)):
     names = ", ".join(finding.term.label for finding in one.effects)
     left_over = one.ladder[-1].holdout.rms_mm
     print(f"{title}: verdict {one.verdict}, held-out RMS {left_over:.3f} mm, {names}")
-    assert one.remainder is not None
-    print(f"    still following the pose: {one.remainder.predictable_mm:.3f} mm")
+    assert one.remaining is not None
+    print(f"    still following something: {one.remaining.dependent_mm:.3f} mm")
 
 # %%
 # Gravity's effects are relatives, and what is left of the family stands in for the one that is
 # missing. The verdict is not ``named`` any more, the error stays above the noise, and some of it
-# still follows the pose: all three say that something is amiss. `How often a diagnosis is right
+# still follows something: all three say that something is amiss. `How often a diagnosis is right
 # <../trust.html>`_ has the shares, also for this case.
 #
 # An effect that was found is fitted together with the geometry, and belongs to the robot from

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -70,7 +71,7 @@ def diagnose_command(
         status=found.status,
         sentences=found.said,
         tables=partial(every_table, found),
-        advice=advice(found, robot, data, to.output),
+        advice=advice(found, robot, data, to.output, in_rows),
         draw=save_diagnosis,
     )
 
@@ -98,14 +99,16 @@ def every_table(found: Diagnosis) -> Iterator[Table]:
 
 
 def advice(
-    found: Diagnosis, robot: str, data: tuple[Path, ...], written: Path | None
+    found: Diagnosis, robot: str, data: tuple[Path, ...], written: Path | None, in_rows: bool
 ) -> Iterator[tuple[str, str]]:
     """What to do next, and its command.  written: where the diagnosis went."""
     if written and found.main and found.status is Status.CONVERGED:
-        files = " ".join(map(str, data))
+        files = shlex.join(map(str, data))
         told, usual = found.provenance.settings, vars(DiagnosisOptions())
         given = [n for n in ("seed", "holdout", "holdout_by", "instrument") if told[n] != usual[n]]
-        split = "".join(f"--{name.replace('_', '-')} {told[name]} " for name in given)
+        split = "".join(
+            f"--{name.replace('_', '-')} {shlex.quote(str(told[name]))} " for name in given
+        ) + ("--rows-in-visit-order " if in_rows else "")
         fit = (
             f"minimax-cal calibrate {robot} {files} --effects {written} --objective sum {split}"
             "-o fit_effects.json"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -241,9 +242,11 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     study, causes = causes_of(study, clean.faults, options.exclude, step_of(CAUSES), *workers)
     causes, spoken, ladder = in_rungs(study, causes, step_of(BUDGET))
     beyond = NOT_ASKED if options.quick else beyond_of(study, causes, judges, step_of(PARTS))
+    refused = math.nan
     if beyond.typical_mm > beyond.geometric_typical_mm:  # what does not extrapolate
         causes, spoken = (beside_them(one) for one in (causes, spoken))
-        ladder = replace(ladder, sure=0)
+        ladder, refused = replace(ladder, sure=0), beyond.typical_mm
+        beyond = beyond_of(study, causes, judges, silent)
     kept = ladder.confirmed
     causes = replace(causes, left=left_beside(study, causes, kept.last.terms))
     last, late = judges.marked(kept.fits[0].cell, kept.last.cell)
@@ -251,17 +254,20 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     tell_steps(steps, progress)
     count = len(steps) - len(ladder.taken) + ladder.sure
     step = steps[count - 1]
-    floor = floor_beneath(robot, clean.data, kept.last, step)
+    judge = step.trusted if step.trusted.poses else step.train
+    whole = floor_beneath(robot, clean.data, kept.last)
+    floor = whole.beneath(judge.rms_mm)  # noise is part of what is left
     share, interval = closed(kept, last, floor, options.seed)
     effects = [*valued(spoken.effects, kept), *valued(spoken.effects, ladder)[ladder.sure :]]
     findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.least)
     step_of(REMAINING)
-    judge = step.trusted if step.trusted.poses else step.train
-    rest, complete = remaining_of(causes.left, judge.rms_mm, floor, clean.data)
-    known = known_noise(kept.last, floor, clean.data, robot.repeatability)
+    known = known_noise(kept.last, whole, clean.data, robot.repeatability)
     wrong = against(robot, floor, step)
     gone, counted = judged_with(asked.data, clean.data, clean.left, judges.held, kept.last.cell)
     told = explanation(findings, causes, known, study.fit.status, failed=bool(wrong))
+    left = () if told["verdict"] == "not_repeatable" else causes.left  # it scatters, that is all
+    error = kept.last.cell.error(clean.data)
+    rest, complete = remaining_of(left, judge.rms_mm, clean.data, error)
     more = ladder.last.cell if len(steps) > count else None
     return Diagnosis(
         **{**told, "meets_floor": down_to(known, complete)},
@@ -287,7 +293,9 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         held=~np.isin(clean.data.line, train.line),
         cells=tuple(fit.cell for fit in kept.fits),
         nominal=study.nominal,
-        remaining=rest,
+        remaining=None if wrong else rest,
+        tested=(known.remaining, known.highest),
+        refused=refused,
         floor_known=complete,
         repeatable=known.is_repeatable,
         set_aside=gone,
@@ -360,15 +368,15 @@ def laddered(study: Study, causes: Causes) -> Ladder:
 
 def beside_them(causes: Causes) -> Causes:
     """The causes, none of them recommended: poses beyond those measured are met worse by them."""
-    return replace(causes, effects=tuple(replace(f, extends=False) for f in causes.effects))
+    effects = (replace(f, extends=not f.established) for f in causes.effects)
+    return replace(causes, effects=tuple(effects))
 
 
-def floor_beneath(robot: Robot, data: Measurements, last: Joint, step: Step) -> Floor:
-    """What noise alone would leave beneath the last rung, no more than that leaves held out."""
+def floor_beneath(robot: Robot, data: Measurements, last: Joint) -> Floor:
+    """What noise alone would leave beneath the last rung."""
     error = last.cell.error(data)
     most = noise_at_most(error, last.poses.left_free)
-    judged = step.trusted if step.trusted.poses else step.train
-    return floor_of(data, error, robot.repeatability, most).beneath(judged.rms_mm)
+    return floor_of(data, error, robot.repeatability, most)
 
 
 def steps_of(

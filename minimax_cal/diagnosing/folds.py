@@ -32,6 +32,8 @@ def fold_of(study: Study, causes: Causes, rows: Array, state: State) -> Ladder:
     used.  state: the geometry that was fitted to them.
     """
     small = studied(study.robot, study.data.take(rows), replace(study.fit, state=state))
+    if not causes.confirmed:
+        return climbed(small, [], [])
     choice = tuned_again(select(causes.choice.part(study.rows.at(rows))))
     named = causes.maps.beside(effects_of(choice))
     sure = [any(is_named(one, terms[0].key) for one in causes.confirmed) for terms in named]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from minimax_cal.diagnosing.result import FOUND, Explained, Finding, ends_of
+from minimax_cal.diagnosing.result import FOUND, Explained, Finding, Proposal, ends_of
 from minimax_cal.diagnosing.result import VERDICTS as VERDICTS  # in annotations that are inherited
 from minimax_cal.diagnosing.result import Untestable as Untestable
 from minimax_cal.diagnosing.sentences import explained
@@ -79,6 +79,13 @@ class RelativeDiagnosis(Explained, Result):
     def reasons(self) -> tuple[str, ...]:
         """The verdict and why, in sentences."""
         return explained(self)
+
+    @derived()
+    def next(self) -> Proposal | None:
+        """The one measurement to make next; None where none is worth it."""
+        from minimax_cal.diagnosing.proposals import proposal
+
+        return proposal(self, self.meets_floor is not None)
 
     def headline(self) -> str:
         """The verdict in words, and the held-out errors."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, Proposal
+from minimax_cal.diagnosing.result import Alternative, Explained, Finding, Proposal
 from minimax_cal.diagnosing.sentences import names_of
 from minimax_cal.evidence.remains import FOLLOWING
 from minimax_cal.modelling.effects.words import name_structure
@@ -14,14 +14,23 @@ REVISIT = Proposal(
     "revisit", "visit 10 poses twice", "whether the remaining error is the arm's repeatability"
 )
 ASKING = (  # of what errors follow: words of the driver, kind and text of what would tell more
-    (("move", "past"), "approach", "visit 10 poses again, each approached from its other side"),
+    (
+        ("move", "its past", "previous"),
+        "approach",
+        "visit 10 poses again, each approached from its other side",
+    ),
     (("load",), "payload", "measure 20 of these poses again with another payload"),
-    (("time", "previous"), "late", "measure the first 10 poses again at the end"),
+    (("time",), "late", "measure the first 10 poses again at the end"),
     (("temperature",), "warm", "measure 10 poses with the arm cold, and again warm"),
     (("where it is",), "instrument", "measure 20 poses again with the instrument elsewhere"),
     (("angle", "attitude", "joints"), "more", "measure 40 more poses all over the workspace"),
 )
 MORE = ASKING[-1]
+CHECK = Proposal(
+    "check",
+    "measure 10 poses again, with robot file, joint signs, zero positions and units checked",
+    "whether these are measurements of this arm",
+)
 AGAIN = Proposal(
     "repeat",
     "visit one pose 30 times in a row, half of them approached from its other side",
@@ -29,11 +38,11 @@ AGAIN = Proposal(
 )
 
 
-def proposal(found: Diagnosis) -> Proposal | None:
-    """What to measure next; None where nothing is open, or the fit failed."""
+def proposal(found: Explained, floor_known: bool) -> Proposal | None:
+    """What to measure next; None where nothing is open."""
     if found.status is Status.FAILED:
-        return None
-    if not found.floor_known:
+        return CHECK
+    if not floor_known:
         return REVISIT
     if found.verdict == "not_repeatable":
         return AGAIN
@@ -41,7 +50,7 @@ def proposal(found: Diagnosis) -> Proposal | None:
     return settled or (of_unknown(found) if found.verdict == "unknown" else None)
 
 
-def of_unknown(found: Diagnosis) -> Proposal:
+def of_unknown(found: Explained) -> Proposal:
     """What would tell more of an error that nothing explains."""
     driver = found.structure_in.partition(FOLLOWING)[2]
     asked = (one for one in ASKING if any(word in driver for word in one[0]))

@@ -466,6 +466,8 @@ class Diagnosis(Explained, Result):
     remaining: what the last step leaves, None in an old file.  floor_known: whether all noise
     beneath it is: that of the joints, which only visits to one pose tell, where it matters.
     repeatable: False where visits to one pose scatter more than instrument and sound joints do.
+    tested: lower 95 % limit of the remaining error, and what noise may add up to at most [mm].
+    refused: RMS outside with the effects, where geometry alone is better and recommended [mm].
     stated_errors, stated_curves: as they stand in the file that the diagnosis was read from.
     """
 
@@ -494,6 +496,8 @@ class Diagnosis(Explained, Result):
     with_them: Annotated[Accuracy | None, Fact(key="accuracy.holdout_with_them", brief=True)] = None
     floor_known: bool = True
     repeatable: bool = True
+    tested: Annotated[tuple[float, float], Fact(key="gap.tested_mm")] = (math.nan, math.nan)
+    refused: Annotated[float, Fact(key="gap.refused_outside_mm")] = math.nan
     possible: Annotated[Step | None, Fact(key="gap.possible")] = None
     possible_cell: Annotated[Cell | None, APART] = None
 
@@ -512,14 +516,17 @@ class Diagnosis(Explained, Result):
         """The error budget on held-out poses, to the arm that `calibrate --effects` fits."""
         rows = [self.budget_row(step) for step in self.ladder]
         rows[1]["outside_rms_mm"] = finite(self.beyond.geometric_typical_mm)
-        if len(rows) > 2:
+        if self.ladder[-1].name.startswith("+ "):
             rows[-1]["outside_rms_mm"] = finite(self.beyond.typical_mm)
         return rows
 
     @derived()
     def budget_possible(self) -> dict[str, Any] | None:
         """The same with the possible causes besides; None without any."""
-        return self.budget_row(replace(self.possible, name=IF_REAL)) if self.possible else None
+        if self.possible is None:
+            return None
+        row = self.budget_row(replace(self.possible, name=IF_REAL))
+        return {**row, "outside_rms_mm": finite(self.refused)}
 
     @staticmethod
     def budget_row(step: Step) -> dict[str, Any]:
@@ -533,16 +540,14 @@ class Diagnosis(Explained, Result):
         """The one measurement to make next; None where none is worth it."""
         from minimax_cal.diagnosing.proposals import proposal
 
-        return proposal(self)
+        return proposal(self, self.floor_known)
 
     @property
     def excess(self) -> str:
         """What the last step leaves, against the noise beneath it."""
         joints = "" if self.floor.source == REPEATS else ", with what sound joints add"
-        return (
-            f"{self.ladder[-1].trusted.rms_mm:.3f} mm against at most {self.floor.high:.3f} mm "
-            f"({self.floor.source}{joints})"
-        )
+        low, high = self.tested
+        return f"at least {low:.3f} mm against at most {high:.3f} mm ({self.floor.source}{joints})"
 
     @property
     def by_rung(self) -> list[Finding]:
@@ -636,6 +641,7 @@ class Diagnosis(Explained, Result):
             "held": held,
             "cells": tuple(cells),
             "possible_cell": more,
+            "floor_known": content.get("floor_known", told.get("meets_floor") is not None),
             "nominal": nominal,
             "stated_errors": errors,
             "stated_curves": {

@@ -16,13 +16,13 @@ from minimax_cal.diagnosing.result import (
 )
 from minimax_cal.evidence.limits import HALF, STRUCTURE
 from minimax_cal.measuring.floor import REPEATS
-from minimax_cal.modelling.effects.words import name_chance, name_structure
+from minimax_cal.modelling.effects.words import name_chance, name_step, name_structure
 from minimax_cal.solvers.status import Status
 
 Named = Finding | Alternative
 NOTHING_MM = 5e-4  # of a length that is reported to three digits
 MAX_NAMED_MINOR = 2  # more minor effects than this are counted, not listed
-NOT_VISITED = "it is not known whether the remaining error is the arm's repeatability"
+NOT_VISITED = "it is not known whether the rest is the arm's repeatability"
 SCATTERS = "Visits to one pose scatter more than the instrument and sound joints do."
 CONTRADICTED = (
     "Unexplained: the best fit contradicts the measurements. It is no calibration of this arm, and "
@@ -61,7 +61,9 @@ def reasons(found: Diagnosis) -> tuple[str, ...]:
         )
         if sentence
     )
-    known = "." if found.floor_known else f"; {NOT_VISITED}."
+    left = found.remaining
+    is_open = not found.floor_known and (left is None or left.unexplained_mm >= NOTHING_MM)
+    known = f"; {NOT_VISITED}." if is_open else "."
     return (f"{first.removesuffix('.')}{known}", *others)
 
 
@@ -113,7 +115,7 @@ def unexplained(found: Explained) -> str:
     left = name_structure(found.structure_in)
     if left in (ABOVE_NOISE, ONLY_MINOR):
         return f"{left}, {found.excess}."
-    sure = any(f.established for f in found.effects)
+    sure = any(f.established and not f.rows for f in found.effects)
     if not found.structure < STRUCTURE:  # it is the causes that are not certain
         return f"{left}: {'these causes are uncertain' if sure else 'the cause is unknown'}."
     after = "after all effects" if sure else "after geometry"
@@ -225,7 +227,9 @@ def shrunk(found: Diagnosis) -> str:
     if len(found.ladder) < 3:
         return f"{text}."
     far = f"largest {last.max_mm:.3f} mm{without_far(found)}"
-    text += f", all confirmed effects {last.rms_mm:.3f} mm ({far})"
+    name = found.ladder[-1].name
+    what = "all confirmed effects" if name.startswith("+ ") else name_step(name)
+    text += f", {what} {last.rms_mm:.3f} mm ({far})"
     return f"{text}; {closed_words(found)}." if math.isfinite(found.closed) else f"{text}."
 
 

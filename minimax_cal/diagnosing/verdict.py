@@ -10,7 +10,7 @@ import numpy as np
 from minimax_cal.diagnosing.causes import Causes
 from minimax_cal.diagnosing.established import asked, loose_among, mostly_loose
 from minimax_cal.diagnosing.last_question import Known, answered
-from minimax_cal.diagnosing.result import Finding, Untestable
+from minimax_cal.diagnosing.result import WORSE_OUTSIDE, Finding, Untestable
 from minimax_cal.diagnosing.what_remains import loudest
 from minimax_cal.evidence.limits import HALF
 from minimax_cal.solvers.status import Status
@@ -67,5 +67,7 @@ def why_loose(effects: Sequence[Finding], loose: Sequence[Finding]) -> str:
     """What is wrong with the names that do not hold."""
     if not asked(effects):
         return UNASKED
+    if any(not found.extends for found in loose):
+        return WORSE_OUTSIDE
     refused = sum(found.size for found in loose if found.established)
     return UNHELPFUL if refused > HALF * sum(found.size for found in loose) else UNSURE

@@ -71,8 +71,9 @@ def motions(choice: Choice) -> list[tuple[str, Array]]:
 
 
 def certain(left: Sequence[Remains]) -> list[Remains]:
-    """What certainly remains and matters."""
-    return [one for one in left if one.p < STRUCTURE and one.share > WORTH]
+    """What certainly remains and matters, what tells most of it first."""
+    sure = [one for one in left if one.p < STRUCTURE and one.share > WORTH]
+    return sorted(sure, key=lambda one: one.telling)
 
 
 def loudest(left: Sequence[Remains]) -> Remains | None:

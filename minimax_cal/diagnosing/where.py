@@ -134,7 +134,8 @@ def where(study: Study) -> Where:
         every = replace(every, components=())  # rounding follows nothing
 
     def at(place: str) -> Follows:
-        return loudest(every, lambda one: one.place.partition(" ")[0] == place) or Follows(place)
+        own = (place, f"{place} tilting", f"{place} along the line of sight")
+        return loudest(every, lambda one: one.place in own) or Follows(place)
 
     return Where(
         by_target=tuple(
@@ -166,11 +167,9 @@ def loudest(every: Asked, chosen: Callable[[Component], bool]) -> Follows | None
     the least by chance.
     """
     numbers = [i for i, one in enumerate(every.components) if chosen(one)]
-    sure = [i for i in numbers if every.p[i] < STRUCTURE]
-    told = [every.told(i) for i in sure] or list(every.loudest(numbers, 1))
-    counts = [every.components[i].functions for i in sure] or [0]
-    both = zip(told, counts, strict=False)
-    most = max(both, key=lambda one: (min(one[0].share, 1.0), -one[1]), default=(None, 0))[0]
+    sure = [i for i in numbers if i in every.loud and every.p[i] < STRUCTURE]
+    told = sorted(map(every.told, sure), key=lambda one: one.telling)
+    most = next(iter(told or every.loudest(numbers, 1)), None)
     return Follows(most.place, most.driver, min(most.share, 1.0), most.p) if most else None
 
 

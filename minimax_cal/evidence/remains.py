@@ -70,7 +70,7 @@ class Remains:
 
     score: as that of a standard normal variable.  p: chance that any of all components scores so
     much on white rows; 1 where any that is loud does by flipped signs.  share: of the square of
-    what is left, as far as this component tells it.
+    what is left, as far as this component tells it.  functions: how many it may follow.
     """
 
     place: str
@@ -78,6 +78,12 @@ class Remains:
     score: float
     p: float
     share: float
+    functions: int = 0
+
+    @property
+    def telling(self) -> tuple[float, int]:
+        """What tells more of the error comes first, of equal ones that of fewer functions."""
+        return -min(self.share, 1.0), self.functions
 
     @property
     def name(self) -> str:
@@ -173,7 +179,7 @@ class Asked:
         one = self.components[number]
         share = share_of(self.rest, one, self.drawn)
         score, p = float(self.score[number]), float(self.p[number])
-        return Remains(one.place, one.driver, score, p, share)
+        return Remains(one.place, one.driver, score, p, share, one.functions)
 
 
 def asked(rest: Rest, components: Sequence[Component]) -> Asked:

@@ -160,7 +160,8 @@ def instrument_alone(data: Measurements) -> tuple[float, str]:
     between = of_coordinate(seen[0]) if seen else math.nan
     if math.isnan(told) and math.isnan(between):
         return math.nan, NOTHING_TELLS
-    return (between, DISTANCES) if not between <= told else (told, DECLARED)
+    largest = float(np.fmax(between, told))
+    return largest, DECLARED if largest == told else DISTANCES
 
 
 def known_floor(data: Measurements, error: Array, repeatability: float) -> tuple[float, str] | None:

@@ -11,9 +11,12 @@ import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.established import is_named
 from minimax_cal.diagnosing.proposals import REVISIT
+from minimax_cal.diagnosing.remaining import remaining_of
 from minimax_cal.diagnosing.sentences import SCATTERS
+from minimax_cal.evidence.remains import Remains
 from minimax_cal.measuring.floor import instrument_alone
 from minimax_cal.modelling.simulate import Truth, gravity, simulate
+from minimax_cal.solvers.status import Status
 
 
 @cache
@@ -137,3 +140,40 @@ def test_what_visits_scatter_is_not_unexplained(cyclic):
     alone = visited(40, 5, 80e-6, cyclic=cyclic)
     assert alone.verdict == "not_repeatable"
     assert alone.next.kind == "repeat"
+
+
+@pytest.mark.parametrize("u95", [1e-3, 30e-6, 1e-9])
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.4])
+def test_the_squares_of_the_parts_are_those_of_the_whole(u95, share):
+    """However large the declared noise, and however much a score says that something tells."""
+    q = np.random.default_rng(0).normal(size=(30, 6))
+    data = mc.measurements(q, np.random.default_rng(1).normal(size=(30, 1, 3)))
+    data = replace(data, columns={"u95": np.full(30, u95)})
+    left = [
+        Remains("J1", "its load", 9.0, 0.002, share, 3),
+        Remains("J2", "time", 9.0, 0.002, 0.1, 4),
+    ]
+    told, known = remaining_of(left, 0.1, data, np.zeros((1, 30, 3)))
+    parts = [told.noise_mm, told.dependent_mm, told.unexplained_mm]
+    assert np.hypot.reduce(parts) == pytest.approx(0.1)
+    assert known == (u95 == 1e-3)
+    assert told.depends[0].place == ("J1" if share > 0.1 else "J2")
+
+
+def test_what_failed_asks_whether_it_is_this_arm():
+    _, found = loose()
+    failed = replace(found, status=Status.FAILED, verdict="unknown", remaining=None)
+    assert failed.next.kind == "check"
+    assert len(failed.reasons) == 1
+    again = mc.Diagnosis.from_dict(json.loads(failed.json()))
+    assert again.next == failed.next
+
+
+def test_an_old_file_knows_its_floor_where_it_met_it():
+    _, found = loose()
+    said = json.loads(found.json())
+    for key in ("floor_known", "remaining", "repeatable", "budget", "next"):
+        del said[key]
+    said["meets_floor"] = None
+    old = mc.Diagnosis.from_dict(said)
+    assert (old.floor_known, old.remaining, old.next) == (False, None, REVISIT)

@@ -113,8 +113,8 @@ def jumps(data: Measurements, error: Array) -> tuple[Array, Array]:
 
 def new_poses(data: Measurements, order: Array) -> Array:
     """(p,) at which visits another pose begins.  order: (v,) rows as visited."""
-    pose = groups(data)[order]
-    return np.flatnonzero(np.concatenate([[True], pose[1:] != pose[:-1]]))
+    both = np.stack([groups(data), sessions(data)])[:, order]
+    return np.flatnonzero(np.append(True, (both[:, 1:] != both[:, :-1]).any(axis=0)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -135,7 +135,7 @@ def waterfall(gap: Diagnosis) -> Figure:
         yaxis=axis("", tickvals=at.tolist(), ticktext=names, range=[len(steps) - 0.5, -0.5],
                    automargin=True, zeroline=False),
     )  # fmt: skip
-    last = f", {steps[-1].holdout.rms_mm:.3f} mm with all effects" if len(steps) > 2 else ""
+    last = f", {steps[-1].holdout.rms_mm:.3f} mm with the effects" if len(steps) > 2 else ""
     says = (
         f"Held-out RMS: {names[0]} {steps[0].holdout.rms_mm:.3f} mm, {names[1]} "
         f"{steps[1].holdout.rms_mm:.3f} mm{last}"
