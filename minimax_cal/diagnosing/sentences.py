@@ -279,11 +279,10 @@ def dependence(one: Dependence) -> str:
 
 def away(found: Diagnosis) -> str:
     """How the model does on whole parts that were held out."""
-    beyond = found.beyond
-    text = beyond.sentence()
-    if beyond.worst and beyond.typical_mm > beyond.geometric_typical_mm:
-        text = text.removesuffix(".") + (
-            f"; geometry alone is better there ({beyond.geometric_typical_mm:.3f} mm): the effects "
-            "do not extrapolate, and none is recommended."
-        )
-    return text
+    text = found.beyond.sentence()
+    if not math.isfinite(found.refused):
+        return text
+    return text.removesuffix(".") + (
+        f"; with the effects {found.refused:.3f} mm: they do not extrapolate, and none is "
+        "recommended."
+    )

@@ -10,6 +10,7 @@ import pytest
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.established import is_named
+from minimax_cal.diagnosing.folds import beyond_of
 from minimax_cal.diagnosing.proposals import REVISIT
 from minimax_cal.diagnosing.remaining import remaining_of
 from minimax_cal.diagnosing.sentences import SCATTERS
@@ -177,3 +178,26 @@ def test_an_old_file_knows_its_floor_where_it_met_it():
     said["meets_floor"] = None
     old = mc.Diagnosis.from_dict(said)
     assert (old.floor_known, old.remaining, old.next) == (False, None, REVISIT)
+
+
+def test_geometry_is_recommended_where_effects_make_regions_left_out_worse(monkeypatch):
+    made, plain = loose()
+    asked = []
+
+    def worse(study, causes, judges, progress):
+        out = beyond_of(study, causes, judges, progress)
+        asked.append(len(causes.confirmed))
+        far = 2.0 * out.geometric_typical_mm
+        return replace(out, typical_mm=far) if len(asked) == 1 else out
+
+    monkeypatch.setattr("minimax_cal.diagnosing.diagnose.beyond_of", worse)
+    found = mc.diagnose(made.robot, made.data)
+    assert asked == [2, 0]
+    assert [step.name for step in found.ladder] == ["nominal", "geometric"]
+    assert not any(one.established for one in found.effects)
+    assert found.verdict == "unknown"
+    outside = plain.beyond.geometric_typical_mm
+    assert found.beyond.typical_mm == pytest.approx(outside)
+    assert found.budget[-1]["outside_rms_mm"] == pytest.approx(outside)
+    assert found.budget_possible["outside_rms_mm"] == pytest.approx(2.0 * outside)
+    assert any("do not extrapolate, and none is recommended" in text for text in found.reasons)
