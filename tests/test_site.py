@@ -210,6 +210,6 @@ def test_what_the_second_example_says_is_what_it_prints(site):
     assert (named, which.strip()) == ("named", "joint_compliance:all")
     assert without != "named"
     assert float(more) > 1.5 * float(left)
-    follows = [float(one) for one in re.findall(r"still following the pose: ([\d.]+) mm", page)]
+    follows = [float(one) for one in re.findall(r"still following something: ([\d.]+) mm", page)]
     assert follows[0] < 0.2 * follows[1]
     assert list((site / "_images").glob("sphx_glr_diagnose_a_gap_*.png"))

@@ -10,7 +10,7 @@ from conftest import run
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.measuring.importers import Imported, import_files
+from minimax_cal.measuring.importers import Imported, import_files, save
 from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.solvers.status import Status
 
@@ -31,7 +31,7 @@ def same(found: Imported, truth: mc.Measurements, targets: int = 3) -> None:
 
 def calibrates(found: Imported, folder: Path) -> mc.Measurements:
     out = folder / "out.csv"
-    out.write_text(found.csv())
+    save(out, found)
     data = mc.read_measurements(out)
     assert_allclose(data.q, found.data.q, rtol=0, atol=1e-8)
     fit = mc.calibrate("irb2600", data, objective="sum")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.importers import cmm, programs, tables
@@ -28,7 +29,7 @@ from minimax_cal.measuring.slips import mended
 from minimax_cal.reading.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
 from minimax_cal.reading.words import ANGLES, LENGTHS, TEMPERATURES, TIMES
 
-__all__ = ["Given", "Imported", "import_files", "read_any", "units_of"]
+__all__ = ["Given", "Imported", "import_files", "read_any", "save", "units_of"]
 
 # The first that fits a file is taken: of the text alone, then of its rows and columns.
 Read = Callable[[Sheet, Given, bool], Reading | None]  # None where a file is of another format
@@ -318,3 +319,8 @@ def file_of_joints(path: Path | str | None, readings: Sequence[Reading], given: 
         of = (points or readings)[0].sheet.path
         raise DataError(f"{of}: holds {lacks if points else neither}")
     return turns[0]
+
+
+def save(path: Path | str, imported: Imported) -> None:
+    """Write the contract's CSV."""
+    write_whole(path, imported.csv())
