@@ -108,9 +108,10 @@ def by_distances(
     known = float(np.nan_to_num(instrument))
     if seen:
         value = math.hypot(max(of_coordinate(seen[0]), known), float(np.nan_to_num(arm)))
-        if value < most:
-            grown = wider(seen[1])
-            return Floor(value, max(value / grown, known), min(value * grown, most), DISTANCES)
+        grown = wider(seen[1])
+        if value / grown < most:  # a fit that leaves less than their middle contradicts no distance
+            ends = max(value / grown, min(known, most)), min(value * grown, most)
+            return Floor(min(value, most), *ends, DISTANCES)
     return Floor(most, min(known, most), most, AT_MOST)
 
 

@@ -6,12 +6,15 @@ import minimax_cal as mc
 from minimax_cal.measuring.floor import (
     AT_MOST,
     DECLARED,
+    DISTANCES,
     REPEATS,
     RMS_OF_REPEATABILITY,
     Floor,
+    by_distances,
     declared,
     floor_of,
     instrument_noise,
+    of_coordinate,
 )
 from minimax_cal.measuring.instrument import instrument_of, with_instrument
 from minimax_cal.measuring.measurements import Measurements
@@ -108,3 +111,14 @@ def test_a_column_counts_more_than_the_option(rng):
     assert declared(bare, np.nan) is None
     assert np.isnan(instrument_noise(bare))
     assert_allclose(instrument_noise(kept), 3e-5 / 1.959964, rtol=1e-6)  # of a coordinate
+
+
+def test_a_fit_that_leaves_a_little_less_contradicts_no_distance():
+    """What distances tell has an interval; what a fit leaves at most may be inside of it."""
+    sigma, sure = 17e-6, 0.05
+    told = of_coordinate(sigma)
+    for most, source in ((1.2 * told, DISTANCES), (0.97 * told, DISTANCES), (0.8 * told, AT_MOST)):
+        floor = by_distances((sigma, sure), np.nan, np.nan, most)
+        assert floor.source == source
+        assert floor.low <= floor.value <= floor.high <= most
+        assert floor.value == min(told, most)
