@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import scipy
@@ -22,10 +22,10 @@ from minimax_cal.dynamics.rows import SLOWEST, UNFITTED_S, Logs, prepare
 from minimax_cal.dynamics.run import NOTHING, Run
 from minimax_cal.dynamics.scene import Arm, sense_of
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError
 
 LATEST, LOOK = 0.1, 0.004  # the latest command that is looked for, and how closely [s]
 BLOCK_S = 1.0  # rows that err together
+IN_A_RUN = 10**6  # stretches, by which they are numbered
 LIMIT = 0.9  # of the largest torque and speed: rows beyond may be at a limit
 BEYOND, CLEAR = 1.05, 0.95  # of a limit: where it acts for sure, and where it does not
 LEAST_ROWS, LEAST_BLOCKS = 10, 3  # of a log, at a limit; and stretches of time
@@ -33,12 +33,8 @@ STANDS = 3.5  # standard deviations by which a number is another
 PREDICTS = 2.5  # the same, by which stretches of a run left out are predicted better
 STEPS, CLOSE_S = 20, 1e-9  # of a fit, and the step that ends it [s]
 AHEAD, INERTIA, FRICTION = "ahead", "inertia", "friction"  # what is fitted beside if it is there
-GAINS, DELAY, TORQUE_LIMIT, SPEED_LIMIT = KINDS = (
-    "servo_gain",
-    "command_delay",
-    "torque_limit",
-    "speed_limit",
-)
+KINDS = ("servo_gain", "command_delay", "torque_limit", "speed_limit")
+GAINS, DELAY, TORQUE_LIMIT, SPEED_LIMIT = KINDS
 FIELDS = {  # of a drive, that belong to an effect, and their units
     GAINS: {"stiffness": "N m/rad", "damper": "N m s/rad", "ahead": "1"},
     DELAY: {"delay": "s"},
@@ -89,11 +85,14 @@ class DriveFit:
         return dict(zip((*FITTED, "torque", "speed"), (*own, *self.limits), strict=True))
 
 
+def stretch_of(run: Array | int, since: Array) -> Array:
+    """(R,) numbers of the stretches of rows: of which run, and when in it [s]."""
+    return np.asarray(run * IN_A_RUN + (since / BLOCK_S).astype(int))
+
+
 def command_of(run: Run) -> Array:
-    """(m, n) commands of a run.  Raises DataError where it has none."""
-    if run.command is None:
-        raise DataError(f"{run.source}: holds no commands (q1_cmd_rad ...)")
-    return run.command
+    """(m, n) commands of a run that has some."""
+    return cast(Array, run.command)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,16 +132,20 @@ class Followed:
         return self.logs.away(UNFITTED_S)
 
     @staticmethod
-    def of(runs: Sequence[Run], arm: Arm, share: float, body: Body) -> Followed:
-        """share: of gravity that drives carry besides.  body: torque of the masses of a motion."""
+    def of(runs: Sequence[Run], arm: Arm, body: Body) -> Followed:
+        """Without gravity that drives carry.  body: torque of the masses of a motion."""
         logs = prepare(runs)
         if logs.unit == NOTHING:
             logs = replace(logs, torque=body(logs.motion))
         told = prepare([replace(run, torque=command_of(run)) for run in runs])
-        still = np.zeros((2, *logs.torque.shape))
-        carried = share * body(Motion(logs.motion.q, *still)) if share else still[0]
         sense = sense_of(logs.motion.qd, arm.soft)
-        return Followed(tuple(runs), logs, told, carried, sense, arm.gain)
+        return Followed(tuple(runs), logs, told, 0.0 * sense, sense, arm.gain)
+
+    def carrying(self, share: float, body: Body) -> Followed:
+        """Where drives carry a share of gravity besides.  body: as `of`."""
+        still = np.zeros((2, *self.logs.torque.shape))
+        weight = body(Motion(self.logs.motion.q, *still)) if share else still[0]
+        return replace(self, carried=share * weight)
 
     def joint(self, j: int) -> Rows:
         """The rows of a joint."""
@@ -150,7 +153,7 @@ class Followed:
         used = ~logs.gap & (self.measured | self.slides[:, j])
         at = logs.picked[used[logs.picked]]
         run = np.searchsorted(logs.start, at, side="right") - 1
-        stretch = run * 10**6 + (logs.since[at] / BLOCK_S).astype(int)
+        stretch = stretch_of(run, logs.since[at])
         curves = [
             scipy.interpolate.CubicSpline(logs.since[a:b], self.told.torque[a:b, j])
             for a, b in zip(logs.start[:-1], logs.start[1:], strict=True)
@@ -180,7 +183,7 @@ class Followed:
             asked = drive.stiffness * (late - run.q[:, j])
             asked -= drive.damper * (qd - drive.ahead * rate)
             torque = run.torque[:, j] * self.gain[j] if self.measured else torque
-            stretch = number * 10**6 + (time / BLOCK_S).astype(int)
+            stretch = stretch_of(number, time)
             out.append(np.array([torque, asked + carried, qd, time, 0 * time + number, stretch]))
         torque, asked, qd, since, of, stretch = np.concatenate(out, axis=1)
         return Samples(torque, asked, qd, since, of, stretch)

@@ -82,6 +82,11 @@ def known(parent: ET.Element, tag: str, name: str = "", **attributes: object) ->
     return part(parent, tag, **({"name": name} if name else {}), **attributes)
 
 
+def parents_of(root: ET.Element) -> dict[ET.Element, ET.Element]:
+    """Of every element below a root what it stands in."""
+    return {child: parent for parent in root.iter() for child in parent}
+
+
 def section(root: ET.Element, tag: str) -> ET.Element:
     """A section of the file, made where it is missing."""
     found = root.find(tag)

@@ -28,7 +28,7 @@ from minimax_cal.robots.sampling import random_joints
 from minimax_cal.robots.transforms import SAME, difference, head, inverse
 from minimax_cal.simulators.arm import Arm, assumed, stiff
 from minimax_cal.simulators.chain import ROBOT, Chain, at_zero, braked, own_pose
-from minimax_cal.simulators.elements import Layout, equip, quaternion, targets
+from minimax_cal.simulators.elements import Layout, equip, parents_of, quaternion, targets
 from minimax_cal.simulators.mjcf import text_of, weigh
 from minimax_cal.simulators.servos import SAMPLES, Drives
 
@@ -157,7 +157,7 @@ def seats(
 
     nominal, robot: each with its frame 0 in the world (4, 4) [m].
     """
-    model, parents = chain.model, {c: p for p in tree.iter() for c in p}
+    model, parents = chain.model, parents_of(tree)
     joints = elements_of(tree, chain)
     bodies = [parents[joint] for joint in joints]
     for number, element in zip(chain.joints, joints, strict=True):

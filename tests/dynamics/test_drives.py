@@ -52,7 +52,7 @@ def logged(seed: int, drive: Drive, lag: float = 0.03, speed: float = 1.0) -> Ru
 def followed(*runs: Run) -> Followed:
     robot = three_joints()
     arm = Arm.of(robot, np.ones(3), robot.ratio, np.zeros(10), prepare(runs))
-    return Followed.of(runs, arm, 0.0, lambda motion: 0.0 * motion.q)
+    return Followed.of(runs, arm, lambda motion: 0.0 * motion.q)
 
 
 def fit(drive: Drive, given: Drive = GIVEN, seed: int = 0, **more: float) -> DriveFit:

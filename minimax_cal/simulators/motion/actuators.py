@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from minimax_cal.dynamics.drives import FIELDS, FITTED, covariance_of
+from minimax_cal.dynamics.drives import FIELDS, FITTED, IN_A_RUN, covariance_of
 from minimax_cal.dynamics.laws import ARMATURE, FRICTION
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
@@ -118,7 +118,7 @@ def of_drives(served: Served, joints: tuple[str, ...], count: int) -> Ranged:
     every = sorted({stretch for change in changes for stretch in change})
     change = np.array([[one.get(stretch, 0.0) for one in changes] for stretch in every])
     change = change.reshape(len(every), len(changes))
-    run = np.array(every, dtype=int) // 10**6
+    run = np.array(every, dtype=int) // IN_A_RUN
     by_run = np.array([change[run == number].sum(axis=0) for number in range(count)])
     covariance = covariance_of(change) if every else np.zeros((0, 0))
     return Ranged(tuple(names), np.array(mean), covariance, spread(by_run))

@@ -34,18 +34,19 @@ from minimax_cal.measuring.faults.fault import Amount
 from minimax_cal.robots.document import Document
 from minimax_cal.robots.mjcf import mujoco, numbers
 from minimax_cal.simulators.chain import Chain, braked
-from minimax_cal.simulators.elements import known, section, tune
+from minimax_cal.simulators.elements import known, parents_of, section, tune
 from minimax_cal.simulators.given import IMPLICIT, elements_of
 from minimax_cal.simulators.motion.correct import HISTORY_FIRST, left_out_by, mean_log
 from minimax_cal.simulators.motion.driven import ahead_of
 from minimax_cal.simulators.motion.judge import Judge
 from minimax_cal.simulators.motion.opened import Opened
-from minimax_cal.simulators.motion.written import HISTORY, SHORTEST, actuators_of
+from minimax_cal.simulators.motion.written import SHORTEST, actuators_of, delayed
 
 WORTH = 0.01  # fall of the mean log joint error by which an effect of a drive is kept
 OTHER_SHARE = 0.4  # fall of what is left, as a mean log, by which drives carry gravity otherwise
 NO_DAMPER = 0.25  # of a joint's damping: a drive with less has none
 SHAKES = 0.5  # of the inertia, damper times timestep: more is too much for an explicit step
+Pair = tuple[Followed, Followed]
 Told = tuple[str, int]  # an effect, and at which joint
 ALL: Told = (GAINS, -1)  # the share of gravity that all drives carry
 
@@ -124,11 +125,10 @@ class Fits:
     left: float
 
     @staticmethod
-    def of(judge: Judge, chain: Chain, given: Sequence[Drive], share: float) -> Fits:
-        """By the runs to learn from."""
-        body, left = body_of(chain), list[float]()
-        learnt, held = (Followed.of(runs, judge.arm, share, body)
-                        for runs in (judge.learning_runs, judge.runs))  # fmt: skip
+    def of(seen: Pair, given: Sequence[Drive], share: float, body: Body) -> Fits:
+        """By the runs to learn from.  seen: these, and those held out."""
+        learnt, held = (one.carrying(share, body) for one in seen)
+        left = list[float]()
         each = tuple(fit_drive(learnt, held, j, drive) for j, drive in enumerate(given))
         for j, fit in enumerate(each):
             rows = held.joint(j)
@@ -152,15 +152,23 @@ def serve(judge: Judge, opened: Opened, *, plain: bool = False) -> Served:
     if judge.held.unit == NOTHING:
         damping = np.array(chain.model.dof_damping[chain.dofs])
     given = [replace(one, damper=one.damper + by) for one, by in zip(own, damping, strict=True)]
-    best = Fits.of(judge, chain, given, first)
+    body = body_of(chain)
+    seen = followed(judge, body)
+    best = Fits.of(seen, given, first, body)
     for other in {0.0, 1.0} - {first}:
-        tried = Fits.of(judge, chain, given, other)
+        tried = Fits.of(seen, given, other, body)
         best = tried if best.beaten_by(tried) else best
     late = hasattr(chain.model, "actuator_delay") and not plain
     kinds = [one for one in KINDS if one != DELAY or late]
     told = tuple((kind, j) for kind in kinds for j, fit in enumerate(best.each)
                  if fit and is_another(kind, fit, given[j], best.held, j, least))  # fmt: skip
     return Served(own, best.each, told, (first, best.share), damping)
+
+
+def followed(judge: Judge, body: Body) -> Pair:
+    """The runs to learn from, and those held out, with their commands."""
+    arm = judge.arm
+    return Followed.of(judge.learning_runs, arm, body), Followed.of(judge.runs, arm, body)
 
 
 def damped_by_joints(judge: Judge, opened: Opened) -> bool:
@@ -172,7 +180,8 @@ def damped_by_joints(judge: Judge, opened: Opened) -> bool:
     damping, held = chain.model.dof_damping[chain.dofs], braked(chain.model)[list(chain.joints)]
     if not held.all():
         return False
-    fits = Fits.of(judge, chain, own_drives(chain), share_of(chain)).each
+    body = body_of(chain)
+    fits = Fits.of(followed(judge, body), own_drives(chain), share_of(chain), body).each
     parts = [fit.drive.damper / damping[j] for j, fit in enumerate(fits) if fit]
     return bool(parts) and float(np.median(parts)) < NO_DAMPER
 
@@ -308,15 +317,12 @@ def write_late(actuator: ET.Element, late: float, step: float) -> None:
     """Let an actuator take its command late."""
     for name in ("delay", "nsample", "interp"):
         actuator.attrib.pop(name, None)
-    if late >= SHORTEST * step:
-        actuator.set("delay", numbers([late]))
-        actuator.set("nsample", str(math.ceil(late / step) + HISTORY))
-        actuator.set("interp", "linear")
+    actuator.attrib |= delayed(late, step)
 
 
 def write_share(root: ET.Element, chain: Chain, share: float) -> None:
     """Let the actuators of an arm carry a share of gravity."""
-    joints, parents = elements_of(root, chain), {c: p for p in root.iter() for c in p}
+    joints, parents = elements_of(root, chain), parents_of(root)
     for body in parents[joints[0]].iter("body"):
         body.set("gravcomp", numbers([share]))
     for joint in joints:

@@ -129,11 +129,11 @@ def motion_gap(
     runs = runs_of(model, opened.chain.robot, runs, commands=driven)
     with one_thread():
         commanded = driven and all(run.command is not None for run in runs)
+        judge = Judge.of(opened, runs, known, fast=commanded)
         if commanded:
             whole = open_model(model, runs[0].joints, tip, freed=False)
-            if damped_by_joints(Judge.of(whole, runs, known, fast=True), whole):
-                opened = whole
-        judge = Judge.of(opened, runs, known, fast=commanded)
+            if damped_by_joints(judge, whole):
+                opened, judge = whole, judge.of_model(whole)
         judge = judge.driving(opened, gains) if driven else judge
         first, notices = [judge.rung("as given", opened.chain)], tuple[str, ...]()
         if fit is not None:

@@ -92,11 +92,8 @@ def by_positions(judge: Judge, opened: Opened, *, plain: bool) -> Answer:
 
 def with_body(opened: Opened, served: Served, names: Sequence[str]) -> Opened:
     """The model with friction and rotors that were fitted beside the drives."""
-    document, given = (
-        opened.given.document.copy(),
-        given_numbers(opened.chain, Bodies.of(opened.chain)),
-    )
-    new = given
+    document = opened.given.document.copy()
+    new = given = given_numbers(opened.chain, Bodies.of(opened.chain))
     for name in names:
         field, beside, _ = HELD[name]
         values = [old if fit is None else max(fit.beside[beside], 0.0)

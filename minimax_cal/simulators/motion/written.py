@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from xml.etree import ElementTree as ET
 
@@ -16,7 +17,7 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import tail
 from minimax_cal.simulators.arm import stiff
 from minimax_cal.simulators.chain import Chain, braked
-from minimax_cal.simulators.elements import known, section, tune
+from minimax_cal.simulators.elements import known, parents_of, section, tune
 from minimax_cal.simulators.given import counts_degrees, elements_of
 from minimax_cal.simulators.mjcf import new_tree
 from minimax_cal.simulators.motion.bodies import Bodies, inertial, parameters_of, pseudo_inertia
@@ -36,7 +37,7 @@ def write_numbers(document: Document, chain: Chain, given: Numbers, found: Numbe
 
     Raises RobotError.
     """
-    parents = {child: parent for parent in document.root.iter() for child in parent}
+    parents = parents_of(document.root)
     for i, joint in enumerate(elements_of(document.root, chain)):
         if differs(found.bodies[i], given.bodies[i]):
             weigh(parents[joint], found.bodies[i])
@@ -118,22 +119,22 @@ def write_bristles(root: ET.Element, chain: Chain, found: Numbers) -> None:
 
 def write_delay(root: ET.Element, chain: Chain, found: Numbers) -> None:
     """A command that acts late, or a torque that is read late."""
-    step = float(chain.model.opt.timestep)
-    if abs(found.late) < SHORTEST * step:
-        return
-    late = abs(found.late)
-    history = str(int(np.ceil(late / step)) + HISTORY)
-    if found.late < 0.0:
-        for name in chain.names:
-            for actuator in actuators_of(root, name):
-                actuator.set("delay", numbers([late]))
-                actuator.set("nsample", history)
-                actuator.set("interp", "linear")
-        return
-    sensors = section(root, "sensor")
-    for name in chain.names:
-        known(sensors, "jointactuatorfrc", f"{name}_torque", joint=name, delay=[late],
-              nsample=history, interp="linear")  # fmt: skip
+    late = delayed(abs(found.late), float(chain.model.opt.timestep))
+    for name in chain.names if late else ():
+        if found.late > 0.0:
+            sensors = section(root, "sensor")
+            known(sensors, "jointactuatorfrc", f"{name}_torque", joint=name, **late)
+            continue
+        for actuator in actuators_of(root, name):
+            actuator.attrib |= late
+
+
+def delayed(late: float, step: float) -> dict[str, str]:
+    """Attributes of what is so late [s]; none where that is no delay.  step: of time [s]."""
+    if late < SHORTEST * step:
+        return {}
+    count = math.ceil(late / step) + HISTORY
+    return {"delay": numbers([late]), "nsample": str(count), "interp": "linear"}
 
 
 def stiffen(root: ET.Element, chain: Chain, found: Numbers) -> None:
