@@ -244,7 +244,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     beyond = NOT_ASKED if options.quick else beyond_of(study, causes, judges, step_of(PARTS))
     refused = math.nan
     if beyond.typical_mm > beyond.geometric_typical_mm:  # what does not extrapolate
-        causes, spoken = (beside_them(one) for one in (causes, spoken))
+        causes, spoken = (not_extending(one) for one in (causes, spoken))
         ladder, refused = replace(ladder, sure=0), beyond.typical_mm
         beyond = beyond_of(study, causes, judges, silent)
     kept = ladder.confirmed
@@ -366,7 +366,7 @@ def laddered(study: Study, causes: Causes) -> Ladder:
     return climbed(study, [found.terms for found in effects], sure, guessed=causes.guessed)
 
 
-def beside_them(causes: Causes) -> Causes:
+def not_extending(causes: Causes) -> Causes:
     """The causes, none of them recommended: poses beyond those measured are met worse by them."""
     effects = (replace(f, extends=not f.established) for f in causes.effects)
     return replace(causes, effects=tuple(effects))

@@ -11,7 +11,7 @@ import numpy as np
 from minimax_cal.diagnosing.joint import Joint, joint
 from minimax_cal.diagnosing.result import TOLD_AS, Finding, Step, as_motion
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.diagnosing.trial import Predicting, Trials
+from minimax_cal.diagnosing.trial import Predicting, Trial, Trials
 from minimax_cal.evidence.limits import END, FOLDS, HELPS, MINOR, SAYS_NOTHING, SEEN_BEFORE
 from minimax_cal.fitting.beyond import without
 from minimax_cal.fitting.stations import steps_of
@@ -39,12 +39,14 @@ Ends = tuple[float, float]
 class Fits(Sequence[Joint]):
     """Geometry, then with each of some effects more; each fit is made when it is first asked for.
 
-    steps: the terms of each effect.
+    steps: the terms of each effect.  made: fits by their number.  The first of them make none.
     """
 
-    def __init__(self, study: Study, steps: Sequence[Sequence[Term]]) -> None:
+    def __init__(
+        self, study: Study, steps: Sequence[Sequence[Term]], made: dict[int, Joint] | None = None
+    ) -> None:
         self.study, self.steps = study, steps
-        self.made: dict[int, Joint] = {}
+        self.made = {} if made is None else made
 
     def __len__(self) -> int:
         return 1 + len(self.steps)
@@ -52,10 +54,13 @@ class Fits(Sequence[Joint]):
     @overload
     def __getitem__(self, at: int) -> Joint: ...
     @overload
-    def __getitem__(self, at: slice) -> list[Joint]: ...
-    def __getitem__(self, at: int | slice) -> Joint | list[Joint]:
+    def __getitem__(self, at: slice) -> Sequence[Joint]: ...
+    def __getitem__(self, at: int | slice) -> Joint | Sequence[Joint]:
         if isinstance(at, slice):
-            return [self[i] for i in range(*at.indices(len(self)))]
+            start, stop, step = at.indices(len(self))
+            if (start, step) == (0, 1) and stop:
+                return Fits(self.study, self.steps[: stop - 1], self.made)
+            return [self[i] for i in range(start, stop, step)]
         number = range(len(self))[at]
         if number not in self.made:
             terms = [term for some in self.steps[:number] for term in some]
@@ -77,15 +82,10 @@ class Ladder:
     parts: tuple[Array, ...]
     sure: int
 
-    def upto(self, count: int) -> Ladder:
-        """With its first effects only."""
-        sure = min(self.sure, count)
-        return Ladder(self.fits[: 1 + count], self.taken[:count], self.parts, sure)
-
     @property
     def confirmed(self) -> Ladder:
         """As far as it is recommended."""
-        return self.upto(self.sure)
+        return replace(self, fits=self.fits[: 1 + self.sure], taken=self.taken[: self.sure])
 
     @property
     def last(self) -> Joint:
@@ -124,25 +124,28 @@ def climbed(
     spared = last.spared([part == number for number in range(FOLDS)])
     mapped = any(EFFECTS[term.effect].is_map for terms in effects for term in terms)
     order = by_size(trials, study, effects) if mapped else list(range(len(effects)))
-    counts = []
+
+    def helps(wide: Trial, number: int) -> bool:
+        both = wide.spared(spared)
+        better = wide.cross_validated(both) < (1.0 - HELPS) * last.cross_validated(both)
+        ends = ends_of(study.scene, effects[number][0]) if guessed else []
+        return better and wide.no_worse(last) and not is_worse(last, wide, ends)
+
     for first in (True, False):
         waiting = [number for number in order if sure[number] == first]
         while waiting:
             refused: list[tuple[int, int]] = []  # with how many were taken before
             for number in waiting:
                 wide = trials.trial((*taken, number))
-                both = wide.spared(spared)
-                better = wide.cross_validated(both) < (1.0 - HELPS) * last.cross_validated(both)
-                ends = ends_of(study.scene, effects[number][0]) if guessed else []
-                if better and wide.no_worse(last) and not is_worse(last, wide, ends):
+                if helps(wide, number):
                     last = wide
                     taken.append(number)
                 else:
                     refused.append((number, len(taken)))
             waiting = [number for number, before in refused if mapped and before < len(taken)]
-        counts.append(len(taken))
     fits = Fits(study, [effects[number] for number in taken])
-    return Ladder(fits, tuple(taken), tuple(spared), counts[0])
+    confirmed = sum(sure[number] for number in taken)
+    return Ladder(fits, tuple(taken), tuple(spared), confirmed)
 
 
 def by_size(trials: Trials, study: Study, effects: Sequence[Sequence[Term]]) -> list[int]:

@@ -18,7 +18,7 @@ from minimax_cal.diagnosing.what_remains import asked_of
 from minimax_cal.evidence.limits import STRUCTURE
 from minimax_cal.evidence.remains import Asked, Component
 from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.facts import Fact, Milli, Mm, derived, in_file
+from minimax_cal.ground.facts import Apart, Fact, Milli, Mm, derived, in_file
 from minimax_cal.ground.files import plain
 from minimax_cal.measuring.faults.points import noise_between
 from minimax_cal.measuring.floor import instrument_noise
@@ -52,7 +52,7 @@ class TargetGap:
     worst: Annotated[float, Fact(key="max_mm", scale=1e3)]
     mean: Milli[Array]
     sight: Annotated[float, Fact(key="mean_sight_mm", scale=1e3)]
-    what: Follows
+    what: Apart[Follows]
 
 
 @dataclass(frozen=True)
@@ -109,10 +109,7 @@ class Where:
     def to_dict(self) -> dict[str, object]:
         """For JSON: strictly JSON-able, units in the names, null for what cannot be told."""
         told = in_file(self)
-        told["by_target"] = [
-            {**{k: v for k, v in in_file(one).items() if k != "what"}, **vars(one.what)}
-            for one in self.by_target
-        ]
+        told["by_target"] = [in_file(one) | vars(one.what) for one in self.by_target]
         told["by_joint"] = [
             {"joint": one.joint, f"rms_{'mm' if one.sliding else 'mrad'}": 1e3 * one.rms,
              **vars(one.what)}
