@@ -60,11 +60,11 @@ def test_compliance_of_a_joint_appears_at_that_joint():
     assert not found.order.p < STRUCTURE
 
 
-@pytest.mark.parametrize("joint", [0, 3, 5])
-def test_a_gear_error_appears_at_its_joint_with_its_size(joint):
+@pytest.mark.parametrize(("joint", "size"), [(0, 2e-4), (3, 2e-4), (5, 2e-4), (3, 1e-3), (5, 1e-3)])
+def test_a_gear_error_appears_at_its_joint_with_its_size(joint, size):
     sim = made(120)
     turn = np.zeros_like(sim.data.q)
-    turn[:, joint] = 2e-4 * np.cos(2.0 * sim.data.q[:, joint] + 1.0)
+    turn[:, joint] = size * np.cos(2.0 * sim.data.q[:, joint] + 1.0)
     made_of = fitted(sim, turn)
     gap = where(made_of).by_joint[joint]
     assert (gap.what.place, gap.what.p < STRUCTURE) == (f"J{joint + 1}", True)
