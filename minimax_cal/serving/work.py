@@ -128,13 +128,14 @@ class Work:
                 job.began = time.monotonic()
                 for command in job.commands:
                     if job.cancelled:
+                        code = 1
                         break
                     job.stage = command.words[0]
                     inputs |= digests(job.at, command)
                     code, told = await self.one(job, command)
                     if code:
                         break
-            if not job.cancelled:
+            if not (job.cancelled and code):  # what ended well was cancelled too late
                 kept(job, code, told, inputs)
         except (OSError, CalibrationError) as error:  # no room, or no process to be had
             job.error = one_line(f"the work could not be done ({error})")

@@ -298,6 +298,15 @@ def test_two_sessions_work_at_once_and_one_waits_for_itself(server, fitted, pose
     assert one["parameters"] == two["parameters"]
 
 
+@pytest.fixture(scope="module")
+def many(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A cell whose diagnosis takes far longer than to cancel it."""
+    path = tmp_path_factory.mktemp("cell") / "poses.csv"
+    data = mc.simulate("irb120", 300, TARGETS, seed=4).data
+    mc.write_measurements(path, replace(data, simulated=False))
+    return path.read_bytes()
+
+
 def waited_for(server: Served, home: str) -> Any:
     """A diagnosis that has told its first stage."""
     assert server.ask("POST", f"{home}/run/diagnose").status == 200
@@ -309,22 +318,26 @@ def waited_for(server: Served, home: str) -> Any:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells whose folder is where")
-def test_work_that_is_cancelled_leaves_nothing(server, fitted):
-    folder = folder_of(server, fitted)
+def test_work_that_is_cancelled_leaves_nothing(server, many):
+    home = server.begin(robot="irb120", objective="sum")
+    server.put(home, "t.csv", many)
+    server.choose(home, measured=["t.csv"])
+    server.run(home, "read")
+    folder = folder_of(server, home)
     before = sorted(folder.rglob("*"))
-    waited_for(server, fitted)
+    waited_for(server, home)
     assert at_work(folder)
-    assert server.ask("POST", f"{fitted}/cancel").status == 200
-    assert server.state(fitted)["job"] is None
+    assert server.ask("POST", f"{home}/cancel").status == 200
+    assert server.state(home)["job"] is None
     assert at_work(folder) == []
     assert sorted(folder.rglob("*")) == before
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells whose folder is where")
-def test_a_killed_server_loses_no_finished_result(tmp_path, poses):
+def test_a_killed_server_loses_no_finished_result(tmp_path, many):
     with serving(tmp_path) as first:
         home = first.begin(robot="irb120", objective="sum")
-        first.put(home, "t.csv", poses)
+        first.put(home, "t.csv", many)
         first.choose(home, measured=["t.csv"])
         before = first.run(home, "read")
         waited_for(first, home)
