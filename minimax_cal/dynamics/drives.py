@@ -41,7 +41,7 @@ FIELDS = {  # of a drive, that belong to an effect, and their units
     TORQUE_LIMIT: {"torque": "N m"},
     SPEED_LIMIT: {"speed": "rad/s"},
 }
-NO_LIMITS = (math.inf, 0.0), (math.inf, 0.0)
+NO_LIMIT = (math.inf, 0.0)
 Body = Callable[[Motion], Array]  # torque (m, n) that masses take for a motion [N m]
 FITTED = ("stiffness", "damper", "ahead", "delay")
 
@@ -272,9 +272,14 @@ class Solved:
     beside: dict[str, float]
     change: Array
 
+    @property
+    def apart(self) -> dict[str, float]:
+        """What was fitted beside that is no number of the drive."""
+        return {name: value for name, value in self.beside.items() if name != AHEAD}
+
     def rest(self, rows: Rows) -> Array:
         """(R,) torque of some rows that it does not explain."""
-        return rows.rest(self.drive, {k: v for k, v in self.beside.items() if k != AHEAD})
+        return rows.rest(self.drive, self.apart)
 
     def told(self, name: str, given: Drive) -> bool:
         """Whether something that was fitted beside is there for sure."""
@@ -331,29 +336,29 @@ def solve_plainly(rows: Rows, held: Rows, given: Drive, always: Sequence[str]) -
 
 
 def covariance_of(change: Array) -> Array:
-    """(p, p) of numbers that change so (G, p) without each stretch [jackknife].
-
-    Wider by as much as Student's t is than the normal law, at 95 %, for as few stretches as matter
-    [Satterthwaite 1946, kurtosis of a normal law].
-    """
-    count, squares = len(change), (change**2).sum(axis=0)
-    few = 3.0 * squares**2 / ((change**4).sum(axis=0) + 1e-300)
-    few = np.clip(few, 2.0, max(count - len(FITTED), 2.0))
-    sigma = scipy.special.stdtrit(few, 0.975) / scipy.special.ndtri(0.975)
-    return np.asarray((count - 1.0) / count * change.T @ change * np.outer(sigma, sigma))
+    """(p, p) of numbers that change so (G, p) without each stretch [jackknife]."""
+    return np.asarray((len(change) - 1.0) / len(change) * change.T @ change)
 
 
 def left_out(matrix: Array, rest: Array, stretch: Array) -> Array:
-    """(G, p) change of a solution without each stretch of rows, to first order."""
+    """(G, p) change of a solution without each stretch of rows, to first order.
+
+    Wider by as much as Student's t is than the normal law, at 95 %, for as few stretches as tell of
+    a number where rows err alike [Satterthwaite 1946].
+    """
     scale = np.sqrt((matrix**2).sum(axis=0)) + 1e-300
     matrix = matrix / scale
-    whole, out = matrix.T @ matrix, []
+    whole, out, tells = matrix.T @ matrix, [], []
     for one in np.unique(stretch):
-        mine = stretch == one
-        part = matrix[mine]
+        part = matrix[stretch == one]
         less = whole - part.T @ part
-        out.append(-np.linalg.lstsq(less, part.T @ rest[mine], rcond=1e-12)[0] / scale)
-    return np.array(out)
+        told = np.linalg.lstsq(less, part.T, rcond=1e-12)[0]
+        out.append(-told @ rest[stretch == one] / scale)
+        tells.append((told**2).sum(axis=1))
+    share = np.array(tells) / np.sum(tells, axis=0)
+    few = np.clip(1.0 / (share**2).sum(axis=0), 2.0, None)
+    wider = scipy.special.stdtrit(few, 0.975) / scipy.special.ndtri(0.975)
+    return np.asarray(np.array(out) * wider)
 
 
 def fit_drive(learnt: Followed, judged: Followed, j: int, given: Drive) -> DriveFit | None:
@@ -370,7 +375,8 @@ def fit_drive(learnt: Followed, judged: Followed, j: int, given: Drive) -> Drive
         held = judged.clear(j, torque, speed)
         found = solve_plainly(rows, held, given, learnt.beside)
         seen = learnt.samples(j, found.drive)
-        (torque, slack), (speed, off) = limits_of(seen) if learnt.measured else NO_LIMITS
+        torque, slack = torque_limit(seen) if learnt.measured else NO_LIMIT
+        speed, off = speed_limit(seen, torque) if learnt.measured else NO_LIMIT
         used, rows = rows, learnt.clear(j, CLEAR * torque, LIMIT * speed)
     gains = np.array([found.drive.stiffness, found.drive.damper])
     unsure = STANDS * np.sqrt(np.diag(covariance_of(found.change))[:2])
@@ -382,14 +388,7 @@ def fit_drive(learnt: Followed, judged: Followed, j: int, given: Drive) -> Drive
     drive = replace(found.drive, damper=max(found.drive.damper, 0.0), torque=float(limit),
                     speed=float(min(speed, given.speed)))  # fmt: skip
     change, stretch = found.change[:, : len(FITTED)], np.unique(used.stretch)
-    beside = {name: value for name, value in found.beside.items() if name != AHEAD}
-    return DriveFit(drive, change, stretch, (slack, off), beside)
-
-
-def limits_of(seen: Samples) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Limits of torque and speed, each with its deviation."""
-    most = torque_limit(seen)
-    return most, speed_limit(seen, most[0])
+    return DriveFit(drive, change, stretch, (slack, off), found.apart)
 
 
 def torque_limit(seen: Samples) -> tuple[float, float]:
@@ -403,13 +402,13 @@ def torque_limit(seen: Samples) -> tuple[float, float]:
         at_limit = (np.abs(seen.asked) > BEYOND * limit + STANDS * noise) & (size > LIMIT * limit)
         at_limit &= seen.torque * seen.asked > 0.0
         if not stands(at_limit, seen.stretch):
-            return math.inf, 0.0
+            return NO_LIMIT
         before, limit = limit, float(np.median(size[at_limit]))
         if limit == before:
             break
     spread = float(np.std(size[at_limit])) + 1e-300
     if spread > (BEYOND - 1.0) * limit + STANDS * noise:
-        return math.inf, 0.0
+        return NO_LIMIT
     return limit, spread / math.sqrt(len(np.unique(seen.stretch[at_limit])))
 
 
@@ -420,7 +419,7 @@ def speed_limit(seen: Samples, torque: float) -> tuple[float, float]:
     falls = np.sign(seen.qd) * (asked - seen.torque) > slack
     fast = np.abs(seen.qd) > LIMIT * np.abs(seen.qd).max()
     if not stands(falls & fast, seen.stretch):
-        return math.inf, 0.0
+        return NO_LIMIT
     found = np.abs(seen.qd[falls & fast])
     count = len(np.unique(seen.stretch[falls & fast]))
     return float(np.median(found)), float(np.std(found)) / math.sqrt(count)

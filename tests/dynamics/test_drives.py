@@ -10,7 +10,9 @@ from minimax_cal.dynamics.drives import (
     Drive,
     DriveFit,
     Followed,
+    covariance_of,
     fit_drive,
+    left_out,
     predicts,
     speed_limit,
     torque_limit,
@@ -104,6 +106,19 @@ def test_intervals_hold_under_noise_that_remembers():
         inside += [abs(getattr(found.drive, name) - getattr(REAL, name)) < 1.96 * found.sigma[name]
                    for name in ("stiffness", "damper", "delay")]  # fmt: skip
     assert 0.88 < np.mean(inside) <= 1.0
+
+
+def test_intervals_hold_where_few_stretches_tell():
+    rng, stretch = np.random.default_rng(5), np.repeat(np.arange(12), 40)
+    speed = rng.normal(size=480) * np.where(stretch < 2, 10.0, 1.0)
+    columns, inside = np.stack([speed, np.ones(480)], axis=1), []
+    for _ in range(1000):
+        noise = rng.normal(size=481)
+        rest = noise[1:] + noise[:-1]  # remembers
+        off = np.linalg.lstsq(columns, rest, rcond=None)[0]
+        change = left_out(columns, rest - columns @ off, stretch)
+        inside.append(np.abs(off) < 1.96 * np.sqrt(np.diag(covariance_of(change))))
+    assert_allclose(np.mean(inside, axis=0), 0.95, atol=0.03)
 
 
 def test_rows_at_a_torque_limit_are_a_limit_and_not_a_gain():

@@ -285,9 +285,8 @@ def write_drives(document: Document, chain: Chain, drives: Sequence[Drive]) -> N
             tune(servo, drive.stiffness / gear**2, (1.0 - drive.ahead) * drive.damper / gear**2)
             write_ahead(root, name, drive.ahead * drive.damper)
         if drive.torque != own.torque:
-            limited = bool(np.isfinite(drive.torque))
             where, what = (joints[j], "actuatorfrc") if floating else (servo, "force")
-            write_limit(where, what, drive.torque / (1.0 if floating else abs(gear)), limited)
+            write_limit(where, what, drive.torque / (1.0 if floating else abs(gear)))
         for actuator in actuators_of(root, name) if regulated or drive.delay != own.delay else ():
             write_late(actuator, drive.delay, step)
     shaken = np.array([d.damper for d in drives]) * step * model.dof_invweight0[chain.dofs]
@@ -295,10 +294,10 @@ def write_drives(document: Document, chain: Chain, drives: Sequence[Drive]) -> N
         section(root, "option").set("integrator", "implicitfast")
 
 
-def write_limit(element: ET.Element, what: str, size: float, limited: bool) -> None:
+def write_limit(element: ET.Element, what: str, size: float) -> None:
     """Limit a force on both sides, or let it be without limits."""
-    element.set(f"{what}limited", "true" if limited else "false")
-    if limited:
+    element.set(f"{what}limited", "true" if math.isfinite(size) else "false")
+    if math.isfinite(size):
         element.set(f"{what}range", numbers([-size, size]))
 
 

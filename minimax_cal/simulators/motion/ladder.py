@@ -23,6 +23,7 @@ from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.robots.urdf import MODELS
 from minimax_cal.simulators.given import largest_inertia
+from minimax_cal.simulators.motion import drives
 from minimax_cal.simulators.motion.actuators import check_files, write_actuators, write_ranges
 from minimax_cal.simulators.motion.bristles import has_bristles
 from minimax_cal.simulators.motion.correct import (
@@ -32,17 +33,6 @@ from minimax_cal.simulators.motion.correct import (
     correct,
     lost,
     mean_log,
-)
-from minimax_cal.simulators.motion.drives import (
-    Served,
-    can_write,
-    damped_by_joints,
-    effects_of,
-    kept,
-    lost_late,
-    serve,
-    steps_with,
-    with_drives,
 )
 from minimax_cal.simulators.motion.fit import Study
 from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge
@@ -132,7 +122,7 @@ def motion_gap(
         judge = Judge.of(opened, runs, known, fast=commanded)
         if commanded:
             whole = open_model(model, runs[0].joints, tip, freed=False)
-            if damped_by_joints(judge, whole):
+            if drives.damped_by_joints(judge, whole):
                 opened, judge = whole, judge.of_model(whole)
         judge = judge.driving(opened, gains) if driven else judge
         first, notices = [judge.rung("as given", opened.chain)], tuple[str, ...]()
@@ -186,31 +176,32 @@ def by_torques(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Answ
     made = correct(bench, found, progress)
     return Answer(made.plain.opened, served, (*rungs, *made.rungs), effects, made.elements,
                   (made.plain, bench.study), made.full.module, made.left_out, made.notices,
-                  (*lost(made), *lost_late(effects)))  # fmt: skip
+                  (*lost(made), *drives.lost_late(effects)))  # fmt: skip
 
 
 def by_commands(
     bench: Bench, found: MotionDiagnosis, progress: Progress
-) -> tuple[Bench, Served | None, tuple[MotionRung, ...], tuple[MotionEffect, ...]]:
+) -> tuple[Bench, drives.Served | None, tuple[MotionRung, ...], tuple[MotionEffect, ...]]:
     """The model with the drives that logged commands show, these, a step for each effect, and what
     each is worth.
     """
     judge, opened = bench.judge, bench.opened
     asked = bench.bristled, bench.plain
-    if judge.drives != OWN_SERVOS or not can_write(opened):
+    if judge.drives != OWN_SERVOS or not drives.can_write(opened):
         return bench, None, (), ()
     progress("fitting the drives to their commands")
-    served = serve(judge, opened, plain=bench.plain)
+    served = drives.serve(judge, opened, plain=bench.plain)
     if not served.changes:
         return bench, served, (), ()
     whole, _ = asked_of(found, bench)
-    beside = bench_of(judge, with_drives(opened, served), found, asked).candidate(whole).opened
-    served = kept(served, judge, beside)
-    effects = tuple(effects_of(served, judge, beside))
+    driven = drives.with_drives(opened, served)
+    beside = bench_of(judge, driven, found, asked).candidate(whole).opened
+    served = drives.kept(served, judge, beside)
+    effects = tuple(drives.effects_of(served, judge, beside))
     off = judge.torque(opened.chain)
     rungs = tuple(judge.rung(name, one.chain, missed=off)
-                  for name, one in steps_with(served, effects, opened))  # fmt: skip
-    return bench_of(judge, with_drives(opened, served), found, asked), served, rungs, effects
+                  for name, one in drives.steps_with(served, effects, opened))  # fmt: skip
+    return bench_of(judge, drives.with_drives(opened, served), found, asked), served, rungs, effects
 
 
 def improves(rungs: Sequence[MotionRung]) -> bool:
