@@ -20,11 +20,11 @@ import minimax_cal as mc
 from experiments import gap_cases, sweep
 from experiments.real import here, real
 from experiments.sweep import Study, study_options
+from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Cell as Entry
 from minimax_cal.ground.tables import Table
-from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.faults import mended, standing_out
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.history import clock, numbered, with_history

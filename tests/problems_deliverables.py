@@ -10,8 +10,8 @@ import numpy as np
 import yaml
 
 import minimax_cal as mc
+from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.opened import place
-from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import Measurements
 
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")

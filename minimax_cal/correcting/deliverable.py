@@ -15,13 +15,13 @@ import numpy as np
 
 from minimax_cal.correcting.exporters.job import Export, job_of
 from minimax_cal.correcting.exporters.table import EXPORTERS
+from minimax_cal.fitting.accuracy import Accuracy, accuracy
 from minimax_cal.fitting.calibrate import fit_split
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.opened import GEOMETRIC, Opened, Result, open_result
 from minimax_cal.fitting.options import OFFSETS, Progress, silent
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import finite
-from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell

@@ -54,6 +54,7 @@ from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_
 from minimax_cal.fitting.claims import too_far
 from minimax_cal.fitting.crossed import MIN_HELD_POSES
 from minimax_cal.fitting.fit import Provenance
+from minimax_cal.fitting.floor import DISTANCES, Floor, floor_of, noise_at_most, with_instrument
 from minimax_cal.fitting.judged import doubts
 from minimax_cal.fitting.options import Options, Progress, silent
 from minimax_cal.fitting.second_visits import contradictions
@@ -74,10 +75,8 @@ from minimax_cal.measuring.faults import find_faults, in_lines, mended, standing
 from minimax_cal.measuring.faults.fault import Fault
 from minimax_cal.measuring.faults.nests import RESEAT
 from minimax_cal.measuring.faults.sessions import session_jumps
-from minimax_cal.measuring.floor import DISTANCES, Floor, floor_of, noise_at_most
 from minimax_cal.measuring.grouping import clusters, held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.dictionary import arm_library

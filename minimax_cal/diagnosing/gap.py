@@ -13,13 +13,13 @@ from minimax_cal.diagnosing.result import TOLD_AS, Finding, Step, as_motion
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.diagnosing.trial import Predicting, Trial, Trials
 from minimax_cal.evidence.limits import END, FOLDS, HELPS, MINOR, SAYS_NOTHING, SEEN_BEFORE
+from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.beyond import without
+from minimax_cal.fitting.floor import Floor
 from minimax_cal.fitting.stations import steps_of
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.faults import mended, standing_out
 from minimax_cal.measuring.faults.nests import RESEAT
-from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell

@@ -11,6 +11,7 @@ from minimax_cal.diagnosing.result import VERDICTS as VERDICTS  # in annotations
 from minimax_cal.diagnosing.result import Untestable as Untestable
 from minimax_cal.diagnosing.sentences import explained
 from minimax_cal.evidence.limits import LEVEL
+from minimax_cal.fitting.accuracy import Accuracy
 from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.fitting.several import RelativeCalibration
 from minimax_cal.ground.facts import APART, Fact, derived, in_file
@@ -18,7 +19,6 @@ from minimax_cal.ground.files import number, plain
 from minimax_cal.ground.records import reading, stored
 from minimax_cal.ground.results import Result, merged
 from minimax_cal.ground.tables import Table, filled
-from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.solvers.status import Status as Status
 

@@ -18,9 +18,9 @@ import numpy as np
 from minimax_cal.diagnosing.sizes import unsized, weights_of
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.diagnosing.trial import Predicting
+from minimax_cal.fitting.accuracy import Accuracy, accuracy
 from minimax_cal.fitting.uncertainty import Estimator, Poses, Uncertainty, uncertainty_of
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.stations import Sessions
 from minimax_cal.modelling.cell import Cell

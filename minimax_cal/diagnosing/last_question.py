@@ -17,10 +17,10 @@ from minimax_cal.diagnosing.joint import Joint
 from minimax_cal.diagnosing.left_out import joint_units
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.evidence.limits import HALF, MAX_JOINT_JITTER, MAX_OVER_NOISE
+from minimax_cal.fitting.floor import REPEATS, Floor, least_scatter, of_coordinate
 from minimax_cal.fitting.intervals import rms_interval
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.points import noise_between
-from minimax_cal.measuring.floor import REPEATS, Floor, least_scatter, of_coordinate
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
 

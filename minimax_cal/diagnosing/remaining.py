@@ -14,8 +14,8 @@ from minimax_cal.diagnosing.result import Dependence, Remaining
 from minimax_cal.diagnosing.what_remains import certain
 from minimax_cal.evidence.limits import MAX_ALONE
 from minimax_cal.evidence.remains import Remains
+from minimax_cal.fitting.floor import REPEATS, instrument_alone, least_scatter
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.floor import REPEATS, instrument_alone, least_scatter
 from minimax_cal.measuring.measurements import Measurements
 
 

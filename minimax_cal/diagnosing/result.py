@@ -15,10 +15,12 @@ import numpy as np
 from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual_curve
 from minimax_cal.evidence.limits import BAND, CONFIRMED, ENOUGH, LEVEL
 from minimax_cal.evidence.remains import FOLLOWING
+from minimax_cal.fitting.accuracy import Accuracy
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
+from minimax_cal.fitting.floor import REPEATS, Floor
+from minimax_cal.fitting.pose_rows import measured_poses, pose_rows
 from minimax_cal.fitting.set_aside import aside_sentence
-from minimax_cal.fitting.told_poses import measured_poses
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.facts import APART, Fact, derived
@@ -27,14 +29,10 @@ from minimax_cal.ground.records import AGAIN, array, as_kind, stored
 from minimax_cal.ground.results import Record, Result
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.units import in_files
-from minimax_cal.measuring.accuracy import Accuracy
-from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.faults.fault import Amount
 from minimax_cal.measuring.faults.nests import RESEAT
-from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.measuring.pose_rows import pose_rows
+from minimax_cal.measuring.measurements import Measurements, SetAside
 from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.words import name_effect, name_place, name_step

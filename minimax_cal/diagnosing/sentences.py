@@ -15,7 +15,7 @@ from minimax_cal.diagnosing.result import (
     Remaining,
 )
 from minimax_cal.evidence.limits import HALF, STRUCTURE
-from minimax_cal.measuring.floor import REPEATS
+from minimax_cal.fitting.floor import REPEATS
 from minimax_cal.modelling.effects.words import name_chance, name_step, name_structure
 from minimax_cal.solvers.status import Status
 

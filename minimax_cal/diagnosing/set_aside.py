@@ -7,13 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from minimax_cal.diagnosing.gap import of_lines
+from minimax_cal.fitting.accuracy import Accuracy
 from minimax_cal.fitting.set_aside import errors_of, with_them
-from minimax_cal.measuring.accuracy import Accuracy
-from minimax_cal.measuring.aside import TOOL, SetAside
 from minimax_cal.measuring.faults.fault import Fault
 from minimax_cal.measuring.faults.nests import RESEAT
 from minimax_cal.measuring.grouping import clusters
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.measurements import TOOL, Measurements, SetAside
 from minimax_cal.measuring.set_aside import set_aside
 from minimax_cal.modelling.cell import Cell
 

@@ -17,11 +17,11 @@ from minimax_cal.diagnosing.study import Study
 from minimax_cal.diagnosing.what_remains import asked_of
 from minimax_cal.evidence.limits import STRUCTURE
 from minimax_cal.evidence.remains import Asked, Component
+from minimax_cal.fitting.floor import instrument_noise
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.facts import Apart, Fact, Milli, Mm, derived, in_file
 from minimax_cal.ground.files import plain
 from minimax_cal.measuring.faults.points import noise_between
-from minimax_cal.measuring.floor import instrument_noise
 from minimax_cal.measuring.stations import stood
 
 MANY = 90  # points from which the workspace is cut into three by three regions, not two by two

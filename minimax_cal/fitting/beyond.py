@@ -14,17 +14,17 @@ from typing import Annotated
 
 import numpy as np
 
+from minimax_cal.fitting.accuracy import Accuracy, accuracy
 from minimax_cal.fitting.identify import RESOLUTION, redundant
 from minimax_cal.fitting.intervals import max_interval, rms_interval, told
+from minimax_cal.fitting.spans import Span, narrow, plan_that_mends, spans_in_words, spans_of
 from minimax_cal.fitting.uncertainty import Estimator, Linearised, PartSums, Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import Fact, derived
 from minimax_cal.ground.results import Record
 from minimax_cal.ground.tables import Table
-from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import Region, groups
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.measuring.spans import Span, narrow, plan_that_mends, spans_in_words, spans_of
 from minimax_cal.modelling.model import SumOfSquares
 from minimax_cal.modelling.near import is_kept, nearby
 from minimax_cal.modelling.parameters import State

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from minimax_cal.fitting.checks import check_plausible, coarse_joints
 from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.floor import with_instrument
 from minimax_cal.fitting.judged import Judged, Parts
 from minimax_cal.fitting.options import (
     Options,
@@ -36,14 +37,12 @@ from minimax_cal.instruments import file
 from minimax_cal.instruments.file import taken
 from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.measuring import checks
-from minimax_cal.measuring.aside import TOOL
 from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.faults.points import noise
 from minimax_cal.measuring.faults.sessions import jumps
 from minimax_cal.measuring.grouping import groups, mislabelled, split, with_groups
 from minimax_cal.measuring.history import time_notices, with_history
-from minimax_cal.measuring.instrument import with_instrument
-from minimax_cal.measuring.measurements import Measurements, measurements
+from minimax_cal.measuring.measurements import TOOL, Measurements, measurements
 from minimax_cal.measuring.set_aside import set_aside
 from minimax_cal.measuring.stations import seen_from
 from minimax_cal.modelling.effects.table import Term

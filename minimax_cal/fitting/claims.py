@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.evidence.noise import orthonormal
+from minimax_cal.fitting.accuracy import Accuracy, accuracy
 from minimax_cal.fitting.beyond import Beyond, left_out, not_claimed
 from minimax_cal.fitting.crossed import MIN_HELD_POSES, crossed
+from minimax_cal.fitting.floor import known_floor
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.positions import lacking, positions_by
 from minimax_cal.fitting.solve import Solved
@@ -19,8 +21,6 @@ from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import name_first
 from minimax_cal.instruments.protocol import corners
-from minimax_cal.measuring.accuracy import Accuracy, accuracy
-from minimax_cal.measuring.floor import known_floor
 from minimax_cal.measuring.grouping import clusters, grouped, parts
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Sessions

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from minimax_cal.fitting.accuracy import Accuracy, accuracy
 from minimax_cal.fitting.beyond import without
 from minimax_cal.fitting.intervals import UNKNOWN, Interval, max_interval, rms_interval, told
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.parameters import State

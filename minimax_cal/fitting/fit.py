@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 import scipy
 
+from minimax_cal.fitting.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.certificate import Certificate
 from minimax_cal.fitting.changed import Change
@@ -30,9 +31,10 @@ from minimax_cal.fitting.intervals import (
 )
 from minimax_cal.fitting.minimax_problem import Distances, trusted_distances
 from minimax_cal.fitting.options import Options, read_options
+from minimax_cal.fitting.pose_rows import errors_of, measured_poses, pose_rows
 from minimax_cal.fitting.set_aside import aside_sentence
+from minimax_cal.fitting.spans import Span, spans_of
 from minimax_cal.fitting.suspects import Suspect, aside, table_of
-from minimax_cal.fitting.told_poses import errors_of, measured_poses
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, uncertainty_from_dict
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.facts import APART, Fact, Later, derived, facts_in_words, in_file, scaled
@@ -40,13 +42,9 @@ from minimax_cal.ground.records import array, as_kind, read
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import capitalise, list_counts
-from minimax_cal.measuring.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
-from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.grouping import clusters, grouped
 from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.measuring.pose_rows import pose_rows
-from minimax_cal.measuring.spans import Span, spans_of
+from minimax_cal.measuring.measurements import Measurements, SetAside
 from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted

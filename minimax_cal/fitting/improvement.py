@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.suspects import MIN_POINTS_LEFT, Suspect, aside
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import name_first
-from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import Measurements
 
 # A point that both arms miss by so many times what lies between them there does not say which of

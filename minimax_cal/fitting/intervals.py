@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri
 
+from minimax_cal.fitting.accuracy import Accuracy
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import scaled
-from minimax_cal.measuring.accuracy import Accuracy
 
 MIN_POSES = 3  # poses; fewer say nothing about their spread
 DRAWS = 2000  # bootstrap samples: the ends are then sure to about 2 % of the width

@@ -9,6 +9,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.between_sessions import between_sessions
 from minimax_cal.fitting.changed import Change
 from minimax_cal.fitting.checks import POOR_FIT, wild
@@ -43,7 +44,6 @@ from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import Later
 from minimax_cal.measuring import checks
-from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.faults.sessions import session_jumps
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Frames

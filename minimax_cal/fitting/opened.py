@@ -16,8 +16,9 @@ import numpy as np
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options, read_options
+from minimax_cal.fitting.pose_rows import measured_poses
+from minimax_cal.fitting.spans import Span, spans_of
 from minimax_cal.fitting.stations import MIN_FRAME_POINTS, moving
-from minimax_cal.fitting.told_poses import measured_poses
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
@@ -26,7 +27,6 @@ from minimax_cal.ground.records import AGAIN, read, reading
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.measuring.spans import Span, spans_of
 from minimax_cal.measuring.stations import labels
 from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.table import EFFECTS, Term

@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 
+from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.checks import check_plausible
 from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
+from minimax_cal.fitting.floor import SIGMAS, declared
 from minimax_cal.fitting.solve import LEAST_POSES
 from minimax_cal.fitting.stations import stationed
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.accuracy import accuracy
-from minimax_cal.measuring.floor import SIGMAS, declared
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.joint_fit import refitted
 from minimax_cal.modelling.parameters import Names, zero_positions

@@ -10,11 +10,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from minimax_cal.fitting.floor import FEWEST
 from minimax_cal.fitting.suspects import Scores, spread_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.faults.fault import FAINT
-from minimax_cal.measuring.floor import FEWEST
 from minimax_cal.measuring.grouping import visits
 from minimax_cal.measuring.measurements import Measurements
 

@@ -8,17 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from minimax_cal.fitting.accuracy import Accuracy, accuracy
 from minimax_cal.fitting.crossed import intervals_of
 from minimax_cal.fitting.intervals import with_ends
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import Solved
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.accuracy import Accuracy, accuracy
-from minimax_cal.measuring.aside import TOOL, SetAside, counted
 from minimax_cal.measuring.grouping import grouped
-from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.measuring.set_aside import merged, set_aside
+from minimax_cal.measuring.measurements import TOOL, Measurements, SetAside
+from minimax_cal.measuring.set_aside import counted, merged, set_aside
 from minimax_cal.measuring.stations import seen_from
 from minimax_cal.modelling.cell import Cell
 

@@ -15,6 +15,13 @@ import numpy as np
 import scipy
 from scipy.spatial import cKDTree
 
+from minimax_cal.fitting.spans import (
+    Span,
+    narrow,
+    outside,
+    plan_that_mends,
+    spans_in_words,
+)
 from minimax_cal.fitting.uncertainty import FRAMES, Uncertainty, holding_radius, position_factor
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
@@ -24,13 +31,6 @@ from minimax_cal.ground.results import Result
 from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.saved import AFTER, BEFORE, Saved
-from minimax_cal.measuring.spans import (
-    Span,
-    narrow,
-    outside,
-    plan_that_mends,
-    spans_in_words,
-)
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots.ranges import SLIDE, near_zero
 from minimax_cal.robots.robot import Robot

@@ -10,12 +10,14 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.spatial import KDTree
 
+from minimax_cal.fitting.accuracy import Accuracy, accuracy
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.opened import Opened, open_result
 from minimax_cal.fitting.opened import Result as Given
 from minimax_cal.fitting.set_aside import aside_sentence, errors_of, with_them
 from minimax_cal.fitting.several.fit import Train, allowed_of, stack_of, start_of
 from minimax_cal.fitting.several.options import RelativeOptions
+from minimax_cal.fitting.spans import Span, narrow, outside, spans_in_words
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
@@ -25,12 +27,9 @@ from minimax_cal.ground.tables import Table
 from minimax_cal.instruments.file import Given as Measured
 from minimax_cal.instruments.file import taken
 from minimax_cal.instruments.instrument import Instrument
-from minimax_cal.measuring.accuracy import Accuracy, accuracy
-from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.checks import check_joints, outliers
 from minimax_cal.measuring.grouping import REPEAT, groups
-from minimax_cal.measuring.measurements import Measurements, read_measurements
-from minimax_cal.measuring.spans import Span, narrow, outside, spans_in_words
+from minimax_cal.measuring.measurements import Measurements, SetAside, read_measurements
 from minimax_cal.modelling.cell import Cell, strangers
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.start import fit_base

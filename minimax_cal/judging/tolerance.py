@@ -6,11 +6,11 @@ import math
 import re
 from dataclasses import dataclass
 
+from minimax_cal.fitting.accuracy import Accuracy
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.intervals import UNKNOWN, Interval, chance_of_larger
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.words import name_first
-from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.solvers.status import Status
 
 PASSED, NOT_PASSED, NOT_STATED = "passed", "not passed", "not stated"

@@ -13,7 +13,6 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import csv_text, write_whole
 from minimax_cal.ground.words import name_first, one_line
-from minimax_cal.measuring.aside import SetAside
 from minimax_cal.reading.rows import NOTHING, TARGET, TEXT, UNITS, Rows, header_check, read_rows
 from minimax_cal.reading.sheet import Lines
 from minimax_cal.reading.words import OWN, joints_of, kind_of, points_of, stems_of
@@ -29,11 +28,27 @@ PLAUSIBLE = {  # least and largest value in SI of columns of a kind
     "base": (-FARTHEST, FARTHEST),
     "qread": (-1e3, 1e3),
 }
+USER, FILE, TOOL = "user", "file", "tool"  # who sets points aside
 MARK = "simulated"  # the column of 1 where points were computed
 NAMED = re.compile(r"smr\d+_target")  # what the tracker calls it
 OF_POINTS = re.compile(f"{NAMED.pattern}|{TARGET.pattern}")
 ANY_TARGET = ("smr1_x_mm", "smr1_y_mm", "smr1_z_mm")  # the header's rules ask for one
 U95 = re.compile(OWN["u95"].pattern)
+
+
+@dataclass(frozen=True)
+class SetAside:
+    """A measured point that takes no part in a fit.
+
+    row: line of the measurement file.  pose: its number among the poses of that file, from 1.  why:
+    the reason; by: USER, FILE or TOOL.
+    """
+
+    row: int
+    pose: int
+    target: str
+    why: str
+    by: str
 
 
 @dataclass(frozen=True, eq=False)

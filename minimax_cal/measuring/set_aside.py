@@ -7,7 +7,8 @@ keeps them beside the points that count (`Measurements.aside`).
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,14 +16,14 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.words import name_first, one_line
-from minimax_cal.measuring.aside import FILE, TOOL, USER, SetAside
-from minimax_cal.measuring.measurements import Measurements, check_seen
+from minimax_cal.measuring.measurements import FILE, TOOL, USER, Measurements, SetAside, check_seen
 
 COLUMN = "set_aside"
 TARGET = r"smr\d+(?:@[\w.-]+)?"  # smr1, or smr1@gripper where there are several tools
 POINT = re.compile(rf"(\d+)(?::({TARGET}))?")
 # a cell holds one of these for each target, or one for the whole pose
 ENTRY = re.compile(rf"(?:({TARGET})\s*:)?\s*(.*?)\s*(?:\[({USER}|{FILE}|{TOOL})\])?")
+WHO = {USER: "the user", FILE: "the measurement file", TOOL: "the program"}  # in sentences
 NO_REASON = "no reason was given"
 MOST_LETTERS = 200  # of a reason
 NAMED = 5  # points that a notice names
@@ -37,16 +38,9 @@ def set_aside(data: Measurements, points: Array, why: str, by: str) -> Measureme
     if not points.any():
         return data
     every = np.union1d(data.line, data.aside.line if data.aside else data.line)
-    new = tuple(
-        SetAside(
-            int(data.line[row]),
-            int(np.searchsorted(every, data.line[row])) + 1,
-            data.target_names[target],
-            why,
-            by,
-        )
-        for row, target in np.argwhere(points)
-    )
+    place = np.searchsorted(every, data.line) + 1
+    new = tuple(SetAside(int(data.line[row]), int(place[row]), data.target_names[target], why, by)
+                for row, target in np.argwhere(points))  # fmt: skip
     shown = np.where(points[..., None], data.y, np.nan)
     aside = replace(data, y=shown, aside=None, set_aside=(), notices=())
     aside = aside.take(np.asarray(points.any(axis=1)))
@@ -174,3 +168,14 @@ def of_name(data: Measurements, name: str) -> Array:
         raise OptionError(f"leave out {name}: no such target; there are {known}")
     targets = np.array([is_meant(found[2] or "", target) for target in data.target_names])
     return np.asarray(rows[:, None] & targets)
+
+
+def counted(points: Sequence[SetAside]) -> str:
+    """How many points, and by whom they were set aside, as 8 points set aside by the user."""
+    count = Counter(point.by for point in points)
+    several = len(count) > 1
+    named = ", ".join(
+        f"{count[by]} by {who}" if several else f"by {who}" for by, who in WHO.items() if count[by]
+    )
+    total = f"{len(points)} point{'s' * (len(points) != 1)} set aside"
+    return f"{total} ({named})" if several else f"{total} {named}"

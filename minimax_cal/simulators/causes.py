@@ -12,11 +12,11 @@ from minimax_cal.diagnosing.diagnose import diagnose
 from minimax_cal.diagnosing.result import Diagnosis, load_diagnosis
 from minimax_cal.fitting.calibrate import again, calibrate
 from minimax_cal.fitting.fit import Fit, load_fit
+from minimax_cal.fitting.floor import Floor
 from minimax_cal.fitting.options import Progress
 from minimax_cal.fitting.same_arm import check_arm
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.checks import check_joints
-from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.grouping import held_out
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.diagnosing.result import Diagnosis
+from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.options import Progress, silent
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, plain, write_whole
-from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.grouping import check_chance
 from minimax_cal.measuring.measurements import Measurements, read_measurements

@@ -15,8 +15,8 @@ from minimax_cal.cli.export import export_command
 from minimax_cal.correcting import deliverable
 from minimax_cal.correcting.deliverable import DELIVERABLES
 from minimax_cal.correcting.export import exported
+from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.opened import place
-from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import Fitted

@@ -15,7 +15,7 @@ from minimax_cal.diagnosing.proposals import REVISIT
 from minimax_cal.diagnosing.remaining import remaining_of
 from minimax_cal.diagnosing.sentences import SCATTERS
 from minimax_cal.evidence.remains import Remains
-from minimax_cal.measuring.floor import instrument_alone
+from minimax_cal.fitting.floor import instrument_alone
 from minimax_cal.modelling.simulate import Truth, gravity, simulate
 from minimax_cal.solvers.status import Status
 

@@ -16,8 +16,8 @@ from minimax_cal.diagnosing.gap import closed_share
 from minimax_cal.diagnosing.result import VERDICTS
 from minimax_cal.evidence.limits import STRUCTURE
 from minimax_cal.fitting.checks import misplaced, put_right
+from minimax_cal.fitting.floor import REPEATS, Floor
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.gravity import G, tubes

@@ -14,10 +14,10 @@ from minimax_cal.diagnosing.error_maps import error_maps, strongest_wave
 from minimax_cal.diagnosing.gap import climbed
 from minimax_cal.diagnosing.joint import joint
 from minimax_cal.diagnosing.study import SUM, Study, studied
+from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.options import silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.modelling.effects.maps import sines, spread
 from minimax_cal.modelling.effects.table import EFFECTS, Term, terms
 from minimax_cal.modelling.simulate import Truth, simulate

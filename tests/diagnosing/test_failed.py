@@ -10,8 +10,8 @@ from conftest import run
 import minimax_cal as mc
 from minimax_cal.diagnosing.diagnose import against
 from minimax_cal.diagnosing.result import Step
-from minimax_cal.measuring.accuracy import Accuracy
-from minimax_cal.measuring.floor import AT_MOST, REPEATS, Floor
+from minimax_cal.fitting.accuracy import Accuracy
+from minimax_cal.fitting.floor import AT_MOST, REPEATS, Floor
 
 
 def mirrored(data: mc.Measurements) -> mc.Measurements:

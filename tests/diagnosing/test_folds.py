@@ -19,12 +19,12 @@ from minimax_cal.diagnosing.causes import Causes, causes_of
 from minimax_cal.diagnosing.folds import beyond_of, fold_of
 from minimax_cal.diagnosing.gap import Judges
 from minimax_cal.diagnosing.study import SUM, Study, studied
+from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.options import silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.fitting.stations import stationed
 from minimax_cal.ground import parallel
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import parts
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.parameters import State

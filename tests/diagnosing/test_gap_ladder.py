@@ -35,9 +35,9 @@ from minimax_cal.diagnosing.result import Finding, Step
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.diagnosing.trial import Trial
 from minimax_cal.evidence.limits import FOLDS, HELPS
+from minimax_cal.fitting.accuracy import Accuracy, accuracy
+from minimax_cal.fitting.floor import REPEATS, Floor
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.accuracy import Accuracy, accuracy
-from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.modelling.effects.maps import curve_of, usual
 from minimax_cal.modelling.effects.table import Term

@@ -14,10 +14,10 @@ from minimax_cal.diagnosing.joint import joint
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.diagnosing.trial import Trials
+from minimax_cal.fitting.accuracy import accuracy
+from minimax_cal.fitting.floor import noise_at_most
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
-from minimax_cal.measuring.accuracy import accuracy
-from minimax_cal.measuring.floor import noise_at_most
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.bounds import at_bounds, bounds
 from minimax_cal.modelling.effects.scene import mask_of

@@ -4,10 +4,10 @@ from numpy.testing import assert_allclose
 from minimax_cal.diagnosing.joint import Joint, joint
 from minimax_cal.diagnosing.left_out import Beside, Block, Left, begun
 from minimax_cal.diagnosing.study import SUM, studied
+from minimax_cal.fitting.floor import AT_MOST, Floor
 from minimax_cal.fitting.options import silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.floor import AT_MOST, Floor
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate

@@ -8,10 +8,9 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.diagnosing.set_aside import WHY
-from minimax_cal.measuring.aside import TOOL, USER
+from minimax_cal.fitting.floor import DISTANCES
 from minimax_cal.measuring.faults.nests import RESEAT
-from minimax_cal.measuring.floor import DISTANCES
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.measurements import TOOL, USER, Measurements
 from minimax_cal.measuring.set_aside import left_out
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 

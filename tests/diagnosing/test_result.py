@@ -21,10 +21,10 @@ from minimax_cal.diagnosing.result import (
     of_curve,
 )
 from minimax_cal.diagnosing.sentences import closed_words
+from minimax_cal.fitting.accuracy import Accuracy
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.measuring.accuracy import Accuracy
-from minimax_cal.measuring.floor import DECLARED, Floor
+from minimax_cal.fitting.floor import DECLARED, Floor
 from minimax_cal.modelling.effects.table import Fitted, Term
 from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.modelling.simulate import simulate

@@ -19,9 +19,9 @@ from minimax_cal.diagnosing.result import (
     Step,
 )
 from minimax_cal.diagnosing.sentences import NOT_VISITED, OPENINGS
+from minimax_cal.fitting.accuracy import Accuracy
 from minimax_cal.fitting.beyond import Beyond
-from minimax_cal.measuring.accuracy import Accuracy
-from minimax_cal.measuring.floor import AT_MOST, DISTANCES, REPEATS, Floor
+from minimax_cal.fitting.floor import AT_MOST, DISTANCES, REPEATS, Floor
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.modelling.simulate import simulate

@@ -11,6 +11,7 @@ from scipy import stats
 
 import minimax_cal as mc
 from minimax_cal.fitting import beyond
+from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.beyond import (
     needed,
     one_step,
@@ -30,7 +31,6 @@ from minimax_cal.fitting.intervals import (
 from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import plain
-from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import parts
 from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.model import moved

@@ -17,8 +17,7 @@ from minimax_cal.ground.facts import derived_facts, facts_in_words, stored_facts
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.words import capitalise
 from minimax_cal.judging.bootstrap import bootstrap
-from minimax_cal.measuring.aside import FILE, TOOL, USER
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.measurements import FILE, TOOL, USER, Measurements
 from minimax_cal.measuring.set_aside import left_out, set_aside
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 from minimax_cal.reporting.html import Wording, compose, read_sources, render

@@ -8,10 +8,9 @@ from conftest import run
 from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
-from minimax_cal.measuring.aside import FILE, TOOL, USER, counted
 from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.measuring.set_aside import NO_REASON, entries, left_out, set_aside, whole
+from minimax_cal.measuring.measurements import FILE, TOOL, USER, Measurements
+from minimax_cal.measuring.set_aside import NO_REASON, counted, entries, left_out, set_aside, whole
 from minimax_cal.modelling.simulate import Simulation
 
 

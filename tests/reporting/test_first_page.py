@@ -14,10 +14,10 @@ from test_report import WORDING, Seen
 import minimax_cal as mc
 from minimax_cal.diagnosing.result import load_diagnosis
 from minimax_cal.dynamics.regressor import Motion
+from minimax_cal.fitting.floor import AT_MOST, Floor
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.tolerance import NOT_PASSED, NOT_STATED, PASSED, limits_of
-from minimax_cal.measuring.floor import AT_MOST, Floor
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.reporting import report
 from minimax_cal.reporting.html import Figure, compose, page, read_sources

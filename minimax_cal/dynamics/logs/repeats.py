@@ -15,24 +15,26 @@ WORD = 4  # rows that have to follow each other alike
 MOST_ALIKE = 0.2  # share of a run's words of torque that may stand elsewhere
 
 
-def words(values: Array) -> list[bytes]:
-    """Rows that follow each other, WORD at a time, as texts; repeated rows count once."""
-    fresh = np.append(True, np.any(np.diff(values, axis=0) != 0.0, axis=1))
-    rows = np.ascontiguousarray(values[fresh])
-    return [rows[i : i + WORD].tobytes() for i in range(len(rows) - WORD + 1)]
+def words(values: Array) -> Array:
+    """Rows that follow each other, WORD at a time, a number for each; repeated rows count once."""
+    fresh = np.append(True, (values[1:] != values[:-1]).any(axis=1))
+    bits = np.ascontiguousarray(values[fresh], dtype=float).view(np.uint64)
+    count, random = max(len(bits) - WORD + 1, 0), np.random.default_rng(0)
+    mixed = bits @ (2 * random.integers(2**63, size=(bits.shape[1], WORD), dtype=np.uint64) + 1)
+    return np.asarray(sum(mixed[i : i + count, i] for i in range(WORD)))
 
 
 def check_repeats(drafts: Sequence[Draft]) -> None:
     """Raise DataError for a run given twice, or torques equal to the digit in other motions."""
     said = [words(draft.torque) for draft in drafts]
-    of_torque = [set(every) for every in said]
+    of_torque = [np.unique(every) for every in said]
     for a, b in combinations(range(len(drafts)), 2):
         few = min(len(of_torque[a]), len(of_torque[b]))
-        if len(of_torque[a] & of_torque[b]) <= MOST_ALIKE * few:
+        if alike(of_torque[a], of_torque[b]) <= MOST_ALIKE * few:
             continue
         one, other = drafts[a], drafts[b]
-        moved = set(words(one.q)), set(words(other.q))
-        if len(moved[0] & moved[1]) > MOST_ALIKE * min(map(len, moved)):
+        moved = np.unique(words(one.q)), np.unique(words(other.q))
+        if alike(*moved) > MOST_ALIKE * min(map(len, moved)):
             raise DataError(
                 f"{other.log.source}: run {other.name} holds rows of {one.name}; give each once"
             )
@@ -48,7 +50,12 @@ def check_repeats(drafts: Sequence[Draft]) -> None:
             )
 
 
-def within(draft: Draft, said: Sequence[bytes], repeated: int) -> bool:
+def alike(one: Array, other: Array) -> int:
+    """How many words two runs share."""
+    return len(np.intersect1d(one, other, assume_unique=True))
+
+
+def within(draft: Draft, said: Array, repeated: int) -> bool:
     """Whether torques of one run repeat to the digit, and its motion does not.
 
     said: their words, of which so many stand there before.
@@ -56,4 +63,4 @@ def within(draft: Draft, said: Sequence[bytes], repeated: int) -> bool:
     if len(said) <= WORD or repeated <= MOST_ALIKE * len(said):
         return False
     moved = words(draft.q)
-    return len(moved) - len(set(moved)) < 0.5 * repeated
+    return len(moved) - len(np.unique(moved)) < 0.5 * repeated

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from minimax_cal.fitting.accuracy import HELD
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS
 from minimax_cal.fitting.pixels.data import PixelData
@@ -20,7 +21,6 @@ from minimax_cal.fitting.pixels.uncertainty import Uncertainty, uncertainty_of
 from minimax_cal.fitting.pixels.worst import WorstPixels, fit_worst
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress, silent
-from minimax_cal.measuring.accuracy import HELD
 from minimax_cal.measuring.grouping import groups, held_out
 from minimax_cal.modelling.cell import pose_to_dict
 from minimax_cal.robots.robot import Robot

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from minimax_cal.fitting.accuracy import HELD
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.opened import listed_effects
 from minimax_cal.fitting.options import listed, priors_of
@@ -38,7 +39,6 @@ from minimax_cal.instruments.check import check_instrument
 from minimax_cal.instruments.file import Given, as_instrument
 from minimax_cal.instruments.instrument import Instrument, checked
 from minimax_cal.instruments.table import is_registered
-from minimax_cal.measuring.accuracy import HELD
 from minimax_cal.measuring.campaigns import session_names
 from minimax_cal.measuring.checks import check_joints, limit_notices
 from minimax_cal.measuring.history import Clock, with_history

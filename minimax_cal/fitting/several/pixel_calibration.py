@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.found import Parameter, link_by_link
 from minimax_cal.fitting.options import listed, qp_name
@@ -34,9 +35,8 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.ground.threads import one_thread
-from minimax_cal.measuring.accuracy import accuracy
-from minimax_cal.measuring.aside import TOOL, SetAside
 from minimax_cal.measuring.checks import check_joints, limit_notices
+from minimax_cal.measuring.measurements import TOOL, SetAside
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.status import Status
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
+from minimax_cal.fitting.accuracy import NO_ENDS, Accuracy
 from minimax_cal.fitting.fit import ACCURACIES
 from minimax_cal.fitting.found import parameter_table
 from minimax_cal.fitting.pixels.judge import Claim
@@ -17,7 +18,6 @@ from minimax_cal.ground.records import as_kind
 from minimax_cal.ground.results import merged
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import capitalise
-from minimax_cal.measuring.accuracy import NO_ENDS, Accuracy
 from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.solvers.status import Status
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from minimax_cal.fitting.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
 from minimax_cal.fitting.fit import ACCURACIES, Provenance
 from minimax_cal.fitting.found import Parameter, parameter_table, table_of_effects
 from minimax_cal.fitting.identify import Identification
@@ -24,10 +25,8 @@ from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import name_first
 from minimax_cal.instruments.instrument import Words
 from minimax_cal.instruments.table import INSTRUMENTS, instrument
-from minimax_cal.measuring.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
-from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.grouping import groups
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.measurements import Measurements, SetAside
 from minimax_cal.modelling.cell import Cell, cell_from_dict, pose_from_dict
 from minimax_cal.modelling.frames import paired, tables_of
 from minimax_cal.robots.frames import CONVENTION, Frame

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
+from minimax_cal.fitting.accuracy import Accuracy
 from minimax_cal.ground.facts import Apart, Fact, derived, scaled
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.units import for_people, in_own_unit
 from minimax_cal.judging.watching.moved import FIRST, Moved, moved_table
-from minimax_cal.measuring.accuracy import Accuracy
 
 
 @dataclass(frozen=True)

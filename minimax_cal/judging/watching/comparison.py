@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.fitting import identify
+from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.beyond import needed, step_without
 from minimax_cal.fitting.checks import wild
 from minimax_cal.fitting.fit import Fit, load_fit
@@ -26,7 +27,6 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.judging.watching.compared import Comparison, Difference, OnPoses
 from minimax_cal.judging.watching.moved import Moved, search
 from minimax_cal.judging.watching.opening import in_names, watched_of
-from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import regions
 from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.model import model_of

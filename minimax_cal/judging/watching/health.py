@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from minimax_cal.fitting.accuracy import Accuracy, accuracy
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.fitting.intervals import Interval, chance_of_larger, max_interval, rms_interval
 from minimax_cal.fitting.options import listed
@@ -34,7 +35,6 @@ from minimax_cal.judging.watching.prospects import hidden, prospects
 from minimax_cal.judging.watching.refit import refit
 from minimax_cal.judging.watching.result import Health, Verdict
 from minimax_cal.judging.watching.watched import Watched
-from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements, read_measurements

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.found import Parameters, link_by_link
@@ -19,7 +20,6 @@ from minimax_cal.judging.watching.moved import Search
 from minimax_cal.judging.watching.opening import in_names
 from minimax_cal.judging.watching.rows import Rows
 from minimax_cal.judging.watching.watched import Watched
-from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.solvers.status import Status

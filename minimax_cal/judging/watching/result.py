@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+from minimax_cal.fitting.accuracy import Accuracy
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.set_aside import aside_sentence
 from minimax_cal.ground.facts import Apart, Fact, derived
@@ -16,8 +17,7 @@ from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.units import in_files
 from minimax_cal.judging.tolerance import KINDS
 from minimax_cal.judging.watching.moved import FIRST, Moved, moved_table
-from minimax_cal.measuring.accuracy import Accuracy
-from minimax_cal.measuring.aside import SetAside
+from minimax_cal.measuring.measurements import SetAside
 from minimax_cal.solvers.status import Status
 
 VALID, NOT_VALID, NOT_DECIDED = "valid", "not valid", "not decided"

@@ -11,7 +11,6 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.aside import FILE
 from minimax_cal.measuring.importers.join import (
     Places,
     in_file_order,
@@ -22,7 +21,7 @@ from minimax_cal.measuring.importers.join import (
 )
 from minimax_cal.measuring.importers.tables import KEPT, Column, Given, Reading
 from minimax_cal.measuring.importers.units import STAMPED, celsius, decide, seconds
-from minimax_cal.measuring.measurements import Measurements, check_finite, marked
+from minimax_cal.measuring.measurements import FILE, Measurements, check_finite, marked
 from minimax_cal.measuring.set_aside import COLUMN, from_column, set_aside, sound
 from minimax_cal.measuring.tools import by_tool
 from minimax_cal.reading.sheet import number_of

@@ -11,6 +11,7 @@ import numpy as np
 
 from minimax_cal.diagnosing.result import Diagnosis, Finding
 from minimax_cal.diagnosing.sentences import OPENINGS, parts_of
+from minimax_cal.fitting.accuracy import NO_ENDS, Accuracy
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.checks import wild
 from minimax_cal.fitting.crossed import intervals_of
@@ -33,10 +34,10 @@ from minimax_cal.judging.tolerance import (
     overall,
     within,
 )
-from minimax_cal.measuring.accuracy import NO_ENDS, Accuracy
-from minimax_cal.measuring.aside import SetAside, counted
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.measurements import SetAside
+from minimax_cal.measuring.set_aside import counted
 from minimax_cal.modelling.cell import Cell as Arm
 from minimax_cal.modelling.effects.words import name_effect, name_structure
 from minimax_cal.modelling.parameters import Names, links_of

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import minimax_cal as mc
+from minimax_cal.fitting.spans import inner_size, least_span, narrow, outside, spans_of
 from minimax_cal.measuring.measurements import Measurements, measurements
-from minimax_cal.measuring.spans import inner_size, least_span, narrow, outside, spans_of
 
 
 def data_of(q: np.ndarray) -> Measurements:

@@ -3,7 +3,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.measuring.floor import (
+from minimax_cal.fitting.floor import (
     AT_MOST,
     DECLARED,
     DISTANCES,
@@ -14,9 +14,10 @@ from minimax_cal.measuring.floor import (
     declared,
     floor_of,
     instrument_noise,
+    instrument_of,
     of_coordinate,
+    with_instrument,
 )
-from minimax_cal.measuring.instrument import instrument_of, with_instrument
 from minimax_cal.measuring.measurements import Measurements
 
 SIGMA = 1e-5

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from minimax_cal.fitting.pose_rows import pose_rows, read_poses
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.measurements import measurements
-from minimax_cal.measuring.pose_rows import pose_rows, read_poses
 
 
 def test_poses_come_back(rng):

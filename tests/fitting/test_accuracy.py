@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.fitting.accuracy import accuracy
 
 # Two targets at three poses [m]; distances 5, 0, - and 1, 2, 2 mm.
 ERROR = 1e-3 * np.array(
