@@ -13,7 +13,7 @@ from minimax_cal.judging.watching.result import SHIFT, Hidden
 from minimax_cal.judging.watching.watched import Watched
 
 MIN_POSES = 2  # poses that place an arm
-DOUBLINGS = 6  # of the poses, of which more are asked of nobody
+DOUBLINGS = 6  # of the poses: nobody measures more than 64 times as many
 
 
 def hidden(watched: Watched, found: Search) -> Iterator[Hidden]:
@@ -52,11 +52,12 @@ def prospects(watched: Watched, found: Search) -> tuple[dict[str, float], int | 
 
 
 def to_decide(interval: Callable[[int], Interval], value: float, size: float, poses: int) -> str:
-    """How many poses would say on which side of a size an RMS lies, in words.
+    """How many poses decide on which side of a limit an RMS lies, in words.
 
-    In every second session of so many: those of which the interval would just leave out the size.
-    It is that of copies of these poses, their number doubled until it does, and a power between.
-    interval: of so many copies.  value: what was seen [m].  poses: that were.
+    Half of all sessions of so many are decided: the interval of an RMS as seen just excludes the
+    limit.  The intervals are those of 1, 2, 4 ... copies of these poses, a power law between.
+    interval: of so many copies.  value: the RMS that was seen [m].  size: the limit [m].  poses:
+    how many were seen.
     """
     side = int(value < size)
     wanted, width = abs(math.log(size / value)), math.inf
