@@ -11,7 +11,7 @@ import pytest
 from conftest import ROOT
 
 import minimax_cal as mc
-from minimax_cal.cli.commands import ENTRIES
+from minimax_cal.cli.commands import ENTRIES, WHOLE
 from minimax_cal.cli.options import FIRST, MOST_USED, RESULT, Grouped, InGroups, in_flags
 from minimax_cal.cli.running import cli
 
@@ -76,11 +76,24 @@ def test_the_command_line_calls_arguments_by_its_options(tmp_path, refuses, says
     refuses("as --columns smr1_mm,q_deg (6 joints) or --columns", "import", tmp_path / "raw.csv")
 
 
+def test_the_first_help_is_twelve_commands_on_one_screen(says):
+    brief, whole = says("--help").out, says(WHOLE).out
+    assert len(brief.splitlines()) <= 30
+    listed, more = (re.findall(r"^  ([a-z]\w+)  ", out, re.M) for out in (brief, whole))
+    assert len(listed) == 12
+    assert more == list(ENTRIES)
+    rest = " ".join(brief.partition("More:")[2].partition("\n\n")[0].split())
+    assert rest == ", ".join(more[12:])
+    assert brief.endswith(f"\nEvery command in a line: minimax-cal {WHOLE}\n")
+
+
 @pytest.mark.parametrize("name", ENTRIES)
 def test_help_is_in_groups_and_whole_sentences(name, says):
     command = cli.commands[name]
     assert isinstance(command, InGroups)
-    out = says(name, "--help").out
+    brief, out = says(name, "--help").out, says(name, WHOLE).out
+    assert len(brief.splitlines()) <= 40
+    assert max(map(len, brief.splitlines())) <= 80
     titles = re.findall(r"^(\S.*):$", out, re.M)
     assert titles[-1] == RESULT
     assert len(titles) == len(set(titles))
@@ -96,6 +109,12 @@ def test_help_is_in_groups_and_whole_sentences(name, says):
         assert titles[0] == FIRST
         part = out.partition(f"{FIRST}:")[2].partition(f"\n{titles[1]}:")[0]
         assert len(re.findall(r"^  -", part, re.M)) == 10
+        assert (
+            brief
+            == out.partition(f"\n{titles[1]}:")[0] + f"\nEvery option: minimax-cal {name} {WHOLE}\n"
+        )
+    else:
+        assert brief == out
     assert len(options) <= 15 or first
     for each in options:
         text = re.sub(r" \[default: [^]]*\]", "", each.help or "")

@@ -76,17 +76,17 @@ def calibrate_command(
     to: Output,
     **chosen: Any,
 ) -> int:
-    """Calibrate ROBOT (a file or a built-in name) from the measurements in DATA.
+    """Calibrate ROBOT from the measurements in DATA.
 
-    DATA has joint columns, and the points of a tracker (smr1_x_mm ...), or those of another
-    instrument: wire1_mm ... (lengths from unknown fixed points to a target on the flange);
-    socket (rows with the same label held the flange's ball in the same socket); surface with kind,
-    plane or sphere (what a probe's ball touched; where known radius_mm, ball_radius_mm, and
-    normal_x, normal_y, normal_z, offset_mm of a body's faces); flange_x_mm, flange_y_mm,
-    flange_z_mm with flange_rx_rad ... or flange_qw ... (whole poses).
+    ROBOT is a file or a built-in name.  DATA has joint columns, and the points of a tracker
+    (smr1_x_mm ...), or those of another instrument: wire1_mm ... (lengths from unknown fixed points
+    to a target on the flange); socket (rows with the same label held the flange's ball in the same
+    socket); surface with kind, plane or sphere (what a probe's ball touched; where known radius_mm,
+    ball_radius_mm, and normal_x, normal_y, normal_z, offset_mm of a body's faces); flange_x_mm,
+    flange_y_mm, flange_z_mm with flange_rx_rad ... or flange_qw ... (whole poses).
 
-    Files of several instruments are one fit: all share the arm, each counts by its own noise.
-    What cameras saw is given with --pixels, --joints and --camera, alone or beside DATA.
+    Files of several instruments are one fit: all share the arm, each counts by its own noise.  What
+    cameras saw is given with --pixels, --joints and --camera, alone or beside DATA.
     """
     files = record_of(PixelFiles, chosen)
     if not (data or files.given):

@@ -40,9 +40,10 @@ from minimax_cal.judging.watching.health import check
 )
 @result_options("the calibration with what moved refitted (JSON)", keep="checked.json")
 def check_command(fit: Path, data: Path, to: Output, **chosen: Any) -> int:
-    """Check with a few poses in DATA whether the calibration FIT is still valid, and what moved.
+    """Check with a few poses in DATA whether FIT is still valid.
 
-    Instrument and reflectors may have moved.  The exit code is 0 if it is valid, else 1.
+    FIT is a calibration; what moved since then is said, too.  Instrument and reflectors may have
+    moved.  The exit code is 0 if it is valid, else 1.
     """
     found = check(fit, data, **chosen)
     to.finish(found, file=lambda: json_text(found.fit_dict()))

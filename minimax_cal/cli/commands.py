@@ -18,18 +18,13 @@ import click
 
 from minimax_cal.ground.errors import OptionError
 
-COMMANDS = {  # in the order of the work
-    "Calibrate": "import calibrate identify relative",
-    "Judge": "evaluate check compare",
-    "Diagnose": "diagnose torques",
-    "Plan": "plan simulate",
-    "Correct": "compensate export",
-    "Simulate": "gap",
-    "Report": "report",
-    "Work on a page": "serve",
-    "Look up": "robots effects backends",
-    "More": "fleet iso9283 map",
+MORE = "More"
+COMMANDS = {  # what most people need, in the order of the work, and the rest
+    "Commands": "import calibrate diagnose check compare evaluate compensate export gap plan "
+    "report serve",
+    MORE: "identify relative torques simulate robots effects backends fleet iso9283 map",
 }
+WHOLE = "--help-all"
 # parameters that name outputs
 WRITTEN = ("output", "figure", "path", "pdf", "truth", "write", "out")
 SPARED = ("numpy.f2py", "numpy.testing")  # which SciPy would load and no command uses
@@ -133,10 +128,27 @@ class Workflow(click.Group):
         return list(self.commands)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The list of commands, part by part."""
+        """What most people need, and names of the rest, or with --help-all what it does, too."""
+        whole = ctx.meta.get(WHOLE)
         for part, names in COMMANDS.items():
             with formatter.section(part):
-                formatter.write_dl([(name, said_of(name)) for name in names.split()])
+                if whole or part != MORE:
+                    formatter.write_dl([(name, said_of(name)) for name in names.split()])
+                else:
+                    formatter.write_text(names.replace(" ", ", "))
+        if not whole:
+            formatter.write(f"\nEvery command in a line: {ctx.command_path} {WHOLE}\n")
+
+
+def show_whole(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
+    """Print the whole help and end."""
+    if asked:
+        ctx.meta[WHOLE] = True
+        click.echo(ctx.get_help())
+        ctx.exit()
+
+
+WHOLE_HELP = click.help_option(WHOLE, hidden=True, callback=show_whole, help="Show all and exit.")
 
 
 def said_of(name: str) -> str:

@@ -15,9 +15,10 @@ from minimax_cal.judging.watching.comparison import compare
 @click.argument("b", type=PATH)
 @result_options("the comparison (JSON)", keep="compared.json")
 def compare_command(a: Path, b: Path, to: Output) -> int:
-    """What differs between two calibrations A and B: before and after a repair, say.
+    """What differs between two calibrations, A and B.
 
-    Both are what `calibrate` or `check` wrote with -o, the earlier first.  Base and reflectors may
-    have moved; parameters that look the same as such a move are shown as nominal.
+    They are from before and after a repair, say.  Both are what `calibrate` or `check` wrote with
+    -o, the earlier first.  Base and reflectors may have moved; parameters that look the same as
+    such a move are shown as nominal.
     """
     return to.finish(compare(a, b))

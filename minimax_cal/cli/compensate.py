@@ -64,11 +64,11 @@ def compensate_command(
     to: Output,
     **chosen: Any,
 ) -> int:
-    """Correct the joint TARGETS (CSV) so that the robot of FIT goes where it is drawn to go.
+    """Correct joint TARGETS, or a whole program, for the robot of FIT.
 
-    FIT is what `calibrate -o` wrote.  TARGETS may be a whole program too: a RAPID module (.mod) or
-    KRL (.src, .dat), whose points alone are changed.  Without -o the corrected file goes to stdout,
-    its summary to stderr.
+    It then goes where it is drawn to go.  FIT is what `calibrate -o` wrote.  TARGETS are a CSV, or
+    a whole program: a RAPID module (.mod) or KRL (.src, .dat), whose points alone are changed.
+    Without -o the corrected file goes to stdout, its summary to stderr.
     """
     check_alike(targets, to.output)
     robot = None if nominal is None else load_robot(nominal)

@@ -53,7 +53,7 @@ from minimax_cal.solvers.status import Status
 def diagnose_command(
     robot: str, data: tuple[Path, ...], in_rows: bool, to: Output, **chosen: Any
 ) -> int:
-    """Say why ROBOT still misses once calibrated, as far as the measurements in DATA can tell.
+    """Say why ROBOT still misses once it is calibrated from DATA.
 
     DATA is as `calibrate` takes it; of logs, `torques` says why their torques are not ROBOT's.
     """

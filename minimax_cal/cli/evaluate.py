@@ -47,11 +47,12 @@ def kind_of_file(path: Path) -> str:
 def evaluate_command(
     fit: Path, data: Path, more: tuple[Path, ...], rung: int | None, new_frame: bool, to: Output
 ) -> int:
-    """Accuracy of a saved calibration FIT on the measurements in DATA; nothing is fitted.
+    """Accuracy of a saved calibration FIT on the measurements in DATA.
 
-    DATA of other instruments than a tracker is as `calibrate` takes it; what they have of their own
-    is fitted.  FIT is a calibration, a diagnosis or a relative calibration, as -o wrote it.  Of a
-    motion diagnosis, DATA and MORE are logs, and its torques are judged.
+    Nothing of the arm is fitted.  DATA of other instruments than a tracker is as `calibrate` takes
+    it; what they have of their own is fitted.  FIT is a calibration, a diagnosis or a relative
+    calibration, as -o wrote it.  Of a motion diagnosis, DATA and MORE are logs, and its torques are
+    judged.
     """
     found: Evaluation | MotionEvaluation
     if kind_of_file(fit) == MotionDiagnosis.KIND:

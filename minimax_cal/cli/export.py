@@ -39,10 +39,10 @@ from minimax_cal.ground.files import json_text
 @QUIET
 @with_output(rows=True)
 def export_command(fit: str, kind: str, to: Output, **chosen: Any) -> int:
-    """Write the robot of FIT (a saved result or a robot) as a file others can load.
+    """Write the robot of FIT as a file that others can load.
 
-    The geometry is fitted again for exactly the effects that the format carries.  With --json its
-    own accuracy goes to stdout, and the file to -o alone.
+    FIT is a saved result or a robot.  The geometry is fitted again for exactly the effects that the
+    format carries.  With --json its own accuracy goes to stdout, and the file to -o alone.
     """
     made = exported(fit, kind, to.output, ExportOptions(**chosen))
     if to.output or not to.as_json:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import click
 
 from minimax_cal.cli.options import (
+    CAMPAIGNS,
     PATH,
     RESULT,
     Output,
@@ -16,6 +18,7 @@ from minimax_cal.cli.options import (
     exit_code,
     options_from,
     options_of,
+    refuse,
     result_options,
 )
 from minimax_cal.dynamics.given import ARM, MotionKnown
@@ -29,8 +32,7 @@ from minimax_cal.simulators.ladder import simulator_gap
 from minimax_cal.simulators.motion.ladder import motion_gap
 
 LOGS = "Logs of motion"
-OF_LOGS = ("holdout_run", "payload", "drive_gain", "ratio", "gains", "friction", "plain",
-           "actuators", "randomize")  # fmt: skip
+OF_LOGS = {*signature(motion_gap).parameters} - {*signature(simulator_gap).parameters}
 
 
 def paired(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -46,7 +48,7 @@ def paired(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 @command
 @click.argument("model", type=PATH)
-@click.argument("data", type=PATH, nargs=-1, required=True)
+@CAMPAIGNS
 @options_of(
     motion_gap,
     ARM,
@@ -90,12 +92,13 @@ def paired(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
 @options_from(Options, "holdout", "seed")
 @result_options("the gap (JSON)", keep="gap.json", figure="the ladder")
 def gap_command(model: Path, data: tuple[Path, ...], to: Output, **chosen: Any) -> int:
-    """How far the simulated arm of MODEL (MJCF or URDF) misses the real one in DATA, and why.
+    """How far a simulated MODEL misses the real arm in DATA, and why.
 
-    DATA of poses: the model is driven with the measured commands in MuJoCo, as given and then
-    corrected step by step; only base and targets are fitted.  Without --fit or --diagnosis a
-    diagnosis is made.  DATA of logs, each a trajectory: the model is moved along runs that no fit
-    saw, and friction, masses, rotor inertias and what else makes a difference is corrected.
+    MODEL is an MJCF or URDF. DATA of poses: the model is driven with the measured commands in
+    MuJoCo, as given and then corrected step by step; only base and targets are fitted.  Without
+    --fit or --diagnosis a diagnosis is made.  DATA of logs, each a trajectory: the model is moved
+    along runs that no fit saw, and friction, masses, rotor inertias and what else makes a
+    difference is corrected.
     """
     if are_logs(data):
         del chosen["seed"]
@@ -106,10 +109,9 @@ def gap_command(model: Path, data: tuple[Path, ...], to: Output, **chosen: Any) 
         return to.finish(moved, notices=said, draw=save_motion_gap)
     if len(data) > 1:
         raise OptionError(f"{data[1]}: poses come in one file; logs need t_s, q1_rad, ..., tau1_Nm")
-    for name in OF_LOGS:
-        if chosen.pop(name):
-            raise OptionError(f"{name}: is for logs of motion, {data[0]} holds poses; leave it")
-    found = to.work(simulator_gap, model, data[0], **chosen)
+    refuse(OF_LOGS, f"is for logs of motion, {data[0]} holds poses")
+    known = {name: chosen[name] for name in chosen.keys() - OF_LOGS}
+    found = to.work(simulator_gap, model, data[0], **known)
     to.wrote(chosen["write"])
     to.finish(found, draw=save_simulator_gap)
     return exit_code(found.status) or int(not found.holds)

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from minimax_cal.cli import options
 from minimax_cal.cli.options import DATA, Output, command, options_of, plain_option, result_options
-from minimax_cal.cli.robots import links_table
 from minimax_cal.fitting.unknown_arm import identify_arm
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
+from minimax_cal.robots.frames import links_table
 
 KNOWN = "What is known"
 

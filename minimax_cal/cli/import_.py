@@ -93,10 +93,10 @@ def import_command(
     to: Output,
     **chosen: Any,
 ) -> int:
-    """Read FILEs of a tracker or controller as they are, show what was understood, write CSV.
+    """Read FILEs of a tracker or controller as they are and write CSV.
 
-    Files of joints with torques or currents in time are logs of motions, which `torques` reads.
-    Without -o nothing is written.
+    What was understood is shown.  Files of joints with torques or currents in time are logs of
+    motions, which `torques` reads.  Without -o nothing is written.
     """
     if not chosen["joints"] and not chosen["columns"] and are_logs(files):
         idle = {*chosen, "leave_out", "mend", "preview"} - {"units"}

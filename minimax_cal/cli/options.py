@@ -18,6 +18,7 @@ from click.core import ParameterSource
 from rich.console import Console
 from rich.text import Text
 
+from minimax_cal.cli.commands import WHOLE, WHOLE_HELP
 from minimax_cal.cli.progress import stages
 from minimax_cal.cli.stderr import PROGRESS, TAKEN, complain, tell, tell_taken
 from minimax_cal.ground.errors import OptionError
@@ -40,6 +41,7 @@ MOST = 1e12  # of any number: squares of what is larger overflow somewhere
 RESULT = "Measurements and result"
 FIRST = "What is used most"
 MOST_USED = {  # ten of each command with many options, by their names in Python
+    "import": "joints columns units layout decimal leave_out mend preview as_json output",
     "calibrate": "objective effects only fix priors holdout instrument figure details output",
     "relative": "effects diagnose noises priors pixels joints camera board details output",
     "diagnose": "exclude instrument holdout quick jobs in_rows figure details as_json output",
@@ -57,7 +59,7 @@ Decorator = Callable[[Command], Command]
 PATH = click.Path(path_type=Path)
 ROBOT = click.argument("robot")
 DATA = click.argument("data", type=PATH)
-CAMPAIGNS = click.argument("data", type=PATH, nargs=-1, required=True, metavar="DATA...")
+CAMPAIGNS = click.argument("data", type=PATH, nargs=-1, required=True)
 SOME_CAMPAIGNS = click.argument("data", type=PATH, nargs=-1, metavar="[DATA...]")
 SOME_DATA = click.argument("data", type=PATH, required=False)
 FIT = click.argument("fit", type=PATH)
@@ -208,7 +210,7 @@ class Grouped(click.Option):
 
 
 class InGroups(click.Command):
-    """A command whose help lists its options part by part: the most used, ..., of the result."""
+    """A command whose help lists the options that are used most, or with --help-all every one."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The options under their headings, in the order in which these come first."""
@@ -224,10 +226,13 @@ class InGroups(click.Command):
                 groups.setdefault(title, []).append(record)
         groups[FIRST] += first.values()
         last = groups.pop(RESULT, [])
+        some = first and not ctx.meta.get(WHOLE)
         for title, records in (*groups.items(), (RESULT, last)):
-            if records:
+            if records and (title == FIRST or not some):
                 with formatter.section(title):
                     formatter.write_dl(records)
+        if some:
+            formatter.write(f"\nEvery option: {ctx.command_path} {WHOLE}\n")
 
 
 def kind_of(default: Any, told: Option, name: str) -> tuple[Any, Any, str, Callable[[Any], Any]]:
@@ -248,7 +253,8 @@ def kind_of(default: Any, told: Option, name: str) -> tuple[Any, Any, str, Calla
 
 def command(made: Command) -> click.Command:
     """A command of the name that its function has before _command."""
-    return click.command(name=made.__name__.removesuffix("_command"), cls=InGroups)(made)
+    named = made.__name__.removesuffix("_command")
+    return click.command(name=named, cls=InGroups)(WHOLE_HELP(made))
 
 
 NAMED = re.compile(r"(?<![\w-])(\w+)=(?:True\b|'([^']*)')?(?=(\S?))")

@@ -98,10 +98,11 @@ def plan_command(
     waypoints: Path | None,
     **chosen: Any,
 ) -> int:
-    """Which poses of ROBOT to measure next, in which order, and how accurate they will make it.
+    """Which poses of ROBOT to measure next, for which accuracy.
 
-    With --camera, poses at which cameras see a board; with --motion, a motion to drive while
-    torques or currents are logged.
+    The poses come in the order in which to measure them, with the accuracy to expect.  With
+    --camera, poses at which cameras see a board; with --motion, a motion to drive while torques or
+    currents are logged.
     """
     if unit not in ANGLES:
         raise OptionError(f"no unit {unit!r}; choose {' or '.join(ANGLES)}")

@@ -19,12 +19,12 @@ from minimax_cal.cli.options import (
     result_options,
     together,
 )
+from minimax_cal.diagnosing.diagnose import DiagnosisOptions
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.pixels.options import PixelFiles, PixelOptions
 from minimax_cal.fitting.several import RelativeOptions, relative
 from minimax_cal.ground.errors import OptionError
 
-SOUGHT = "What is sought"
 CAMERAS = ("camera_on", "fix_camera", "camera_prior")
 
 
@@ -37,17 +37,14 @@ CAMERAS = ("camera_on", "fix_camera", "camera_prior")
 @options_from(PixelOptions, *CAMERAS)
 @options_from(Options, "method")
 @plain_option(
-    SOUGHT,
+    "What is sought",
     "--diagnose",
     is_flag=True,
     help="Look for effects of the arm that explain what geometry leaves.",
 )
-@plain_option(
-    SOUGHT,
-    "--without",
+@options_from(
+    DiagnosisOptions,
     "exclude",
-    multiple=True,
-    metavar="EFFECT",
     help="With --diagnose: do not consider this effect; `minimax-cal effects` lists them.",
 )
 @result_options("the result (JSON)", keep="relative.json")

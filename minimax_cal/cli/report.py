@@ -34,11 +34,11 @@ from minimax_cal.reporting.report import Chosen, signed
 def report_command(
     results: Sequence[Path], path: Path, pdf: Path | None, to: Output, **chosen: Any
 ) -> int:
-    """A page to sign of RESULTS: a calibration, a diagnosis, or both of the same measurements.
+    """A page to sign of RESULTS: a calibration, a diagnosis, or both.
 
-    RESULTS are files that `calibrate`, `diagnose` or `relative` wrote with -o; that of `gap -o` may
-    come with them; that of `torques -o` stands alone.  The page needs no network; PDF and PNG need
-    an installed Chromium, Chrome or Edge.
+    RESULTS are of the same measurements, as `calibrate`, `diagnose` or `relative` wrote them with
+    -o; that of `gap -o` may come with them; that of `torques -o` stands alone.  The page needs no
+    network; PDF and PNG need an installed Chromium, Chrome or Edge.
     """
     found = signed(results, path, Chosen(**chosen), pdf, to.notice)
     for line in found.lines():

@@ -11,7 +11,7 @@ from contextvars import copy_context
 import click
 
 from minimax_cal.cli import INTERRUPTED, MISUSED
-from minimax_cal.cli.commands import ENTRIES, Commands, Workflow
+from minimax_cal.cli.commands import ENTRIES, WHOLE_HELP, Commands, Workflow
 from minimax_cal.cli.stderr import AS_JSON, complain
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
 
@@ -21,6 +21,7 @@ from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
     commands=Commands(ENTRIES),
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+@WHOLE_HELP
 @click.version_option(package_name="minimax-cal", prog_name="minimax-cal")
 def cli() -> None:
     """Calibrate robot arms, and tell why a calibrated arm still misses."""

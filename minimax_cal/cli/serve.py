@@ -28,10 +28,11 @@ from minimax_cal.serving.server import FOLDER, PORT, redirecting, serve
 )
 @flag("--no-browser", help="Print the address and open no browser.")
 def serve_command(port: int | None, folder: Path, no_browser: bool) -> int:
-    """A page to work in, in the browser of this machine: drop files, fit, diagnose, judge, plan.
+    """A page in the browser: drop files, fit, diagnose, judge, plan.
 
-    It prints one address, with a token that opens it.  Only this machine can reach it, nothing
-    leaves the machine, and each click shows the command line that does the same.  Ctrl-C ends it.
+    The command prints one address, with a token that opens the page.  Only this machine can reach
+    it, nothing leaves the machine, and each click shows the command line that does the same.
+    Ctrl-C ends it.
     """
     with ExitStack() as files:
 

@@ -104,9 +104,8 @@ class Options:
 
     objective: str = fitted(
         "minimax",
-        "What is minimised: sum, minimax (the worst target), point (the worst point), pose, or "
-        "one target alone, as smr:2. Of pixels: sum (the default there), minimax, or camera (the "
-        "worst camera).",
+        "What is minimised: sum, minimax (worst target), point (worst point), pose, or one target "
+        "alone, as smr:2. Of pixels: sum (default), minimax or camera (worst camera).",
     )
     qp: QpSolver = solved(  # noqa: RUF009
         "daqp",
@@ -136,8 +135,7 @@ class Options:
     only: str = fitted("", "Fit the joints' zero positions alone: offsets.", metavar="offsets")
     instrument: str | None = known(
         None,
-        "u95 of a coordinate, where the data have no column for it: it weighs the points and tells "
-        "the noise floor.",
+        "u95 of a coordinate, where the data have no column for it; gives weights and noise floor.",
         metavar="10um+2.5um/m",
     )
     priors: Mapping[str, float] = fitted(

@@ -1,24 +1,28 @@
 """A frame as people write it: origin in mm, A, B, C in degrees; quaternion and rotation vector.
 
 A turns about z, B about the y axis that results, C about the x axis that results then, as KUKA
-does: the rotation is Rz(A) Ry(B) Rx(C).
+does: the rotation is Rz(A) Ry(B) Rx(C).  And the links of an arm as its file writes them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import for_people, turned_for_people
-from minimax_cal.robots.kinematics import quaternion, rotation_vector
+from minimax_cal.robots.kinematics import MDH_NAMES, quaternion, rotation_vector
 from minimax_cal.robots.transforms import from_rpy, level_rpy
 
+if TYPE_CHECKING:
+    from minimax_cal.robots.robot import Robot
+
 CONVENTION = "A about z, then B about y, then C about x, each axis as turned: Rz(A) Ry(B) Rx(C)"
+LENGTHS = ("a", "d")
 Triple = tuple[float, float, float]
 
 
@@ -73,3 +77,19 @@ def frames_tables(frames: Mapping[str, Frame], title: str) -> tuple[Table, Table
             "frame | w .6f | x .6f | y .6f | z .6f | rx rad .6f | ry rad .6f | rz rad .6f",
         ),
     )
+
+
+def links_table(robot: Robot) -> Table:
+    """Links and limits in millimetres and degrees, in the convention of the robot's file."""
+    units = [turned_for_people("m" if name in LENGTHS else "rad") for name in MDH_NAMES]
+    own, _ = robot.notation.written(robot.mdh, robot.prismatic)
+    rows = (
+        (f"J{i + 1}", *(size * part for (size, _), part in zip(units, link, strict=True)),
+         scale * robot.lower[i], scale * robot.upper[i], unit)
+        for i, link in enumerate(own)
+        for scale, unit in [turned_for_people("m" if robot.prismatic[i] else "rad")]
+    )  # fmt: skip
+    heads = (f"{name} {unit} .3f" for name, (_, unit) in zip(MDH_NAMES, units, strict=True))
+    craig = " (modified DH)" if robot.notation.modified else ""
+    title = f"{robot.name}: links and limits{craig}"
+    return Table.made(title, rows, "joint", *heads, "from .1f", "to .1f", "in")

@@ -11,7 +11,7 @@ import numpy as np
 from minimax_cal.fitting.fit import load_fit
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.ground.errors import CalibrationError
-from minimax_cal.measuring.measurements import read_measurements
+from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.reporting.html.page import figure_data
 from minimax_cal.reporting.html.scene import space_of, workspace
 from minimax_cal.reporting.html.sources import read_sources
@@ -25,6 +25,7 @@ class Point:
     """A target at a pose.  before, after: how far the arm misses it [mm], NaN where not known.
 
     use: training, held out, or left out of the fit.  suspect: whether it stands out from the fit.
+    pose, name: of pose and target as the file names them.
     """
 
     line: int
@@ -33,6 +34,8 @@ class Point:
     after: float
     use: str
     suspect: bool
+    pose: str
+    name: str
 
     @property
     def key(self) -> str:
@@ -59,6 +62,8 @@ def points_of(
         outside = 1e3 * np.linalg.norm(cell.error(whole), axis=-1)
     except CalibrationError:  # the poses of other measurements
         outside = np.full((len(whole.target_names), whole.poses), np.nan)
+    poses_called = called(whole)
+    names = {name: target_called(whole, name) for name in whole.target_names}
     out = []
     for row, column in np.argwhere(whole.seen):
         line, target = int(whole.line[row]), whole.target_names[column]
@@ -67,8 +72,23 @@ def points_of(
         before, after = (float(size[n][at]) for n in size) if used else (
             np.nan, float(outside[column, row]))  # fmt: skip
         use = ("held out" if found.held[at[1]] else "training") if used else "left out"
-        out.append(Point(line, target, before, after, use, (line, target) in suspects))
+        suspect = (line, target) in suspects
+        name = names[target]
+        out.append(Point(line, target, before, after, use, suspect, poses_called[row], name))
     return tuple(out)
+
+
+def called(data: Measurements) -> list[str]:
+    """Every row as people call it, as `Measurements.called` does one."""
+    names = data.columns.get("pose", np.full(data.poses, ""))
+    pairs = zip(names.tolist(), data.line.tolist(), strict=True)
+    return [f"pose {name}" if name else f"line {line}" for name, line in pairs]
+
+
+def target_called(data: Measurements, target: str) -> str:
+    """A target, with the name that the tracker's file gives it."""
+    given = [name for name in data.unknown.get(f"{target}_target", ()) if name]
+    return f"{target} ({given[0]})" if given else target
 
 
 @lru_cache(maxsize=KEPT)
@@ -82,9 +102,11 @@ def view_of(fit: str, moment: int, size: int) -> dict[str, Any]:
     space = space_of(poses, cell)
     target, pose = np.nonzero(np.isfinite(space.points[..., 0]).T)
     lines, names = poses.data.line[space.chosen[pose]], poses.data.target_names
+    every = dict(zip(poses.data.line, called(poses.data), strict=True))
     keys = [f"{line}:{names[k]}" for line, k in zip(lines, target, strict=True)]
     sizes = np.linalg.norm(space.after[pose, target], axis=-1)
     before = np.linalg.norm(space.before[pose, target], axis=-1)
-    more = {"keys": keys, "size": [round(float(s), 4) for s in sizes],
+    known = {int(line): every[line] for line in set(lines)}
+    more = {"keys": keys, "called": known, "size": [round(float(s), 4) for s in sizes],
             "size_before": [round(float(s), 4) for s in before]}  # fmt: skip
     return {**drawn, "arms": {**drawn["arms"], **more}}

@@ -17,6 +17,7 @@ from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import visible
 from minimax_cal.reporting.html.more_charts import waterfall
 from minimax_cal.reporting.html.page import figure_data, needed, template
+from minimax_cal.robots.frames import links_table
 from minimax_cal.robots.robot import builtin_robots, load_robot
 from minimax_cal.serving.cell import Point, points_of
 from minimax_cal.serving.sessions import GIVEN, SCRIPT, Choices, Session, mark
@@ -39,6 +40,7 @@ from minimax_cal.serving.work import Job, Record, record_of
 MOST_POINTS = 300  # rows of the table; the worst come first
 MOST_ROWS = 60
 KEPT = 16  # results in memory
+ARMS = (FIT, URDF, MJCF, CORRECTED)  # whose accuracy stands beside them
 WHAT = {
     SCRIPT: "all that was done here, as command lines",
     POSES: "the measurements, as they were understood",
@@ -174,6 +176,21 @@ def understood(file: dict[str, Any]) -> tuple[str, Table]:
     return visible(line), Table(str(file["file"]), header, rows)
 
 
+def robot_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+    """The links of the robot, as its file was understood."""
+    if not chosen.robot:
+        return None
+    built_in = chosen.robot in builtin_robots()
+    file = (chosen.robot, 0, 0) if built_in else mark(at.folder / GIVEN / chosen.robot)
+    return {"table": links_of(*file)}
+
+
+@lru_cache(maxsize=KEPT)
+def links_of(path: str, moment: int, size: int) -> Table:
+    """Links and limits of a built-in robot, or of a file as it was at a moment."""
+    return links_table(load_robot(path))
+
+
 def fit_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
     """The calibration in a sentence, and its numbers in large letters."""
     path = at.folder / FIT
@@ -223,20 +240,22 @@ def points_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
 def ladder_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
     """The diagnosis: while it is at work the rungs so far, then what it says."""
     if job and job.step == "diagnose":
-        return {"rungs": job.rungs, "headline": "", "tables": []}
+        return {"rungs": job.rungs, "sentences": (), "tables": []}
     path = at.folder / DIAGNOSIS
     if not path.is_file():
         return None
-    headline, tables, _ = diagnosis_words(*mark(path))
-    return {"rungs": [], "headline": headline, "tables": tables}
+    sentences, tables, _ = diagnosis_words(*mark(path))
+    return {"rungs": [], "sentences": sentences, "tables": tables}
 
 
 @lru_cache(maxsize=KEPT)
-def diagnosis_words(path: str, moment: int, size: int) -> tuple[str, tuple[Table, ...], Panel]:
-    """Headline, tables and chart of a diagnosis' file as it was at a moment."""
+def diagnosis_words(
+    path: str, moment: int, size: int
+) -> tuple[tuple[str, ...], tuple[Table, ...], Panel]:
+    """Sentences, tables and chart of a diagnosis' file as it was at a moment."""
     gap = load_diagnosis(path)
     tables = filled(gap.ladder_table(), gap.effects_table(), gap.rival_table())
-    return gap.headline(), tables, figure_data(waterfall(gap))
+    return gap.said, tables, figure_data(waterfall(gap))
 
 
 def verdict_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
@@ -254,28 +273,50 @@ def plan_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
     record, path = record_of(at, "plan"), at.folder / NEXT
     if not record or record.code or not path.is_file():
         return None
-    promise, _, _ = record.told.partition("\n\n")
     rows = list(csv.reader(path.read_text("utf-8").splitlines()))
     header = rows[0] if rows else []
     kept = [i for i, name in enumerate(header) if name.startswith(("pose", "q"))]
     body = tuple(tuple(row[i] for i in kept) for row in rows[1 : MOST_ROWS + 1])
-    return {"promise": promise, "table": Table(NEXT, tuple(header[i] for i in kept), body)}
+    return {
+        "promise": paragraph(at, "plan"),
+        "table": Table(NEXT, tuple(header[i] for i in kept), body),
+    }
 
 
 def told_panel(step: str) -> Callable[[Session, Choices, Job | None], Panel | None]:
-    """What the command of a step printed."""
+    """What the command of a step printed before its tables."""
 
     def made(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
-        record = record_of(at, step)
-        return {"text": record.told} if record and record.told else None
+        text = paragraph(at, step)
+        return {"text": text} if text else None
 
     return made
 
 
+def paragraph(at: Session, step: str) -> str:
+    """The first paragraph that the command of a step printed; empty where it did not end well."""
+    record = record_of(at, step)
+    return record.told.partition("\n\n")[0] if record and not record.code else ""
+
+
 def downloads_panel(at: Session, chosen: Choices, job: Job | None) -> Panel:
     """Every file that the commands wrote."""
-    files = [(p.name, p.stat().st_size, WHAT.get(p.name, "")) for p in at.files()]
+    files = [
+        (p.name, p.stat().st_size, WHAT.get(p.name, ""), accuracy_of(at, p.name))
+        for p in at.files()
+    ]
     return {"files": files, "base": base(at)}
+
+
+def accuracy_of(at: Session, name: str) -> str:
+    """How accurate the arm of a file is, as the command said that wrote it; else empty."""
+    if name not in ARMS:
+        return ""
+    step = next(step for step, one in STEPS.items() if one.writes == name)
+    record = record_of(at, step)
+    notices = record.notices if record and not record.code else ()
+    exported = (text for text in notices if text.startswith(f"{step} "))
+    return paragraph(at, step) or next(exported, "")
 
 
 def base(at: Session) -> str:
@@ -286,6 +327,7 @@ def base(at: Session) -> str:
 PANELS: dict[str, Callable[[Session, Choices, Job | None], Panel | None]] = {
     "files": files_panel,
     "understood": understood_panel,
+    "robot": robot_panel,
     "fit": fit_panel,
     "accuracy": accuracy_panel,
     "points": points_panel,

@@ -229,6 +229,16 @@ async def put(request: Request) -> Response:
 
 
 @asked
+async def take(request: Request) -> Response:
+    """Choose files that were dropped, in the place of those that they replace."""
+    told = await words_of(request)
+    names = told.get("names")
+    names = list(map(str, names)) if isinstance(names, list) else []
+    await run_in_threadpool(session_of(request).take, str(told.get("kind")), names)
+    return JSONResponse({})
+
+
+@asked
 async def drop(request: Request) -> Response:
     """Remove a file that was dropped."""
     session_of(request).remove(request.query_params.get("name", ""))
@@ -280,6 +290,7 @@ ROUTES = [
     Route("/s/{session}/view/{name}", view),
     Route("/s/{session}/choices", choose, methods=["PATCH"]),
     Route("/s/{session}/given", put, methods=["PUT"]),
+    Route("/s/{session}/given", take, methods=["POST"]),
     Route("/s/{session}/given", drop, methods=["DELETE"]),
     Route("/s/{session}/file/{name:path}", fetch),
     Route("/s/{session}/run/{step}", run, methods=["POST"]),

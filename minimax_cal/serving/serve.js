@@ -193,13 +193,8 @@
       }
     }
     if (!names.length) return;
-    if (kind !== "measured") {
-      await choose({ [kind]: names[0] });
-      return;
-    }
-    const known = now.choices.measured ?? [];
-    await choose({ measured: [...known, ...names.filter((name) => !known.includes(name))] })
-      && await run("read");
+    const taken = await tell("POST", "/given", JSON.stringify({ kind, names }));
+    if (taken && kind === "measured") await run("read");
   }
 
   // ---- a DH table that is typed: a CSV of it goes the way of a dropped file ----------------------
@@ -312,6 +307,11 @@
 
   const shown = () => Number(document.querySelector("input[name=shown]:checked").value);
 
+  const called = (key) => { // a point, by the names that its file gives
+    const [line, target] = key.split(":");
+    return `${cell.arms.called[line]}, ${target}`;
+  };
+
   // The errors in two colours where a limit is given: within it, and beyond.
   function errorTraces(arms) {
     const number = shown(), errors = number ? arms.after : arms.before;
@@ -331,7 +331,7 @@
         arrows(flat(points), flat(vectors), arms.steps[Number(byId("times").value)])) },
         { ...put({ ...trace, mode: "markers" }, at),
           customdata: some.map((i) => arms.keys[i]), hovertemplate: "%{text}<extra></extra>",
-          text: some.map((i) => `line ${arms.keys[i].replace(":", ", ")}: ${size[i].toFixed(3)} mm`),
+          text: some.map((i) => `${called(arms.keys[i])}: ${size[i].toFixed(3)} mm`),
           marker: { color: colour, symbol, size: symbol === "x" ? 4 : 3.5 } },
       ];
     });
@@ -360,7 +360,7 @@
     if (!place.dataset.drawn) place.on("plotly_click", picked);
     place.dataset.drawn = "yes";
     byId("times-told").textContent = `× ${arms.steps[Number(byId("times").value)]}`;
-    byId("pose-told").textContent = `line ${pose.line} (${pose.held ? "held out" : "training"}): `
+    byId("pose-told").textContent = `${arms.called[pose.line]} (${pose.held ? "held out" : "training"}): `
       + pose.error.map((size, i) => `${arms.names[i]} ${size === null ? "–" : size.toPrecision(3)} mm`).join(", ");
     byId("cell-told").textContent = `Arrows go from where the model says to where the reflector was measured, `
       + `magnified. Click a reflector to bring the arm there and to find its row.`;

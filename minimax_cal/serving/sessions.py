@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,6 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import json_of, json_text, read_raw, write_whole
 from minimax_cal.ground.words import one_line, visible
+from minimax_cal.measuring.importers import read_any
+from minimax_cal.measuring.importers.tables import Given
 from minimax_cal.measuring.set_aside import MOST_LETTERS, POINT
 from minimax_cal.robots.robot import builtin_robots
 
@@ -139,6 +141,29 @@ class Session:
             stream.truncate(size)
         return path
 
+    def take(self, kind: str, names: Sequence[str]) -> Choices:
+        """Choose files that were dropped at once; they replace what they cannot stand beside.
+
+        kind: measured, robot or targets.  Of measured files, those go that hold joint values, or
+        points, as one of these does.  Raises OptionError.
+        """
+        now, new = self.choices, self.held(*names)
+        gone = {
+            "measured": [name for name in now.measured if self.held(name) & new],
+            "robot": [],  # which can be chosen again
+            "targets": [now.targets],
+        }
+        if kind not in gone or not names:
+            raise OptionError("name the files, and what they are for")
+        for name in {*gone[kind]} - {"", *names}:
+            self.remove(name)
+        every = list(dict.fromkeys([*self.choices.measured, *names]))
+        return self.choose({kind: every if kind == "measured" else names[0]})
+
+    def held(self, *names: str) -> frozenset[str]:
+        """What dropped files say that they hold: joints, points, both or neither."""
+        return frozenset().union(*(held_in(*mark(self.file(GIVEN, name))) for name in names))
+
     def remove(self, name: str) -> Choices:
         """Remove a file that was dropped, and every choice of it."""
         self.file(GIVEN, name).unlink(missing_ok=True)
@@ -176,6 +201,17 @@ def mark(path: Path) -> tuple[str, int, int]:
 def digest_of(path: str, moment: int, size: int) -> str:
     """SHA-256 of a file as it was at a moment."""
     return sha256(Path(path).read_bytes()).hexdigest()
+
+
+@lru_cache(maxsize=256)
+def held_in(path: str, moment: int, size: int) -> frozenset[str]:
+    """Which of joints and points a file has by its own header as it was at a moment."""
+    try:
+        found = read_any(path, Given())
+    except CalibrationError:
+        return frozenset()
+    kinds = {"joints": found.joints, "points": found.smrs}
+    return frozenset(kind for kind, some in kinds.items() if some and found.sheet.header)
 
 
 def is_whole(path: Path) -> bool:

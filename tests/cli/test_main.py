@@ -161,7 +161,7 @@ def test_simulate_backends_robots_and_help(tmp_path, answered, says):
     assert "daqp" in answered("backends")["backends"]
     assert "irb2600" in says("robots").out
     assert "calibrate" in says("--help").out
-    assert "--cv" in says("calibrate --help").out
+    assert "--cv" in says("calibrate --help-all").out
     assert run("--version") == 0
 
 

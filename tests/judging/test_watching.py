@@ -1,6 +1,7 @@
 """A calibration watched: what moved is found, what cannot be told is said, no more is named."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from problems_watch import SHIFT, checked, seen_anew, shifted
 import minimax_cal as mc
 from experiments import one_session
 from experiments.one_session import Job
-from minimax_cal.judging.watching import moved
+from minimax_cal.judging.tolerance import Limit
+from minimax_cal.judging.watching import health, moved
 from minimax_cal.judging.watching.both import (
     NEW,
     OLD,
@@ -74,6 +76,33 @@ def test_rates_are_those_promised():
     results = [checked(arm, seed) for arm in ("irb2600", "ur10") for seed in range(150)]
     assert np.mean([r.joint in r.named for r in results]) >= 0.95
     assert np.mean([bool(r.alarms) for r in results]) < 0.01
+
+
+@pytest.mark.parametrize(("seen", "poses"), [(1.2, 12), (0.85, 10)])
+def test_as_many_poses_as_named_decide_every_second_session(seen, poses):
+    """Within a factor of 1.5, by sessions drawn from the law of the first."""
+    rng = np.random.default_rng(3)
+    rms = np.sqrt(3.0 * (1.0 + 0.3**2))  # mm, of pose and reflector
+
+    def session(count: int) -> tuple[np.ndarray, mc.Measurements]:
+        error = 1e-3 * (rng.normal(size=(1, count, 3)) + 0.3 * rng.normal(size=(3, count, 3)))
+        return error, mc.measurements(rng.uniform(-2.0, 2.0, (count, 6)), error.swapaxes(0, 1))
+
+    def judged(error: np.ndarray, data: mc.Measurements) -> health.Verdict:
+        return health.verdict(Limit("rms", seen * rms), error, data, 0.0, 0)
+
+    named = []
+    while len(named) < 25:
+        error, data = session(poses)
+        error *= 1e-3 * rms / np.sqrt((error**2).sum(axis=-1).mean())
+        if (found := judged(error, data)).valid is None:
+            said = re.search(r": (?:about|more than) (\d+) poses like these decide$", found.why)
+            named.append(int(said[1]))
+    few, many = (
+        np.mean([judged(*session(round(count))).valid is not None for _ in range(80)])
+        for count in np.median(named) * np.array([1.0 / 1.5, 1.5])
+    )
+    assert few < 0.5 < many
 
 
 def test_the_size_of_the_shift_is_told(knocked):

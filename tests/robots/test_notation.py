@@ -12,10 +12,10 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.cli.robots import links_table
 from minimax_cal.correcting.export import export
 from minimax_cal.correcting.exporters.table import EXPORTERS
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.robots.frames import links_table
 from minimax_cal.robots.robot import robot_from_dict
 
 NOISE = 20e-6  # of a coordinate [m]

@@ -88,6 +88,47 @@ def test_a_removed_file_is_chosen_no_more(at):
     assert at.given() == []
 
 
+JOINTS = "Pose,q1_deg,q2_deg\nP1,1,2\nP2,3,4\n"
+POINTS = "Pose,x_mm,y_mm,z_mm\nP1,1,2,3\nP2,3,4,5\n"
+BOTH = "q1_deg,q2_deg,smr1_x_mm,smr1_y_mm,smr1_z_mm\n1,2,3,4,5\n3,4,5,6,7\n"
+NO_HEADER = "1 2 3\n4 5 6\n"
+
+
+@pytest.mark.parametrize(
+    ("before", "dropped", "left"),
+    [
+        ({"a.csv": JOINTS}, {"b.csv": POINTS}, ["a.csv", "b.csv"]),
+        ({"a.csv": JOINTS, "b.csv": POINTS}, {"c.csv": POINTS}, ["a.csv", "c.csv"]),
+        ({"a.csv": JOINTS, "b.csv": POINTS}, {"c.csv": BOTH}, ["c.csv"]),
+        ({"a.csv": BOTH}, {"b.csv": POINTS, "c.csv": JOINTS}, ["b.csv", "c.csv"]),
+        ({"a.csv": BOTH}, {"a.csv": POINTS}, ["a.csv"]),
+        ({"a.txt": NO_HEADER}, {"b.txt": NO_HEADER}, ["a.txt", "b.txt"]),  # of another target
+        ({}, {"a.csv": POINTS, "b.csv": POINTS}, ["a.csv", "b.csv"]),  # at once
+    ],
+)
+def test_a_dropped_file_replaces_what_holds_the_same(at, before, dropped, left):
+    for files in (before, dropped):
+        for name, text in files.items():
+            (at.folder / GIVEN / name).write_text(text)
+        if files:
+            at.take("measured", list(files))
+    assert list(at.choices.measured) == left
+    assert set(at.given()) == {"poses.csv", *left}
+
+
+def test_targets_replace_those_before_and_robots_stay_to_choose(at):
+    for name in ("a.csv", "b.csv", "arm.json", "other.json"):
+        (at.folder / GIVEN / name).write_text("x")
+    for kind, names in (("targets", ("a.csv", "b.csv")), ("robot", ("arm.json", "other.json"))):
+        for name in names:
+            at.take(kind, [name])
+    assert (at.choices.targets, at.choices.robot) == ("b.csv", "other.json")
+    assert at.given() == ["arm.json", "b.csv", "other.json", "poses.csv"]
+    for kind, names in (("report", ["a.csv"]), ("robot", []), ("robot", ["../x"])):
+        with pytest.raises(OptionError):
+            at.take(kind, names)
+
+
 def test_a_session_is_full_at_last(at, monkeypatch):
     assert at.room("new.csv") == 256 << 20
     monkeypatch.setattr("minimax_cal.serving.sessions.MOST_TOGETHER", 10)

@@ -1,8 +1,10 @@
 """The page's work is the command line's: same numbers, whole files, ended when it is to end."""
 
+import html
 import http.client
 import json
 import os
+import re
 import socket
 import stat
 import sys
@@ -132,6 +134,63 @@ def test_files_of_tracker_and_controller_are_one(server, poses):
     assert f"{POSES} poses, 6 joints, targets smr1" in state["panels"]["understood"]
     found = mc.read_measurements(folder_of(server, home) / "poses.csv")
     assert found.q.shape == (POSES, 6)
+
+
+def test_names_are_those_of_the_files(server, poses):
+    """Of poses, and of the tracker's targets, in the table of points and in the view."""
+    home = server.begin(robot="irb120", objective="sum")
+    rows = [line.split(",") for line in poses.decode().splitlines()[1:]]
+    points = [["Pose;Nest;x_mm;y_mm;z_mm"]]
+    points += [[f"P{i:03d}", nest, *row[k : k + 3]] for i, row in enumerate(rows, 1)
+               for nest, k in (("left", 6), ("right", 9))]  # fmt: skip
+    joints = [["Pose", *(f"q{j}_rad" for j in range(1, 7))]]
+    joints += [[f"P{i:03d}", *row[:6]] for i, row in enumerate(rows, 1)]
+    for name, lines in (("points.csv", points), ("joints.csv", joints)):
+        server.put(home, name, "\n".join(map(";".join, lines)).encode())
+        told = json.dumps({"kind": "measured", "names": [name]})
+        assert server.ask("POST", f"{home}/given", told).status == 200
+    for step in ("read", "fit"):
+        state = server.run(home, step)
+        assert state["steps"][step]["state"] == "done", state["steps"][step]
+    assert state["panels"]["understood"].count("<details open>") == 2
+    shown = state["panels"]["points"]
+    assert ">pose P007<" in shown
+    assert "smr1 (left)" in shown
+    called = server.ask("GET", f"{home}/view/workspace").json["arms"]["called"]
+    assert called["8"] == "pose P007"
+    assert "ABB IRB 120: links and limits" in state["panels"]["robot"]
+
+
+def test_accuracy_stands_beside_each_download(server, fitted):
+    """That of the file itself, as the command says it."""
+    server.put(fitted, "targets.csv", b"q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n1,2,3,4,5,6\n")
+    server.choose(fitted, targets="targets.csv")
+    for step in ("urdf", "mjcf", "correct"):
+        panels = server.run(fitted, step)["panels"]
+    for name, words in (
+        ("fit.json", r"RMS error [\d.]+ mm -&gt; [\d.]+ mm"),
+        ("robot.urdf", r"urdf holds geometry alone: held-out RMS [\d.]+ mm"),
+        ("robot.xml", r"mjcf holds .*: held-out RMS [\d.]+ mm"),
+        ("corrected.csv", r"Expect on the arm: held-out RMS [\d.]+ mm"),
+    ):
+        row = panels["downloads"].partition(f"download>{name}<")[2].partition("</li>")[0]
+        assert re.search(words, row), row
+    assert "─" not in panels["told"]  # tables are not prose
+    assert "Expect on the arm" in panels["told"]
+    assert server.ask("DELETE", f"{fitted}/given?name=targets.csv").status == 200
+
+
+def test_a_diagnosis_is_said_in_paragraphs(server, results):
+    """A paragraph for each sentence of the terminal's first screen."""
+    home = server.begin(robot="ur10")
+    text = (results / "gap.json").read_text()
+    (folder_of(server, home) / "diagnosis.json").write_text(text)
+    shown = server.state(home)["panels"]["ladder"]
+    said = mc.Diagnosis.load(results / "gap.json").said
+    assert len(said) > 1
+    assert [html.unescape(one) for one in re.findall(r'<p class="headline">(.*)</p>', shown)] == [
+        *said
+    ]
 
 
 def test_names_from_files_are_only_text(server, poses):

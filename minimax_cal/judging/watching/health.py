@@ -31,7 +31,7 @@ from minimax_cal.judging.tolerance import (
 from minimax_cal.judging.watching.moved import Search, search, sized
 from minimax_cal.judging.watching.opening import in_names, watched_of
 from minimax_cal.judging.watching.placing import Placing
-from minimax_cal.judging.watching.prospects import hidden, prospects
+from minimax_cal.judging.watching.prospects import hidden, prospects, to_decide
 from minimax_cal.judging.watching.refit import refit
 from minimax_cal.judging.watching.result import Health, Verdict
 from minimax_cal.judging.watching.watched import Watched
@@ -186,8 +186,10 @@ def verdict(limit: Limit, error: Array, data: Measurements, used: float, seed: i
     group, rms = groups(data), limit.kind == "rms"
     kind = rms_interval if rms else max_interval
 
-    def interval(level: float) -> Interval:
-        return kind(larger, group, level, rng=np.random.default_rng(seed))
+    def interval(level: float, copies: int = 1) -> Interval:
+        each = np.add.outer(len(group) * np.arange(copies), group).ravel()
+        error = np.tile(larger, (1, copies, 1))
+        return kind(error, each, level, rng=np.random.default_rng(seed))
 
     found = accuracy(larger)
     value = found.rms_mm if rms else found.max_mm
@@ -207,8 +209,13 @@ def verdict(limit: Limit, error: Array, data: Measurements, used: float, seed: i
         said = f"{seen}, and a maximum needs at least {MIN_POSES} poses"
         return told(None, CONFIDENCE_RANGE[0], said)
     sure = confidence(interval, 1e-3 * limit.size_mm, above=value > limit.size_mm)
-    decided = None if sure < MIN_CONFIDENCE else value <= limit.size_mm
-    return told(decided, sure, seen if decided is not None else f"{seen}: more poses may decide")
+    if sure >= MIN_CONFIDENCE:
+        return told(value <= limit.size_mm, sure, seen)
+    if not rms:  # which grows with the poses
+        return told(None, sure, f"{seen}: more poses may decide")
+    copied = partial(interval, 2.0 * MIN_CONFIDENCE - 1.0)
+    many = to_decide(copied, 1e-3 * value, 1e-3 * limit.size_mm, poses)
+    return told(None, sure, f"{seen}: {many} poses like these decide")
 
 
 def confidence(interval: Any, size: float, *, above: bool) -> float:
