@@ -30,6 +30,7 @@ from minimax_cal.modelling.parameters import State
 
 RESAMPLES = 1000
 FEWEST = 100  # of them that show a gap
+ROUNDING = 1e-9  # share of a squared error that is none
 SPARED = 10  # groups of training poses that are left out in turn, for the interval
 FAULTS = ("outliers", "swapped_rows", RESEAT)  # that are mended before anything is fitted
 
@@ -310,7 +311,8 @@ def with_shares(findings: Sequence[Finding], steps: Sequence[Step], floor: float
 
     Faults that are mended share the first step after geometry.  Points that stand out judge none.
     """
-    gap = max(steps[1].trusted.rms_mm ** 2 - floor**2, 1e-12)
+    whole = steps[1].trusted.rms_mm ** 2
+    gap = whole - floor**2 if floor**2 < whole * (1.0 - ROUNDING) else np.nan
     out, at = [], 1
     of_data = [f for f in findings if f.rows or f.term.effect not in EFFECTS]
     mendable = [f for f in of_data if f.term.effect in FAULTS]
@@ -323,7 +325,7 @@ def with_shares(findings: Sequence[Finding], steps: Sequence[Step], floor: float
         low = 2 if fault else (at + 1 if at > 1 or not mendable else 3)
         before, after = steps[low - 1].trusted.rms_mm, steps[low].trusted.rms_mm
         at = low if not fault or found is mendable[-1] else at
-        share = (before**2 - after**2) / gap / (len(mendable) if fault else 1)
+        share = min((before**2 - after**2) / gap, 1.0) / (len(mendable) if fault else 1)
         minor = not fault and before**2 - after**2 < MINOR * geometric
         out.append(replace(found, before=before, after=after, share=share, minor=minor))
     return sorted(out, key=lambda f: -f.share if np.isfinite(f.share) else -np.inf)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -111,13 +111,13 @@ class Finding(Record):
     terms: what is fitted; several lines of one gear are one effect.  values, sigmas, names, units:
     of its parameters, SI.  size: lambda, the weighed square of its projected motion.  p_value:
     probability of so much by accident, the whole library tried.  share: of the gap that it closes
-    on held-out poses.  before, after: held-out RMS without and with it, the larger effects being
-    known [mm].  rows: of a data fault.  motion: the largest that a unit of each parameter makes at
-    the poses of the fit [rad, or m for a bending], where its own unit rests on masses that nobody
-    told; empty otherwise.  again: frequency, the share of the subsamples of the poses in which it
-    is found again; NaN where poses are too few to ask.  minor: whether it is below 5 % of the
-    squared held-out error that geometry leaves.  extends: False where the effects together make
-    regions that are left out worse than geometry alone.
+    on held-out poses, NaN where noise alone leaves as much.  before, after: held-out RMS without
+    and with it, the larger effects being known [mm].  rows: of a data fault.  motion: the largest
+    that a unit of each parameter makes at the poses of the fit [rad, or m for a bending], where its
+    own unit rests on masses that nobody told; empty otherwise.  again: frequency, the share of the
+    subsamples of the poses in which it is found again; NaN where poses are too few to ask.  minor:
+    whether it is below 5 % of the squared held-out error that geometry leaves.  extends: False
+    where the effects together make regions that are left out worse than geometry alone.
     curve: (3, g) of an error map: joint value, turn, sigma [rad].
     shown: the terms that the data ask for, where `terms` are the whole law that these belong to.
     """
@@ -379,7 +379,10 @@ class Explained:
     not_testable: effects, and what the data lack for them.
     meets_floor: whether the remaining error is down to the known noise, None where that is not
     known.
+    Of a class: SHARE: of which squared error the effects' shares are.
     """
+
+    SHARE: ClassVar[str] = "that geometry leaves"
 
     status: Status
     verdict: Annotated[str, Fact(among=VERDICTS)]
@@ -471,6 +474,7 @@ class Diagnosis(Explained, Result):
 
     KIND = "diagnosis"
     COMMAND = "diagnose"
+    SHARE = "above noise"
 
     robot: str
     ladder: Annotated[tuple[Step, ...], Fact(key="gap.ladder", fewest=2)]

@@ -77,7 +77,7 @@ def explained(found: Explained) -> tuple[str, ...]:
 
 def causes_first(found: Explained) -> tuple[str, ...]:
     """What comes first: the causes, or that the most is unexplained."""
-    causes = (listed(title_of(found), found.main), subsampled(found.main))
+    causes = (listed(title_of(found), found.main, found.SHARE), subsampled(found.main))
     return (opening(found), *causes) if is_partial(found) else (*causes, opening(found))
 
 
@@ -126,15 +126,13 @@ def unexplained(found: Explained) -> str:
     )
 
 
-def listed(title: str, findings: Sequence[Finding]) -> str:
-    """Causes with their share, the largest first, those of one kind together."""
+def listed(title: str, findings: Sequence[Finding], of: str) -> str:
+    """Causes with their share of something, the largest first, those of one kind together."""
     kinds: dict[str, list[Finding]] = {}
     for finding in findings:
         kinds.setdefault(finding.term.effect, []).append(finding)
     parts = [cause_of(same, first=i == 0) for i, same in enumerate(kinds.values())]
-    share = (
-        " of the squared error that geometry leaves" if any("%" in part for part in parts) else ""
-    )
+    share = f" of the squared error {of}" if any("%" in part for part in parts) else ""
     return f"{title}: {'; '.join(parts)}{share}." if parts else ""
 
 

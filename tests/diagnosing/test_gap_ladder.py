@@ -334,8 +334,10 @@ def test_faults_that_are_mended_share_the_first_rung() -> None:
     assert found[0].term.effect == "readback"  # what has no share comes first
     alone = with_shares([faults[0]], STEPS[:3], 0.0)[0]
     assert_allclose((alone.before, alone.after, alone.share), (1.0, 0.8, 0.36))
-    exact = with_shares([more[0]], (*STEPS[:2], STEPS[3]), 1.0)  # no gap: nothing is divided by 0
-    assert np.isfinite(exact[0].share)
+    exact = with_shares([more[0]], (*STEPS[:2], STEPS[3]), 1.0)  # no gap, and no share of it
+    assert np.isnan(exact[0].share)
+    small = with_shares([more[0]], (*STEPS[:2], STEPS[3]), 0.999)  # no more than all of it
+    assert small[0].share == 1.0
 
 
 # ---- how much is closed ------------------------------------------------------------------------

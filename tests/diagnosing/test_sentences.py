@@ -106,7 +106,7 @@ def test_causes_stand_by_their_share_and_tables_in_the_order_of_the_ladder(
     assert causes.startswith("Main causes: joint compliance at joint 2 (")
     places = [causes.index(f", {share} %") for share in (60, 20, 12)]
     assert places == sorted(places)
-    assert causes.endswith("12 % of the squared error that geometry leaves.")
+    assert causes.endswith("12 % of the squared error above noise.")
     assert [row[0] for row in found.effects_table().rows] == IN_WORDS
     assert [row[0] for row in found.parameter_table().rows] == IN_WORDS
     assert [step.name for step in found.ladder[2:]] == [f"+ {name}" for name in LADDER]
