@@ -21,9 +21,8 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.dynamics.logs import read_runs
     from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
     from minimax_cal.dynamics.run import Run
-    from minimax_cal.fitting.calibrate import calibrate
+    from minimax_cal.fitting.calibrate import calibrate, calibrate_many
     from minimax_cal.fitting.fit import Fit, load_fit
-    from minimax_cal.fitting.many import calibrate_many
     from minimax_cal.fitting.options import Options
     from minimax_cal.fitting.several.kinds import relative
     from minimax_cal.fitting.several.pixel_calibration import calibrate_pixels
@@ -164,7 +163,7 @@ MODULES = {  # name: where it is defined
     "load_fit": "fitting.fit",
     "Options": "fitting.options",
     "calibrate": "fitting.calibrate",
-    "calibrate_many": "fitting.many",
+    "calibrate_many": "fitting.calibrate",
     "calibrate_pixels": "fitting.several.pixel_calibration",
     "relative": "fitting.several.kinds",
     "bootstrap": "judging.bootstrap",

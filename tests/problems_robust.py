@@ -6,8 +6,7 @@ import numpy as np
 
 import minimax_cal as mc
 from experiments.speed import identified
-from minimax_cal.fitting.robust import Robust, robust_fit
-from minimax_cal.fitting.trimmed import Fitter
+from minimax_cal.fitting.robust import Fitter, Robust, robust_fit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import Model, SumOfSquares

@@ -31,7 +31,7 @@ from minimax_cal.planning.motion_plan import GROUP, MotionOptions, plan_motion
 from minimax_cal.planning.options import PlanOptions, limits_of
 from minimax_cal.planning.plan import plan
 from minimax_cal.planning.result import Plan
-from minimax_cal.planning.stops import ANGLES
+from minimax_cal.planning.route import ANGLES
 from minimax_cal.reporting.plots.plan import save_plan
 from minimax_cal.robots.robot import Robot, load_robot
 

@@ -40,13 +40,12 @@ from minimax_cal.diagnosing.gap import (
 from minimax_cal.diagnosing.joint import Joint
 from minimax_cal.diagnosing.last_question import down_to, known_noise
 from minimax_cal.diagnosing.moved import session_notices
-from minimax_cal.diagnosing.remaining import remaining_of
-from minimax_cal.diagnosing.reseats import sized, with_targets
 from minimax_cal.diagnosing.result import Diagnosis, Finding, Step
-from minimax_cal.diagnosing.set_aside import judged_with
+from minimax_cal.diagnosing.scatter import are_wrong, unpulled, wrong_rows
+from minimax_cal.diagnosing.set_aside import judged_with, sized, with_targets
 from minimax_cal.diagnosing.study import SUM, Study, studied
-from minimax_cal.diagnosing.tails import are_wrong, unpulled, wrong_rows
 from minimax_cal.diagnosing.verdict import explanation
+from minimax_cal.diagnosing.what_remains import remaining_of
 from minimax_cal.diagnosing.where import where
 from minimax_cal.evidence.alternatives import resemblances
 from minimax_cal.fitting.beyond import Beyond

@@ -8,7 +8,7 @@ from typing import Any
 
 from minimax_cal.diagnosing.diagnose import diagnose
 from minimax_cal.diagnosing.result import Diagnosis
-from minimax_cal.fitting.many import Data, do_many
+from minimax_cal.fitting.calibrate import Data, do_many
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.robots.robot import Robot
 

@@ -1,18 +1,26 @@
-"""Is anything left?  What effects leave of an arm's errors, asked by `evidence.remains`."""
+"""Is anything left?  What effects leave of an arm's errors, asked by `evidence.remains`.
+
+error^2 = noise^2 + what depends on something^2 + what nothing explains^2.  A part that nobody has
+measured is no number here: the scatter of the joints, which only visits to one pose tell.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from minimax_cal.diagnosing.result import Dependence, Remaining
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.evidence.limits import MAX_JOINT_JITTER, STRUCTURE, WORTH
+from minimax_cal.evidence.limits import MAX_ALONE, MAX_JOINT_JITTER, STRUCTURE, WORTH
 from minimax_cal.evidence.noise import Noise, Problem, restricted
 from minimax_cal.evidence.remains import Asked, Remains, asked, rest_of
 from minimax_cal.evidence.selection import Choice
+from minimax_cal.fitting.floor import REPEATS, instrument_alone, least_scatter
 from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.remaining import components
 from minimax_cal.modelling.rows import Posed
@@ -79,3 +87,29 @@ def certain(left: Sequence[Remains]) -> list[Remains]:
 def loudest(left: Sequence[Remains]) -> Remains | None:
     """Of what certainly remains and matters the loudest; None where nothing does."""
     return next(iter(certain(left)), None)
+
+
+# ---- where each part is known from ---------------------------------------------------------------
+
+
+def remaining_of(
+    left: Sequence[Remains], last: float, data: Measurements, error: Array
+) -> tuple[Remaining, bool]:
+    """What remains, and whether all noise beneath it is known.
+
+    left: what the last step leaves, as asked of its poses.  last: RMS distance that it leaves at
+    held-out poses [mm].  data: without faults; error: (k, m, 3) of its arm at them [m].
+    """
+    again = least_scatter(data, error)
+    noise, source = instrument_alone(data)
+    if again:  # joints that stop on either side have no middle: by the mean of the squares
+        noise, source = 1e3 * math.sqrt(float(again[0].mean())), REPEATS
+    known = source == REPEATS or last <= MAX_ALONE * noise
+    noise = min(noise, last) if math.isfinite(noise) else noise
+    rest = math.sqrt(last**2 - (noise**2 if noise > 0.0 else 0.0))
+    depends = tuple(
+        Dependence(one.place, one.driver, min(last * math.sqrt(one.share), rest), one.p)
+        for one in certain(left)
+    )
+    told = Remaining(depends, 0.0, noise, source)
+    return replace(told, unexplained_mm=math.sqrt(rest**2 - told.dependent_mm**2)), known

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,8 +30,9 @@ from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.fitting.solve import LEAST_POSES, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationWarning
+from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
 from minimax_cal.ground.options import takes
+from minimax_cal.ground.parallel import share
 from minimax_cal.ground.threads import one_thread
 from minimax_cal.instruments import file
 from minimax_cal.instruments.file import taken
@@ -210,3 +211,79 @@ def with_jump(robot: Robot, poses: Parts, options: Options, progress: Progress) 
     since = float(poses.data.columns["clock"][rows[np.argmax(sizes)]])
     found = Term(SESSION_JUMP.name, "frame", {"since": since})
     return replace(options, effects=[found if e in JUMP else e for e in options.effects])
+
+
+# ---- many at once --------------------------------------------------------------------------------
+
+
+Data = Measurements | str | Path | tuple[ArrayLike, ArrayLike]
+
+
+def calibrate_many(
+    robots: Robot | str | Path | Sequence[Robot | str | Path],
+    data: Sequence[Data],
+    *,
+    jobs: int = -1,
+    cluster: str = "",
+    **options: Any,
+) -> tuple[Fit | CalibrationError, ...]:
+    """Calibrate from many sets of measurements.
+
+    Parameters
+    ----------
+    robots
+        One for all, or one for each set.
+    data
+        As `calibrate` takes each.
+    jobs
+        Processes, -1 for one a core, 1 for this one alone.
+    cluster
+        Address of a Dask scheduler, as tcp://host:port, whose workers then do it.
+    options
+        Of `calibrate`, for all.
+
+    Returns
+    -------
+    tuple[Fit | CalibrationError, ...]
+        A fit for each set in its order, or the error that says why there is none.
+
+    Raises
+    ------
+    OptionError
+        For wrong input.
+
+    Examples
+    --------
+    >>> fits = mc.calibrate_many("irb120", ["monday.csv", "friday.csv"], objective="sum")
+    """
+    return do_many(calibrate, robots, data, jobs, cluster, options)
+
+
+def do_many(
+    verb: Callable[..., Any],
+    robots: Robot | str | Path | Sequence[Robot | str | Path],
+    data: Sequence[Data],
+    jobs: int,
+    cluster: str,
+    options: dict[str, Any],
+) -> tuple[Any, ...]:
+    """What a verb makes of each robot and its data, or the error that says why it makes nothing."""
+    arms = [robots] * len(data) if isinstance(robots, Robot | str | Path) else list(robots)
+    if len(arms) != len(data):
+        raise CalibrationError(f"{len(arms)} robots for {len(data)} data sets; give one for each")
+    known: dict[str, Robot] = {}
+    for arm in arms:
+        if not isinstance(arm, Robot) and str(arm) not in known:
+            known[str(arm)] = load_robot(arm)
+    loaded = [arm if isinstance(arm, Robot) else known[str(arm)] for arm in arms]
+    calls = [(verb, arm, sheet, options) for arm, sheet in zip(loaded, data, strict=True)]
+    found = dict(share(one, calls, [verb.__module__], processes=jobs, cluster=cluster))
+    return tuple(found[number] for number in range(len(calls)))
+
+
+def one(verb: Callable[..., Any], robot: Robot, data: Data, options: dict[str, Any]) -> Any:
+    """What a verb makes of one, or the error that says why it makes nothing."""
+    try:
+        return verb(robot, data, **options)
+    except CalibrationError as error:
+        return error

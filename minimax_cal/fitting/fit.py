@@ -15,9 +15,9 @@ import numpy as np
 import scipy
 
 from minimax_cal.fitting.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
+from minimax_cal.fitting.between_sessions import Change
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.certificate import Certificate
-from minimax_cal.fitting.changed import Change
 from minimax_cal.fitting.crossed import NOT_CROSSED, Within, intervals_of
 from minimax_cal.fitting.found import Parameter, Parameters, parameter_table, table_of_effects
 from minimax_cal.fitting.identify import Identification

@@ -10,8 +10,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from minimax_cal.fitting.accuracy import accuracy
-from minimax_cal.fitting.between_sessions import between_sessions
-from minimax_cal.fitting.changed import Change
+from minimax_cal.fitting.between_sessions import Change, between_sessions
 from minimax_cal.fitting.checks import POOR_FIT, wild
 from minimax_cal.fitting.claims import (
     bad_rows,
@@ -27,14 +26,17 @@ from minimax_cal.fitting.common_scale import common_share, with_lack
 from minimax_cal.fitting.crossed import NOT_CROSSED, few_poses
 from minimax_cal.fitting.fit import Fit, KeptDistance, Provenance, Work, WorstCase
 from minimax_cal.fitting.found import Parameters, link_by_link
-from minimax_cal.fitting.improvement import Improvement, no_better, rms_of, said_without
 from minimax_cal.fitting.options import Options, qp_name
 from minimax_cal.fitting.outcome import (
+    Improvement,
     compared,
     exchanged_rows,
     hidden,
     impossible,
+    no_better,
+    rms_of,
     said_of_exchanged,
+    said_without,
 )
 from minimax_cal.fitting.second_visits import contradictions
 from minimax_cal.fitting.set_aside import judged_with

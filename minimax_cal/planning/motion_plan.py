@@ -37,7 +37,7 @@ from minimax_cal.planning.motion import (
     shrunk,
 )
 from minimax_cal.planning.options import PlanOptions
-from minimax_cal.planning.stops import ANGLES, rounded_csv
+from minimax_cal.planning.route import ANGLES, rounded_csv
 from minimax_cal.planning.visibility import THICK, Room
 from minimax_cal.robots.gravity import masses_of, weighed
 from minimax_cal.robots.robot import Robot, load_robot

@@ -14,8 +14,7 @@ from minimax_cal.planning.candidates import Poses, rarest
 from minimax_cal.planning.designs.criteria import Criterion, inverse, sizes_of
 from minimax_cal.planning.designs.exchange import Menu
 from minimax_cal.planning.designs.search import DRAWS, Found, quick_design
-from minimax_cal.planning.observability import INDICES, observability
-from minimax_cal.planning.promise import Both, Growth, Separation
+from minimax_cal.planning.promise import INDICES, Both, Growth, Separation, observability
 from minimax_cal.planning.prospect import Ahead
 from minimax_cal.planning.route import Visits
 from minimax_cal.planning.separating import Contest, Question

@@ -16,11 +16,9 @@ from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table, records_of
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.planning.candidates import Poses
-from minimax_cal.planning.observability import INDICES
-from minimax_cal.planning.promise import Both, Growth, Separation
+from minimax_cal.planning.promise import INDICES, Both, Growth, Separation
 from minimax_cal.planning.prospect import Instrument
-from minimax_cal.planning.route import Visits
-from minimax_cal.planning.stops import rounded_csv, stops
+from minimax_cal.planning.route import Visits, rounded_csv, stops
 
 POWER = "separate"  # the criterion that is a power: the larger the better
 MEANINGS = {

@@ -18,7 +18,7 @@ from minimax_cal.cli.plan import plan_command
 from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.planning import outlook, task
 from minimax_cal.planning import plan as module
-from minimax_cal.planning.stops import ANGLES
+from minimax_cal.planning.route import ANGLES
 
 FEW = ("--candidates", 80, "-q")
 WIDE = ("--acceptance", 180)

@@ -12,8 +12,8 @@ from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.established import is_named
 from minimax_cal.diagnosing.folds import beyond_of
 from minimax_cal.diagnosing.proposals import REVISIT
-from minimax_cal.diagnosing.remaining import remaining_of
 from minimax_cal.diagnosing.sentences import SCATTERS
+from minimax_cal.diagnosing.what_remains import remaining_of
 from minimax_cal.evidence.remains import Remains
 from minimax_cal.fitting.floor import instrument_alone
 from minimax_cal.modelling.simulate import Truth, gravity, simulate

@@ -8,9 +8,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from minimax_cal.evidence.evened import TOGETHER, evened, times_before
 from minimax_cal.evidence.noise import Noise, Problem, orthonormal
-from minimax_cal.evidence.remains import Component, Fading, Rest, asked, rest_of
+from minimax_cal.evidence.remains import (
+    TOGETHER,
+    Component,
+    Fading,
+    Rest,
+    asked,
+    evened,
+    rest_of,
+    times_before,
+)
 from minimax_cal.ground.arrays import Array
 
 VISITS, WIDTH = 80, 6

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.checks import LARGE_LENGTH, too_changed
-from minimax_cal.fitting.improvement import compare_arms, improvement
+from minimax_cal.fitting.outcome import compare_arms, improvement
 from minimax_cal.fitting.same_arm import FRACTION, check_arm, least_noise
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.measuring.measurements import Measurements

@@ -14,9 +14,8 @@ import minimax_cal as mc
 from minimax_cal import solvers
 from minimax_cal.fitting import robust
 from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
-from minimax_cal.fitting.robust import LOSSES, distances, moments, robust_fit
+from minimax_cal.fitting.robust import LOSSES, Weighted, distances, moments, robust_fit
 from minimax_cal.fitting.suspects import unlikely
-from minimax_cal.fitting.trimmed import Weighted
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Prior
 from minimax_cal.modelling.parameters import State

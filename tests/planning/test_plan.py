@@ -36,10 +36,10 @@ from minimax_cal.planning.designs.criteria import (
 )
 from minimax_cal.planning.designs.exchange import Menu, exchange, floor, lower_bound, polar
 from minimax_cal.planning.designs.search import best_design, first_design, worth
-from minimax_cal.planning.observability import observability
 from minimax_cal.planning.options import PlanOptions
 from minimax_cal.planning.outlook import sigmas
 from minimax_cal.planning.plan import plan
+from minimax_cal.planning.promise import observability
 from minimax_cal.planning.prospect import (
     Instrument,
     Prospect,

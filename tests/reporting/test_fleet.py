@@ -10,8 +10,7 @@ from problems_watch import shifted
 
 import minimax_cal as mc
 from minimax_cal.modelling.simulate import Truth, simulate
-from minimax_cal.reporting.fleet.overview import Fleet
-from minimax_cal.reporting.fleet.work import Row
+from minimax_cal.reporting.fleet.overview import Fleet, Row
 
 pytest.importorskip("jinja2", reason="needs pip install minimax-cal[fleet]")
 

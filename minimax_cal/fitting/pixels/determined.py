@@ -13,11 +13,11 @@ from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.drawing import Drawing, Scale, scale_of
 from minimax_cal.fitting.pixels.fit import ROUNDS, PixelFit, fit_pixels, right, softly
+from minimax_cal.fitting.pixels.judge import Uncertainty, uncertainty_of
 from minimax_cal.fitting.pixels.model import PixelModel, Scene
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.plausible import WHOLE_IMAGE, check_start
 from minimax_cal.fitting.pixels.start import from_far, start_scene
-from minimax_cal.fitting.pixels.uncertainty import Uncertainty, uncertainty_of
 from minimax_cal.fitting.pixels.worst import WorstPixels, fit_worst
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress, silent

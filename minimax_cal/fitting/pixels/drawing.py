@@ -13,8 +13,7 @@ import numpy as np
 import scipy
 
 from minimax_cal.fitting.pixels.fit import PixelFit
-from minimax_cal.fitting.pixels.judge import drawn_covariance
-from minimax_cal.fitting.pixels.uncertainty import Uncertainty
+from minimax_cal.fitting.pixels.judge import Uncertainty, drawn_covariance
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.parameters import links_of
 from minimax_cal.robots.robot import Robot

@@ -23,11 +23,16 @@ from minimax_cal.fitting.pixels.determined import (
     placed,
 )
 from minimax_cal.fitting.pixels.fit import PixelFit
-from minimax_cal.fitting.pixels.judge import Claim, arms_apart, drawn_sigma, position_sigma
+from minimax_cal.fitting.pixels.judge import (
+    Claim,
+    Uncertainty,
+    arms_apart,
+    drawn_sigma,
+    position_sigma,
+)
 from minimax_cal.fitting.pixels.model import Scene, units_of
 from minimax_cal.fitting.pixels.options import PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import contradiction, file_notices, outlier_notices
-from minimax_cal.fitting.pixels.uncertainty import Uncertainty
 from minimax_cal.fitting.several.identify import Alone
 from minimax_cal.fitting.several.pixel_result import PIXELS, PixelCalibration
 from minimax_cal.fitting.several.result import InstrumentResult, Measured
