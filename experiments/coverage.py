@@ -22,7 +22,7 @@ import minimax_cal as mc
 from experiments import sweep
 from experiments.record import canvas
 from experiments.sweep import Study, study_options
-from minimax_cal.fitting.intervals import chance_of_larger, max_interval, rms_interval
+from minimax_cal.fitting.accuracy import chance_of_larger, max_interval, rms_interval
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.uncertainty import (

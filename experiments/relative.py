@@ -26,14 +26,13 @@ from experiments.real import here, real
 from experiments.record import canvas
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
-from minimax_cal.fitting.positions import position_sigma
+from minimax_cal.fitting.claims import position_sigma
 from minimax_cal.fitting.several import RelativeCalibration, relative
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.instruments import Instrument, closures, distances, flange_poses
-from minimax_cal.instruments.closing import CLOSED, reach
 from minimax_cal.instruments.poses import WholePoses
-from minimax_cal.instruments.sockets import Visits
+from minimax_cal.instruments.sockets import CLOSED, Visits, reach
 from minimax_cal.instruments.wires import Lengths, wire_names
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.measurements import Measurements, measurements

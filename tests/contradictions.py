@@ -7,9 +7,9 @@ import re
 from collections.abc import Iterator
 
 import minimax_cal as mc
-from minimax_cal.diagnosing.last_question import ABOVE_NOISE
 from minimax_cal.diagnosing.result import Explained
 from minimax_cal.diagnosing.sentences import NOT_VISITED, NOTHING_MM
+from minimax_cal.diagnosing.verdict import ABOVE_NOISE
 from minimax_cal.dynamics.laws import USUAL
 from minimax_cal.dynamics.result import SENTENCES
 from minimax_cal.evidence.limits import CONFIRMED, STRUCTURE

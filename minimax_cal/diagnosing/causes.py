@@ -15,12 +15,12 @@ from minimax_cal.diagnosing.scatter import weighed_anew
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.diagnosing.what_remains import left_by, loudest
 from minimax_cal.evidence import selection
-from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.bench import Added, Bench
 from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import ENOUGH
 from minimax_cal.evidence.remains import Remains, rest_of
 from minimax_cal.evidence.selection import Choice
+from minimax_cal.evidence.stability import alternatives
 from minimax_cal.fitting.options import Progress
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults import in_lines

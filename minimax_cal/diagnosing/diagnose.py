@@ -38,16 +38,15 @@ from minimax_cal.diagnosing.gap import (
     with_shares,
 )
 from minimax_cal.diagnosing.joint import Joint
-from minimax_cal.diagnosing.last_question import down_to, known_noise
 from minimax_cal.diagnosing.moved import session_notices
 from minimax_cal.diagnosing.result import Diagnosis, Finding, Step
 from minimax_cal.diagnosing.scatter import are_wrong, unpulled, wrong_rows
 from minimax_cal.diagnosing.set_aside import judged_with, sized, with_targets
 from minimax_cal.diagnosing.study import SUM, Study, studied
-from minimax_cal.diagnosing.verdict import explanation
+from minimax_cal.diagnosing.verdict import down_to, explanation, known_noise
 from minimax_cal.diagnosing.what_remains import remaining_of
 from minimax_cal.diagnosing.where import where
-from minimax_cal.evidence.alternatives import resemblances
+from minimax_cal.evidence.stability import resemblances
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
 from minimax_cal.fitting.claims import too_far
@@ -56,12 +55,12 @@ from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.floor import DISTANCES, Floor, floor_of, noise_at_most, with_instrument
 from minimax_cal.fitting.judged import doubts
 from minimax_cal.fitting.options import Options, Progress, silent
-from minimax_cal.fitting.second_visits import contradictions
 from minimax_cal.fitting.several.checks import check_no_others, with_others
 from minimax_cal.fitting.several.kinds import READ
 from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
+from minimax_cal.fitting.suspects import contradictions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.options import check_left_out, grouped, takes

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.diagnosing.result import Alternative, Finding
-from minimax_cal.evidence.dictionary import Key
+from minimax_cal.evidence.library import Key
 from minimax_cal.evidence.limits import CERTAIN, FREQUENT, HALF
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.evidence.stability import Repeats, repeated, subsamples

@@ -14,9 +14,8 @@ from minimax_cal.diagnosing.causes import Causes, sought_again, whole
 from minimax_cal.diagnosing.established import often
 from minimax_cal.diagnosing.gap import motions as motions_of
 from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis, RelativeStep
-from minimax_cal.diagnosing.last_question import Known
 from minimax_cal.diagnosing.result import Finding
-from minimax_cal.diagnosing.verdict import explanation
+from minimax_cal.diagnosing.verdict import Known, explanation
 from minimax_cal.diagnosing.what_remains import NOTHING, left_over, motions
 from minimax_cal.evidence.limits import HELPS, MAX_JOINT_JITTER, MINOR
 from minimax_cal.evidence.remains import Remains

@@ -15,17 +15,15 @@ from functools import cached_property
 
 import numpy as np
 
-from minimax_cal.diagnosing.sizes import unsized, weights_of
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.diagnosing.trial import Predicting
+from minimax_cal.diagnosing.trial import Predicting, unsized, weights_of
 from minimax_cal.fitting.accuracy import Accuracy, accuracy
 from minimax_cal.fitting.uncertainty import Estimator, Poses, Uncertainty, uncertainty_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.stations import Sessions
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.effects.bounds import at_bounds, bounds, settled
-from minimax_cal.modelling.effects.table import NOTHING, Term, names_of
+from minimax_cal.modelling.effects.table import NOTHING, Term, at_bounds, bounds, names_of, settled
 from minimax_cal.modelling.joint_fit import extended, fitted
 from minimax_cal.modelling.model import Model, moved
 from minimax_cal.modelling.parameters import State

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from minimax_cal.diagnosing.last_question import ABOVE_NOISE, ONLY_MINOR
 from minimax_cal.diagnosing.result import (
     Alternative,
     Dependence,
@@ -14,6 +13,7 @@ from minimax_cal.diagnosing.result import (
     Finding,
     Remaining,
 )
+from minimax_cal.diagnosing.verdict import ABOVE_NOISE, ONLY_MINOR
 from minimax_cal.evidence.limits import HALF, STRUCTURE
 from minimax_cal.fitting.floor import REPEATS
 from minimax_cal.modelling.effects.words import name_chance, name_step, name_structure

@@ -42,11 +42,10 @@ from minimax_cal.dynamics.run import CURRENT, Run
 from minimax_cal.dynamics.scene import Arm, Scene, sense_of
 from minimax_cal.dynamics.search import FRICTION, RIGID, Columns, dictionary_of, generous
 from minimax_cal.dynamics.softness import softened
-from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import LEVEL, MINOR
 from minimax_cal.evidence.selection import Choice, select
-from minimax_cal.evidence.stability import Repeats, halves, repeated
+from minimax_cal.evidence.stability import Repeats, alternatives, halves, repeated
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import check_left_out, takes

@@ -11,7 +11,7 @@ import numpy as np
 from minimax_cal.dynamics.laws import Term
 from minimax_cal.dynamics.rows import Whitening
 from minimax_cal.dynamics.scene import Scene
-from minimax_cal.evidence.dictionary import Spec
+from minimax_cal.evidence.library import Spec
 from minimax_cal.evidence.noise import Noise, Problem, orthonormal
 from minimax_cal.ground.arrays import Array
 

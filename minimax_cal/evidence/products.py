@@ -12,8 +12,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from minimax_cal.evidence.limits import LEAST_NOISE_DOF
-from minimax_cal.evidence.noise import RANK, Noise, Problem, costs, noise_of, told_apart, triangles
-from minimax_cal.evidence.ratios import NODES, RATIOS, ZERO, find_ratio, interpolation, nodes
+from minimax_cal.evidence.noise import (
+    NODES,
+    RANK,
+    RATIOS,
+    ZERO,
+    Noise,
+    Problem,
+    costs,
+    find_ratio,
+    interpolation,
+    nodes,
+    noise_of,
+    told_apart,
+    triangles,
+)
 from minimax_cal.ground.arrays import Array
 
 LEAST = RANK**2  # of a column's square: what is left of one that geometry imitates is no less

@@ -23,8 +23,7 @@ from minimax_cal.evidence.bench import (
     credible,
     together,
 )
-from minimax_cal.evidence.dictionary import Dictionary
-from minimax_cal.evidence.library import Candidate, Library
+from minimax_cal.evidence.library import Candidate, Dictionary, Library
 from minimax_cal.evidence.limits import (
     CONTENDERS,
     LEAST_DOF,

@@ -1,16 +1,22 @@
-"""Accuracy of positions: functions of error arrays, nothing else."""
+"""Accuracy of positions: functions of error arrays, nothing else.
+
+The pose is the unit: errors of its targets belong together.  Both intervals speak of poses drawn
+as these were, and of this one fit.  Nothing can be told of faults that the poses do not show: where
+one pose in a hundred misses by ten times as much, a few dozen poses without one promise too much.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass, field, replace
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from scipy.special import ndtri
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import APART, Fact
+from minimax_cal.ground.facts import APART, Fact, scaled
 from minimax_cal.ground.results import Record
 from minimax_cal.ground.tables import Table
 
@@ -91,3 +97,143 @@ def before_and_after(accuracies: Mapping[str, Accuracy]) -> tuple[Accuracy, Accu
         return accuracies["nominal"], held, where
     where = f"the {train.poses} poses of the fit itself (none was held out)"
     return accuracies["nominal_train"], train, where
+
+
+# ---- intervals -----------------------------------------------------------------------------------
+
+
+MIN_POSES = 3  # poses; fewer say nothing about their spread
+DRAWS = 2000  # bootstrap samples: the ends are then sure to about 2 % of the width
+PIVOTS = 4000  # simulated samples behind the interval of the largest error
+TAIL = 100  # no more than so many of the largest errors tell the tail
+BUNDLES = 2000  # more poses than these are drawn in bundles
+FARTHEST = 10.0  # times what was seen: an end beyond it is of the assumed law, not of the poses
+TINY = 1e-9  # of the mean square: an error that is exactly zero has no logarithm
+
+
+class Interval(NamedTuple):
+    """Two ends, NaN each where too little is known."""
+
+    low: float
+    high: float
+
+
+UNKNOWN = Interval(math.nan, math.nan)
+
+
+def told(interval: Interval, seen: float) -> Interval:
+    """An interval as it is told to people: never ending below what was seen, and open above where
+    the poses give no upper end.
+
+    Of few poses, or where one is nearly all of the error, the samples that lack it leave the end to
+    the tail of an assumed law: it covers, and says nothing.  seen: the value itself [m].
+    """
+    high = max(interval.high, seen) if interval.high <= FARTHEST * seen else math.nan
+    return Interval(interval.low, high)
+
+
+def with_ends(seen: Accuracy, rms: Interval, largest: Interval) -> Accuracy:
+    """An accuracy with intervals of its RMS and of its largest error [m]."""
+    ends = [tuple(scaled(interval, 1e3)) for interval in (rms, largest)]
+    return replace(seen, rms_ci95_mm=ends[0], max_ci95_mm=ends[1])
+
+
+def rms_interval(
+    error: Array, group: Array | None = None, level: float = 0.95, *, rng: np.random.Generator
+) -> Interval:
+    """Interval for the RMS distance over poses like these [m].
+
+    Studentised bootstrap of the log mean square over poses [Davison and Hinkley 1997, ch. 5], its
+    samples spread by a kernel in the logarithm: without it the skewness of few squares is missed.
+    error: (k, m, 3) measured minus predicted, NaN where not measured [m].  group: (m,) poses with
+    one number are drawn together.
+    """
+    square = (error**2).sum(axis=-1)
+    seen = np.isfinite(square)
+    total, count = np.where(seen, square, 0.0).sum(axis=0), seen.sum(axis=0)
+    total, count = (np.bincount(members(error, group), of) for of in (total, count))
+    total, count = total[count > 0], count[count > 0]
+    bundle = np.arange(len(count)) % BUNDLES
+    total, count = np.bincount(bundle, total), np.bincount(bundle, count)
+    m = len(count)
+    if m < MIN_POSES:
+        return UNKNOWN
+    mean = float(total.sum() / count.sum())
+    if mean == 0.0:
+        return Interval(0.0, 0.0)
+    total = np.maximum(total, TINY * mean * count)
+    logs = np.log(total / count)
+    width = min(float(logs.std(ddof=1)), 1.0) * m**-0.2
+    drawn = rng.integers(0, m, (DRAWS, m))
+    kernel = np.exp(width * rng.normal(size=drawn.shape) - 0.5 * width**2)
+    log, spread = log_mean(total[drawn] * kernel, count[drawn])
+    own, own_spread = log_mean(total, count)
+    student = (log - math.log(mean)) / np.maximum(spread, TINY)
+    low, high = np.quantile(student, (0.5 - 0.5 * level, 0.5 + 0.5 * level))
+    with np.errstate(over="ignore"):  # open above where one pose is nearly all of the error
+        ends = np.exp(0.5 * (own - np.array([high, low]) * own_spread))
+    return Interval(*ends.tolist())
+
+
+def log_mean(total: Array, count: Array) -> tuple[Array, Array]:
+    """Logarithm of a ratio of sums over poses, and its standard error, to first order.
+
+    total, count: (..., m).  Returns (...) each.
+    """
+    m = total.shape[-1]
+    mean = total.sum(-1) / count.sum(-1)
+    off = (total - mean[..., None] * count) / count.mean(-1)[..., None]
+    return np.log(mean), np.sqrt((off**2).sum(-1) / (m * (m - 1.0))) / mean
+
+
+def members(error: Array, group: Array | None) -> Array:
+    """(m,) number of each pose's group, counted from 0 in the order of their first poses."""
+    if group is None:
+        return np.arange(error.shape[1])
+    _, first, inverse = np.unique(group, return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[inverse.reshape(-1)])
+
+
+def max_interval(
+    error: Array, group: Array | None = None, level: float = 0.95, *, rng: np.random.Generator
+) -> Interval:
+    """Where the largest distance of equally many new poses will lie [m].
+
+    A prediction interval: exact where the logarithms of the larger half of the poses' largest
+    distances are the upper half of a normal sample; a little too wide for lighter tails, as those
+    of tracker noise.  It is wide: no method without such an assumption has an upper end at all, for
+    the new poses exceed the largest distance seen with probability 1/2.  error: (k, m, 3) measured
+    minus predicted, NaN where not measured [m].  group: (m,) poses with one number count as one.
+    """
+    distance = np.linalg.norm(error, axis=-1)
+    seen = np.isfinite(distance)
+    group = members(error, group)[seen.any(axis=0)]
+    each = np.where(seen, distance, 0.0).max(axis=0, initial=0.0)[seen.any(axis=0)]
+    largest = np.full(group.max(initial=-1) + 1, -1.0)
+    np.maximum.at(largest, group, each)
+    largest = largest[largest >= 0.0]
+    m = len(largest)
+    if m < MIN_POSES:
+        return UNKNOWN
+    size = float(np.sqrt(np.mean(largest**2)))
+    if size == 0.0:
+        return Interval(0.0, 0.0)
+    top = min((m + 1) // 2, TAIL)
+    logs = np.log(np.maximum(np.sort(largest)[m - top :], math.sqrt(TINY) * size))
+    simulated = top_of_normal(m, top, rng)
+    new = top_of_normal(m, 1, rng)[:, 0]
+    pivot = (new - simulated.mean(axis=1)) / simulated.std(axis=1, ddof=1)
+    low, high = np.quantile(pivot, (0.5 - 0.5 * level, 0.5 + 0.5 * level))
+    middle, spread = float(logs.mean()), float(logs.std(ddof=1))
+    return Interval(math.exp(middle + low * spread), math.exp(middle + high * spread))
+
+
+def top_of_normal(count: int, top: int, rng: np.random.Generator) -> Array:
+    """The largest of normal samples of a size: (PIVOTS, top), by Renyi's sums [Renyi 1953]."""
+    gaps = rng.exponential(size=(PIVOTS, top)) / (count - np.arange(top))
+    return np.asarray(-ndtri(-np.expm1(-np.cumsum(gaps, axis=1))))
+
+
+def chance_of_larger(poses: int) -> float:
+    """Probability that the next pose misses by more than all so far: 1/(n+1), whatever the law."""
+    return 1.0 / (poses + 1.0)

@@ -14,9 +14,8 @@ from typing import Annotated
 
 import numpy as np
 
-from minimax_cal.fitting.accuracy import Accuracy, accuracy
+from minimax_cal.fitting.accuracy import Accuracy, accuracy, max_interval, rms_interval, told
 from minimax_cal.fitting.identify import RESOLUTION, redundant
-from minimax_cal.fitting.intervals import max_interval, rms_interval, told
 from minimax_cal.fitting.spans import Span, narrow, plan_that_mends, spans_in_words, spans_of
 from minimax_cal.fitting.uncertainty import Estimator, Linearised, PartSums, Poses
 from minimax_cal.ground.arrays import Array

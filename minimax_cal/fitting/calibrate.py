@@ -32,7 +32,6 @@ from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
 from minimax_cal.ground.options import takes
-from minimax_cal.ground.parallel import share
 from minimax_cal.ground.threads import one_thread
 from minimax_cal.instruments import file
 from minimax_cal.instruments.file import taken
@@ -268,6 +267,8 @@ def do_many(
     options: dict[str, Any],
 ) -> tuple[Any, ...]:
     """What a verb makes of each robot and its data, or the error that says why it makes nothing."""
+    from minimax_cal.ground.parallel import share  # slow to import
+
     arms = [robots] * len(data) if isinstance(robots, Robot | str | Path) else list(robots)
     if len(arms) != len(data):
         raise CalibrationError(f"{len(arms)} robots for {len(data)} data sets; give one for each")

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtr
 
-from minimax_cal.evidence.components import fit_components
+from minimax_cal.evidence.noise import fit_components
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.lack import by_pose

@@ -12,9 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from minimax_cal.fitting.accuracy import Accuracy, accuracy
+from minimax_cal.fitting.accuracy import (
+    UNKNOWN,
+    Accuracy,
+    Interval,
+    accuracy,
+    max_interval,
+    rms_interval,
+    told,
+)
 from minimax_cal.fitting.beyond import without
-from minimax_cal.fitting.intervals import UNKNOWN, Interval, max_interval, rms_interval, told
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import groups

@@ -14,22 +14,25 @@ from typing import Annotated, Any
 import numpy as np
 import scipy
 
-from minimax_cal.fitting.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
-from minimax_cal.fitting.between_sessions import Change
-from minimax_cal.fitting.beyond import Beyond
-from minimax_cal.fitting.certificate import Certificate
-from minimax_cal.fitting.crossed import NOT_CROSSED, Within, intervals_of
-from minimax_cal.fitting.found import Parameter, Parameters, parameter_table, table_of_effects
-from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.intervals import (
+from minimax_cal.fitting.accuracy import (
+    HELD,
+    NO_ENDS,
     UNKNOWN,
+    Accuracy,
     Interval,
+    accuracy,
+    before_and_after,
     max_interval,
     rms_interval,
     told,
     with_ends,
 )
-from minimax_cal.fitting.minimax_problem import Distances, trusted_distances
+from minimax_cal.fitting.between_sessions import Change
+from minimax_cal.fitting.beyond import Beyond
+from minimax_cal.fitting.crossed import NOT_CROSSED, Within, intervals_of
+from minimax_cal.fitting.found import Parameter, Parameters, parameter_table, table_of_effects
+from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.minimax_problem import Certificate, Distances, trusted_distances
 from minimax_cal.fitting.options import Options, read_options
 from minimax_cal.fitting.pose_rows import errors_of, measured_poses, pose_rows
 from minimax_cal.fitting.set_aside import aside_sentence

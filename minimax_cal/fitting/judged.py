@@ -38,11 +38,10 @@ from minimax_cal.fitting.outcome import (
     said_of_exchanged,
     said_without,
 )
-from minimax_cal.fitting.second_visits import contradictions
 from minimax_cal.fitting.set_aside import judged_with
 from minimax_cal.fitting.solve import PER, Solved
 from minimax_cal.fitting.stations import jumps
-from minimax_cal.fitting.suspects import Suspect
+from minimax_cal.fitting.suspects import Suspect, contradictions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import Later
 from minimax_cal.measuring import checks

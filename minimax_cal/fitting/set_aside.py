@@ -8,9 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from minimax_cal.fitting.accuracy import Accuracy, accuracy
+from minimax_cal.fitting.accuracy import Accuracy, accuracy, with_ends
 from minimax_cal.fitting.crossed import intervals_of
-from minimax_cal.fitting.intervals import with_ends
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import Solved

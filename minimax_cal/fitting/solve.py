@@ -8,10 +8,15 @@ from functools import cached_property, partial
 import numpy as np
 
 from minimax_cal.fitting import identify
-from minimax_cal.fitting.certificate import Certificate, certify
 from minimax_cal.fitting.checks import POOR_FIT, too_changed
 from minimax_cal.fitting.identify import MAX_NAMED, Because, Identification, Reason
-from minimax_cal.fitting.minimax_problem import Distances, minimax_problem, trusted_distances
+from minimax_cal.fitting.minimax_problem import (
+    Certificate,
+    Distances,
+    certify,
+    minimax_problem,
+    trusted_distances,
+)
 from minimax_cal.fitting.options import (
     OFFSETS,
     Options,
@@ -35,8 +40,16 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Frames, Sessions, seen_from
 from minimax_cal.modelling import start
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.effects.bounds import at_bounds, bounds, settled
-from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term, names_of, of_sessions
+from minimax_cal.modelling.effects.table import (
+    NOTHING,
+    Fitted,
+    Term,
+    at_bounds,
+    bounds,
+    names_of,
+    of_sessions,
+    settled,
+)
 from minimax_cal.modelling.effects.table import terms as terms_of
 from minimax_cal.modelling.joint_fit import extended, fitted, scene_of
 from minimax_cal.modelling.model import (

@@ -174,3 +174,12 @@ def pair(text: str, name: str, scale: float) -> tuple[float, float]:
     if not parts[0] < parts[1]:
         raise OptionError(f"{name}={text!r}: the limits are reversed; give low:high")
     return parts[0], parts[1]
+
+
+# ---- seeds ---------------------------------------------------------------------------------------
+
+
+def check_seed(seed: int) -> None:
+    """Raise OptionError for a seed that NumPy's generators do not take."""
+    if seed < 0:
+        raise OptionError(f"seed {seed}: give a whole number, 0 or more")

@@ -17,7 +17,6 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.instruments.closing import CLOSED, reach
 from minimax_cal.instruments.instrument import (
     UNREADY,
     Columns,
@@ -32,6 +31,7 @@ from minimax_cal.instruments.instrument import (
 from minimax_cal.instruments.options import FAR, InstrumentOptions
 from minimax_cal.instruments.protocol import Arm, FlangePoses, ResidualRows
 from minimax_cal.instruments.shapes import PLANE, SPHERE, Shapes, Surface, placed_best
+from minimax_cal.instruments.sockets import CLOSED, reach
 from minimax_cal.measuring.measurements import joint_rows
 from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.kinematics import hat, right_jacobian

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from minimax_cal.fitting.accuracy import Interval
 from minimax_cal.fitting.fit import Fit
-from minimax_cal.fitting.intervals import Interval
 from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
 from minimax_cal.fitting.options import Progress, silent, solver_of
 from minimax_cal.fitting.solve import QP_TOLERANCE
@@ -22,7 +22,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.facts import scaled
 from minimax_cal.ground.files import plain
-from minimax_cal.ground.seeds import check_seed
+from minimax_cal.ground.options import check_seed
 from minimax_cal.ground.stages import count_stage
 from minimax_cal.ground.tables import Table, records_of
 from minimax_cal.ground.units import for_people, in_files

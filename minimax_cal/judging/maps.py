@@ -26,9 +26,8 @@ from minimax_cal.fitting.uncertainty import FRAMES, Uncertainty, holding_radius,
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.facts import Apart, Fact, Milli, Mm
-from minimax_cal.ground.options import grouped
+from minimax_cal.ground.options import check_seed, grouped
 from minimax_cal.ground.results import Result
-from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.saved import AFTER, BEFORE, Saved
 from minimax_cal.modelling.cell import Cell

@@ -6,9 +6,8 @@ import math
 import re
 from dataclasses import dataclass
 
-from minimax_cal.fitting.accuracy import Accuracy
+from minimax_cal.fitting.accuracy import UNKNOWN, Accuracy, Interval, chance_of_larger
 from minimax_cal.fitting.beyond import Beyond
-from minimax_cal.fitting.intervals import UNKNOWN, Interval, chance_of_larger
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.words import name_first
 from minimax_cal.solvers.status import Status

@@ -17,7 +17,7 @@ import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
-from minimax_cal.ground.seeds import check_seed
+from minimax_cal.ground.options import check_seed
 from minimax_cal.measuring.history import clock, numbered, sessions
 from minimax_cal.measuring.measurements import Measurements
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from minimax_cal.evidence.dictionary import Spec
-from minimax_cal.evidence.library import Library
+from minimax_cal.evidence.library import Library, Spec
 from minimax_cal.evidence.noise import Noise
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.gears import GEAR_RIPPLE

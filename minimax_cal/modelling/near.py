@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.effects.bounds import settled
+from minimax_cal.modelling.effects.table import settled
 from minimax_cal.modelling.model import Model, SumOfSquares, arrays_of
 from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots.kernels import sums

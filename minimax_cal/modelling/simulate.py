@@ -10,8 +10,7 @@ import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import grouped
-from minimax_cal.ground.seeds import check_seed
+from minimax_cal.ground.options import check_seed, grouped
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots import kinematics

@@ -40,8 +40,7 @@ from minimax_cal.planning.options import USUAL, PlanOptions, check_options
 from minimax_cal.planning.plan import chosen, enough
 from minimax_cal.planning.prospect import Instrument
 from minimax_cal.planning.result import Plan
-from minimax_cal.planning.setting import Ground, check_same, surroundings
-from minimax_cal.planning.task import Task
+from minimax_cal.planning.task import Ground, Task, check_same, surroundings
 from minimax_cal.planning.visibility import Room, View
 from minimax_cal.robots.robot import Robot, load_robot
 

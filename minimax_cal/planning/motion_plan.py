@@ -22,9 +22,8 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.facts import Apart, Fact
 from minimax_cal.ground.files import plain
-from minimax_cal.ground.options import grouped, takes
+from minimax_cal.ground.options import check_seed, grouped, takes
 from minimax_cal.ground.results import Result
-from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.ground.tables import Table
 from minimax_cal.planning.candidates import limits_of

@@ -11,8 +11,7 @@ import numpy as np
 
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import plain
-from minimax_cal.ground.options import SI, grouped, pair, triple
-from minimax_cal.ground.seeds import check_seed
+from minimax_cal.ground.options import SI, check_seed, grouped, pair, triple
 from minimax_cal.planning.prospect import Instrument
 from minimax_cal.planning.result import MEANINGS, POWER
 from minimax_cal.planning.visibility import NORMALS

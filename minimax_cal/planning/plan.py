@@ -22,8 +22,7 @@ from minimax_cal.planning.options import PlanOptions, check_options, settings_of
 from minimax_cal.planning.outlook import grown, indices, remarks, separated
 from minimax_cal.planning.result import POWER, Plan, Travel
 from minimax_cal.planning.route import shortest, travel, visits
-from minimax_cal.planning.setting import ground_of, surroundings
-from minimax_cal.planning.task import Task, task_of
+from minimax_cal.planning.task import Task, ground_of, surroundings, task_of
 from minimax_cal.planning.visibility import Room, Sight
 from minimax_cal.robots.robot import Robot, load_robot
 

@@ -9,7 +9,7 @@ import pytest
 import minimax_cal as mc
 from experiments import blind_gap, motion_blind, relative_gap
 from experiments.gap_cases import make
-from minimax_cal.diagnosing.last_question import ABOVE_NOISE
+from minimax_cal.diagnosing.verdict import ABOVE_NOISE
 from minimax_cal.dynamics.laws import USUAL
 from tests.contradictions import contradictions
 

@@ -19,9 +19,8 @@ from minimax_cal.fitting.floor import noise_at_most
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.measuring.history import with_history
-from minimax_cal.modelling.effects.bounds import at_bounds, bounds
 from minimax_cal.modelling.effects.scene import mask_of
-from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.table import Term, at_bounds, bounds
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.robot import Robot
 

@@ -9,8 +9,8 @@ from test_verdict import finding
 import minimax_cal as mc
 from experiments.gap_cases import Cause
 from experiments.machines import Asked, make
-from minimax_cal.diagnosing.last_question import ABOVE_NOISE, ONLY_MINOR, Known, answered
 from minimax_cal.diagnosing.result import Finding
+from minimax_cal.diagnosing.verdict import ABOVE_NOISE, ONLY_MINOR, Known, answered
 
 NAN = float("nan")
 QUIET = Known(highest=0.05, remaining=0.04, visits=NAN, expected=NAN)

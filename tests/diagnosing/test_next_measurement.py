@@ -19,10 +19,10 @@ from minimax_cal.diagnosing.next_measurement import (
     separate,
     separate_with,
 )
-from minimax_cal.evidence.alternatives import ENOUGH
 from minimax_cal.evidence.bench import bench
 from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.noise import Noise
+from minimax_cal.evidence.stability import ENOUGH
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array

@@ -9,8 +9,8 @@ from scipy.stats import multivariate_normal
 
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.joint import joint
-from minimax_cal.diagnosing.sizes import unsized, weights_of
 from minimax_cal.diagnosing.study import Study, studied
+from minimax_cal.diagnosing.trial import unsized, weights_of
 from minimax_cal.fitting.uncertainty import Estimator, Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.table import Term

@@ -15,21 +15,24 @@ from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence import limits
 from minimax_cal.evidence.bench import bench
-from minimax_cal.evidence.components import fit_components
-from minimax_cal.evidence.dictionary import Dictionary, Spec
-from minimax_cal.evidence.library import Library
+from minimax_cal.evidence.library import Dictionary, Library, Spec
 from minimax_cal.evidence.limits import LEAST_NOISE_DOF
-from minimax_cal.evidence.noise import Noise, Problem, inflation, orthonormal, restricted
-from minimax_cal.evidence.products import LEAST
-from minimax_cal.evidence.ratios import (
+from minimax_cal.evidence.noise import (
     NODES,
+    Noise,
+    Problem,
     find_ratio,
+    fit_components,
+    inflation,
     interpolation,
     nodes,
+    orthonormal,
+    restricted,
 )
-from minimax_cal.evidence.ratios import (
+from minimax_cal.evidence.noise import (
     RATIOS as RATIOS,
 )
+from minimax_cal.evidence.products import LEAST
 from minimax_cal.evidence.selection import NOTHING, Choice, select, tuned_again
 from minimax_cal.evidence.sweeping import COUNT, Swept, ratios_about
 from minimax_cal.fitting.options import Options, silent

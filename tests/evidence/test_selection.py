@@ -17,14 +17,12 @@ from minimax_cal.diagnosing.causes import chosen
 from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.evidence import selection
-from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.bench import against_signs, bench, columns_of, credible
-from minimax_cal.evidence.dictionary import Spec
-from minimax_cal.evidence.library import Kind, Library
+from minimax_cal.evidence.library import Kind, Library, Spec
 from minimax_cal.evidence.limits import LEVEL, PARTS, ROUNDS
 from minimax_cal.evidence.noise import Noise, Problem, orthonormal
 from minimax_cal.evidence.selection import select, tuned
-from minimax_cal.evidence.stability import Repeats, halves, repeated, subsamples
+from minimax_cal.evidence.stability import Repeats, alternatives, halves, repeated, subsamples
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array

@@ -11,7 +11,15 @@ from scipy import stats
 
 import minimax_cal as mc
 from minimax_cal.fitting import beyond
-from minimax_cal.fitting.accuracy import accuracy
+from minimax_cal.fitting.accuracy import (
+    Interval,
+    accuracy,
+    chance_of_larger,
+    max_interval,
+    rms_interval,
+    told,
+    top_of_normal,
+)
 from minimax_cal.fitting.beyond import (
     needed,
     one_step,
@@ -20,14 +28,6 @@ from minimax_cal.fitting.beyond import (
     without,
 )
 from minimax_cal.fitting.crossed import MIN_HELD_POSES
-from minimax_cal.fitting.intervals import (
-    Interval,
-    chance_of_larger,
-    max_interval,
-    rms_interval,
-    told,
-    top_of_normal,
-)
 from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import plain

@@ -9,11 +9,12 @@ from problems_fit import solve
 
 import minimax_cal as mc
 from experiments.speed import identified
-from minimax_cal.fitting.certificate import PointCones, certify
 from minimax_cal.fitting.found import Parameter
 from minimax_cal.fitting.minimax_problem import (
     Distances,
     MinimaxProblem,
+    PointCones,
+    certify,
     measured_distances,
     minimax_problem,
 )

@@ -23,7 +23,7 @@ from minimax_cal.instruments import (
     read_relative,
     write_relative,
 )
-from minimax_cal.instruments.closing import reach
+from minimax_cal.instruments.sockets import reach
 from minimax_cal.robots.sampling import random_poses
 
 # ---- instrument data -----------------------------------------------------------------------------

@@ -43,12 +43,11 @@ from minimax_cal.instruments import (
     flange_poses,
     poses_as_targets,
 )
-from minimax_cal.instruments.closing import closing_poses, reach
 from minimax_cal.instruments.instrument import Words, bare
 from minimax_cal.instruments.options import known_of
 from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
 from minimax_cal.instruments.reflectors import spots_of
-from minimax_cal.instruments.sockets import free_numbers, misclosures
+from minimax_cal.instruments.sockets import closing_poses, free_numbers, misclosures, reach
 from minimax_cal.instruments.tracker import Points
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.parameters import State

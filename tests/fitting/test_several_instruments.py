@@ -29,8 +29,8 @@ from minimax_cal.instruments import (
     read_relative,
     write_relative,
 )
-from minimax_cal.instruments.closing import reach
 from minimax_cal.instruments.file import as_instrument
+from minimax_cal.instruments.sockets import reach
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.simulate import Truth, simulate

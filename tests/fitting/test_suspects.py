@@ -12,12 +12,13 @@ from problems_robust import NOISE, Case, fit, misread, shifted, state_of
 from scipy import stats
 
 import minimax_cal as mc
-from minimax_cal.fitting.second_visits import contradictions, nearest
 from minimax_cal.fitting.suspects import (
     FALSE_DISCOVERY_RATE,
     Scores,
     Spread,
+    contradictions,
     fit_log_scale,
+    nearest,
     scores,
     spread_of,
     unlikely,

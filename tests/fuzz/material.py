@@ -19,7 +19,7 @@ import minimax_cal as mc
 from experiments.pixel_cells import board_points, make_cell, write_cell
 from minimax_cal.cli import main
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
-from minimax_cal.instruments.closing import reach
+from minimax_cal.instruments.sockets import reach
 
 POSES = 24
 CELLS = """

@@ -8,7 +8,7 @@ from numpy.testing import assert_array_equal
 
 import minimax_cal as mc
 from minimax_cal.planning.candidates import limits_of
-from minimax_cal.planning.setting import check_same
+from minimax_cal.planning.task import check_same
 
 
 def test_a_fit_of_another_arm_is_refused(robot, noisy):

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.diagnosing import next_measurement
-from minimax_cal.evidence.alternatives import ENOUGH
+from minimax_cal.evidence.stability import ENOUGH
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.cell import still
 from minimax_cal.modelling.effects.scene import Scene
@@ -50,7 +50,7 @@ from minimax_cal.planning.prospect import (
 )
 from minimax_cal.planning.result import POWER, Plan
 from minimax_cal.planning.route import lengths, shortest, travel, visits
-from minimax_cal.planning.setting import surroundings
+from minimax_cal.planning.task import surroundings
 from minimax_cal.robots.sampling import random_poses
 
 ROUNDING = 1e-9  # relative: the same numbers by other algebra

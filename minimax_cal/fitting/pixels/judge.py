@@ -15,7 +15,7 @@ from typing import Annotated
 
 import numpy as np
 
-from minimax_cal.evidence.components import fit_components
+from minimax_cal.evidence.noise import fit_components
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.pixels.identify import gram_of_pixels, lengths_of
 from minimax_cal.ground.arrays import Array

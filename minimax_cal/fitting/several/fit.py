@@ -28,8 +28,7 @@ from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS, without_resting
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.instruments.instrument import Instrument
-from minimax_cal.modelling.effects.bounds import at_bounds
-from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.table import Term, at_bounds
 from minimax_cal.modelling.near import between, is_kept
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.modelling.rows import MIN_COMPUTED_NOISE

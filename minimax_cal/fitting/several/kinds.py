@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.fitting.accuracy import HELD
+from minimax_cal.fitting.claims import lacking, position_sigma, positions_by
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.opened import listed_effects
 from minimax_cal.fitting.options import listed, priors_of
-from minimax_cal.fitting.positions import lacking, position_sigma, positions_by
 from minimax_cal.fitting.several import fit, plausible, remarks
 from minimax_cal.fitting.several.checks import check_given, check_noises, check_options
 from minimax_cal.fitting.several.fit import InstrumentFit, Train

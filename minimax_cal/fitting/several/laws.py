@@ -12,12 +12,12 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.modelling.effects.bounds import bounds
 from minimax_cal.modelling.effects.scene import BESIDE, Scene
 from minimax_cal.modelling.effects.table import (
     EFFECTS,
     Pick,
     Term,
+    bounds,
     fields_of,
     names_of,
     parse,

@@ -9,11 +9,19 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from minimax_cal.fitting.accuracy import HELD, NO_ENDS, Accuracy, accuracy, before_and_after
+from minimax_cal.fitting.accuracy import (
+    HELD,
+    NO_ENDS,
+    Accuracy,
+    Interval,
+    accuracy,
+    before_and_after,
+    rms_interval,
+    told,
+)
 from minimax_cal.fitting.fit import ACCURACIES, Provenance
 from minimax_cal.fitting.found import Parameter, parameter_table, table_of_effects
 from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.intervals import Interval, rms_interval, told
 from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.fitting.several.identify import Alone
 from minimax_cal.ground.arrays import Array, rms

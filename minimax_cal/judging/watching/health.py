@@ -11,15 +11,21 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.accuracy import Accuracy, accuracy
+from minimax_cal.fitting.accuracy import (
+    Accuracy,
+    Interval,
+    accuracy,
+    chance_of_larger,
+    max_interval,
+    rms_interval,
+)
 from minimax_cal.fitting.fit import Fit, load_fit
-from minimax_cal.fitting.intervals import Interval, chance_of_larger, max_interval, rms_interval
 from minimax_cal.fitting.options import listed
 from minimax_cal.fitting.same_arm import check_arm, computed, residual
 from minimax_cal.fitting.set_aside import errors_of, with_them
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.seeds import check_seed
+from minimax_cal.ground.options import check_seed
 from minimax_cal.judging.tolerance import (
     KINDS,
     MAX_EXCEED_CHANCE,

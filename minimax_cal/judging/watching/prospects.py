@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from minimax_cal.fitting.intervals import FARTHEST, Interval
+from minimax_cal.fitting.accuracy import FARTHEST, Interval
 from minimax_cal.judging.watching.moved import MIN_OWN_MOTION, Search, joint_of
 from minimax_cal.judging.watching.result import SHIFT, Hidden
 from minimax_cal.judging.watching.watched import Watched

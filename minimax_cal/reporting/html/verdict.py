@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 from minimax_cal.diagnosing.result import Diagnosis
-from minimax_cal.fitting.accuracy import Accuracy
+from minimax_cal.fitting.accuracy import UNKNOWN, Accuracy, Interval
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.identify import Because
-from minimax_cal.fitting.intervals import UNKNOWN, Interval
 from minimax_cal.reporting.html.content import Note, caveat, text
 
 OBJECTIVES = {
