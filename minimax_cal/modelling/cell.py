@@ -15,7 +15,7 @@ from minimax_cal.ground.files import saved_content
 from minimax_cal.ground.units import in_mm
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.history import Clock, ordered
-from minimax_cal.measuring.measurements import FARTHEST, Measurements
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import ALONE, Sessions, labels, moved, seen_from, shifts
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Fitted, fitted_from_list
@@ -25,6 +25,7 @@ from minimax_cal.robots.kinematics import rotation, rotation_vector
 from minimax_cal.robots.robot import Robot, checked_poses, robot_from_dict, told_missing
 from minimax_cal.robots.transforms import transform
 
+LARGEST = 1e9  # of a place in a file [m]: a fit that failed may end anywhere
 LATE = 0.1  # of a session: so far beyond its ends, effects of time are not extrapolated silently
 
 
@@ -169,7 +170,7 @@ def pose_from_dict(content: Mapping[str, Any]) -> Array:
     turn = np.array(content["rotation_vector_rad"], dtype=float)
     place = np.array(content["translation_mm"], dtype=float)
     pose = transform(rotation(turn.reshape(3)), 1e-3 * place.reshape(3))
-    if not np.isfinite(pose).all() or np.abs(pose).max() > FARTHEST:
+    if not np.isfinite(pose).all() or np.abs(pose).max() > LARGEST:
         raise ValueError("a pose is not of plausible numbers")
     return pose
 
@@ -217,7 +218,7 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
             f"{source}: is not a saved calibration (robot, base, targets_mm: {said(error)}); "
             "write one with minimax-cal calibrate"
         ) from error
-    if not np.abs(spots).max(initial=0.0) <= FARTHEST:
+    if not np.abs(spots).max(initial=0.0) <= LARGEST:
         raise CalibrationError(f"{source}: targets are not plausible numbers")
     names = tuple(map(str, targets))
     cell = Cell(robot_from_dict(robot, source), base, names, spots, effects, sessions)

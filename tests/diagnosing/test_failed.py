@@ -1,17 +1,20 @@
 """A diagnosis that contradicts its own data: failed, and no robot comes of it."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import run
+from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.diagnosing.diagnose import against
 from minimax_cal.diagnosing.result import Step
 from minimax_cal.fitting.accuracy import Accuracy
 from minimax_cal.fitting.floor import AT_MOST, REPEATS, Floor
+from minimax_cal.robots.transforms import transform
 
 
 def mirrored(data: mc.Measurements) -> mc.Measurements:
@@ -30,6 +33,9 @@ def test_it_ends_with_one_and_writes_no_robot(
     assert not out.exists()
     found = mc.Diagnosis.from_dict(json.loads(said.out))
     assert (found.status, found.verdict) == ("failed", "unknown")
+    gone = replace(found.cells[0], base=transform(np.eye(3), np.array([3e5, 0.0, 0.0])))
+    again = mc.Diagnosis.from_dict(json.loads(replace(found, cells=(gone,)).json()))
+    assert_allclose(again.cells[0].base, gone.base, rtol=1e-9)  # wherever it ended
     assert "no calibration of this arm" in found.headline()
     assert "no calibration of this arm" in found.notices[-1]
     with pytest.raises(mc.OptionError, match="contradicts its own data"):
