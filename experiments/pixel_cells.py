@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 import minimax_cal as mc
 from minimax_cal.fitting.pixels.camera import Camera
 from minimax_cal.fitting.pixels.data import PixelData
-from minimax_cal.fitting.pixels.identify import gram_of_pixels
+from minimax_cal.fitting.pixels.fit import gram_of_pixels
 from minimax_cal.fitting.pixels.judge import POSES as JUDGED
 from minimax_cal.fitting.pixels.judge import everywhere, free_motion, missed, tool_points
 from minimax_cal.fitting.pixels.model import PixelModel, Scene, lens_of

@@ -38,8 +38,14 @@ from experiments.pixel_cells import (
 )
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.pixels.data import PixelData
-from minimax_cal.fitting.pixels.fit import ANY, by_depths, fit_drawn, known_of, reprojected
-from minimax_cal.fitting.pixels.identify import identified
+from minimax_cal.fitting.pixels.fit import (
+    ANY,
+    by_depths,
+    fit_drawn,
+    identified,
+    known_of,
+    reprojected,
+)
 from minimax_cal.fitting.pixels.model import PixelModel
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import directions, from_far, poses_of_images, start_scene

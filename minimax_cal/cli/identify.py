@@ -9,7 +9,7 @@ from minimax_cal.cli.options import DATA, Output, command, options_of, plain_opt
 from minimax_cal.fitting.unknown_arm import identify_arm
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
-from minimax_cal.robots.frames import links_table
+from minimax_cal.robots.transforms import links_table
 
 KNOWN = "What is known"
 

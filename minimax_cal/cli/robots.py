@@ -7,8 +7,8 @@ import click
 from minimax_cal.cli import options
 from minimax_cal.cli.schemas import schema_of, schema_option
 from minimax_cal.ground.tables import Table
-from minimax_cal.robots.frames import links_table
 from minimax_cal.robots.robot import builtin_robots, load_robot
+from minimax_cal.robots.transforms import links_table
 
 
 @options.command

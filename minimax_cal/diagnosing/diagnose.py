@@ -38,11 +38,11 @@ from minimax_cal.diagnosing.gap import (
     with_shares,
 )
 from minimax_cal.diagnosing.joint import Joint
-from minimax_cal.diagnosing.moved import session_notices
 from minimax_cal.diagnosing.result import Diagnosis, Finding, Step
 from minimax_cal.diagnosing.scatter import are_wrong, unpulled, wrong_rows
 from minimax_cal.diagnosing.set_aside import judged_with, sized, with_targets
 from minimax_cal.diagnosing.study import SUM, Study, studied
+from minimax_cal.diagnosing.trial import session_notices
 from minimax_cal.diagnosing.verdict import down_to, explanation, known_noise
 from minimax_cal.diagnosing.what_remains import remaining_of
 from minimax_cal.diagnosing.where import where
@@ -55,9 +55,8 @@ from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.floor import DISTANCES, Floor, floor_of, noise_at_most, with_instrument
 from minimax_cal.fitting.judged import doubts
 from minimax_cal.fitting.options import Options, Progress, silent
-from minimax_cal.fitting.several.checks import check_no_others, with_others
 from minimax_cal.fitting.several.kinds import READ
-from minimax_cal.fitting.several.options import RelativeOptions
+from minimax_cal.fitting.several.options import RelativeOptions, check_no_others, with_others
 from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.fitting.suspects import contradictions

@@ -37,7 +37,7 @@ from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.words import name_effect, name_place, name_step
 from minimax_cal.modelling.frames import frames_of
-from minimax_cal.robots.frames import CONVENTION, Frame
+from minimax_cal.robots.transforms import CONVENTION, Frame
 from minimax_cal.solvers.status import Status
 
 FOUND = (  # columns of the effects

@@ -14,19 +14,22 @@ and maximisation [Dempster, Laird, Rubin 1977].  What the data tell by themselve
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.limits import MAX_RISE
+from minimax_cal.fitting.between_sessions import amounts, change_of, frame_changes
 from minimax_cal.fitting.beyond import are_needed, step_without
-from minimax_cal.fitting.uncertainty import Estimator, Linearised, Poses
+from minimax_cal.fitting.uncertainty import Estimator, Linearised, Poses, quantile
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term, at_bounds, bounds
+from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.solvers.bounded import bounded
 from minimax_cal.solvers.least_squares import solve_normal
@@ -262,3 +265,24 @@ class Trial(Predicting):
     def no_worse(self, other: Trial) -> bool:
         """Whether the poses of the fit are predicted as well as by another."""
         return self.square <= (1.0 + MAX_RISE) ** 2 * other.square
+
+
+# ---- since when ----------------------------------------------------------------------------------
+
+
+def session_notices(study: Study, findings: Sequence[Finding]) -> Iterator[str]:
+    """Effects that hold from a session on, with intervals, and where each session's frame stands.
+
+    findings: with values and sigmas of the last fit.
+    """
+    names = list(study.data.frames)
+    for finding in findings:
+        if "session" not in finding.term.choice:
+            continue
+        value, sigma = np.array(finding.values), np.array(finding.sigmas)
+        half = quantile(0.95, study.fit.uncertainty.dof) * sigma
+        found = amounts(finding.names, finding.units, value, sigma, half)
+        change = change_of(finding.term, names, found, finding.p_value)
+        yield f"{name_effect(change.effect, change.place)}: {change.when} by {change.sizes}"
+    if len(names) > 1:
+        yield from (frame.sentence for frame in frame_changes(study.geometric, study.fit))

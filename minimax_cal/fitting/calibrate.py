@@ -24,9 +24,13 @@ from minimax_cal.fitting.options import (
     silent,
     usable,
 )
-from minimax_cal.fitting.several.checks import check_no_others, only_others, with_others
 from minimax_cal.fitting.several.kinds import READ, relative_with
-from minimax_cal.fitting.several.options import RelativeOptions
+from minimax_cal.fitting.several.options import (
+    RelativeOptions,
+    check_no_others,
+    only_others,
+    with_others,
+)
 from minimax_cal.fitting.solve import LEAST_POSES, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array

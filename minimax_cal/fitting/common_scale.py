@@ -18,10 +18,10 @@ from scipy.special import stdtr
 from minimax_cal.evidence.noise import fit_components
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.lack import by_pose
 from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import State, links_of, zero_positions
+from minimax_cal.modelling.rows import by_pose
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
 

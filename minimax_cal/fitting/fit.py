@@ -56,8 +56,8 @@ from minimax_cal.modelling.frames import frames_of, tables_of, with_effects
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, model_of, pose_weights
 from minimax_cal.modelling.parameters import Names
-from minimax_cal.robots.frames import CONVENTION, Frame, frames_tables
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.transforms import CONVENTION, Frame, frames_tables
 from minimax_cal.solvers.minimax import Kkt, Step
 from minimax_cal.solvers.status import Status
 

@@ -9,8 +9,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.robots.frames import Frame, frames_tables
-from minimax_cal.robots.transforms import inverse, nearest_rotation, transform
+from minimax_cal.robots.transforms import Frame, frames_tables, inverse, nearest_rotation, transform
 
 FLAT = 0.02  # width over length of reflectors from which their turn is told; as `checks.collinear`
 # of the frames' names

@@ -21,7 +21,7 @@ import numpy as np
 from minimax_cal.fitting.identify import RESOLUTION
 from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, Camera, read_camera
 from minimax_cal.fitting.pixels.data import PixelData, read_board
-from minimax_cal.fitting.pixels.identify import identified
+from minimax_cal.fitting.pixels.fit import identified
 from minimax_cal.fitting.pixels.judge import everywhere, free_motion
 from minimax_cal.fitting.pixels.model import LENS, PixelModel, Scene, lens_of
 from minimax_cal.fitting.pixels.options import PixelOptions

@@ -17,8 +17,8 @@ from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import visible
 from minimax_cal.reporting.html.more_charts import waterfall
 from minimax_cal.reporting.html.page import figure_data, needed, template
-from minimax_cal.robots.frames import links_table
 from minimax_cal.robots.robot import builtin_robots, load_robot
+from minimax_cal.robots.transforms import links_table
 from minimax_cal.serving.cell import Point, points_of
 from minimax_cal.serving.sessions import GIVEN, SCRIPT, Choices, Session, mark
 from minimax_cal.serving.steps import (

@@ -21,7 +21,7 @@ from minimax_cal.robots.mjcf import numbers
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import head, inverse, level_to, link, shift, tail
 from minimax_cal.simulators.arm import Arm
-from minimax_cal.simulators.servos import (
+from minimax_cal.simulators.drive import (
     LEVER,
     NOTHING,
     SAG,

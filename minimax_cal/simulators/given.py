@@ -28,9 +28,9 @@ from minimax_cal.robots.sampling import random_joints
 from minimax_cal.robots.transforms import SAME, difference, head, inverse
 from minimax_cal.simulators.arm import Arm, assumed, stiff
 from minimax_cal.simulators.chain import ROBOT, Chain, at_zero, braked, own_pose
+from minimax_cal.simulators.drive import SAMPLES, Drives
 from minimax_cal.simulators.elements import Layout, equip, parents_of, quaternion, targets
 from minimax_cal.simulators.mjcf import text_of, weigh
-from minimax_cal.simulators.servos import SAMPLES, Drives
 
 ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 IMPLICIT = (2, 3)  # mjINT_IMPLICIT, mjINT_IMPLICITFAST

@@ -22,8 +22,8 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import tail
 from minimax_cal.simulators.arm import Arm
 from minimax_cal.simulators.chain import ROBOT
+from minimax_cal.simulators.drive import Drives
 from minimax_cal.simulators.elements import Layout, equip, known, part, quaternion, targets
-from minimax_cal.simulators.servos import Drives
 
 COMMANDS = ".commands.json"
 SEEN = 0.02  # radius of the links that are drawn [m]

@@ -11,12 +11,7 @@ from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.causes import with_untested
 from minimax_cal.diagnosing.established import loose_among, mostly_loose
 from minimax_cal.diagnosing.result import Alternative, Finding
-from minimax_cal.diagnosing.verdict import (
-    UNASKED,
-    UNHELPFUL,
-    UNSURE,
-    why_loose,
-)
+from minimax_cal.diagnosing.verdict import UNASKED, UNHELPFUL, UNSURE, why_loose
 from minimax_cal.evidence import limits
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.table import Term

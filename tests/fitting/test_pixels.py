@@ -24,7 +24,7 @@ from experiments.pixel_cells import (
 from minimax_cal.fitting.pixels.camera import INTRINSICS, distorted, slopes, undistorted
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.determined import determined
-from minimax_cal.fitting.pixels.identify import gram_of_pixels
+from minimax_cal.fitting.pixels.fit import gram_of_pixels
 from minimax_cal.fitting.pixels.judge import Claim
 from minimax_cal.fitting.pixels.model import PixelModel, Scene, Sight
 from minimax_cal.fitting.pixels.options import PixelOptions, check_options, doubts_of

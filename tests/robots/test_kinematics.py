@@ -14,10 +14,9 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.reach import arm_of
 from minimax_cal.modelling.reach import bent as reached_at
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.frames import CONVENTION, Frame, frames_tables
 from minimax_cal.robots.kernels import choice, plain, sums
 from minimax_cal.robots.sampling import random_poses
-from minimax_cal.robots.transforms import transform
+from minimax_cal.robots.transforms import CONVENTION, Frame, frames_tables, transform
 
 # ---- kinematics ----------------------------------------------------------------------------------
 

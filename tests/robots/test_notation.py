@@ -15,8 +15,8 @@ import minimax_cal as mc
 from minimax_cal.correcting.export import export
 from minimax_cal.correcting.exporters.table import EXPORTERS
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.robots.frames import links_table
 from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.robots.transforms import links_table
 
 NOISE = 20e-6  # of a coordinate [m]
 Content = dict[str, Any]

@@ -16,15 +16,14 @@ from typing import Annotated
 import numpy as np
 
 from minimax_cal.evidence.noise import fit_components
-from minimax_cal.fitting.pixels.fit import PixelFit
-from minimax_cal.fitting.pixels.identify import gram_of_pixels, lengths_of
+from minimax_cal.fitting.pixels.fit import PixelFit, gram_of_pixels, lengths_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import Fact, Mm, derived
 from minimax_cal.measuring.measurements import measurements
 from minimax_cal.modelling.cell import still
-from minimax_cal.modelling.lack import DRIVERS, UNIT, by_pose, joint_units
 from minimax_cal.modelling.model import TARGET, model_of
 from minimax_cal.modelling.parameters import State, zero_positions
+from minimax_cal.modelling.rows import DRIVERS, UNIT, by_pose, joint_units
 from minimax_cal.modelling.start import fit_base
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_joints

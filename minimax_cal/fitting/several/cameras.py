@@ -23,8 +23,7 @@ from minimax_cal.fitting.pixels.determined import (
     placed,
     table_of,
 )
-from minimax_cal.fitting.pixels.fit import PixelFit
-from minimax_cal.fitting.pixels.identify import reference_of
+from minimax_cal.fitting.pixels.fit import PixelFit, reference_of
 from minimax_cal.fitting.pixels.model import LENS, PixelModel, Scene, imaged, turned, units_of
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.ground.arrays import Array

@@ -16,13 +16,15 @@ from minimax_cal.fitting.claims import lacking, position_sigma, positions_by
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.opened import listed_effects
 from minimax_cal.fitting.options import listed, priors_of
-from minimax_cal.fitting.several import fit, plausible, remarks
-from minimax_cal.fitting.several.checks import check_given, check_noises, check_options
+from minimax_cal.fitting.several import fit, plausible
 from minimax_cal.fitting.several.fit import InstrumentFit, Train
 from minimax_cal.fitting.several.identify import Alone
 from minimax_cal.fitting.several.options import (
     Progress,
     RelativeOptions,
+    check_given,
+    check_noises,
+    check_options,
     read_noises,
     silent,
 )
@@ -207,7 +209,7 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
         identification=found.identification,
         position_sigma=np.nan if left_open else sigma,
         positions_open=left_open,
-        beyond=remarks.beyond(robot, found, options) if single else (),
+        beyond=plausible.beyond(robot, found, options) if single else (),
         notices=tuple(dict.fromkeys(notices)),
         provenance=Provenance.of(robot, source, settings),
         instruments=instruments_of(found, every, splits, measured),
@@ -228,19 +230,19 @@ def judged(
     sigma: of a position, but for what is open [m].
     """
     robot, every, options = asked.robot, asked.every, asked.options
-    unfitted = [remarks.unfitted(robot, found, i, options) for i in range(len(every))]
+    unfitted = [plausible.unfitted(robot, found, i, options) for i in range(len(every))]
     wrong = plausible.contradiction(robot, every, found, measured, [mend for _, mend in unfitted])
     said = [
         *(remark for i, one in enumerate(found.stack.instruments)
           for remark in one.remarks(fit.own_parameters(robot, found, i), found.noise[i])),
-        *remarks.of_beyond(result),
-        *remarks.of_scale(found),
-        *remarks.weak(found, result, measured, sigma),
-        *remarks.unlikely(result, measured),
+        *plausible.of_beyond(result),
+        *plausible.of_scale(found),
+        *plausible.weak(found, result, measured, sigma),
+        *plausible.unlikely(result, measured),
         *filter(None, (*(notice for notice, _ in unfitted), wrong)),
     ]  # fmt: skip
     for data, (held, _), each in zip(every, asked.splits, measured, strict=True):
-        said += remarks.general(each, data, held)
+        said += plausible.general(each, data, held)
     return replace(
         result,
         status=Status.FAILED if wrong else result.status,

@@ -9,25 +9,31 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.checks import POOR_FIT, check_mends, check_plausible
+from minimax_cal.fitting.checks import POOR_FIT, WILD_ANGLE, check_mends, check_plausible
 from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
+from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.several.fit import (
     InstrumentFit,
     Train,
     allowed_of,
+    fit_instruments,
     stack_of,
     start_of,
 )
-from minimax_cal.fitting.several.options import RelativeOptions, sigmas_of
-from minimax_cal.fitting.several.result import Measured
+from minimax_cal.fitting.several.identify import identified
+from minimax_cal.fitting.several.options import RelativeOptions, sigmas_of, silent
+from minimax_cal.fitting.several.result import Measured, RelativeCalibration
 from minimax_cal.fitting.several.stack import Block, Stack, own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.instrument import PLENTY, Instrument, Slip, anywhere
 from minimax_cal.instruments.options import FAR
 from minimax_cal.instruments.protocol import Arm, FlangePoses
+from minimax_cal.measuring import checks
 from minimax_cal.measuring.slips import of_joints, of_units
+from minimax_cal.modelling.model import TARGET
 from minimax_cal.modelling.parameters import State
+from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.robots.robot import Robot
 
 RESIZED = 0.25  # of what the arm sweeps: a fit that changes it by more is of no arm
@@ -141,3 +147,123 @@ def swept(robot: Robot, fit: InstrumentFit, state: State) -> float:
     arm = Arm.of(robot, anywhere(robot, PLENTY).q).at(state.mdh)
     place = arm.place(block.instrument.targets(block.own(x))).mean(axis=1)
     return float(np.sqrt(place.var(axis=0).sum()))
+
+
+# ---- remarks -------------------------------------------------------------------------------------
+
+
+LEAST = 5e-6  # a fit that misses by less leaves nothing to explain [m]
+WEAK = 3.0  # times what was measured: positions that are told worse are weakly told
+WILD_LENGTH = 0.02  # of the reach: no link is farther from its drawing
+
+
+def of_beyond(result: RelativeCalibration) -> tuple[str, ...]:
+    """What is told that one reflector would not tell."""
+    names = ", ".join(result.beyond)
+    what = "identified beyond what one reflector at the pose's origin tells"
+    return (f"{what}: {names}",) if names else ()
+
+
+def of_scale(fit: InstrumentFit) -> tuple[str, ...]:
+    """What stands for the length standard that closures lack."""
+    reasons = fit.identification.reasons
+    kept = [name for name, why in reasons.items() if why.kind is Because.NO_SCALE]
+    if not kept:
+        return ()
+    first = fit.stack.instruments[0]
+    return (
+        f"the scale is not identifiable from {first.kind}: {kept[0]} is kept as drawn, whatever "
+        "its prior, and if that is wrong by a part in a thousand, so is every length; sigmas leave "
+        "this out; " + first.scale[-1],
+    )
+
+
+def general(result: Measured, data: Instrument, held: Array) -> tuple[str, ...]:
+    """What the reader should know: nothing held out, measurements that stand out."""
+    notices = []
+    if not held.any():
+        notices.append("no pose is held out: nothing here says how the fit does on new poses")
+    elif not result.accuracy["holdout"].poses:
+        notices.append("the held-out rows close with nothing: no held-out accuracy")
+    distance = np.full((len(result.parts), len(held)), np.nan)
+    distance[:, ~held] = np.linalg.norm(result.errors["train"], axis=-1)
+    distance[:, held] = np.linalg.norm(result.errors["holdout"], axis=-1)
+    return (*notices, *checks.outliers(replace(data.at, target_names=result.parts), distance))
+
+
+def weak(
+    fit: InstrumentFit, result: RelativeCalibration, measured: Sequence[Measured], sigma: float
+) -> tuple[str, ...]:
+    """A notice where positions are told far worse than what was measured.
+
+    sigma: of a position, but for what is open [m].
+    """
+    rms_mm = min(each.accuracy["train"].rms_mm for each in measured)
+    expected_mm = 1e3 * sigma
+    more = [one.words.more for one in fit.stack.instruments]
+    untold = [
+        p.name for p in result.parameters if TARGET in p.name and p.because is Because.NOT_TOLD
+    ]
+    if not all(more) or not (expected_mm > WEAK * rms_mm or untold):
+        return ()
+    where = f" ({', '.join(untold)} not at all)" if untold else ""
+    return (
+        f"positions are poorly determined{where}: by the sigmas to {expected_mm:.3g} mm, "
+        f"what was measured fits to {rms_mm:.3g} mm, and model error makes positions worse still; "
+        f"turn the flange more from pose to pose, and measure with {more[0]}",
+    )
+
+
+def unlikely(result: RelativeCalibration, measured: Sequence[Measured]) -> tuple[str, ...]:
+    """Notices where the result is no calibration of this robot but of another one."""
+    notices, reach = [], result.nominal.reach()
+    for key, what in (("nominal_train", "the nominal robot"), ("train", "the best fit")):
+        miss_mm = max(each.accuracy[key].rms_mm for each in measured)
+        if miss_mm > 1e3 * POOR_FIT * reach:
+            notices.append(
+                f"{what} misses by {miss_mm:.3g} mm: check that it is the robot of these "
+                "measurements, with its joint signs, zero positions and units"
+            )
+    limits = {"m": WILD_LENGTH * reach, "rad": WILD_ANGLE}
+    links = [p for p in result.parameters if p.name.rstrip("0123456789") in MDH_NAMES]
+    wild = [p for p in links if abs(p.value - p.nominal) > limits[p.unit]]
+    if wild:
+        named = ", ".join(f"{p.name} by {1e3 * (p.value - p.nominal):+.4g}" for p in wild[:5])
+        notices.append(
+            f"implausibly large changes (mm, mrad): {named}; is the robot file the right one?"
+        )
+    return tuple(notices)
+
+
+def unfitted(robot: Robot, fit: InstrumentFit, i: int, options: RelativeOptions) -> tuple[str, str]:
+    """A notice, and its mend, where more of an instrument would explain what the fit leaves."""
+    one, noise = fit.stack.instruments[i], float(fit.noise[i])
+    more = one.wider()
+    if not more or noise < LEAST:
+        return "", ""
+    try:
+        wider = fit_instruments(robot, fit.trains, replace(options, **dict[str, Any](more)), silent)
+    except DataError:  # too few numbers for so many unknowns
+        return "", ""
+    return one.told_wider(noise, float(wider.noise[i]))
+
+
+def beyond(robot: Robot, fit: InstrumentFit, options: RelativeOptions) -> tuple[str, ...]:
+    """Parameters that a lone instrument tells, and one point of it would not."""
+    one = fit.stack.instruments[0]
+    point = one.lone
+    if point is None:
+        return ()
+    lone = Stack.of(robot, [point.ready(robot, options)], [""])
+    own = one.lone_values(fit.stack.blocks[0].own(fit.stack.part(fit.state, 0)))
+    x = lone.state(fit.state.mdh, [own])
+    allowed, wanted = allowed_of(lone, options)
+    alone = identified(
+        robot, lone, lone.reference(robot, x), x, allowed, wanted,
+        known=np.zeros(lone.names.count, dtype=bool), resolution=options.resolution,
+    )  # fmt: skip
+    rows = lone.names.geometric + one.targets_at.start
+    more = fit.identification.active[:rows] & ~alone.active[:rows]
+    known = np.pad(alone.active[rows:], (0, len(one.lone_names) + rows - len(alone.active)))
+    untold = (name for name, told in zip(one.lone_names, known, strict=True) if not told)
+    return (*(lone.names.all[i] for i in np.flatnonzero(more)), *untold)

@@ -37,8 +37,8 @@ from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements, SetAside
 from minimax_cal.modelling.cell import Cell, cell_from_dict, pose_from_dict
 from minimax_cal.modelling.frames import paired, tables_of
-from minimax_cal.robots.frames import CONVENTION, Frame
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.transforms import CONVENTION, Frame
 from minimax_cal.solvers.status import Status
 
 SEVERAL = "several"  # kind of a calibration from several files

@@ -21,13 +21,12 @@ from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import for_people, in_own_unit
 from minimax_cal.judging.watching.both import FOOT, KNOWN, NEW, OLD, Both, Part, critical
 from minimax_cal.judging.watching.old import Old
-from minimax_cal.judging.watching.placing import Placing
-from minimax_cal.judging.watching.rows import Rows
+from minimax_cal.judging.watching.placing import Placing, Rows
 from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.measuring.grouping import regions
 from minimax_cal.measuring.history import clock, is_timed
-from minimax_cal.modelling.lack import WAVES, by_pose, by_time
 from minimax_cal.modelling.parameters import links_of
+from minimax_cal.modelling.rows import WAVES, by_pose, by_time
 
 
 def joined(watched: Watched, rows: Rows, column: Array) -> Both:

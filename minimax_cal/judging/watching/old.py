@@ -14,7 +14,7 @@ from minimax_cal.judging.watching.both import KNOWN, OLD, Both, Part, fit_varian
 from minimax_cal.measuring.grouping import groups, regions
 from minimax_cal.measuring.history import clock, is_timed
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.lack import by_pose
+from minimax_cal.modelling.rows import by_pose
 
 PLENTY = 500  # poses that tell what more would
 SHARES = 0.5 ** np.arange(6)  # of the joints' noise, of which one is taken

@@ -18,7 +18,7 @@ from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.facts import Later
 from minimax_cal.judging.watching.moved import Search
 from minimax_cal.judging.watching.opening import in_names
-from minimax_cal.judging.watching.rows import Rows
+from minimax_cal.judging.watching.placing import Rows
 from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell

@@ -16,7 +16,7 @@ from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.uncertainty import Estimator, Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.judging.watching.old import Old, noise_root, own_poses
-from minimax_cal.judging.watching.rows import Rows
+from minimax_cal.judging.watching.placing import Rows
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.table import names_of

@@ -17,12 +17,12 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import tail
 from minimax_cal.simulators.arm import stiff
 from minimax_cal.simulators.chain import Chain, braked
+from minimax_cal.simulators.drive import STEPS, carried
 from minimax_cal.simulators.elements import known, parents_of, section, tune
 from minimax_cal.simulators.given import counts_degrees, elements_of
 from minimax_cal.simulators.mjcf import new_tree
 from minimax_cal.simulators.motion.bodies import Bodies, inertial, parameters_of, pseudo_inertia
 from minimax_cal.simulators.motion.numbers import Numbers, bristle
-from minimax_cal.simulators.servos import STEPS, carried
 
 SAME = 1e-12  # relative change of a number that is none
 TURNS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
