@@ -220,7 +220,7 @@ def elsewhere(judged: Judgement, other: Claim) -> str:
     asked = next(name for name in CLAIMS if name != other.name)
     kind = {"rms": "RMS", "max": "Largest"}[judged.limit.kind]
     return (
-        f"{kind} error passed {asked} the measured region alone: {other.name} them it is "
+        f"{kind} error passed {asked} the measured region alone: {other.name} it is "
         f"{seen:.3f} mm, more than the {limit:g} mm required"
     )
 
