@@ -17,6 +17,7 @@ from minimax_cal.cli.options import (
     options_from,
     with_output,
 )
+from minimax_cal.cli.stderr import complain
 from minimax_cal.reporting.report import Chosen, signed
 
 
@@ -34,14 +35,14 @@ from minimax_cal.reporting.report import Chosen, signed
 def report_command(
     results: Sequence[Path], path: Path, pdf: Path | None, to: Output, **chosen: Any
 ) -> int:
-    """A page to sign of RESULTS: a calibration, a diagnosis, or both.
+    """Four pages, one to sign, of RESULTS: a calibration, a diagnosis, or both.
 
     RESULTS are of the same measurements, as `calibrate`, `diagnose` or `relative` wrote them with
-    -o; that of `gap -o` may come with them; that of `torques -o` stands alone.  The page needs no
-    network; PDF and PNG need an installed Chromium, Chrome or Edge.
+    -o; that of `gap -o` may come with them; that of `torques -o` stands alone.  They need no
+    network; PDF and PNG need an installed Chromium, Chrome or Edge.  Not passed ends with code 1.
     """
     found = signed(results, path, Chosen(**chosen), pdf, to.notice)
     for line in found.lines():
         click.echo(line)
     to.wrote(path, pdf)
-    return 0
+    return complain(found.complaint) if found.complaint else 0

@@ -43,13 +43,14 @@ class Figures:
     """How well an arm predicts points that no fit saw [mm], NaN where that is not known.
 
     rms, largest: on held-out poses, inside the measured region.  typical, worst: RMS outside it, of
-    all parts that were left out and of the worst.
+    all parts that were left out and of the worst; furthest: largest error there.
     """
 
     rms: float = math.nan
     largest: float = math.nan
     typical: float = math.nan
     worst: float = math.nan
+    furthest: float = math.nan
 
     @staticmethod
     def of(fit: Fit, crossed: bool = True) -> Figures:
@@ -58,7 +59,7 @@ class Figures:
         if crossed and fit.error_crossed.size:
             inside = fit.within.after
         rms, largest = (inside.rms_mm, inside.max_mm) if inside.poses else (math.nan, math.nan)
-        return Figures(rms, largest, outside.typical_mm, outside.worst_mm)
+        return Figures(rms, largest, outside.typical_mm, outside.worst_mm, outside.largest_mm)
 
     @staticmethod
     def at_rung(known: Opened) -> Figures:
@@ -67,26 +68,30 @@ class Figures:
         if known.fit and last:
             return Figures.of(known.fit)
         away = known.outside()
-        typical, worst = math.nan, math.nan
+        outside = (math.nan,) * 3
         if last:
-            typical, worst = away.typical_mm, away.worst_mm
+            outside = away.typical_mm, away.worst_mm, away.largest_mm
         elif rung.name == GEOMETRIC:
-            typical, worst = away.geometric_typical_mm, away.geometric_worst_mm
+            outside = away.geometric_typical_mm, away.geometric_worst_mm, math.nan
         if not known.held.any():
-            return Figures(typical=typical, worst=worst)
+            return Figures(math.nan, math.nan, *outside)
         seen = known.data.take(known.held)
         error = rung.error[:, known.held] if rung.error is not None else None
         inside = accuracy(known.cell.error(with_history(seen)) if error is None else error)
-        return Figures(inside.rms_mm, inside.max_mm, typical, worst)
+        return Figures(inside.rms_mm, inside.max_mm, *outside)
 
     def sentence(self) -> str:
         """For people; that nothing is known where that is so."""
-        said = [] if math.isnan(self.rms) else [f"held-out RMS {self.rms:.3f} mm"]
+        said = []
+        if not math.isnan(self.rms):
+            said.append(f"held-out RMS {self.rms:.3f} mm, largest {self.largest:.3f} mm")
         if not math.isnan(self.typical):
+            far = "" if math.isnan(self.furthest) else f", largest {self.furthest:.3f} mm"
             said.append(
-                f"outside the measured region {self.typical:.3f} mm, at worst {self.worst:.3f} mm"
+                f"outside the measured region RMS {self.typical:.3f} mm, worst region "
+                f"{self.worst:.3f} mm RMS{far}"
             )
-        return ", ".join(said) or "not known"
+        return "; ".join(said) or "not known"
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +174,7 @@ def block(
         "holdout_rms_mm": finite(figures.rms),
         "outside_typical_mm": finite(figures.typical),
         "outside_worst_mm": finite(figures.worst),
+        "outside_largest_mm": finite(figures.furthest),
     }
 
 
@@ -319,7 +325,7 @@ def as_written(made: Delivered, known: Opened, file: Export) -> Delivered:
     found = replace(made, missed=(accuracy(error), accuracy(error + file.off(rows))))
     own, rms = made.figures, found.rms_of_file
     figures = Figures(rms(own.rms), found.largest_of_file(own.largest), rms(own.typical),
-                      rms(own.worst))  # fmt: skip
+                      rms(own.worst), found.largest_of_file(own.furthest))  # fmt: skip
     return replace(found, figures=figures)
 
 

@@ -24,6 +24,7 @@ Cell = str | float | int
 EDGE, BETWEEN = 1, 3  # letters beside a table's columns, and between two
 MAX_ROWS = 6  # of a table on a first screen
 LONGEST_NAME = 28  # letters of a cell that is a name; what is longer is a sentence, and wraps
+SHORT, MAX_SHORT = ' class="name"', 16  # of a cell of a page that stays in one line, and letters
 JOINT = "\N{WORD JOINER}"
 JOINED = rf"\1{JOINT}\2"
 BAR = " | "  # between columns that one text tells
@@ -170,7 +171,11 @@ class Table:
 
         def row(cells: list[str], tags: list[str]) -> str:
             whole = zip(cells, tags, classes, strict=True)
-            inner = "".join(f"<{tag}{kind}>{escape(cell)}</{tag[:2]}>" for cell, tag, kind in whole)
+            inner = "".join(
+                f"<{tag}{kind or SHORT * (tag == 'td' and len(cell) <= MAX_SHORT)}>"
+                f"{escape(cell)}</{tag[:2]}>"
+                for cell, tag, kind in whole
+            )
             return f"<tr>{inner}</tr>"
 
         heads, body = ['th scope="col"'] * len(self.header), ["td"] * (len(self.header) - 1)

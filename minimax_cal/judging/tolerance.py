@@ -34,10 +34,11 @@ class Limit:
 
 @dataclass(frozen=True)
 class Bound:
-    """A value and its upper 95 % limit, NaN where it is not known [mm]."""
+    """A value and its 95 % limits, NaN where they are not known [mm]."""
 
     value: float
     high: float
+    low: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -129,8 +130,8 @@ def within(
     rms, largest = intervals
     return Claim(
         "inside",
-        Bound(after.rms_mm, 1e3 * rms.high),
-        Bound(after.max_mm, 1e3 * largest.high),
+        Bound(after.rms_mm, 1e3 * rms.high, 1e3 * rms.low),
+        Bound(after.max_mm, 1e3 * largest.high, 1e3 * largest.low),
         after.poses if poses is None else poses,
         name,
         (before.rms_mm, before.max_mm),
@@ -219,7 +220,7 @@ def elsewhere(judged: Judgement, other: Claim) -> str:
     asked = next(name for name in CLAIMS if name != other.name)
     kind = {"rms": "RMS", "max": "Largest"}[judged.limit.kind]
     return (
-        f"{kind} error passed {asked} the measured region alone: {other.name} them it is "
+        f"{kind} error passed {asked} the measured region alone: {other.name} it is "
         f"{seen:.3f} mm, more than the {limit:g} mm required"
     )
 

@@ -1,4 +1,4 @@
-"""A calibration, a diagnosis or both as one page that needs nothing else."""
+"""A calibration, a diagnosis or both as four pages that need nothing else."""
 
 from __future__ import annotations
 
@@ -45,6 +45,7 @@ class Chosen:
     tolerance_for: inside or outside the measured region.
     facts: a TOML file with serial_number, controller, tool ...
     rung: of a diagnosis, the last unless given.
+    appendix: with all that the four pages leave out, as distributions, correlations, ISO 9283.
     deliver: formats of `export`, or compensate: the requirement is judged by what each reaches,
     fitted for exactly what it carries; where a result holds effects and nothing is named, by
     corrected targets.
@@ -73,6 +74,7 @@ class Chosen:
     date: str = said(
         "", "The date of the report [default: SOURCE_DATE_EPOCH, or today].", metavar="YYYY-MM-DD"
     )
+    appendix: bool = said(False, "With all that the four pages leave out.")
     rung: int | None = None
 
     def wording(self) -> Wording:
@@ -81,8 +83,9 @@ class Chosen:
         title, customer, author, date = (
             getattr(self, name) or told.get(name, "") for name in WORDS
         )
-        return Wording(date_of(date), title, customer, author, told, limits_of(self.tolerance),
-                       claim_called(self.tolerance_for), self.rung, self.deliver)  # fmt: skip
+        limits, which = limits_of(self.tolerance), claim_called(self.tolerance_for)
+        more = (self.rung, self.deliver, self.appendix)
+        return Wording(date_of(date), title, customer, author, told, limits, which, *more)
 
 
 @takes(chosen=Chosen, read={"deliver": lambda given: tuple(listed(given))})
@@ -94,7 +97,7 @@ def report(
     pdf: Path | str | None = None,
     notify: Callable[[str], object] = warnings.warn,
 ) -> Path:
-    """A page to sign of a calibration, a diagnosis, or both of the same measurements.
+    """Four pages, one to sign, of a calibration, a diagnosis, or both of the same measurements.
 
     Parameters
     ----------

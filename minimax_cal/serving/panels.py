@@ -14,7 +14,7 @@ from minimax_cal.fitting.fit import load_fit
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import json_of
 from minimax_cal.ground.tables import Table, filled
-from minimax_cal.ground.words import visible
+from minimax_cal.ground.words import capitalise, visible
 from minimax_cal.reporting.html.more_charts import waterfall
 from minimax_cal.reporting.html.page import figure_data, needed, template
 from minimax_cal.robots.robot import builtin_robots, load_robot
@@ -54,6 +54,7 @@ WHAT = {
     MJCF: "the calibrated robot for MuJoCo",
     CORRECTED: "the joint targets, corrected",
 }
+BANNERS = {"passed without": "unstated", "passed": "passed", "not passed": "failed"}  # how it looks
 Panel = dict[str, Any]
 Tile = tuple[str, str, str]  # name, before, after
 
@@ -263,9 +264,9 @@ def verdict_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None
     record = record_of(at, "judge")
     if not record or record.code:
         return None
-    lines = record.told.splitlines()
-    verdict = lines[0] if lines else ""
-    return {"verdict": verdict, "lines": lines[1:], "base": base(at)}
+    verdict, *lines = record.told.splitlines() or [""]
+    kind = next((kind for said, kind in BANNERS.items() if verdict.startswith(said)), "unstated")
+    return {"verdict": capitalise(verdict), "kind": kind, "lines": lines, "base": base(at)}
 
 
 def plan_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:

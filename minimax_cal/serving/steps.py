@@ -22,10 +22,14 @@ KEPT = 64  # results whose data are remembered
 
 @dataclass(frozen=True)
 class Command:
-    """A command line.  words: after the program's name.  to: the file that gets its stdout."""
+    """A command line.  words: after the program's name.  to: the file that gets its stdout.
+
+    judges: exit code 1 with words on stdout is an answer, as not passed.
+    """
 
     words: tuple[str, ...]
     to: str = ""
+    judges: bool = False
 
     def line(self) -> str:
         """As people type it, in the session's folder."""
@@ -104,7 +108,7 @@ def judging(at: Session, chosen: Choices) -> tuple[Command, ...]:
     limits = {"rms": chosen.rms, "max": chosen.most}
     told = ", ".join(f"{name} {limit:g}" for name, limit in limits.items() if limit)
     asked = ("--tolerance", told, "--tolerance-for", chosen.claim) if told else ()
-    return (Command(("report", *results, *asked, "-o", REPORT)),)
+    return (Command(("report", *results, *asked, "-o", REPORT), judges=True),)
 
 
 def planning(at: Session, chosen: Choices) -> tuple[Command, ...]:

@@ -158,6 +158,8 @@ class Work:
         if not code and command.to:
             write_whole(job.at.folder / command.to, text)
             text = ""
+        if code == 1 and command.judges and text:
+            code, job.error = 0, ""
         if code and not job.error:
             job.error = "; ".join(list(job.other)[-3:]) or f"the command ended with {code}"
         return code, text[:MOST_TOLD]

@@ -122,8 +122,8 @@ class SimulatorGap(Result):
         typical, worst = (self.beyond.get(key) for key in ("typical_mm", "worst_mm"))
         if typical is not None and worst is not None:
             text += (
-                f". Outside the measured region its fit claims {typical:.3f} mm, at worst "
-                f"{worst:.3f} mm ({self.beyond.get('worst_where')})"
+                f". Outside the measured region its fit claims RMS {typical:.3f} mm, worst region "
+                f"{worst:.3f} mm RMS ({self.beyond.get('worst_where')})"
             )
         elif self.beyond.get("narrow"):
             text += f". Outside the measured region nothing is claimed: {self.beyond['reason']}"

@@ -306,7 +306,7 @@ def test_tables_hold_what_a_hand_reckons():
     )
     own = Delivered(
         "compensate", "geometry", (), (), cell_of(mc.load_robot("ur10")), None,
-        Figures(0.07, 0.2, 0.08, 0.1), Figures(),
+        Figures(0.07, 0.2, 0.08, 0.1, 0.3), Figures(),
     )  # fmt: skip
     assert [row[0] for row in found.tables()[0].rows] == ["as commanded", "missed, by the model"]
     found = replace(found, delivered=own)
@@ -324,7 +324,8 @@ def test_tables_hold_what_a_hand_reckons():
     assert found.headline() == (
         "1 of 2 targets corrected, which are off by up to 3.000 mm, 1.000 mrad as commanded; "
         "1 missed, which stay off by up to 0.004 mm, 0.002 mrad. Expect on the arm: held-out RMS "
-        "0.070 mm, outside the measured region 0.080 mm, at worst 0.100 mm."
+        "0.070 mm, largest 0.200 mm; outside the measured region RMS 0.080 mm, worst region "
+        "0.100 mm RMS, largest 0.300 mm."
     )
     assert found.complaint().startswith("1 of 2 targets are missed: limit at line 3: ")
     told = found.to_dict()

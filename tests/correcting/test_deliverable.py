@@ -119,7 +119,7 @@ def test_each_says_what_it_carries(to, soft):
     assert {t.label for t in found.cell.effects.terms} == set(found.carries)
     assert found.to_dict().keys() == {
         "format", "carries", "not_carried", "holdout_rms_mm", "outside_typical_mm",
-        "outside_worst_mm",
+        "outside_worst_mm", "outside_largest_mm",
     }  # fmt: skip
 
 

@@ -110,7 +110,7 @@ def test_what_is_passed_does_not_hide_what_is_seen_beyond():
     passed, failed = (judge(Limit("rms", size), inside) for size in (0.2, 0.12))
     away = beyond(Beyond((Fold("one end", 20, 0.3, 0.9, 0.2),), 0.3, 0.3, "", 0.4, 1.2))
     assert elsewhere(passed, away) == (
-        "RMS error passed inside the measured region alone: outside them it is 0.300 mm, more than "
+        "RMS error passed inside the measured region alone: outside it is 0.300 mm, more than "
         "the 0.2 mm required"
     )
     assert elsewhere(failed, away) == ""

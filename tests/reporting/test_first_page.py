@@ -9,21 +9,22 @@ import numpy as np
 import pytest
 from conftest import run
 from dynamics.motions import simulated, three_joints
+from numpy.testing import assert_allclose
 from test_report import WORDING, Seen
 
 import minimax_cal as mc
 from minimax_cal.diagnosing.result import load_diagnosis
 from minimax_cal.dynamics.regressor import Motion
-from minimax_cal.fitting.floor import AT_MOST, Floor
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.tolerance import NOT_PASSED, NOT_STATED, PASSED, limits_of
+from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.reporting import report
 from minimax_cal.reporting.html import Figure, compose, page, read_sources
 from minimax_cal.reporting.html.document import Wording
 from minimax_cal.reporting.html.facts import FACTS
-from minimax_cal.reporting.html.first_page import Signed, left_now, limits_now, signed
+from minimax_cal.reporting.html.first_page import Signed, signed, worst_joint
 from minimax_cal.reporting.html.motion import compose_motion, motion_of
 from minimax_cal.reporting.html.sources import Sources
 
@@ -44,8 +45,8 @@ def rendered(wording: Wording, *paths: Path) -> Seen:
 
 def rows(seen: Seen) -> dict[str, list[str]]:
     """The table of the result by what its first cells name, their poses before the rest."""
-    every = [row for title, found in seen.tables.items() if title.startswith("Model: ")
-             for row in found]  # fmt: skip
+    every = [row for title, found in seen.tables.items()
+             if title.startswith(("Model: ", "Result by")) for row in found]  # fmt: skip
     names = [row[0].partition(" (") for row in every]
     return {
         name: [poses.removesuffix(")"), *row[1:]]
@@ -56,18 +57,24 @@ def rows(seen: Seen) -> dict[str, list[str]]:
 def test_requirement_result_and_verdict(whole, tmp_path, says):
     fit, out = mc.load_fit(whole), tmp_path / "report.html"
     high = 1e3 * fit.within.rms.high
-    for size, verdict in ((1.1 * high, "passed"), (0.5 * fit.within.after.rms_mm, "not passed")):
+    low = 1e3 * fit.within.rms.low
+    for size, verdict, code in (
+        (1.1 * high, "passed", 0),
+        (0.5 * fit.within.after.rms_mm, "not passed", 1),
+    ):
         told = ("report", whole, "--tolerance", f"rms {size:.6f}", "-o", out)
-        stdout, stderr = says(*told)
-        assert stdout.splitlines()[0] == verdict
+        stdout, stderr = says(*told, code=code)
+        where = " inside the measured region" * (not code)
+        assert stdout.splitlines()[0] == f"{verdict}{where}"
         assert f"written: {out}" in stderr
+        assert ("error: RMS error at most" in stderr) == bool(code)
         seen = Seen(out.read_text())
-        poses, before, after, limit, asked, said = rows(seen)["RMS, inside measured region"]
+        poses, before, after, limit, asked, said = rows(seen)["corrected targets: RMS, inside"]
         assert poses == f"{fit.within.after.poses} cross-validated"
         assert (before, after) == (f"{fit.within.before.rms_mm:.3f}",
                                    f"{fit.within.after.rms_mm:.3f}")  # fmt: skip
-        assert (limit, asked, said) == (f"{high:.3f}", f"{size:.3g}", verdict)
-        assert verdict.capitalize() in seen.text["verdict"]
+        assert (limit, asked, said) == (f"{low:.3f} to {high:.3f}", f"{size:.3g}", verdict)
+        assert f"{verdict.capitalize()}{where}" in seen.text["verdict"]
 
 
 def test_beyond_is_asked_of_the_worst_part(whole, tmp_path, refuses, says):
@@ -77,8 +84,9 @@ def test_beyond_is_asked_of_the_worst_part(whole, tmp_path, refuses, says):
     assert 1e3 * fit.within.rms.high < size < fit.beyond.rms_high_mm
     told = ("report", whole, "--tolerance", f"rms {size:.6f}", "-o", out, "-q")
     assert says(*told).out.startswith("passed")
-    assert says(*told, "--tolerance-for", "outside").out.startswith("not passed")
-    assert rows(Seen(out.read_text()))["RMS, outside, worst part"][-1] == "not passed"
+    assert says(*told, "--tolerance-for", "outside", code=1).out.startswith("not passed")
+    row = rows(Seen(out.read_text()))["corrected targets: RMS, worst region"]
+    assert row[-1] == "not passed"
     refuses("choose inside or outside", *told, "--tolerance-for", "above")
 
 
@@ -89,7 +97,8 @@ def test_an_arm_of_half_its_lengths_is_not_signed_unseen(robot, tmp_path, says):
         fit = mc.calibrate(robot, made.data.with_y(factor * made.data.y))
         fit.save(tmp_path / "fit.json")
         page = tmp_path / "report.html"
-        said = says("report", tmp_path / "fit.json", "--tolerance", "rms 5", "-o", page, "-q").out
+        asked = ("report", tmp_path / "fit.json", "--tolerance", "rms 5", "-o", page, "-q")
+        said = says(*asked, code=int(told)).out
         assert said.startswith("not passed" if told else "passed")  # it has failed
         assert ("Implausibly large changes: a1 by" in said) == told
         assert ("another arm's" in Seen(page.read_text()).text["verdict"]) == told
@@ -100,57 +109,39 @@ def test_the_page_says_which_model_is_signed(results, whole):
     assert any(title == "Model: geometry alone" for title in plain.tables)
     text = plain.text["verdict"]
     assert "Signed is the calibration (geometry alone)" in text
-    assert "What limits it now: gearboxes wind up under gravity" in text
+    assert "Main cause: joint compliance of the whole arm (gearboxes wind up" in text
     both = rendered(WORDING, whole, results / "gap.json")
-    assert any(title == "Model: geometry, joint compliance" for title in both.tables)
+    assert "corrected targets: RMS, inside" in rows(both)
     assert "Signed is the calibration" not in both.text["verdict"]
     # all that these data tell of the noise is that of the instrument
-    assert "is the instrument's noise" in both.text["verdict"]
+    assert "is the instrument's noise" in both.text["budget"]
     # parameters of effects stand once: with the fit if it has them
     assert "parameters of the effects" in plain.tables
     assert "parameters of the effects" not in both.tables
     assert "effects beyond geometry" in both.tables
 
 
-def test_only_what_a_diagnosis_establishes_is_told_for_established(results):
-    fit, gap = mc.load_fit(results / "fit.json"), load_diagnosis(results / "gap.json")
-
-    def limiting(verdict: str, share: float) -> str:
-        found = tuple(replace(one, share=share) for one in gap.effects)
-        told = Sources(fit, replace(gap, verdict=verdict, effects=found))
-        return limits_now(told, signed(told, (), "inside", None))
-
-    cause = "gearboxes wind up under gravity"
-    assert limiting("named", 0.9).startswith(f"{cause} (joint compliance of the whole arm), which")
-    for verdict in ("unknown", "not_repeatable"):
-        guess = limiting(verdict, 0.9)
-        assert "establishes" not in guess
-        said = {"unknown": "Unexplained by the diagnosis: ", "not_repeatable": "Not repeatable: "}
-        assert said[verdict] in guess
-        assert guess.startswith(f"{cause} (")
-    assert cause not in limiting("named", -0.001)  # a cause that closes nothing limits nothing
-
-
-def test_a_floor_that_is_an_upper_bound_is_no_cause(results):
-    gap = load_diagnosis(results / "gap.json")
-    rest = replace(gap.remaining, unexplained_mm=0.026)
-    sure = Floor(0.043, 0.04, 0.046, "the instrument")
-    open_ = Floor(0.043, 0.0, 0.043, AT_MOST)
-    assert (sure.certain, open_.certain) == (True, False)
-    near = 0.05
-    assert left_now(replace(gap, floor=sure), near) == (
-        "measurement noise (0.043\N{NO-BREAK SPACE}mm)."
-    )
-    told = left_now(replace(gap, floor=open_, remaining=rest, floor_known=False), near)
-    assert told.startswith("a remaining error that no known effect explains (")
-    assert told.endswith("0.026 mm may be the arm's repeatability).")
+def test_the_worst_joint_is_the_one_that_effects_turn_most(whole, results):
+    """The rigid arm at joints turned so sees the targets where the arm with its effects does."""
+    fit = mc.load_fit(whole)
+    (said,) = worst_joint(read_sources([whole]))
+    known = re.search(r"joint (\d), turned ([\d.]+) degrees .*\(line (\d+);", said)
+    assert known
+    turn = fit.cell.effects.turn(fit.cell.scene(with_history(fit.data)))
+    rigid = replace(fit.cell, effects=type(fit.cell.effects)((), ()))
+    assert_allclose(rigid.predict(fit.data.q + turn), fit.cell.predict(fit.data.q), atol=1e-12)
+    assert float(known[2]) == pytest.approx(np.degrees(np.abs(turn).max()), abs=5e-4)
+    row = np.flatnonzero(fit.data.line == int(known[3]))[0]
+    assert abs(turn[row, int(known[1]) - 1]) == np.abs(turn).max()
+    assert not list(worst_joint(read_sources([results / "fit.json"])))  # geometry turns none
 
 
 def test_rungs_of_a_diagnosis(results, tmp_path):
     gap = load_diagnosis(results / "gap.json")
     for number, step in ((0, gap.ladder[0]), (1, gap.ladder[1]), (None, gap.ladder[-1])):
         wording = Wording("2026-11-21", rung=number)
-        found = rows(rendered(wording, results / "gap.json"))["RMS, inside measured region"]
+        found = rows(rendered(wording, results / "gap.json"))
+        found = found.get("RMS, inside") or found["corrected targets: RMS, inside"]
         assert found[0] == f"{step.holdout.poses} held out"
         assert found[2] == f"{step.holdout.rms_mm:.3f}"
     with pytest.raises(mc.OptionError, match="no step 7"):
@@ -198,7 +189,7 @@ def test_paper_and_picture_by_the_ending(results, tmp_path, monkeypatch):
     assert run("report", results / "fit.json", "-o", tmp_path / "page.pdf") == 0
     ((text, path),) = printed
     assert path == tmp_path / "page.pdf"
-    assert "accuracy" in Seen(text).text
+    assert "budget" in Seen(text).text
 
 
 # ---- deliver -------------------------------------------------------------------------------------
@@ -270,14 +261,16 @@ def test_the_page_and_the_command_say_for_which_file(fit, between, tmp_path, ref
     fit.save(tmp_path / "fit.json")
     asked = ("report", tmp_path / "fit.json", "--tolerance", between, "-o", tmp_path / "page.html")
     first, *rest = says(*asked).out.splitlines()
-    assert first == PASSED
+    assert first.startswith(PASSED)
     assert any(
         "hold for joint targets corrected by minimax-cal compensate" in line for line in rest
     )
     assert any(line.startswith("urdf: not passed: urdf holds geometry alone") for line in rest)
     page = (tmp_path / "page.html").read_text()
-    assert "Files and corrected targets" in page
-    first, *rest = says(*asked, "--deliver", "urdf", "--deliver", "ros-yaml").out.splitlines()
+    assert "Result by deliverable" in page
+    first, *rest = says(
+        *asked, "--deliver", "urdf", "--deliver", "ros-yaml", code=1
+    ).out.splitlines()
     assert first == NOT_PASSED
     assert any(
         "hold for the urdf file of minimax-cal export (geometry alone)" in line for line in rest
@@ -330,7 +323,7 @@ def test_passed_only_without_them_is_said_in_the_verdict_line(files, says):
 
 def test_with_room_enough_it_is_passed_with_them_too(files):
     found = signed(read_sources([files / "used.json"]), limits_of("rms 2"), "inside", None)
-    assert found.sentence == found.verdict == PASSED
+    assert (found.sentence, found.verdict) == (f"{PASSED} inside the measured region", PASSED)
     assert found.lines()[2].startswith(f"{2 * BAD} points set aside by the user; with them RMS")
 
 
@@ -347,10 +340,19 @@ def test_without_any_the_page_says_so(files):
     assert "No measured point was set aside." in page.render(compose(sources, WORDING))
 
 
+def test_what_one_of_two_results_sets_aside_is_said(files):
+    """The calibration sets nothing aside, and the diagnosis of the same measurements does."""
+    fit, gap = mc.load_fit(files / "used.json"), load_diagnosis(files / "gap.json")
+    found = signed(Sources(replace(fit, set_aside=()), gap), (), "inside", None)
+    assert found.aside[0].startswith(f"In the diagnosis: {2 * BAD} points set aside by the user")
+    both = signed(Sources(fit, gap), (), "inside", None)
+    assert [said[:22] for said in both.aside] == [f"{2 * BAD} points set aside by"]  # once, of both
+
+
 # ---- report motion -------------------------------------------------------------------------------
 
 
-MOTION_WORDING = Wording("2026-11-25", author="A. Smith")
+MOTION_WORDING = Wording("2026-11-25", author="A. Smith", appendix=True)
 
 
 @pytest.fixture(scope="module")
@@ -374,13 +376,13 @@ def test_sections_hold_the_budget_the_curves_and_the_run_left_out(saved):
     last = source.found.budget[-1]
     assert budget[0].rows[-1] == (last.name, *last.holdout_rms)
     assert budget[1].rows[-1] == (last.name, *last.holdout_rms_moving)
-    figures = [one for one in blocks["torques"] if isinstance(one, Figure)]
-    assert [one.name for one in figures] == ["joint-1", "joint-2", "joint-3"]
-    measured, predicted, band, curve = figures[2].traces
+    figures = {one.name: one for one in blocks["where"] if isinstance(one, Figure)}
+    assert sorted(figures) == ["joint-1", "joint-2", "joint-3"]
+    measured, predicted, band, curve = figures["joint-3"].traces
     assert measured["y"] == pytest.approx(source.found.held_run.measured[2], rel=1e-5)
     assert predicted["y"] == pytest.approx(source.found.held_run.predicted[2], rel=1e-5)
     assert len(band["y"]) == 2 * len(curve["y"])
-    assert f"{last.holdout_rms_moving[2]:.3g} N m" in figures[2].says
+    assert f"{last.holdout_rms_moving[2]:.3g} N m" in figures["joint-3"].says
     assert blocks["provenance"][0].rows[0][2] == source.file.digest
 
 

@@ -85,7 +85,7 @@ def test_people_read_a_distance_that_is_the_norm_in_json(tmp_path, noisy, says):
     frames = json.loads(out.read_text())["frames"]
     away = np.linalg.norm(frames["base"]["xyz_mm"])
     assert f"the base is {away:.3f} mm from the instrument" in " ".join(told.split())
-    assert run("report", out, "-o", page, "-q") == 0
+    assert run("report", out, "-o", page, "-q", "--appendix") == 0
     seen = Seen(page.read_text())
     rows = {row[0]: row[1:] for title, found in seen.tables.items()
             if title.startswith(f"frames: the base is {away:.3f} mm") for row in found}  # fmt: skip

@@ -20,6 +20,7 @@ pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[ap
 pytestmark = pytest.mark.dev
 PHONE = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
 POSES, TARGETS = 30, 2
+PASSED = "Passed inside the measured region"
 DIGITS = 1e-8  # of measurements that import writes: half a nanometre and a nanoradian [m]
 HUGE = """
 const file = new File(["x"], "huge.csv");
@@ -162,7 +163,7 @@ def test_from_dropped_files_to_a_passed_report(fitted, server, downloads, tmp_pa
     fill(driver, "#judge [name=most]", "")
     fill(driver, "#judge [name=rms]", "5")
     do(driver, "judge")
-    assert one(driver, "[data-panel=verdict] .banner").text == "Passed"
+    assert one(driver, "[data-panel=verdict] .banner").text == PASSED
 
     do(driver, "urdf")
     click(driver, "[data-panel=downloads] a[href$='robot.urdf']")
@@ -302,7 +303,7 @@ def test_the_whole_work_in_two_browsers(server, tmp_path, tmp_path_factory):
         assert "--effects diagnosis.json" in one(left, "[data-said=fit]").text
         fill(left, "#judge [name=rms]", "0.1")
         do(left, "judge")
-        assert one(left, "[data-panel=verdict] .banner").text == "Passed"
+        assert one(left, "[data-panel=verdict] .banner").text == PASSED
         do(left, "plan")
         do(left, "mjcf")
         drop(left, "targets", targets)
@@ -335,7 +336,7 @@ def test_a_real_arm(driver, server, tmp_path):
     assert_allclose(ours.error, direct.error, rtol=0, atol=DIGITS)  # of the file as it came
     fill(driver, "#judge [name=rms]", "1")
     do(driver, "judge")
-    assert one(driver, "[data-panel=verdict] .banner").text == "Passed"
+    assert one(driver, "[data-panel=verdict] .banner").text == PASSED
     do(driver, "urdf")
     assert (folder / "robot.urdf").stat().st_size > 1000
     assert severe(driver) == []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ MOST_POSES = 500  # drawn one by one; more only cost time and hide each other
 
 @dataclass(frozen=True)
 class Note:
-    """A sentence or some.  kind: text, reason, caveat, missing, warning or banner."""
+    """A sentence or some.  kind: text, verdict, notice, caveat, missing, warning or banner."""
 
     text: str
     kind: str = "text"
@@ -55,11 +55,12 @@ Blocks = Sequence[Block]
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A part of the report.  name: of its element."""
+    """A part of the report.  name: of its element.  sheet: whether it is a page of its own."""
 
     name: str
     title: str
     blocks: tuple[Block, ...]
+    sheet: bool = True
 
     @property
     def is_told(self) -> bool:
@@ -82,6 +83,17 @@ class Report:
     sections: tuple[Section, ...]
     digest: str
     kind: str = "Calibration report"
+
+
+def bound(pages: Sequence[Section], more: Sequence[Section], appendix: bool) -> tuple[Section, ...]:
+    """The pages with the appendix, or with a line that says what it would hold."""
+    pages = [part for part in pages if part.is_told]
+    rest = [replace(part, sheet=False) for part in more if part.is_told]
+    if appendix or not rest:
+        return (*pages, *rest)
+    titles = "; ".join(part.title for part in rest)
+    note = Note(f"This report is without its appendix, which has: {titles}.", "notice")
+    return (*pages[:-1], replace(pages[-1], blocks=(*pages[-1].blocks, note)))
 
 
 def text(sentence: str) -> Note:

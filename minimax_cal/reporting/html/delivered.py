@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from minimax_cal.correcting.deliverable import COMPENSATED, Delivered, deliver
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.words import capitalise
 from minimax_cal.judging.tolerance import (
     NOT_PASSED,
     NOT_STATED,
@@ -20,13 +20,13 @@ from minimax_cal.judging.tolerance import (
     judge,
     overall,
 )
-from minimax_cal.modelling.effects.words import name_kinds
 from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.solvers.status import Status
 
 USUAL = (COMPENSATED, "urdf")  # where none is named: all that joints correct, and no effect
 NOWHERE = Bound(math.nan, math.nan)
 CORRECTED = "joint targets corrected by minimax-cal compensate"
+SHORT = "corrected targets"
 
 Claims = tuple[Claim, ...]
 
@@ -44,6 +44,20 @@ class Row:
         """For people."""
         to = self.delivered.format
         return CORRECTED if to == COMPENSATED else f"the {to} file of minimax-cal export"
+
+    @property
+    def short(self) -> str:
+        """In a table."""
+        to = self.delivered.format
+        return SHORT if to == COMPENSATED else f"{to} file"
+
+    def said(self) -> str:
+        """What it holds of the full model, in a sentence."""
+        own = self.delivered
+        if own.reason:
+            return f"{own.sentence()}."
+        out = f"fitted without {own.lacks}, which it leaves out" if own.lacks else "the whole model"
+        return f"{capitalise(self.short)}: {out}."
 
     @property
     def verdict(self) -> str:
@@ -107,8 +121,8 @@ def claim_of_file(claim: Claim, made: Delivered) -> Claim:
     rms, largest = claim.rms, claim.largest
     return replace(
         claim,
-        rms=Bound(made.rms_of_file(rms.value), made.rms_of_file(rms.high)),
-        largest=Bound(made.largest_of_file(largest.value), made.largest_of_file(largest.high)),
+        rms=Bound(*map(made.rms_of_file, (rms.value, rms.high, rms.low))),
+        largest=Bound(*map(made.largest_of_file, (largest.value, largest.high, largest.low))),
     )
 
 
@@ -135,20 +149,3 @@ def governing(rows: Sequence[Row], named: bool) -> Row | None:
             if row.verdict == verdict:
                 return row
     return rows[0]
-
-
-def delivered_table(rows: Sequence[Row]) -> Table:
-    """What each carries and reaches, beside the full model."""
-    whole = rows[0].delivered
-    every = (*whole.carries, *whole.not_carried)
-    parts = [("full model (no file has it)", every, every[:0], whole.whole, "")]
-    for row in rows:
-        own = row.delivered
-        parts.append((row.name, own.carries, own.not_carried, own.figures, row.verdict))
-    return Table.made(
-        "Files and corrected targets, each fitted for exactly the effects that it includes",
-        [(name, name_kinds(held), name_kinds(rest), of.rms, of.largest, of.worst, verdict)
-         for name, held, rest, of, verdict in parts],
-        "delivered as | includes | leaves out | inside, RMS mm .3f | inside, largest mm .3f | "
-        "outside, worst RMS mm .3f | verdict",
-    )  # fmt: skip

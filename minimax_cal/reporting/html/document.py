@@ -8,19 +8,15 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any
 
-from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit
-from minimax_cal.fitting.opened import RELATIVE
-from minimax_cal.fitting.several import RelativeCalibration
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import visible
 from minimax_cal.judging.tolerance import Limit
-from minimax_cal.reporting.html import fit_sections, gap_sections, simulator_section
-from minimax_cal.reporting.html.content import Block, Blocks, Note, Report, Section, text
+from minimax_cal.reporting.html import appendix, pages
+from minimax_cal.reporting.html.content import Block, Blocks, Note, Report, Section, bound, text
 from minimax_cal.reporting.html.facts import told_facts
 from minimax_cal.reporting.html.first_page import Signed, page_blocks, signed
-from minimax_cal.reporting.html.sources import Sources
-from minimax_cal.reporting.html.verdict import gap_verdict
+from minimax_cal.reporting.html.sources import Sources, named
 
 FILES, PACKAGES = "what | file | SHA-256", "package | version"  # columns of tables
 HEX = re.compile(r"[0-9a-f]{64}")
@@ -32,31 +28,18 @@ def of_fit(blocks: Callable[[Fit], Blocks]) -> Callable[[Sources], Blocks]:
     return lambda sources: blocks(sources.fit) if sources.fit else ()
 
 
-def of_gap(blocks: Callable[[Diagnosis], Blocks]) -> Callable[[Sources], Blocks]:
-    """What needs a diagnosis; nothing without one."""
-    return lambda sources: blocks(sources.gap) if sources.gap else ()
-
-
-SECTIONS = (  # name, title, what it holds
-    ("accuracy", "Accuracy", fit_sections.accuracy),
-    ("workspace", "The errors in the workspace", fit_sections.errors_in_space),
-    ("joints", "What the errors go with", fit_sections.joints),
-    ("suspects", "Suspect points", fit_sections.suspect_points),
-    ("parameters", "Parameters", of_fit(fit_sections.parameters)),
-    ("correlations", "How the parameters hang together", of_fit(fit_sections.correlated)),
-    ("iso9283", "Values by the formulas of ISO 9283", of_fit(fit_sections.iso_values)),
-    ("solution", "How the fit was found", of_fit(fit_sections.solution)),
-    ("diagnosis", "Diagnosis", of_gap(gap_verdict)),
-    ("gap", "Error budget, step by step", of_gap(gap_sections.gap_steps)),
-    ("causes", "Causes and alternatives", gap_sections.causes),
-    ("where", "Where geometry leaves errors", of_gap(gap_sections.places)),
-    ("untestable", "What could not be tested", of_gap(gap_sections.untestable)),
-    ("simulator", "The arm in the simulator", simulator_section.blocks),
+PAGES = (  # name, title, what it holds: after the page to sign
+    ("budget", "Error budget", pages.budget),
+    ("where", "Where the errors are", pages.where),
+    ("parameters", "Parameters", pages.parameters),
 )
-WITHOUT_COORDINATES = (
-    ("accuracy", "Accuracy", fit_sections.parts_accuracy),
-    ("diagnosis", "Diagnosis", fit_sections.parts_causes),
-    ("parameters", "Parameters", fit_sections.parts_parameters),
+APPENDIX = (
+    ("accuracy", "How large the errors are", appendix.accuracy),
+    ("joints", "What the errors go with", appendix.joints),
+    ("correlations", "How the parameters hang together", of_fit(appendix.correlated)),
+    ("iso9283", "Values by the formulas of ISO 9283", of_fit(appendix.iso_values)),
+    ("solution", "How the fit was found", of_fit(appendix.solution)),
+    ("simulator", "The arm in the simulator", appendix.simulator),
 )
 
 
@@ -66,7 +49,7 @@ class Wording:
 
     date: of the report, ISO 8601.  facts: by the keys of `facts.FACTS`.  limits: what is required,
     which: of which claim, inside or outside.  rung: of a diagnosis.
-    deliver: by which deliverables.
+    deliver: by which deliverables.  appendix: whether it holds more than the four pages.
     """
 
     date: str
@@ -78,6 +61,7 @@ class Wording:
     which: str = "inside"
     rung: int | None = None
     deliver: tuple[str, ...] = ()
+    appendix: bool = False
 
     def judge(self, sources: Sources) -> Signed:
         """What the page judges.  Raises OptionError."""
@@ -97,17 +81,17 @@ def compose(sources: Sources, wording: Wording, found: Signed | None = None) -> 
     facts += [("Date of this report", wording.date), ("Poses", counted(sources))]
     facts += [("Measurements", file_name(told.data) or "not named")]
     facts += [("SHA-256 of the measurements", told.data_sha256 or "not recorded")]
-    parts = WITHOUT_COORDINATES if sources.relative else SECTIONS
-    every = (Section(name, title, tuple(made(sources))) for name, title, made in parts)
-    sections = (section for section in every if section.is_told)
     found = found or wording.judge(sources)
-    first = Section("verdict", "Requirement and result", page_blocks(sources, found))
+    sheets = [Section("verdict", "Requirement and result", page_blocks(sources, found))]
+    sheets += [Section(name, title, tuple(made(sources))) for name, title, made in PAGES]
+    more = [Section(name, title, tuple(made(sources))) for name, title, made in APPENDIX]
+    more += appendix.other_tables(sources, [*sheets, *more])
     return Report(
         title=visible(wording.title) or f"{kind} of {sources.robot}",
         robot=sources.robot,
         facts=tuple(facts),
         signatures=signers(visible(wording.author), visible(wording.customer)),
-        sections=(first, *sections, provenance_section(sources)),
+        sections=bound(sheets, [*more, provenance_section(sources)], wording.appendix),
         digest=told.data_sha256 if HEX.fullmatch(told.data_sha256) else "",
     )
 
@@ -135,12 +119,6 @@ def counted(sources: Sources) -> str:
     targets = len(sources.cell.target_names) if sources.cell else 0
     seen = f", {targets} target{'s' if targets > 1 else ''}" if targets else ""
     return f"{train} training, {held} held out{seen}"
-
-
-def named(sources: Sources) -> list[tuple[str, Fit | Diagnosis | RelativeCalibration]]:
-    """The results with what they are."""
-    every = (("calibration", sources.fit), ("diagnosis", sources.gap), (RELATIVE, sources.relative))
-    return [(kind, result) for kind, result in every if result]
 
 
 def provenance_section(sources: Sources) -> Section:

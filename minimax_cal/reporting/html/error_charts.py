@@ -14,7 +14,6 @@ from minimax_cal.reporting.html.charts import (
     figure,
     frame,
     heading,
-    is_wide,
     key,
     line,
     log_axis,
@@ -25,7 +24,6 @@ from minimax_cal.reporting.html.charts import (
 from minimax_cal.reporting.html.content import Figure, label, plain, some
 from minimax_cal.reporting.html.sources import Poses
 
-BINS = 30
 LEVELS = 400  # steps of a distribution that are drawn
 TREND = 12  # bins of a running median
 FEWEST = 5  # poses of a bin of it
@@ -67,30 +65,6 @@ def known(values: Array) -> Array:
 def every_size(poses: Poses) -> Array:
     """All sizes of errors, before and after."""
     return np.concatenate([known(values) for _, *pair in groups(poses) for values in pair])
-
-
-def histogram(poses: Poses, names: Names) -> Figure:
-    """Shares of points by size of error, held-out and training poses each in a panel."""
-    every = every_size(poses)
-    edges = (
-        np.geomspace(every.min(), every.max() * 1.001, BINS + 1)
-        if is_wide(every, ratio=FAR)
-        else np.linspace(0.0, every.max() * 1.001, BINS + 1)
-    )
-
-    def area(look: str, name: str, values: Array, panel: int) -> dict[str, Any]:
-        count = np.histogram(known(values), edges)[0]
-        share = 100.0 * np.append(count, 0) / max(count.sum(), 1)
-        fill = {"fill": "tozeroy", "fillcolor": LOOKS[look][3], "showlegend": panel == 0}
-        return line(look, name, edges, share, panel=panel, step=True, **fill)
-
-    axes = (log_axis(SIZE, every, ratio=FAR), axis("points (%)"))
-    says = (
-        f"Histograms of the position error, {names[0]} and {names[1]}. "
-        f"{within(poses, names, 'half', 50.0)}"
-    )
-    return figure("histogram", "How large the errors are", says,
-                  *panels(poses, names, area, *axes))  # fmt: skip
 
 
 def panels(
@@ -138,7 +112,7 @@ def cumulative(poses: Poses, names: Names) -> Figure:
     axes = (log_axis(SIZE, every_size(poses), ratio=FAR), axis("points with less error (%)"))
     says = f"Cumulative distribution of the position error. {within(poses, names, '95 %', 95.0)}"
     return figure("cumulative", "Which share of the points is better than a limit", says,
-                  *panels(poses, names, steps, *axes))  # fmt: skip
+                  *panels(poses, names, steps, *axes), 260)  # fmt: skip
 
 
 def boxes(poses: Poses, names: Names) -> Figure:

@@ -1,21 +1,22 @@
-"""The page to sign: requirement, result, verdict, what limits it; one final number."""
+"""The page to sign: verdict, cause, result by deliverable, what was set aside, a picture."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from minimax_cal.diagnosing.result import Diagnosis, Finding
-from minimax_cal.diagnosing.sentences import OPENINGS, parts_of
+from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.accuracy import NO_ENDS, Accuracy
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.checks import wild
 from minimax_cal.fitting.crossed import intervals_of
 from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.set_aside import aside_sentence
+from minimax_cal.fitting.several import RelativeCalibration
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import capitalise
@@ -39,22 +40,22 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import SetAside
 from minimax_cal.measuring.set_aside import counted
 from minimax_cal.modelling.cell import Cell as Arm
-from minimax_cal.modelling.effects.words import name_effect, name_structure
+from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.parameters import Names, links_of
-from minimax_cal.reporting.html.content import Block, Note, caveat, text
-from minimax_cal.reporting.html.delivered import Row, delivered_table, governing, rows_of
-from minimax_cal.reporting.html.sources import Sources
-from minimax_cal.reporting.html.verdict import fit_warnings, number, trouble
+from minimax_cal.reporting.html.content import Block, Figure, Note, caveat, text
+from minimax_cal.reporting.html.delivered import Row, governing, rows_of
+from minimax_cal.reporting.html.error_charts import cumulative
+from minimax_cal.reporting.html.more_charts import budget_chart, waterfall
+from minimax_cal.reporting.html.pages import names_of, split_reasons
+from minimax_cal.reporting.html.sources import Sources, follows, named
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.status import Status
 
-CERTAIN = ("named", "one_of")  # verdicts that let a cause be told for established
-CLOSES = 0.005  # share of the gap that is told as 1 %: a cause of less does not limit
-NEAR_NOISE = 1.5  # times the noise floor: what is left is noise
 MAX_NAMED = 5  # more kinds of effects than this are counted, not listed
 SHOWN_REASONS = 3  # why points were set aside
 NOTHING_ASIDE = "No measured point was set aside."
 NO_LIMIT = "No requirement was given: the result is stated, and nothing is passed or failed."
+NO_CAUSE = "The cause of the remaining error is not known: diagnose the same measurements."
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,8 @@ class Signed:
     wild: links that no whole arm changes so much, empty where there are none.  rows: of what leaves
     the house; row: that of them which is judged, None where the result itself is.
     set_aside: points that take no part; with_them: the claim inside where they count, None without
-    any; judged_with: the requirements against their bounds.  which: the claim that is judged.
+    any; judged_with: the requirements against their bounds.  aside: what any of the results sets
+    aside, in sentences.  which: the claim that is judged.
     """
 
     model: str
@@ -77,6 +79,7 @@ class Signed:
     with_them: Claim | None = None
     judged_with: tuple[Judgement, ...] = ()
     which: str = "inside"
+    aside: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -94,10 +97,19 @@ class Signed:
         return f"Result and verdict hold for {self.row.name} ({self.model}){rest}."
 
     @property
+    def only_without(self) -> bool:
+        """Whether it is passed only without the points that were set aside."""
+        return bool(self.verdict == PASSED and self.judged_with) and (
+            overall(self.judged_with) != PASSED
+        )
+
+    @property
     def sentence(self) -> str:
-        """The verdict; where it is passed only without points set aside, that it is so."""
-        if self.verdict != PASSED or not self.judged_with or overall(self.judged_with) == PASSED:
-            return self.verdict
+        """The verdict and where it holds; that it holds only without points set aside."""
+        if self.verdict != PASSED:
+            return self.verdict or NO_LIMIT
+        if not self.only_without:
+            return f"{PASSED} {self.which} the measured region"
         with_all = overall(self.judged_with)
         worst = next(one for one in self.judged_with if one.verdict == with_all)
         them = "it" if len(self.set_aside) == 1 else "them"
@@ -118,12 +130,16 @@ class Signed:
     def lines(self) -> list[str]:
         """For a terminal."""
         said = [one.sentence() for one in self.judged]
-        aside = [aside_of(self)] if self.set_aside else []
         if not self.judged:
-            return aside
+            return [self.sentence, *self.aside]
         told = [self.holds_for] if self.row else []
         rows = [row.line() for row in self.rows]
-        return [self.sentence, *said, *aside, *told, *rows, *self.besides]
+        return [self.sentence, *said, *self.aside, *told, *rows, *self.besides]
+
+    @property
+    def complaint(self) -> str:
+        """What of the requirement is not passed."""
+        return "; ".join(one.sentence() for one in self.judged if one.verdict == NOT_PASSED)
 
 
 def signed(
@@ -151,15 +167,16 @@ def signed(
     claims = refused(claims, own.status) if own else claims
     odd = changed(fit.nominal.robot, fit.cell.robot) if fit else ""
     rows = rows_of(sources, deliver, rung, limits, which, claims_of, claims)
+    aside = asides(sources)
     if row := governing(rows, bool(deliver)):
         model = with_effects(row.delivered.cell)
-        found = Signed(model, row.claims, row.judged, odd, rows, row, which=which)
+        found = Signed(model, row.claims, row.judged, odd, rows, row, which=which, aside=aside)
         return counting_all(found, sources, limits, which)
     chosen = next((claim for claim in claims if claim.name == which), None)
     if chosen is None:
         chosen = beyond(Beyond(reason="this result makes no such claim"))
     judged = tuple(judge(limit, chosen) for limit in limits)
-    found = Signed(model, claims, judged, odd, which=which)
+    found = Signed(model, claims, judged, odd, which=which, aside=aside)
     return counting_all(found, sources, limits, which)
 
 
@@ -182,23 +199,26 @@ def counting(claim: Claim, found: Accuracy | None) -> Claim:
     """A claim inside, where the points that were set aside count."""
     if found is None:
         return claim
-    (_, rms), (_, largest) = found.rms_ci95_mm or NO_ENDS, found.max_ci95_mm or NO_ENDS
-    return replace(claim, rms=Bound(found.rms_mm, rms), largest=Bound(found.max_mm, largest))
+    (least, rms), (low, largest) = found.rms_ci95_mm or NO_ENDS, found.max_ci95_mm or NO_ENDS
+    bounds = Bound(found.rms_mm, rms, least), Bound(found.max_mm, largest, low)
+    return replace(claim, rms=bounds[0], largest=bounds[1])
 
 
-def aside_of(found: Signed) -> str:
-    """How many points were set aside, by whom, why, and the error with them."""
-    reasons = Counter(point.why for point in found.set_aside).most_common()
+def asides(sources: Sources) -> tuple[str, ...]:
+    """What each result sets aside; once where calibration and diagnosis say the same."""
+    said = {kind: aside_of(result) for kind, result in named(sources) if result.set_aside}
+    if len(said) == len(named(sources)) and len(set(said.values())) == 1:
+        return tuple(set(said.values()))
+    return tuple(f"In the {kind}: {text}" for kind, text in said.items())
+
+
+def aside_of(result: Fit | Diagnosis | RelativeCalibration) -> str:
+    """How many points a result sets aside, by whom, why, and its error with them."""
+    reasons = Counter(point.why for point in result.set_aside).most_common()
     why = "; ".join(f"{text} ({count})" for text, count in reasons[:SHOWN_REASONS])
     more = f"; {len(reasons) - SHOWN_REASONS} more reasons" if len(reasons) > SHOWN_REASONS else ""
-    seen = found.with_them
-    them = "it" if len(found.set_aside) == 1 else "them"
-    errors = (
-        f"; with {them} RMS {seen.rms.value:.3f} mm, largest {seen.largest.value:.3f} mm"
-        if seen
-        else ""
-    )
-    return f"{counted(found.set_aside)}{errors}. Why: {why}{more}"
+    seen = None if isinstance(result, RelativeCalibration) else result.with_them
+    return f"{aside_sentence(result.set_aside, seen)} Why: {why}{more}."
 
 
 def refused(claims: tuple[Claim, ...], status: Status) -> tuple[Claim, ...]:
@@ -286,81 +306,121 @@ def claim_of_parts(sources: Sources) -> Claim:
 
 
 def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
-    """Verdict, table, and a few lines."""
+    """Verdict, cause, results, what was set aside, and a picture."""
     kind = {PASSED: "passed", NOT_PASSED: "failed"}.get(found.verdict, "unstated")
-    banner = capitalise(found.sentence) if found.verdict else NO_LIMIT
-    kind = kind if found.sentence == found.verdict else "unstated"
-    banner += f" {found.which} the measured region" if kind == "passed" else ""
+    kind = "unstated" if found.only_without else kind
     alarm = "caveat" if kind == "passed" else "warning"  # nothing is red under what is passed
-    lines: list[Block] = [Note(banner, f"banner {kind}" if found.verdict else "text")]
-    lines += [text(found.holds_for)] if found.row else []
-    lines += [result_table(sources, found), text(basis(found))]
-    lines += [Note(f"{said}.", alarm) for said in found.besides]
-    if sources.results:
-        lines.append(Note(f"{aside_of(found)}.", alarm) if found.set_aside else text(NOTHING_ASIDE))
-    lines += [delivered_table(found.rows)] if found.rows else []
-    lines += [Note(one.sentence() + ".") for one in found.judged if not one.plain]
-    if limiting := limits_now(sources, found):
-        lines.append(text(f"What limits it now: {limiting}"))
+    lines: list[Block] = [
+        Note(capitalise(found.sentence), f"banner {kind}" if found.verdict else "text"),
+        *because(sources),
+        result_table(found),
+        text(basis(found)),
+        *(text(row.said()) for row in found.rows),
+        *(Note(f"{said}.", alarm) for said in found.besides),
+    ]
+    if sources.results or sources.relative:
+        lines += [Note(said, alarm) for said in found.aside] or [text(NOTHING_ASIDE)]
+    lines += [text(one.sentence() + ".") for one in found.judged if not one.plain]
     lines += [text(which) for which in which_is_which(sources, found)]
     lines += [Note(notice, alarm) for notice in sources.notices]
     wrong = fit_warnings(sources.fit) if sources.fit else ()
     if sources.gap and not sources.fit:
         wrong = trouble(sources.gap.status, "")
     lines += [caveat(one.text) if kind == "passed" else one for one in wrong]
-    return tuple(lines)
+    return (*lines, picture(sources, found))
 
 
-def result_table(sources: Sources, found: Signed) -> Table:
-    """Before, result, its 95 % limit, what is required, verdict."""
-    named = {(one.bound, one.limit.kind): one for one in found.judged}
+def because(sources: Sources) -> Iterator[Note]:
+    """The cause with its share, and the joint that it turns most; how to find it where unknown."""
+    fit = sources.fit
+    few = [said for said in fit.notices if said.startswith("too few poses")] if fit else []
+    if found := sources.gap or sources.causes:
+        (first, *others), _ = split_reasons(found)
+        yield Note(first, "verdict")
+        yield from [text(" ".join(others))] if others else []
+    elif few:
+        yield text(f"What limits it now: {few[0].removeprefix('too few poses: ')}.")
+    elif fit and fit.cell.effects.causes:
+        yield text(f"The model holds {model_of(fit)}; what each explains is in the diagnosis.")
+    else:
+        yield text(NO_CAUSE)
+    yield from map(text, worst_joint(sources))
+
+
+def worst_joint(sources: Sources) -> Iterator[str]:
+    """The joint that effects turn most, in degrees, and the pose; nothing where none turns one."""
+    fit, gap = sources.fit, sources.gap
+    cell, data, error = None, None, np.zeros(0)
+    if fit and fit.cell.effects.terms:
+        cell, data, error = fit.cell, fit.data, fit.error
+    elif gap and gap.cells and gap.cells[-1].effects.terms:
+        cell, data, error = gap.cells[-1], gap.data, gap.errors[1]
+    if cell is None or data is None or not (data.poses and follows(cell, data, error)):
+        return
+    turn = np.degrees(cell.effects.turn(cell.scene(with_history(data))))
+    turn[:, data.sliding] = 0.0
+    pose, joint = np.unravel_index(np.argmax(np.abs(turn)), turn.shape)
+    if turn[pose, joint]:
+        at = ", ".join(
+            f"{1e3 * q:.0f} mm" if slides else f"{np.degrees(q):.0f}"
+            for q, slides in zip(data.q[pose], data.sliding, strict=True)
+        )
+        yield (
+            f"Worst joint: joint {joint + 1}, turned {abs(turn[pose, joint]):.3f} degrees by all "
+            f"effects at its worst pose ({data.called(data.line[pose])}; joints at {at} deg)."
+        )
+
+
+def picture(sources: Sources, found: Signed) -> Figure:
+    """How far each step brings the error down, or of how many points."""
+    if sources.gap:
+        return waterfall(sources.gap)
+    if sources.poses:
+        return cumulative(sources.poses, names_of(sources))
+    inside = found.claims[0]
+    after = (found.model, inside.rms.value, inside.largest.value)
+    return budget_chart("ladder", [("nominal arm", *inside.before), after])
+
+
+def result_table(found: Signed) -> Table:
+    """Of each deliverable: before, result, its 95 % interval, what is required, verdict."""
+    groups = [(f"{row.short}: ", row.claims, row.judged) for row in found.rows]
+    groups = groups or [("", found.claims, found.judged)]
     rows: list[tuple[object, ...]] = []
-    for claim in found.claims:
-        if claim.name == "outside" and claim.reason:
-            continue
-        title = "inside measured region" if claim.name == "inside" else "outside, worst part"
-        for i, kind in enumerate(KINDS):
-            bound = claim.bound(kind)
-            one = named.get((bound, kind))
-            which = f" ({claim.sets[i]})" if claim.sets[i] else ""
-            asked = (one.limit.size_mm, one.verdict) if one else (None, "")
-            size = claim.before[i], bound.value, bound.high
-            rows.append((f"{KINDS[kind]}, {title}{which}", *size, *asked))
+    for name, claims, judged in groups:
+        said = {one.limit.kind: (one.limit.size_mm, one.verdict) for one in judged}
+        for claim in claims:
+            inside = claim.name == "inside"
+            if claim.reason and not inside:
+                continue
+            for i, (kind, title) in enumerate(KINDS.items()):
+                bound, seen = claim.bound(kind), f" ({claim.sets[i]})" if claim.sets[i] else ""
+                which = "inside" if inside else "worst region" if kind == "rms" else "outside"
+                asked = said.get(kind, ()) if claim.name == found.which else ()
+                rows.append((f"{name}{title}, {which}{seen}", *ends(claim.before[i], bound),
+                             *(asked or (None, ""))))  # fmt: skip
     if (all_of := found.with_them) is not None:
         rows += [
-            (f"{name}, inside, with {len(found.set_aside)} points set aside", before, bound.value,
-             bound.high, None, "")
-            for (kind, name), before in zip(KINDS.items(), all_of.before, strict=True)
-            for bound in [all_of.bound(kind)]
+            (f"{groups[0][0]}{title}, inside, with {len(found.set_aside)} points set aside",
+             *ends(before, all_of.bound(kind)), None, "")
+            for (kind, title), before in zip(KINDS.items(), all_of.before, strict=True)
         ]  # fmt: skip
-    rows += iso_rows(sources.fit) if sources.fit else ()
-    columns = "before mm .3f | result mm .3f | 95 % limit mm .3f | required mm .3g | verdict"
-    head = f"error of position (on poses) | {columns}"
-    return Table.made(f"Model: {found.model}", rows, head)
+    columns = "before mm .3f | result mm .3f | 95 % interval mm | required mm .3g | verdict"
+    title = "Result by deliverable" if found.rows else f"Model: {found.model}"
+    every = Table.made(title, rows, f"error of position (poses) | {columns}")
+    return every if found.judged else every.only(*range(4))
 
 
-def iso_rows(fit: Fit) -> list[tuple[object, ...]]:
-    """Mean and largest AP of held-out poses by the formulas of ISO 9283, where they can be had."""
-    from minimax_cal.judging.standard import iso9283
-
-    try:
-        values = iso9283(fit).parts["holdout"].values
-    except (CalibrationError, KeyError):
-        return []
-    sizes = [1e3 * np.linalg.norm(values[key].position, axis=1) for key in ("before", "after")]
-    if not all(np.isfinite(size).any() for size in sizes):
-        return []
-    return [
-        (f"AP of ISO 9283, {name} ({np.isfinite(sizes[1]).sum()} held out)",
-         *map(take, sizes), None, None, "")
-        for name, take in (("mean", np.nanmean), ("largest", np.nanmax))
-    ]  # fmt: skip
+def ends(before: float, bound: Bound) -> tuple[float, float, str]:
+    """Cells of a row: before, result, its interval."""
+    low, high = ("" if math.isnan(end) else f"{end:.3f}" for end in (bound.low, bound.high))
+    return before, bound.value, f"{low or 'up'} to {high}" if high else f"from {low}" if low else ""
 
 
 def basis(found: Signed) -> str:
     """What the numbers rest on."""
     inside = found.claims[0]
-    out = f"Inside the measured region: on {inside.where}. "
+    out = f"Inside the measured region: {inside.where}. "
     away = found.claims[1] if len(found.claims) > 1 else None
     if away and not away.reason:
         out += f"Outside: {away.where.removeprefix('outside the measured region, in ')}. "
@@ -368,7 +428,7 @@ def basis(found: Signed) -> str:
         out += f"Outside them nothing is claimed: {away.reason}. "
     out += (
         "With 95 % confidence the RMS of such poses, and the largest error of as many new ones, "
-        "stay below the 95 % limits, which are compared with the requirement."
+        "lie in the intervals, whose upper ends are compared with the requirement."
     )
     told = [claim for claim in found.claims if not claim.reason]
     if any(math.isnan(claim.bound(kind).high) for claim in told for kind in KINDS):
@@ -376,83 +436,43 @@ def basis(found: Signed) -> str:
     return out
 
 
-def limits_now(sources: Sources, found: Signed) -> str:
-    """The one thing that keeps the error from being smaller; empty where nobody knows."""
-    left = found.claims[0].rms.value
-    if found.row and found.row.delivered.lacks:
-        own = found.row.delivered
-        whole = number(own.whole.rms)
-        return (
-            f"{own.lacks}, which {own.format} leaves out; the full model has {whole} RMS."
-            f"{unexplained_of(sources.gap)}"
+def fit_warnings(fit: Fit) -> tuple[Note, ...]:
+    """What nobody should sign without having read it."""
+    held, notes = fit.accuracy["holdout"], []
+    if not held.poses:
+        notes.append(
+            caveat(
+                "No pose was held out: these numbers were reached on the poses of the fit and are "
+                "too good for new ones."
+            )
         )
-    if sources.gap:
-        lacking = [f for f in causes(sources.gap) if not (holds(sources, f) or f.share < CLOSES)]
-        if lacking and sources.gap.verdict in CERTAIN:
-            return f"{said_of(lacking)}, which the diagnosis establishes and this model leaves out."
-        if lacking:
-            return f"{said_of(lacking)}, which this model leaves out.{unexplained_of(sources.gap)}"
-        return left_now(sources.gap, left) + unexplained_of(sources.gap)
-    if sources.fit:
-        few = [notice for notice in sources.fit.notices if notice.startswith("too few poses")]
-        if few:
-            return few[0].removeprefix("too few poses: ") + "."
-        return (
-            f"what {model_of(sources.fit)} leaves, {number(left)} RMS; a diagnosis of the same "
-            "measurements finds its cause."
+    elif not held.rms_mm < fit.accuracy["nominal"].rms_mm:
+        notes.append(
+            Note("On poses not used for the fit, the calibration is no improvement.", "warning")
         )
-    return ""
+    return (*notes, *trouble(fit.status, fit.reason or fit.status.advice))
 
 
-def unexplained_of(gap: Diagnosis | None) -> str:
-    """What the diagnosis does not explain, after a space; empty where it explains all."""
-    if gap is None or gap.verdict not in ("unknown", "not_repeatable"):
-        return ""
-    if gap.verdict == "not_repeatable":
-        return f" {OPENINGS[gap.verdict]}"
-    return f" Unexplained by the diagnosis: {name_structure(gap.structure_in)}."
-
-
-def left_now(gap: Diagnosis, left: float) -> str:
-    """What remains beneath the causes that were found.  left: RMS [mm].
-
-    A floor that is only the most that noise may be tells no cause: it is what the model leaves.
-    """
-    floor, rest = gap.floor, gap.remaining
-    if floor.certain and left <= NEAR_NOISE * floor.value:
-        return f"measurement noise ({number(floor.value)})."
-    parts = f" ({', '.join(parts_of(gap, rest))})" if rest else ""
-    return f"a remaining error that no known effect explains{parts}."
-
-
-def causes(gap: Diagnosis) -> list[Finding]:
-    """The confirmed effects, the largest first."""
-    return [f for f in gap.effects if f.established and not f.rows]
-
-
-def holds(sources: Sources, finding: Finding) -> bool:
-    """Whether the model that is signed has an effect."""
-    if sources.fit is None:
-        return True
-    return finding.term.effect in {term.effect for term in sources.fit.cell.effects.terms}
-
-
-def said_of(findings: list[Finding]) -> str:
-    """Causes in words, at most three."""
-    named = [f"{f.cause} ({f.name})" for f in findings[:3]]
-    more = f" and {len(findings) - 3} more" if len(findings) > 3 else ""
-    return ", ".join(named) + more
+def trouble(status: str, advice: str) -> tuple[Note, ...]:
+    """A warning where the numbers did not work out."""
+    if status == "converged":
+        return ()
+    if status == "no_better":
+        return (Note(f"{advice}.", "warning"),)
+    tail = f": {advice}." if advice else "."
+    return (Note(f"The fit did not converge ({status.replace('_', ' ')}){tail}", "warning"),)
 
 
 def which_is_which(sources: Sources, found: Signed) -> list[str]:
     """Where fit and diagnosis hold different models: which one is signed."""
-    if not (sources.fit and sources.gap):
+    fit, gap = sources.fit, sources.gap
+    if not (fit and gap):
         return []
-    last, _ = claims_at(sources.gap, None)
-    if all(holds(sources, f) for f in causes(sources.gap)):
+    held = {term.effect for term in fit.cell.effects.terms}
+    if all(f.term.effect in held for f in gap.effects if f.established and not f.rows):
         return []
-    final = sources.gap.ladder[-1].holdout.rms_mm
+    last, _ = claims_at(gap, None)
     return [
-        f"Signed is the calibration ({found.model}). The diagnosis in the appendix ends with "
-        f"another model ({last}), of {number(final)} RMS on its held-out poses."
+        f"Signed is the calibration ({found.model}), which leaves confirmed causes out. With them "
+        f"({last}) the RMS on held-out poses is {gap.ladder[-1].holdout.rms_mm:.3f} mm."
     ]

@@ -1,4 +1,4 @@
-"""Charts of a fit (iterations, correlations) and of a diagnosis (the gap, its causes)."""
+"""Charts of correlations, of an error budget and of what a diagnosis leaves."""
 
 from __future__ import annotations
 
@@ -9,64 +9,25 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.diagnosing.curves import VIEWS, Curve
-from minimax_cal.diagnosing.result import Diagnosis
-from minimax_cal.fitting.fit import Fit
+from minimax_cal.diagnosing.result import IF_REAL, Diagnosis
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import capitalise
-from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.reporting.html.charts import (
     LOOKS,
     axis,
     broken,
     figure,
     frame,
-    heading,
     key,
     line,
     log_axis,
     two_looks,
 )
 from minimax_cal.reporting.html.content import Figure, label, plain, some
-from minimax_cal.reporting.html.error_charts import panel_axes
-
-LOWEST = 1e-18  # what a logarithmic axis shows of zero
-STRETCH = 2.0  # an axis that a few points stretch more than this is cut
-
-
-def iterations(fit: Fit) -> Figure:
-    """Cost of the least squares, and how far from optimal the minimax was, step by step."""
-    panels: list[tuple[str, str, Array, Array]] = []
-    if fit.trace:
-        cost = 1e6 * np.array(fit.trace)
-        panels.append(("least squares", "cost (mm²)", np.arange(len(cost)), cost))
-    if fit.minimax and fit.minimax.trace:
-        kkt = np.array([s.kkt for s in fit.minimax.trace])
-        at = np.array([s.iteration for s in fit.minimax.trace])
-        panels.append(("minimax", "KKT residual", at, kkt))
-    traces: list[dict[str, Any]] = []
-    layout = frame(
-        annotations=[heading(p[0], i, len(panels)) for i, p in enumerate(panels)], showlegend=False
-    )
-    for i, (name, ylabel, x, y) in enumerate(panels):
-        y = np.maximum(y, LOWEST)
-        traces.append(
-            line("after", name, x, y, panel=i, mode="lines+markers", marker={"color": "after"})
-        )
-        part = panel_axes(
-            i, len(panels), axis("iteration", dtick=max(1, len(x) // 8)), log_axis(ylabel, y)
-        )
-        for each in part.values():
-            each.pop("matches", None)
-        layout |= part
-    says = "; ".join(
-        f"{name}: {ylabel} from {y[0]:.3g} to {y[-1]:.3g} in {len(y) - 1} steps"
-        for name, ylabel, _, y in panels
-    )
-    return figure("iterations", "How the fit converged", f"{says}.", traces, layout, 300)
-
 
 MOST_LABELS = 24  # of a side of the map of correlations
+STRETCH = 2.0  # an axis that a few points stretch more than this is cut
 
 
 def correlations(known: Uncertainty) -> tuple[tuple[str, ...], Array]:
@@ -108,41 +69,47 @@ def correlation_map(known: Uncertainty) -> Figure:
 
 
 def waterfall(gap: Diagnosis) -> Figure:
-    """The gap from the nominal robot down to the noise."""
-    steps, floor = gap.ladder, gap.floor.value
-    held = np.array([s.holdout.rms_mm for s in steps])
-    train = np.array([s.train.rms_mm for s in steps])
-    worst = np.array([s.holdout.max_mm for s in steps])
-    at = np.arange(len(steps))
+    """The error budget of a diagnosis, as on a first screen."""
+    *steps, _ = (r for table in gap.first_tables() for r in table.rows if r[0] != IF_REAL)
+    return budget_chart("ladder", steps, gap.floor.value)
+
+
+def budget_chart(
+    name: str,
+    steps: Sequence[Sequence[Any]],
+    floor: float = math.nan,
+    said: Sequence[float] = (),
+) -> Figure:
+    """What each step leaves of the error.
+
+    steps: name, held-out RMS, largest.  said: RMS as a fit says.  floor: of the noise, NaN where
+    not known.  All [mm].
+    """
+    names, held, worst = zip(*steps, strict=True)
+    at, ends = np.arange(len(steps)), np.array([-0.5, len(steps) - 0.5])
+    marks = [("RMS", "circle", held), ("largest", "line-ns-open", worst)]
+    marks += [("RMS, as the fit says", "circle-open", tuple(said))] if said else []
     traces: list[dict[str, Any]] = []
-    for name, symbol, x in (
-        ("held-out RMS", "circle", held),
-        ("training RMS", "circle-open", train),
-        ("largest, held out", "line-ns-open", worst),
-    ):
+    for words, symbol, x in marks:
         marker = {"color": "ink", "symbol": symbol, "size": 10, "line": {"width": 2}}
         traces.append(
-            line("after", name, x, at, mode="markers", marker=marker) | {"line": {"width": 0}}
+            line("after", words, np.array(x), at, mode="markers", marker=marker)
+            | {"line": {"width": 0}}
         )
     if floor > 0.0:
-        traces.append(
-            line("third", "noise floor", np.full(2, floor), np.array([-0.5, at[-1] + 0.5]))
-        )
-    every = np.concatenate([held, train, worst, [floor] if floor > 0.0 else []])
-    names = [name_step(s.name) for s in steps]
+        traces.append(line("third", "noise", np.full(2, floor), ends))
+    marks_are = "dot RMS, bar largest" + ", circle as the fit says" * bool(said)
+    sizes = (np.array(one) for one in (held, worst, [floor] if floor > 0.0 else []))
     layout = frame(
-        xaxis=log_axis("error (mm)", every),
-        yaxis=axis("", tickvals=at.tolist(), ticktext=names, range=[len(steps) - 0.5, -0.5],
-                   automargin=True, zeroline=False),
+        xaxis=log_axis(f"error (mm): {marks_are}", *sizes),
+        yaxis=axis("", tickvals=at.tolist(), ticktext=[label(name) for name in names],
+                   range=ends[::-1].tolist(), automargin=True, zeroline=False,
+                   tickfont={"size": 11}),
+        margin={"l": 56, "r": 12, "t": 8, "b": 44}, showlegend=False,
     )  # fmt: skip
-    last = f", {steps[-1].holdout.rms_mm:.3f} mm with the effects" if len(steps) > 2 else ""
-    says = (
-        f"Held-out RMS: {names[0]} {steps[0].holdout.rms_mm:.3f} mm, {names[1]} "
-        f"{steps[1].holdout.rms_mm:.3f} mm{last}"
-    )
-    tail = f"; noise alone would leave {floor:.3f} mm" if math.isfinite(floor) else ""
-    title = f"Held-out error from {held[0]:.3f} mm to {held[-1]:.3f} mm"
-    return figure("ladder", title, f"{says}{tail}.", traces, layout, 120 + 44 * len(steps))
+    title = f"Held-out RMS error: {held[0]:.3f} mm, in the end {held[-1]:.3f} mm"
+    says = "Errors on held-out poses after each step; the dotted line is the noise."
+    return figure(name, title, says, traces, layout, 72 + 22 * len(steps))
 
 
 def curve_chart(name: str, curve: Curve, held: Array) -> Figure:

@@ -11,6 +11,7 @@ import numpy as np
 
 from minimax_cal.dynamics.laws import WORDS
 from minimax_cal.dynamics.result import MotionDiagnosis
+from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import visible
@@ -32,6 +33,7 @@ from minimax_cal.reporting.html.content import (
     Note,
     Report,
     Section,
+    bound,
     caveat,
     label,
     plain,
@@ -41,6 +43,7 @@ from minimax_cal.reporting.html.document import FILES, Wording, made_by, signers
 from minimax_cal.reporting.html.facts import told_facts
 from minimax_cal.reporting.html.sources import File, Result, content_of
 
+SHOWN = 3  # joints that are drawn on a page, the worst ones
 BAND = 2.0  # standard deviations of a band
 SPEEDS = "speed [rad/s, m/s]"
 
@@ -55,6 +58,8 @@ class MotionSource:
     def lines(self) -> list[str]:
         """For a terminal."""
         return [self.found.headline()]
+
+    complaint = ""  # nothing is required of torques
 
 
 def motion_of(results: Sequence[Result]) -> MotionSource | None:
@@ -89,12 +94,17 @@ def compose_motion(source: MotionSource, wording: Wording) -> Report:
     facts += [("Customer", visible(wording.customer))] if wording.customer else []
     facts += [("Date of this report", wording.date), ("Held out", found.held_out)]
     facts += [("Logs", ", ".join(map(visible, found.runs)))]
-    sections = (
+    worst = np.argsort(-np.array(found.budget[-1].holdout_rms_moving))
+    sheets = (
         Section("verdict", "Result", verdict_blocks(found)),
-        Section("budget", "Error budget, step by step", budget_blocks(found)),
-        Section("effects", "Effects", effect_blocks(found)),
-        Section("torques", "Torques and friction of each joint", joint_figures(found)),
-        Section("unexplained", "What has no name", unexplained_blocks(found)),
+        Section("budget", "Error budget", budget_blocks(found)),
+        Section("where", "Where the errors are",
+                (*unexplained_blocks(found), *joint_figures(found, worst[:SHOWN]))),
+        Section("parameters", "Parameters", effect_blocks(found)),
+    )  # fmt: skip
+    rest = joint_figures(found, worst[SHOWN:])
+    more = (
+        Section("torques", "Torques and friction of the other joints", rest),
         Section("untestable", "What could not be tested", untestable_blocks(found)),
         Section("provenance", "Provenance", provenance_blocks(source)),
     )
@@ -103,7 +113,7 @@ def compose_motion(source: MotionSource, wording: Wording) -> Report:
         robot=visible(robot),
         facts=tuple(facts),
         signatures=signers(visible(wording.author), visible(wording.customer)),
-        sections=sections,
+        sections=bound(sheets, more, wording.appendix),
         digest="",
         kind="Motion diagnosis",
     )
@@ -111,13 +121,13 @@ def compose_motion(source: MotionSource, wording: Wording) -> Report:
 
 def verdict_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
     """The answer, and what to bear in mind."""
-    return (Note(found.headline(), "banner"), *(Note(one, "notice") for one in found.notices))
+    notices = (Note(one, "notice") for one in found.notices)
+    return (Note(found.headline(), "verdict"), *notices, budget_figure(found))
 
 
 def budget_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
-    """Tables of all rows and of moving ones, and how both fall."""
-    moving = found.budget_table("moving", "holdout_rms_moving")
-    return budget_figure(found), found.budget_table(), moving
+    """Tables of all rows and of moving ones."""
+    return found.budget_table(), found.budget_table("moving", "holdout_rms_moving")
 
 
 def budget_figure(found: MotionDiagnosis) -> Figure:
@@ -153,9 +163,9 @@ def effect_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
     return filled(found.effects_table(), Table.made("Alternatives", rows, columns))
 
 
-def joint_figures(found: MotionDiagnosis) -> tuple[Block, ...]:
-    """Of each joint, a run left out and the friction curve."""
-    return tuple(joint_figure(found, j) for j in range(len(found.curves)))
+def joint_figures(found: MotionDiagnosis, joints: Array) -> tuple[Block, ...]:
+    """Of some joints, a run left out and the friction curve."""
+    return tuple(joint_figure(found, int(j)) for j in joints)
 
 
 def joint_figure(found: MotionDiagnosis, j: int) -> Figure:

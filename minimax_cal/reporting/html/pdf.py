@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import subprocess
 import tempfile
@@ -32,7 +31,6 @@ FLAGS = (
     "--no-pdf-header-footer",
 )
 SHEET = "794,1123"  # A4 in CSS pixels
-SCRIPT = re.compile(r"<script\b.*?</script>", re.DOTALL | re.IGNORECASE)
 PATIENCE = 180.0  # seconds that a browser may take
 HINT = "open the HTML file in a browser and print it from there"
 
@@ -55,8 +53,7 @@ def picture(page: str, path: Path, browser: str) -> None:
 
     What holds for print holds for the screen then.
     """
-    still = SCRIPT.sub("", page)  # charts stand on later pages
-    sheet = still.replace("@media print {", "@media all {")
+    sheet = page.replace("@media print {", "@media all {")
     sheet = sheet.replace("<html ", "<html data-sheet ", 1)
     flags = ("--hide-scrollbars", f"--window-size={SHEET}", "--force-device-scale-factor=2")
     made(sheet, path, browser, "page.png", "--screenshot={}", *flags)

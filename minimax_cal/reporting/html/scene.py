@@ -182,9 +182,9 @@ def workspace(poses: Poses, cell: Cell, names: Names) -> View:
     )  # fmt: skip
     says = (
         f"The errors as arrows in the workspace, from where the model says to where the target was "
-        f"measured, magnified. Largest {np.nanmax(large[0]):.3f} mm {names[0]}, "
-        f"{np.nanmax(large[1]):.3f} mm {names[1]}. The arm is drawn from its calibrated chain of "
-        f"frames.{cut}"
+        f"measured, magnified. Largest, training poses too: {np.nanmax(large[0]):.3f} mm "
+        f"{names[0]}, {np.nanmax(large[1]):.3f} mm {names[1]}. The arm is drawn by its calibrated "
+        f"chain of frames.{cut}"
     )
     return View(
         "workspace", "The errors in the workspace", says, traces, layout, 560,

@@ -29,6 +29,8 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.simulators.motion.result import MotionGap
 from minimax_cal.simulators.result import SimulatorGap
 
+SAME = 1e-6  # a file's own errors come back to this [m]
+
 Result = (
     Fit
     | Diagnosis
@@ -130,6 +132,17 @@ class Sources:
         if self.fit:
             return self.fit.cell
         return self.gap.cells[-1] if self.gap and self.gap.cells else None
+
+
+def named(sources: Sources) -> list[tuple[str, Fit | Diagnosis | RelativeCalibration]]:
+    """The results with what they are."""
+    every = (("calibration", sources.fit), ("diagnosis", sources.gap), (RELATIVE, sources.relative))
+    return [(kind, result) for kind, result in every if result]
+
+
+def follows(cell: Cell, data: Measurements, error: Array) -> bool:
+    """Whether errors come back from the columns of a file; its effects need others where not."""
+    return bool(np.nanmax(np.abs(cell.error(data) - error), initial=0.0) <= SAME)
 
 
 def read_sources(results: Sequence[Result]) -> Sources:
