@@ -110,6 +110,7 @@ def of_rest(found: mc.Diagnosis) -> Iterator[tuple[str, bool]]:
     if found.structure_in == ABOVE_NOISE and found.verdict == "unknown":
         low, high = found.tested
         yield "above noise that is as large", f"{low:.3f}" > f"{high:.3f}"
+        yield "two noises", not noise > high
     yield (
         "random, and above noise",
         not (found.verdict == "none" and found.structure < STRUCTURE and left.depends),

@@ -43,7 +43,7 @@ from minimax_cal.diagnosing.scatter import are_wrong, unpulled, wrong_rows
 from minimax_cal.diagnosing.set_aside import judged_with, sized, with_targets
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.diagnosing.trial import session_notices
-from minimax_cal.diagnosing.verdict import down_to, explanation, known_noise
+from minimax_cal.diagnosing.verdict import ABOVE_NOISE, down_to, explanation, known_noise
 from minimax_cal.diagnosing.what_remains import remaining_of
 from minimax_cal.diagnosing.where import where
 from minimax_cal.evidence.stability import resemblances
@@ -263,7 +263,8 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     told = explanation(findings, causes, known, study.fit.status, failed=bool(wrong))
     left = () if told["verdict"] == "not_repeatable" else causes.left  # it scatters, that is all
     error = kept.last.cell.error(clean.data)
-    rest, complete = remaining_of(left, judge.rms_mm, clean.data, error)
+    most = known.highest if told["structure_in"] == ABOVE_NOISE else math.inf
+    rest, complete = remaining_of(left, judge.rms_mm, clean.data, error, most)
     more = ladder.last.cell if len(steps) > count else None
     return Diagnosis(
         **{**told, "meets_floor": down_to(known, complete)},

@@ -93,19 +93,20 @@ def loudest(left: Sequence[Remains]) -> Remains | None:
 
 
 def remaining_of(
-    left: Sequence[Remains], last: float, data: Measurements, error: Array
+    left: Sequence[Remains], last: float, data: Measurements, error: Array, most: float = math.inf
 ) -> tuple[Remaining, bool]:
     """What remains, and whether all noise beneath it is known.
 
     left: what the last step leaves, as asked of its poses.  last: RMS distance that it leaves at
-    held-out poses [mm].  data: without faults; error: (k, m, 3) of its arm at them [m].
+    held-out poses [mm].  data: without faults; error: (k, m, 3) of its arm at them [m].  most: what
+    noise is said to be at most, which few visits that are far off do not change [mm].
     """
     again = least_scatter(data, error)
     noise, source = instrument_alone(data)
     if again:  # joints that stop on either side have no middle: by the mean of the squares
         noise, source = 1e3 * math.sqrt(float(again[0].mean())), REPEATS
     known = source == REPEATS or last <= MAX_ALONE * noise
-    noise = min(noise, last) if math.isfinite(noise) else noise
+    noise = min(noise, last, most) if math.isfinite(noise) else noise
     rest = math.sqrt(last**2 - (noise**2 if noise > 0.0 else 0.0))
     depends = tuple(
         Dependence(one.place, one.driver, min(last * math.sqrt(one.share), rest), one.p)

@@ -161,6 +161,19 @@ def test_the_squares_of_the_parts_are_those_of_the_whole(u95, share):
     assert told.depends[0].place == ("J1" if share > 0.1 else "J2")
 
 
+def test_few_visits_that_are_far_off_are_no_noise_of_the_others():
+    """What is said to be above noise of so much is not that noise."""
+    rng = np.random.default_rng(2)
+    q, y = np.repeat(rng.normal(size=(40, 6)), 2, axis=0), 1e-5 * rng.normal(size=(80, 1, 3))
+    y[:2, 0, 0] += 1e-3, -1e-3
+    error = np.moveaxis(y, 1, 0)
+    data = mc.measurements(q, 1.0 + y)
+    whole, _ = remaining_of([], 0.1, data, error)
+    told, known = remaining_of([], 0.1, data, error, 0.02)
+    assert (whole.noise_mm, told.noise_mm, known) == (0.1, 0.02, True)
+    assert np.hypot(told.noise_mm, told.unexplained_mm) == pytest.approx(0.1)
+
+
 def test_what_failed_asks_whether_it_is_this_arm():
     _, found = loose()
     failed = replace(found, status=Status.FAILED, verdict="unknown", remaining=None)
