@@ -20,12 +20,9 @@ from experiments.poses import (
     Found,
     adjoint,
     exp,
-    fit_of,
     gauss_newton,
-    inverse,
     lever,
     points,
-    pose,
     pose_residual,
     pose_slope,
     poses_of,
@@ -36,6 +33,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import Chain
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.transforms import inverse, transform
 
 
 def left_product(p: Array) -> Array:
@@ -84,7 +82,7 @@ def closed_form(A: Array, B: Array, rounds: int = 20) -> tuple[Array, Array]:
     rows = np.concatenate([A[:, :3, :3], np.broadcast_to(-np.eye(3), (len(A), 3, 3))], axis=-1)
     right = B[:, :3, 3] @ turn_z.T - A[:, :3, 3]
     shift = np.linalg.lstsq(rows.reshape(-1, 6), right.reshape(-1), rcond=1e-12)[0]
-    return pose(turn_x, shift[:3]), pose(turn_z, shift[3:])
+    return transform(turn_x, shift[:3]), transform(turn_z, shift[3:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +114,7 @@ def twists(arm: Placed, links: Chain, with_links: bool) -> Array:
     still = np.zeros_like(links.x)
     lengths = [np.concatenate([links.x, still], 1), np.concatenate([links.z, still], 1)]
     geometry = np.concatenate([*lengths, np.concatenate([moment, axis], axis=1)])
-    flange = pose(np.moveaxis(links.axes, -1, 0).swapaxes(-1, -2), links.origin.T)
+    flange = transform(np.moveaxis(links.axes, -1, 0).swapaxes(-1, -2), links.origin.T)
     parts = [
         np.moveaxis(geometry, -1, 0).swapaxes(-1, -2)[..., : 5 * n if with_links else 0],
         np.broadcast_to(np.eye(6), (m, 6, 6)),
@@ -166,10 +164,10 @@ class Start:
     found: Found[Placed]
 
 
-def start_of(robot: Robot, train: Measurements, length: float = np.nan) -> Start:
-    """Hand-eye calibration with the nominal geometry.  length: NaN for the triangle's `lever`."""
+def start_of(robot: Robot, train: Measurements) -> Start:
+    """Hand-eye calibration with the nominal geometry."""
     shape = triangle(train.y)
-    measured, length = poses_of(shape, train.y), length if np.isfinite(length) else lever(shape)
+    measured, length = poses_of(shape, train.y), lever(shape)
     found = place(robot.mdh, train.q * robot.sign, robot.prismatic, measured, length)
     return Start(shape, length, measured, found)
 
@@ -177,7 +175,7 @@ def start_of(robot: Robot, train: Measurements, length: float = np.nan) -> Start
 def placed_fit(robot: Robot, shape: Array, found: Found[Placed]) -> Fit:
     """An MDH arm fitted to poses; the SMRs sit in the tool as measured on average."""
     arm, sign, prismatic = found.x, robot.sign, robot.prismatic
-    return fit_of(lambda q: points(arm.poses(q * sign, prismatic), shape), found)
+    return Fit(lambda q: points(arm.poses(q * sign, prismatic), shape), str(found.status))
 
 
 def nominal(robot: Robot, train: Measurements) -> Fit:
@@ -186,8 +184,8 @@ def nominal(robot: Robot, train: Measurements) -> Fit:
     return placed_fit(robot, start.shape, start.found)
 
 
-def mdh_pose(robot: Robot, train: Measurements, length: float = np.nan) -> Fit:
-    """MDH, all parameters, fitted to measured poses.  length: see `start_of`."""
-    start, q = start_of(robot, train, length), train.q * robot.sign
+def mdh_pose(robot: Robot, train: Measurements) -> Fit:
+    """MDH, all parameters, fitted to measured poses."""
+    start, q = start_of(robot, train), train.q * robot.sign
     found = place(robot.mdh, q, robot.prismatic, start.measured, start.length, links=True)
     return placed_fit(robot, start.shape, found)

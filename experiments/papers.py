@@ -34,7 +34,6 @@ from experiments import (
     verdicts_m,
     verdicts_s,
 )
-from experiments.real import SHARED
 from experiments.sweep import Study, study_options
 from experiments.verdicts import HEADER, HOLDS, MISSING, NO, Verdict, of_quick, table_of
 from minimax_cal.ground.files import write_whole
@@ -58,15 +57,6 @@ def made_by(
     return make
 
 
-def from_methods(study: Study) -> list[Verdict]:
-    """Paper M, Tables 1 and 4."""
-    found = methods.run(study.quick, study.seed, SHARED, study.sweep)
-    tables = [methods.PROPERTIES, methods.PRINTED, methods.claims_table(found)]
-    tables += [methods.accuracy_table(case, results) for case, results in found]
-    study.save(tables, {}, methods.figures(found))
-    return verdicts_m.tables_1_4(found)
-
-
 def from_errata(study: Study) -> list[Verdict]:
     """Both papers as printed."""
     study.save([errata.table()], {})
@@ -85,7 +75,7 @@ STUDIES: dict[str, Callable[[Study], list[Verdict]]] = {
     "courses": made_by(courses, verdicts_s.courses),
     "any_base": made_by(any_base, verdicts_s.anywhere),
     "conditions": made_by(conditions, verdicts_m.conditions),
-    "methods": from_methods,
+    "methods": made_by(methods, verdicts_m.tables_1_4),
     "splits": made_by(splits, verdicts_m.many_splits),
     "algorithm_1": made_by(algorithm_1, verdicts_m.to_the_letter),
     "errata": from_errata,
