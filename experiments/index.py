@@ -18,7 +18,7 @@ BAR = re.compile(r"(?<!\\)\|")  # between cells; a bar within one is escaped
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a study went: done, failed (with its error) or skipped; files: what it wrote."""
+    """How a study went: done, or failed with its error; files: what it wrote."""
 
     name: str
     description: str

@@ -1,4 +1,4 @@
-"""The diagnosis of several instruments on simulated arms of which the causes are known.
+"""Does a diagnosis of several instruments name the cause?  Arms of which the causes are known.
 
     python -m experiments.relative_gap [--quick] [--out FOLDER] [--seed N] [--jobs N] ...
 

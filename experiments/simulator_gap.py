@@ -1,4 +1,4 @@
-"""A simulated arm in MuJoCo beside the real one: does the simulator do what the fit says?
+"""Does a simulator do what the fit says?  Published gains, corrected step by step, in MuJoCo.
 
     python -m experiments.simulator_gap [--quick] [--out FOLDER] [--json FILE] [--seed N] ...
 
