@@ -35,8 +35,8 @@ from experiments.blind_gap import (
     troubles,
     verdicts,
 )
-from experiments.gap_cases import Cause
-from experiments.machines import INSIDE, MAKES, MECHANISMS, OUTSIDE, Asked, Made, make, places
+from experiments.gap_cases import Cause, Sealed
+from experiments.machines import INSIDE, MAKES, MECHANISMS, OUTSIDE, Asked, make, places
 from experiments.sweep import Study, study_options
 from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.ground.arrays import Array
@@ -132,7 +132,7 @@ def run(asked: Asked) -> Row:
     return score(asked, made, said, likeness(made)) | {"seconds": seconds}
 
 
-def diagnosed(made: Made) -> Row:
+def diagnosed(made: Sealed) -> Row:
     """The JSON of a diagnosis that sees the files alone."""
     with TemporaryDirectory() as name:
         robot, data = Path(name) / "robot.json", Path(name) / "data.csv"
@@ -144,7 +144,7 @@ def diagnosed(made: Made) -> Row:
             return {"verdict": "error", "trouble": f"{type(error).__name__}: {error}"}
 
 
-def score(asked: Asked, made: Made, said: Row, alike: tuple[Array, Array]) -> Row:
+def score(asked: Asked, made: Sealed, said: Row, alike: tuple[Array, Array]) -> Row:
     """What an answer is worth, as plain data.
 
     said: the JSON of a diagnosis.  alike: as `likeness` tells.
@@ -180,10 +180,10 @@ def score(asked: Asked, made: Made, said: Row, alike: tuple[Array, Array]) -> Ro
     }  # fmt: skip
 
 
-def likeness(made: Made) -> tuple[Array, Array]:
+def likeness(made: Sealed) -> tuple[Array, Array]:
     """(c,) rho^2 of each cause's own law, and of the best other law."""
     own, other = np.zeros(len(made.truth)), np.zeros(len(made.truth))
-    for i, (truth, part) in enumerate(zip(made.truth, made.displacement, strict=True)):
+    for i, (truth, part) in enumerate(zip(made.truth, made.parts, strict=True)):
         found = resemblance(made.robot, made.data, part)
         mine = [rho2 for name, rho2 in found.items() if is_right(name, truth)]
         rest = [rho2 for name, rho2 in found.items() if not is_right(name, truth)]

@@ -412,7 +412,7 @@ def test_lambda_is_what_was_asked_for_in_shops(law):
         place = machines.places(law, robot, 3)[-1]
         made = machines.make(Asked(robot, "test", (Cause(law, place, 70.0, 1),), poses=60))
         assert_allclose(made.powers, [70.0], rtol=1e-5)
-        assert made.displacement.shape == (1, 3, made.data.poses, 3)
+        assert made.parts.shape == (1, 3, made.data.poses, 3)
 
 
 def test_a_separable_cause_is_told_from_one_that_is_not():
