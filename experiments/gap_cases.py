@@ -1,7 +1,7 @@
 """Measurement files with a known gap between model and robot, for the blind study of `diagnose`.
 
 A `Case` says what is wrong with an arm; `make` builds the arm, lets it be measured and keeps the
-truth; `write` leaves robot.json and data.csv for the diagnosis, and the truth in a file apart.
+truth; `write` leaves robot.json and data.csv for the diagnosis.
 
 The laws here are this file's own and share no code with the library that is judged by them: every
 deviation is finite (offsets go through the forward kinematics, links turn and bend), and they are
@@ -13,18 +13,15 @@ after projection on what no error of the geometry could explain.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import json_text, write_whole
 from minimax_cal.measuring.measurements import Measurements, measurements, write_measurements
 from minimax_cal.robots.robot import Robot, load_robot
 
@@ -898,27 +895,10 @@ def measured(world: World, y: Array, rng: np.random.Generator) -> Measurements:
 
 # ---- files -------------------------------------------------------------------------------------
 
-ROBOT, DATA, TRUTH = "robot.json", "data.csv", "sealed/truth.json"
+ROBOT, DATA = "robot.json", "data.csv"
 
 
 def write(sealed: Sealed, folder: Path) -> None:
-    """Leave robot.json and data.csv for the diagnosis, and the truth in a folder apart."""
-    (folder / TRUTH).parent.mkdir(parents=True, exist_ok=True)
+    """Leave robot.json and data.csv for the diagnosis, and nothing of the truth."""
     sealed.robot.save(folder / ROBOT)
     write_measurements(folder / DATA, sealed.data)
-    content: dict[str, Any] = {name: getattr(sealed, name) for name in Truth.__annotations__}
-    for name in ("displacement", "parts"):
-        content[name] = content[name].tolist()
-    write_whole(folder / TRUTH, json_text(content))
-
-
-def open_seal(folder: Path) -> Truth:
-    """The truth that `write` left."""
-    content = json.loads((folder / TRUTH).read_text("utf-8"))
-    for name in ("truth", "background"):
-        content[name] = tuple((effect, place) for effect, place in content[name])
-    for name in ("displacement", "parts"):
-        content[name] = np.array(content[name], dtype=float)
-    for name in ("powers", "amplitudes"):
-        content[name] = tuple(content[name])
-    return Truth(**content)

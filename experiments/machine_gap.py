@@ -10,38 +10,35 @@ which its own law explains so much more than the best other that 25 of lambda di
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
-import click
 import numpy as np
 
-import minimax_cal as mc
 from experiments import sweep
-from experiments.blind_gap import (
+from experiments.gap_cases import Cause, Sealed
+from experiments.machines import INSIDE, MAKES, MECHANISMS, OUTSIDE, Asked, make, places
+from experiments.scoring import (
     Criterion,
     Row,
     answers,
+    asked,
+    blind_study,
     chosen,
+    headline,
     is_right,
-    number_of,
+    misses,
     pairing,
+    save,
+    scored,
     share_of,
-    text_of,
-    troubles,
     verdicts,
 )
-from experiments.gap_cases import Cause, Sealed
-from experiments.machines import INSIDE, MAKES, MECHANISMS, OUTSIDE, Asked, make, places
-from experiments.sweep import Study, study_options
+from experiments.sweep import Study
 from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
-from minimax_cal.measuring.measurements import write_measurements
 
 POWERS = (50.0, 100.0, 300.0, 1000.0, 5000.0)
 CLEAR = (100.0, 300.0, 1000.0)
@@ -123,60 +120,33 @@ def some_cases(
 # ---- one run -------------------------------------------------------------------------------------
 
 
-def run(asked: Asked) -> Row:
+def run(case: Asked) -> Row:
     """Make the files, let them be diagnosed, and score."""
-    made = make(asked)
-    began = time.perf_counter()
-    said = diagnosed(made)
-    seconds = time.perf_counter() - began
-    return score(asked, made, said, likeness(made)) | {"seconds": seconds}
+    made = make(case)
+    answer = asked(made)
+    return score(case, made, answer.said, likeness(made)) | {"seconds": answer.seconds}
 
 
-def diagnosed(made: Sealed) -> Row:
-    """The JSON of a diagnosis that sees the files alone."""
-    with TemporaryDirectory() as name:
-        robot, data = Path(name) / "robot.json", Path(name) / "data.csv"
-        made.robot.save(robot)
-        write_measurements(data, made.data)
-        try:
-            return mc.diagnose(robot, data, quick=True).to_dict()
-        except Exception as error:  # a crash is an answer too, and a bad one
-            return {"verdict": "error", "trouble": f"{type(error).__name__}: {error}"}
-
-
-def score(asked: Asked, made: Sealed, said: Row, alike: tuple[Array, Array]) -> Row:
+def score(case: Asked, made: Sealed, said: Row, alike: tuple[Array, Array]) -> Row:
     """What an answer is worth, as plain data.
 
     said: the JSON of a diagnosis.  alike: as `likeness` tells.
     """
     sets = answers(said)
-    names = [options[0] for options in sets]
     own, other = alike
     power = np.array(made.powers)
-    gap = said.get("gap", {})
-    count = len(made.truth)
-    there = {"outliers": asked.off, "frame_drift": asked.creep}  # and small, but no wrong names
+    there = {"outliers": case.off, "frame_drift": case.creep}  # and small, but no wrong names
+    names = [options[0] for options in sets]
     beside = [name for name in names if name in made.truth or not there.get(name[0])]
-    return {
-        "condition": asked.condition,
-        "asked": [asked.robot, asked.poses, asked.spread, asked.targets,
-                  *(word for word in ("told", "off", "oval", "creep") if getattr(asked, word))],
-        "seed": asked.seed,
-        "laws": [cause.law for cause in asked.causes],
-        "truth": [list(name) for name in made.truth],
+    return scored(case, made, said, beside) | {
+        "asked": [case.robot, case.poses, case.spread, case.targets,
+                  *(word for word in ("told", "off", "oval", "creep") if getattr(case, word))],
         "lambda": float(power.min(initial=np.inf)),
         "telling": float((power * (own - other)).min(initial=np.inf)),
         "left": float((power * (1.0 - np.maximum(own, other))).min(initial=np.inf)),
-        "verdict": str(said["verdict"]),
-        "names": [list(name) for name in beside],
         "tentative": [[str(e["effect"]), str(e["place"])] for e in said.get("effects", [])
                       if not e.get("established", True)],
-        "strange": sum(not any(is_right(n, t) for t in made.truth) for n in beside),
-        "all_right": len(beside) == count == pairing(made.truth, [[n] for n in beside]),
-        "in_sets": pairing(made.truth, sets) == count,
-        "final_mm": number_of(gap, "holdout_rms_mm", "final"),
-        "geometric_mm": number_of(gap, "holdout_rms_mm", "geometric"),
-        "trouble": str(said.get("trouble", "")),
+        "in_sets": pairing(made.truth, sets) == len(made.truth),
     }  # fmt: skip
 
 
@@ -258,15 +228,6 @@ def criteria(rows: Sequence[Row]) -> list[Criterion]:
     ]  # fmt: skip
 
 
-def headline(found: Sequence[Criterion]) -> Table:
-    """The criteria."""
-    return Table.made(
-        "names on arms as shops have them: shares [%] with 95 % intervals, and the limits",
-        (criterion.line() for criterion in found),
-        "criterion | runs d | found .1f | from .1f | to .1f | limit | verdict",
-    )
-
-
 def per_law(rows: Sequence[Row]) -> Table:
     """Separable single causes by their law."""
     seen = [row for row in rows if row["condition"] in ("single", "orders") and separable(row)]
@@ -289,44 +250,17 @@ def per_law(rows: Sequence[Row]) -> Table:
     )
 
 
-def misses(found: Sequence[Criterion], each: int) -> Table:
-    """The runs behind the limits, for those who mend the diagnosis."""
-    lines: list[tuple[Cell, ...]] = []
-    for criterion in found:
-        for row in criterion.misses()[:each]:
-            truth = [
-                (law, place) for law, (_, place) in zip(row["laws"], row["truth"], strict=True)
-            ]
-            lines.append((
-                criterion.reason, f"{' '.join(map(str, row['asked']))} #{row['seed']}",
-                text_of(truth),
-                row["trouble"][:60] or f"{row['verdict']} {text_of(row['names'])}",
-                row["lambda"], row["telling"], row["final_mm"] / row["geometric_mm"],
-            ))  # fmt: skip
-    return Table.made(
-        "misses, some of each",
-        lines,
-        "what | arm | truth | said | lambda .0f | telling .0f | RMS .3f",
-    )
-
-
 SPARSE = 40  # of the cases of --quick, each so many-th by itself
 
 
-@study_options("machine_gap")
-@click.option("--only", multiple=True, help="A condition to run, such as pair; may be repeated.")
-@click.option(
-    "--every", type=int, help="Run each N-th case alone [default: 1; with --quick 40, in seconds]."
-)
+@blind_study("machine_gap")
 def main(study: Study, only: tuple[str, ...], every: int | None) -> None:
     """Names on arms as shops have them."""
     cases = plan(study.seed, QUICK if study.quick else Size())
     rows = study.sweep(run, chosen(study, cases, only, every, SPARSE), "diagnoses")
     found = criteria(rows)
-    tables = [headline(found), verdicts(rows), per_law(rows), misses(found, 8),
-              *([troubles(rows)] if any(row["trouble"] for row in rows) else [])]  # fmt: skip
-    names = ("criterion", "runs", "found", "low", "high", "limit", "verdict")
-    study.save(tables, {"criteria": tables[0].records(*names), "rows": rows})
+    missed = misses(found, lambda row: " ".join(map(str, row["asked"])), "geometric_mm")
+    save(study, [headline(found), verdicts(rows), per_law(rows), missed], rows, {})
 
 
 if __name__ == "__main__":
