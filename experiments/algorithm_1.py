@@ -19,14 +19,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from experiments import sweep
 from experiments.conditions import FOLDERS, ROBOTS
 from experiments.real import here
-from experiments.record import canvas
 from experiments.speed import fitted
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.minimax_problem import (
@@ -45,9 +43,6 @@ from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.minimax import Linear
 from qp_backends import solve as solve_qp
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 ARMS = ("irb2600", "irb120", "ur10e", "meca500")  # simulated
 REAL = {"real irb120": "irb120", "real fanuc": "fanuc"}
@@ -201,12 +196,11 @@ def table_of(found: Mapping[Job, Course]) -> Table:
             (job.arm, name, course.ways["as printed"][0], *[math.nan] * (len(steps) - 1), value)
             for name, value in course.ours.items()
         ]
-    header = ("arm", "way", "start", *(f"step {step}" for step in steps))
-    return Table(
+    return Table.made(
         "Algorithm 1 of paper M: RMSE(φ) over the optimum, minus one; our backends at their end",
-        header,
-        tuple(rows),
-        ("", "", *[".1e"] * (len(steps) + 1)),
+        rows,
+        "arm | way | start .1e",
+        *(f"step {step} .1e" for step in steps),
     )
 
 
@@ -215,24 +209,13 @@ def reached(values: tuple[float, ...], step: int) -> float:
     return values[step] if step < len(values) else math.inf
 
 
-def picture(found: Mapping[Job, Course]) -> Figure:
-    """Course of every arm."""
-    figure = canvas(9.0, 3.6)
-    for axes, way in zip(figure.subplots(1, 2, sharey=True), WAYS, strict=True):
-        for job, course in found.items():
-            axes.semilogy(np.maximum(course.ways[way], 1e-13), label=job.arm)
-        axes.set(title=way, xlabel="outer step", ylabel="RMSE(phi) over the optimum - 1")
-    axes.legend(fontsize="small")
-    return figure
-
-
 def save(study: Study, found: Mapping[Job, Course]) -> None:
-    """Table and picture."""
+    """The table."""
     content = {
         job.arm: {"ways": dict(course.ways), "ours": dict(course.ours)}
         for job, course in found.items()
     }
-    study.save([table_of(found)], content, {"algorithm_1": picture(found)})
+    study.save([table_of(found)], content)
 
 
 @study_options("algorithm_1")

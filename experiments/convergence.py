@@ -302,9 +302,8 @@ def row_of(found: Sequence[Outcome], method: str, parameters: str, every: int, l
     )
 
 
-HEADER = ("method", "parameters", "starts", "iterations", "RMS mm", "ms a start", "converged %",
-          "to the minimum %")  # fmt: skip
-FORMATS = ("", "", "d", ".2f", ".3f", ".2f", ".2f", ".2f")
+COLUMNS = ("method | parameters | starts d | iterations .2f | RMS mm .3f | ms a start .2f | "
+           "converged % .2f | to the minimum % .2f")  # fmt: skip
 
 
 def table_2(rows: Sequence[Row], setting: Setting) -> Table:
@@ -313,13 +312,12 @@ def table_2(rows: Sequence[Row], setting: Setting) -> Table:
         (f"{method.upper()} (paper)", "all", 3969, *values[:2], 1e3 * values[2], *values[3:])
         for method, values in PAPERS_TABLE.items()
     ]
-    return Table(
+    return Table.made(
         f"convergence from off starts (base turned by {setting.base_angle:g} rad, poses within "
         f"{setting.span:g} rad, noise {1e6 * setting.noise:g} um, errors {1e3 * setting.length:g} "
         f"mm and {1e3 * setting.angle:g} mrad, transmission {1e3 * setting.transmission:g} mrad)",
-        HEADER,
         (*(row.cells() for row in rows), *theirs),
-        FORMATS,
+        COLUMNS,
     )
 
 
@@ -361,56 +359,47 @@ def moved_table(found: Sequence[Moved]) -> Table:
     )
 
 
-def separable_shares(study: Study, setting: Setting, every: int) -> tuple[int, float, float]:
+def separable_table(
+    study: Study, settings: Sequence[tuple[float, Setting]], every: int, columns: str
+) -> Table:
     """How many starts, and which share of them SNLGN and SNLLM bring to the minimum [%]."""
-    least = least_cost(setting)
-    rows = [
-        row_of(
-            outcomes(study, setting, method, "identifiable", every, 500),
-            method,
-            "identifiable",
-            every,
-            least,
-            setting.poses,
-        )
-        for method in ("snlgn", "snllm")
-    ]
-    gauss_newton, levenberg = (100.0 * float(row.minimum.mean()) for row in rows)
-    return len(rows[0].minimum), gauss_newton, levenberg
+    rows: list[tuple[Cell, ...]] = []
+    for first, setting in settings:
+        for angle in (0.0, 0.5):
+            other = replace(setting, base_angle=angle)
+            least, shares = least_cost(other), list[float]()
+            for method in ("snlgn", "snllm"):
+                found = outcomes(study, other, method, "identifiable", every, 500)
+                row = row_of(found, method, "identifiable", every, least, other.poses)
+                shares.append(100.0 * float(row.minimum.mean()))
+            rows.append((first, angle, len(row.minimum), *shares))
+    title = (
+        "separable methods on the identifiable parameters, from the paper's start: share of starts "
+        "that reach the minimum"
+    )
+    return Table.made(title, rows, columns)
 
 
 def span_table(study: Study, setting: Setting, every: int) -> Table:
     """Where the claim of global convergence ends: wider poses have other minima."""
-    rows: list[tuple[Cell, ...]] = []
-    for span in (1.0,) if study.quick else (0.5, 1.0, 1.5, 2.0, np.pi):
-        for angle in (0.0, 0.5):
-            wider = replace(setting, span=span, base_angle=angle)
-            rows.append((span, angle, *separable_shares(study, wider, every)))
-    return Table.made(
-        "separable methods on the identifiable parameters, from the paper's start: share of starts "
-        "that reach the minimum",
-        rows,
+    spans = (1.0,) if study.quick else (0.5, 1.0, 1.5, 2.0, np.pi)
+    return separable_table(
+        study, [(span, replace(setting, span=span)) for span in spans], every,
         "poses within rad .2f | base turned rad .1f | starts d | SNLGN % .1f | SNLLM % .1f",
-    )
+    )  # fmt: skip
 
 
 def seed_table(study: Study, setting: Setting, every: int) -> Table:
     """The separable methods on other simulated arms and poses: how safe the claim is."""
-    rows: list[tuple[Cell, ...]] = []
-    for seed in range(setting.seed, setting.seed + (2 if study.quick else 4)):
-        for angle in (0.0, 0.5):
-            other = replace(setting, seed=seed, base_angle=angle)
-            rows.append((seed, angle, *separable_shares(study, other, max(every, 2))))
-    return Table.made(
-        "separable methods on the identifiable parameters, other simulated arms: share of starts "
-        "that reach the minimum",
-        rows,
+    seeds = range(setting.seed, setting.seed + (2 if study.quick else 4))
+    return separable_table(
+        study, [(seed, replace(setting, seed=seed)) for seed in seeds], max(every, 2),
         "seed d | base turned rad .1f | starts d | SNLGN % .2f | SNLLM % .2f",
-    )
+    )  # fmt: skip
 
 
-def maps(rows: Sequence[Row], what: str) -> Figure:
-    """Paper S, Fig. 3: a value over the grid of deviations, a panel a method."""
+def rms_map(rows: Sequence[Row]) -> Figure:
+    """Paper S, Fig. 3: RMS at the end over the grid of deviations, a panel a method."""
     from matplotlib.colors import LogNorm
 
     figure = canvas(4.2 * len(rows), 4)
@@ -418,31 +407,15 @@ def maps(rows: Sequence[Row], what: str) -> Figure:
     for axes, row in zip(panels, rows, strict=True):
         theta, alpha = grid(row.every)
         side = len(np.unique(theta))
-        values = (row.iterations if what == "iterations" else row.rms_mm).reshape(side, side)
-        values = np.where(row.converged.reshape(side, side), values, np.nan)
+        values = np.where(row.converged, row.rms_mm, np.nan).reshape(side, side)
         known = values[np.isfinite(values)] if np.isfinite(values).any() else np.ones(1)
         least = max(known.min(), 1e-3)
         norm = LogNorm(least, max(known.max(), 10.0 * least))
         edge = (alpha.min(), alpha.max(), theta.min(), theta.max())
         image = axes.imshow(values, origin="lower", extent=edge, norm=norm, cmap="viridis")
         axes.set(title=f"{row.method.upper()}, {row.parameters}", xlabel="alpha_3 off by (rad)")
-        figure.colorbar(image, ax=axes, label=what, shrink=0.8)
+        figure.colorbar(image, ax=axes, label="RMS mm", shrink=0.8)
     panels[0].set_ylabel("theta_2 off by (rad)")
-    return figure
-
-
-def surface(rows: Sequence[Row]) -> Figure:
-    """The RMS at the end over the deviations; starts that do not converge are left out."""
-    figure = canvas(4.2 * len(rows), 4)
-    for number, row in enumerate(rows, start=1):
-        axes = figure.add_subplot(1, len(rows), number, projection="3d")
-        theta, alpha = grid(row.every)
-        side = len(np.unique(theta))
-        height = np.log10(np.where(row.converged, row.rms_mm, np.nan)).reshape(side, side)
-        axes.plot_surface(alpha.reshape(side, side), theta.reshape(side, side), height,
-                          cmap="viridis")  # fmt: skip
-        axes.set(title=row.method.upper(), xlabel="alpha_3 (rad)", ylabel="theta_2 (rad)",
-                 zlabel="log10 RMS mm")  # fmt: skip
     return figure
 
 
@@ -474,34 +447,25 @@ def study_of(study: Study, base_angle: float = 0.3) -> Found:
     return Found(rows, again, setting)
 
 
-def pictures(rows: Sequence[Row], surfaces: bool) -> dict[str, Figure]:
-    """Fig. 3 for each set of parameters, by file name; surfaces take their time."""
-    figures = {}
-    for parameters in dict.fromkeys(row.parameters for row in rows):
-        chosen = [row for row in rows if row.parameters == parameters]
-        name = parameters.replace(", ", "_")
-        for what in ("iterations", "RMS mm"):
-            figures[f"{what.split()[0].lower()}_{name}"] = maps(chosen, what)
-        if surfaces:
-            figures[f"surface_{name}"] = surface(chosen)
-    return figures
-
-
 def save(study: Study, found: Found) -> None:
     """Table 2, and how the claim of global convergence fares on other arms and wider poses."""
     rows, setting = found.rows, found.setting
-    tables = [
-        table_2(rows, setting),
+    first = table_2(rows, setting)
+    more = [
         moved_table(found.moved),
         seed_table(study, setting, SPARSE if study.quick else 3),
         span_table(study, setting, SPARSE if study.quick else 7),
     ]
-    names = [name.replace(" ", "_").replace("%", "percent") for name in HEADER]
+    names = [name.replace(" ", "_").replace("%", "percent") for name in first.header]
     content = {
         "rows": [dict(zip(names, row.cells(), strict=True)) for row in rows],
         "least_rms_mm": float(1e3 * np.sqrt(least_cost(setting) / setting.poses)),
     }
-    study.save(tables, content, pictures(rows, not study.quick))
+    figures = {
+        f"rms_{name.replace(', ', '_')}": rms_map([row for row in rows if row.parameters == name])
+        for name in dict.fromkeys(row.parameters for row in rows)
+    }
+    study.save([first, *more], content, figures)
 
 
 @study_options("convergence")

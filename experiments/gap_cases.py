@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from experiments.real import off_drawing
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements, measurements, write_measurements
 from minimax_cal.robots.robot import Robot, load_robot
@@ -721,13 +722,12 @@ def told_robot(name: str) -> Robot:
 
 def true_robot(told: Robot, rng: np.random.Generator) -> Robot:
     """The arm itself: errors of its geometry, and other masses and centres than told."""
-    n = told.joints
-    mdh = told.mdh + rng.normal(size=(n, 5)) * ([LENGTH] * 2 + [ANGLE] * 3)
+    n, off = told.joints, off_drawing(told, rng, LENGTH, ANGLE)
     factor = 1.0 + WRONG * np.clip(rng.normal(size=n), -2.5, 2.5)
     way = rng.normal(size=(n, 3))
-    off = np.linalg.norm(told.com, axis=1, keepdims=True) * WRONG
-    com = told.com + off * way / np.linalg.norm(way, axis=1, keepdims=True)
-    return replace(told, mdh=mdh, mass=told.mass * factor, com=com)
+    wrong = np.linalg.norm(told.com, axis=1, keepdims=True) * WRONG
+    com = told.com + wrong * way / np.linalg.norm(way, axis=1, keepdims=True)
+    return replace(off, mass=told.mass * factor, com=com)
 
 
 def some_poses(robot: Robot, count: int, rng: np.random.Generator) -> Array:

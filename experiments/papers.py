@@ -10,11 +10,6 @@ behind it.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace

@@ -50,7 +50,7 @@ def asked(made: Sealed, **options: object) -> Answer:
         robot, data = Path(name) / ROBOT, Path(name) / DATA
         began = time.perf_counter()
         try:
-            said = mc.diagnose(robot, data, quick=True, **options).to_dict()  # type: ignore[arg-type]
+            said = mc.diagnose(robot, data, quick=True, **options).to_dict()
         except Exception as error:  # a crash is an answer too, and a bad one
             said = {"verdict": "error", "trouble": f"{type(error).__name__}: {error}"}
         seconds = time.perf_counter() - began

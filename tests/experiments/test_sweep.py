@@ -28,7 +28,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 import minimax_cal as mc
 from experiments import __main__ as studies
 from experiments import sweep as module
-from experiments.index import tables_of
 from experiments.record import save_figure, save_json, save_tables
 from experiments.sweep import Study, study_options, sweep
 from minimax_cal.ground import parallel
@@ -327,7 +326,7 @@ def test_all_studies_make_one_page(tmp_path, monkeypatch, capsys):
     out, numbers = tmp_path / "out", tmp_path / "all.json"
     (out / "fake_good").mkdir(parents=True)
     (out / "fake_good" / "old_1.csv").write_text("of an earlier run")
-    (out / "fake_good" / "old.md").write_text("**old**\n\n| stale |\n| --- |\n| stale |\n")
+    (out / "fake_good" / "old.html").write_text("<table><tr><td>stale</td></tr></table>")
     options = ["--quick", "--seed", "7", "--out", str(out), "--json", str(numbers)]
     result = CliRunner().invoke(studies.everything, options)
     assert result.exit_code == 1
@@ -353,14 +352,6 @@ def test_all_studies_make_one_page(tmp_path, monkeypatch, capsys):
     }
     CliRunner().invoke(studies.everything, options)
     assert (out / "index.html").read_text() == page
-
-
-def test_tables_survive_markdown():
-    table = Table("t | t", ("a|b", "n"), (("x | y", 1.0), ("", 2.0)), ("", ".1f"))
-    (found,) = tables_of(table.markdown())
-    assert (found.title, found.header, found.right) == ("t | t", table.header, (False, True))
-    assert [list(row) for row in found.rows] == table.cells()
-    assert tables_of("no table\n| lonely |\n") == []
 
 
 def test_studies_are_listed_and_run_by_name(monkeypatch, capsys, tmp_path):
