@@ -11,7 +11,7 @@ behind it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from types import ModuleType
 from typing import Any
@@ -40,14 +40,14 @@ def own(study: Study, name: str) -> Study:
 
 
 def made_by(
-    module: ModuleType, judged: Callable[[Any], list[Verdict]]
+    module: ModuleType, judged: Callable[[Any], Iterable[Verdict]]
 ) -> Callable[[Study], list[Verdict]]:
     """A study that finds (`study_of`) and saves, and the verdicts on what it found."""
 
     def make(study: Study) -> list[Verdict]:
         found = module.study_of(study)
         module.save(study, found)
-        return judged(found)
+        return list(judged(found))
 
     return make
 
