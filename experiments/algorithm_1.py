@@ -22,7 +22,6 @@ from functools import partial
 
 import numpy as np
 
-from experiments import sweep
 from experiments.conditions import FOLDERS, ROBOTS
 from experiments.real import here
 from experiments.speed import fitted
@@ -222,7 +221,3 @@ def save(study: Study, found: Mapping[Job, Course]) -> None:
 def main(study: Study) -> None:
     """Paper M's Algorithm 1 to the letter, on simulated and real arms."""
     save(study, study_of(study))
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.gap_cases import (
     ARMS,
     DISTORTED,
@@ -530,7 +529,3 @@ def main(study: Study, only: tuple[str, ...], every: int | None) -> None:
         misses(found, lambda row: f"{row['robot']} {row['poses']}", "oracle_mm"),
     ]
     save(study, tables, rows, {"blind_gap_detectability": detectability_picture(rows)})
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

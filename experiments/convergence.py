@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 
-from experiments import pseudo_inverse, sweep
+from experiments import pseudo_inverse
 from experiments.pseudo_inverse import ROUNDING
 from experiments.record import canvas
 from experiments.speed import identified
@@ -473,7 +473,3 @@ def save(study: Study, found: Found) -> None:
 def main(study: Study, base_angle: float) -> None:
     """Convergence of NLGN, NLLM, SNLGN, SNLLM from off starts: paper S, Table 2, Fig. 3."""
     save(study, study_of(study, base_angle))
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

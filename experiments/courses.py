@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments import pseudo_inverse, sweep
+from experiments import pseudo_inverse
 from experiments.convergence import CAP, PAPER, SAME, Setting, flat, grid, letter, measured, nudged
 from experiments.real import here, real
 from experiments.record import canvas
@@ -282,7 +282,3 @@ def save(study: Study, found: Found) -> None:
 def main(study: Study) -> None:
     """Error against iteration from the paper's start: paper S, Fig. 4-7."""
     save(study, study_of(study))
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

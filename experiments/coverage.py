@@ -20,7 +20,6 @@ import numpy as np
 from scipy import stats
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.record import canvas
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.intervals import chance_of_larger, max_interval, rms_interval
@@ -572,7 +571,3 @@ def rows_of(found: dict[str, Runs]) -> list[dict[str, object]]:
         for case in CASES
         for i, kind in enumerate(KINDS)
     ]
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

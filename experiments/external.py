@@ -17,7 +17,7 @@ import click
 import numpy as np
 
 import minimax_cal as mc
-from experiments import gap_cases, sweep
+from experiments import gap_cases
 from experiments.real import here, real
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.accuracy import accuracy
@@ -232,7 +232,3 @@ def main(study: Study, arms: str, ways: str, halves: int) -> None:
     every = Table("every split", HEADER, tuple(rows_of(jobs, claims)),
                   ("", "", "", "d", *[".4f"] * 5, *[".2f"] * 5))  # fmt: skip
     study.save([summary(jobs, claims), every], {"rows": every.records(*NAMES)})
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

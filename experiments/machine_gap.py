@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from experiments import sweep
 from experiments.gap_cases import Cause, Sealed
 from experiments.machines import INSIDE, MAKES, MECHANISMS, OUTSIDE, Asked, make, places
 from experiments.scoring import (
@@ -261,7 +260,3 @@ def main(study: Study, only: tuple[str, ...], every: int | None) -> None:
     found = criteria(rows)
     missed = misses(found, lambda row: " ".join(map(str, row["asked"])), "geometric_mm")
     save(study, [headline(found), verdicts(rows), per_law(rows), missed], rows, {})
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -23,7 +23,7 @@ from experiments.hand_eye import mdh_pose, nominal
 from experiments.poe import poe_pose, poe_position
 from experiments.poses import Fit, orientation_error, poses_of, triangle
 from experiments.real import SHARED
-from experiments.sweep import Study, start, study_options
+from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.tables import Cell, Table
@@ -334,7 +334,3 @@ def numbers(studies: Studies) -> dict[str, object]:
 def main(study: Study, folder: Path) -> None:
     """Calibration methods side by side, on simulated and real robots."""
     save(study, study_of(study, folder))
-
-
-if __name__ == "__main__":
-    start(__file__)

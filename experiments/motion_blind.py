@@ -18,7 +18,6 @@ import click
 import numpy as np
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.motion_cases import (
     CAUSES,
     LIBRARY,
@@ -354,7 +353,3 @@ def main(study: Study, arms: int, cases: int) -> None:
     tables = [questions_table(told), causes_table(told), time_table(told)]
     keys = ("question", "cases", "yes", "percent", "interval", "asked")
     study.save(tables, {"questions": tables[0].records(*keys), "cases": [*map(record, told)]})
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

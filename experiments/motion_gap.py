@@ -22,7 +22,6 @@ import click
 import numpy as np
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.driven_arms import ARMS, DrivenArm, commands, drawn_arm, drive_along, logged
 from experiments.motion_real import DRIVE_GAIN, RATIO, REAL
 from experiments.real import SHARED, here
@@ -241,7 +240,3 @@ def main(study: Study) -> None:
     elif not study.quick:
         click.echo(f"{REAL}: its logs are not on this machine; only simulated arms", err=True)
     study.save(tables, content)
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

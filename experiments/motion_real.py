@@ -18,7 +18,6 @@ import click
 import numpy as np
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.real import SHARED, here
 from experiments.sweep import Study, study_options
 from minimax_cal.dynamics.given import runs_of
@@ -188,7 +187,3 @@ def main(study: Study) -> None:
              "confirmed": list(one.confirmed)} for one in told
         ]  # fmt: skip
     study.save(tables, content)
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -25,7 +25,6 @@ import click
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from experiments import sweep
 from experiments.real import here, real
 from experiments.record import interval
 from experiments.sweep import Study, study_options
@@ -384,7 +383,3 @@ def main(study: Study, count: int, with_real: bool, drift: bool, commands: tuple
     names = ("arms", "cut", "command", "cuts", "right_percent", "right_low", "right_high",
              "other_percent", "other_low", "other_high")  # fmt: skip
     study.save([table], {"rows": table.records(*names)})
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -16,7 +16,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.pixel_cells import (
     BOARD,
     DISTANCE,
@@ -422,7 +421,3 @@ def main(study: Study) -> None:
         ],
     }  # fmt: skip
     study.save(tables, content)
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -21,7 +21,6 @@ import click
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from experiments import sweep
 from experiments.real import here, off_drawing, real
 from experiments.record import canvas
 from experiments.sweep import Study, study_options
@@ -559,7 +558,3 @@ def main(study: Study, seeds: int) -> None:
         ],
     }
     study.save(tables, content, {"relative": figure_of(found)})
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from experiments import sweep
 from experiments.relative import COMPLIANCE, NOISE, SIMULATORS, Arm, Measured
 from experiments.sweep import Study, study_options
 from minimax_cal.diagnosing.instruments import diagnose_relative
@@ -158,7 +157,3 @@ def main(study: Study) -> None:
     answers = list(study.sweep(run, jobs))
     table = table_of(jobs, answers)
     study.save([table], {"answers": [vars(a) for a in answers]}, {})
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -20,7 +20,6 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.driven_arms import DrivenArm, Motion, commands, drawn_arm, served
 from experiments.sweep import Study, study_options
 from minimax_cal.dynamics.given import MotionKnown
@@ -287,7 +286,3 @@ def main(study: Study) -> None:
         "accused": [list(one) for one in wrongly],
     }  # fmt: skip
     study.save(tables, content)
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

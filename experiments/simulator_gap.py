@@ -22,7 +22,6 @@ import click
 import numpy as np
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.optional import optional
@@ -214,7 +213,3 @@ def main(study: Study, poses: int) -> None:
     }
     figures = {"simulator_gap_ladder": simulator_figure(results[0].gap)}
     study.save([table], content, figures, packages=("mujoco",))
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

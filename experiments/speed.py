@@ -31,7 +31,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import minimax_cal as mc
-from experiments import speed_peers, sweep
+from experiments import speed_peers
 from experiments.speed_peers import Raw
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting import identify
@@ -417,7 +417,3 @@ def main(study: Study, repeats: int, part: tuple[str, ...]) -> None:
     ]
     content = {"ratios": over, "seconds": seconds, "memory_gb": memory, "numba": numba}
     study.save(tables, content, packages=("numba", "casadi", "cvxpy", "daqp"))
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

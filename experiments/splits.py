@@ -17,9 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
-from experiments import sweep
-from experiments.conditions import FOLDERS, ROBOTS
-from experiments.real import here
+from experiments.conditions import ROBOTS, robots_here
 from experiments.record import canvas
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
@@ -102,7 +100,7 @@ def run(job: Job) -> Held:
 
 def jobs_of(study: Study) -> list[Job]:
     """Random splits and groups of every robot whose measurements are here."""
-    robots = [name for name in ROBOTS if name not in FOLDERS or here(FOLDERS[name])]
+    robots = robots_here()
     count, clusterings = (2, 1) if study.quick else (24, 4)
     number = {"random": count, "by groups": 2 if study.quick else clusterings * REGIONS}
     return [
@@ -192,7 +190,3 @@ def save(study: Study, found: dict[Job, Held]) -> None:
 def main(study: Study) -> None:
     """Minimax against the sum over many splits, at random and by groups."""
     save(study, study_of(study))
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from experiments import algorithm_1, splits
 from experiments.conditions import PAPER, ROBOTS, Errors, Outcome
+from experiments.errata import Erratum, stands
 from experiments.methods import METHODS as COMPARED
 from experiments.methods import MINIMAX, PARTS, PRINTED, SINGLE, Studies, figure_of
 from experiments.methods import POSE as POSE_FIT
@@ -265,4 +266,14 @@ def own_cell() -> list[Verdict]:
         hardware("M IV: parameters into the controller (absacc.cfg)", "readily compensated",
                  "an ABB controller with Absolute Accuracy, whose format is not published; "
                  "MOC.cfg and corrected targets are written"),
+    ]  # fmt: skip
+
+
+def slips(found: Sequence[Erratum]) -> list[Verdict]:
+    """Both papers as printed."""
+    shown = sum(map(stands, found))
+    return [
+        Verdict("S, M: the formulas as printed", "errata", f"{len(found)} slips",
+                f"{shown} shown by counter-example", HOLDS if shown == len(found) else NO,
+                "list with proofs: docs/errata.md")
     ]  # fmt: skip
