@@ -33,7 +33,7 @@ from minimax_cal.fitting.minimax_problem import (
 )
 from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.parameters import State
@@ -185,7 +185,7 @@ def study_of(study: Study) -> dict[Job, Course]:
 def table_of(found: Mapping[Job, Course]) -> Table:
     """RMSE(φ) over the optimum after some outer steps, and of our backends at the end."""
     steps = [step for step in SHOWN if all(step <= job.outer for job in found)]
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for job, course in found.items():
         rows += [
             (job.arm, way, values[0], *(reached(values, step) for step in steps))

@@ -13,7 +13,7 @@ holds; the true effect deleted from the library; known causes with distorted law
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -353,20 +353,18 @@ def criteria(rows: Sequence[Row]) -> list[Criterion]:
     ]  # fmt: skip
 
 
-def no_shares(rows: Sequence[Row]) -> list[tuple[Cell, ...]]:
+def no_shares(rows: Sequence[Row]) -> Iterator[tuple[Cell, ...]]:
     """Lines of the headline that are no shares."""
     seen = [row for row in rows if row["condition"] in ALONE and row["lambda"] >= VISIBLE]
     sizes = np.array([row["set_size"] for row in seen if row["set_size"]], dtype=float)
     times = np.array([row["seconds"] for row in rows], dtype=float)
-    lines: list[tuple[Cell, ...]] = []
     for text, values, middle, bound in (
         ("one effect, lambda >= 50: mean size of the set", sizes, np.mean, "<= 2"),
         ("median seconds of a quick diagnosis", times, np.median, "< 0.5"),
     ):
         value, low, high = spread(values, middle)
         kept = "met" if value <= float(bound.split()[1]) else "MISSED"
-        lines.append((text, len(values), value, low, high, bound, kept if len(values) else ""))
-    return lines
+        yield text, len(values), value, low, high, bound, kept if len(values) else ""
 
 
 def spread(values: Array, middle: Callable[[Array], Any]) -> tuple[float, float, float]:
@@ -406,7 +404,7 @@ def confusion(rows: Sequence[Row]) -> Table:
 def per_effect(rows: Sequence[Row]) -> Table:
     """Names and sets of every effect that is visible alone."""
     seen = [row for row in rows if row["condition"] in ALONE and row["lambda"] >= VISIBLE]
-    lines: list[tuple[Cell, ...]] = []
+    lines = []
     for effect in LIBRARY:
         own = [row for row in seen if row["truth"][0][0] == effect]
         sized = [row["set_size"] for row in own if row["set_size"]]
@@ -461,7 +459,7 @@ def detectability(rows: Sequence[Row]) -> Table:
 
 def shrink(rows: Sequence[Row]) -> Table:
     """Held-out RMS against the oracle's, and the noise floor that was said against the true one."""
-    lines: list[tuple[Cell, ...]] = []
+    lines = []
     for text, above, below in (
         ("held-out RMS / oracle", "final_mm", "oracle_mm"),
         ("held-out RMS, geometry only / oracle", "geometric_mm", "oracle_mm"),

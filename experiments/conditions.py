@@ -21,7 +21,6 @@ from experiments.real import here, real
 from experiments.record import canvas
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.measurements import Measurements
@@ -131,7 +130,7 @@ def errors_of(cell: Cell, data: Measurements) -> Errors:
 
 def table_of(title: str, found: dict[str, Outcome]) -> Table:
     """Table 3 for one robot, training and held out side by side."""
-    rows: list[tuple[TableCell, ...]] = []
+    rows = []
     for number, (condition, outcome) in enumerate(found.items()):
         for where, e in (("training", outcome.train), ("held out", outcome.held)):
             rows.append((f"{number} {condition}", where, len(e.ao), *e.sums, e.phi, rms(e.ap),
@@ -205,7 +204,7 @@ def sums_figure(title: str, found: dict[str, Outcome]) -> Figure:
 
 def claims(found: dict[str, dict[str, Outcome]]) -> Table:
     """Whether minimax has the smallest RMSE(phi): it must in training, it need not held out."""
-    rows: list[tuple[TableCell, ...]] = []
+    rows = []
     for robot, outcomes in found.items():
         for part, where in (("train", "training"), ("held", "held out")):
             phi = {name: getattr(outcome, part).phi for name, outcome in outcomes.items()}

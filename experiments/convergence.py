@@ -363,7 +363,7 @@ def separable_table(
     study: Study, settings: Sequence[tuple[float, Setting]], every: int, columns: str
 ) -> Table:
     """How many starts, and which share of them SNLGN and SNLLM bring to the minimum [%]."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for first, setting in settings:
         for angle in (0.0, 0.5):
             other = replace(setting, base_angle=angle)

@@ -33,7 +33,6 @@ from minimax_cal.fitting.uncertainty import (
     quantile,
 )
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.bootstrap import bootstrap
 from minimax_cal.measuring.measurements import Measurements, measurements
@@ -353,7 +352,7 @@ def outside(runs: Runs, kind: int) -> list[str]:
 
 def parameters_table(found: dict[str, Runs]) -> Table:
     """Pooled and extreme coverage of the parameters, by case and kind of sigma."""
-    rows: list[tuple[TableCell, ...]] = []
+    rows = []
     for case in CASES:
         runs = found[case.name]
         for kind, name in enumerate(KINDS):
@@ -377,7 +376,7 @@ def parameters_table(found: dict[str, Runs]) -> Table:
 
 def positions_table(found: dict[str, Runs]) -> Table:
     """Pooled coverage of predicted coordinates."""
-    rows: list[tuple[TableCell, ...]] = []
+    rows = []
     for case in CASES:
         runs = found[case.name]
         for kind, name in enumerate(KINDS):
@@ -400,7 +399,7 @@ def each_table(case: Case, runs: Runs) -> Table:
     """Every parameter of one case."""
     low, high = band(len(runs.error))
     shares = [coverage(runs, kind) for kind in range(len(KINDS))]
-    rows: list[tuple[TableCell, ...]] = []
+    rows = []
     for i, name in enumerate(runs.names):
         true = float(runs.error[:, i].std())
         typical = np.sqrt((runs.sigma[:, :, i] ** 2).mean(axis=0)) / true
@@ -454,7 +453,7 @@ def bootstrap_table(found: dict[str, tuple[Array, Array]]) -> Table:
 
 def verdicts(found: dict[str, Runs]) -> Table:
     """The criterion, for the cases that have to meet it."""
-    rows: list[tuple[TableCell, ...]] = []
+    rows = []
     for case in CASES:
         if not case.asked:
             continue

@@ -173,7 +173,7 @@ NAMES = ("arm", "way", "split", "seed", "within_mm", "typical_mm", "worst_mm", "
 
 def summary(jobs: Sequence[Job], claims: Sequence[Claim | None]) -> Table:
     """How far the claims hold: shares [%] and medians of the ratios."""
-    rows: list[tuple[Entry, ...]] = []
+    rows = []
     pairs = [(job, c) for job, c in zip(jobs, claims, strict=True) if c]
     for arm, way in dict.fromkeys((job.arm, job.way) for job, _ in pairs):
         own = [(job, c) for job, c in pairs if (job.arm, job.way) == (arm, way)]

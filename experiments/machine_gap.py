@@ -37,7 +37,7 @@ from experiments.scoring import (
 from experiments.sweep import Study
 from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 
 POWERS = (50.0, 100.0, 300.0, 1000.0, 5000.0)
 CLEAR = (100.0, 300.0, 1000.0)
@@ -230,7 +230,7 @@ def criteria(rows: Sequence[Row]) -> list[Criterion]:
 def per_law(rows: Sequence[Row]) -> Table:
     """Separable single causes by their law."""
     seen = [row for row in rows if row["condition"] in ("single", "orders") and separable(row)]
-    lines: list[tuple[Cell, ...]] = []
+    lines = []
     for law in INSIDE:
         own = [row for row in seen if row["laws"] == [law]]
         if own:

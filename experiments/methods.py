@@ -240,7 +240,7 @@ def accuracy_table(case: Case, results: Results) -> Table:
     """Position and orientation errors of every method, training beside held out."""
     units = {name: unit for name, (unit, _) in FIGURES.items()}
     header = [f"{name} {units[name]}, {part} .3f" for name in units for part in PARTS]
-    rows: list[tuple[Cell, ...]] = [
+    rows = [
         (name, *(figure_of(outcomes, key, part) for key in FIGURES for part in PARTS))
         for name, outcomes in results.items()
         if outcomes

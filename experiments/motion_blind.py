@@ -42,7 +42,7 @@ from minimax_cal.dynamics.scene import Arm, Scene
 from minimax_cal.dynamics.search import Columns, dictionary_of
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 
 VISIBLE = 50.0  # squared size, over the noise, from which a cause must be seen
 SEPARABLE = 25.0  # the same beside the nearest other law, from which it must be told from that
@@ -294,7 +294,7 @@ def questions_table(told: Sequence[Told]) -> Table:
 
 def causes_table(told: Sequence[Told]) -> Table:
     """What is said of each cause that the logs show and tell from others."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for name in CAUSES:
         own = [o for o in (*separable(told), *clear(told)) if o.case.causes[0][0] == name]
         if own:

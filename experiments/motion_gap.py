@@ -27,7 +27,7 @@ from experiments.motion_real import DRIVE_GAIN, RATIO, REAL
 from experiments.real import SHARED, here
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.simulators.motion.ladder import MOTOR
 from minimax_cal.simulators.motion.module import loaded
@@ -159,7 +159,7 @@ SAID = {"before": "URDF", "plain": "corrected file", "full": "with its module",
 
 def rest_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
     """What remains where friction is that of bristles, without and with motors that hold it."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for i in range(0, len(cases), 2):
         plain, motor = found[i : i + 2]
         rows.append((cases[i].arm, plain.before, *shares(plain)[:2], *shares(motor)[:2]))
@@ -175,7 +175,7 @@ def rest_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
 
 def closed_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
     """What remains on the unseen run, case by case, and its median."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for case, one in zip(cases, found, strict=True):
         rows.append((f"{case.arm} {case.seed}: {', '.join(case.withheld)}", one.before,
                      *shares(one)))  # fmt: skip
@@ -205,7 +205,7 @@ def shares(one: Closed) -> tuple[float, float, float, float]:
 def real_table(found: Sequence[Judged]) -> Table:
     """RMS current of the real arm's runs, each judged by a model that did not see it."""
     n = len(found[0].before)
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for name, said in SAID.items():
         each = np.array([getattr(one, name) for one in found])
         rows.append((said, *np.sqrt((each**2).mean(axis=0)).tolist()))

@@ -29,7 +29,7 @@ from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.positions import position_sigma
 from minimax_cal.fitting.several import RelativeCalibration, relative
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.instruments import Instrument, closures, distances, flange_poses
 from minimax_cal.instruments.closing import CLOSED, reach
 from minimax_cal.instruments.poses import WholePoses
@@ -451,7 +451,7 @@ def after_base(data: Measurements, robot: Robot, spot: Array) -> float:
 
 def real_table(found: dict[tuple[str, str], list[RealOutcome]]) -> Table:
     """Real arms by their own points: medians over the hold-outs."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for (robot, kind), some in found.items():
         middle = np.median([(o.held_mm, *o.position_mm) for o in some], axis=0).tolist()
         rows.append((REAL[robot], KINDS[kind], some[0].poses, some[0].identified, *middle))
@@ -468,7 +468,7 @@ Found = dict[tuple[str, str, float], list[Outcome]]
 
 def identified_table(found: Found) -> Table:
     """What each kind of measurement can tell."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for (robot, kind, compliance), outcomes in found.items():
         if not compliance:
             one, agree = outcomes[0], sum(o.rank == o.identified for o in outcomes)
@@ -489,7 +489,7 @@ def middle(values: Sequence[float]) -> float:
 
 def accuracy_table(found: Found, compliance: float) -> Table:
     """Medians over the seeds of held-out and true errors."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for (robot, kind, bend), some in found.items():
         if bend == compliance:
             tracker = middle([o.true_mm[1] for o in found[robot, "tracker", compliance]])

@@ -19,7 +19,7 @@ from experiments.sweep import Study, study_options
 from minimax_cal.diagnosing.instruments import diagnose_relative
 from minimax_cal.fitting.several.kinds import labels_of
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.instruments.file import Given, as_instrument
 from minimax_cal.measuring.measurements import measurements
 from minimax_cal.modelling.simulate import gravity
@@ -124,7 +124,7 @@ def run(job: Job) -> Answer:
 
 def table_of(jobs: list[Job], answers: list[Answer]) -> Table:
     """How often each verdict was given, and wrong names."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     pairs = list(zip(jobs, answers, strict=True))
     for title, kinds in SETS.items():
         for cause in dict.fromkeys(job.called for job in jobs):

@@ -195,7 +195,7 @@ def misses(criteria: Sequence[Criterion], arm: Callable[[Row], str], against: st
 
     against: what the held-out RMS is compared with.
     """
-    lines: list[tuple[Cell, ...]] = []
+    lines = []
     for criterion in criteria:
         for row in criterion.misses()[:MISSES_EACH]:
             others = [":".join(name) for name in row.get("set", [])[1:4]]

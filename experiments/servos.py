@@ -25,7 +25,7 @@ from experiments.sweep import Study, study_options
 from minimax_cal.dynamics.given import MotionKnown
 from minimax_cal.dynamics.run import NOTHING, TORQUE, Run
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.robots.mjcf import mujoco, numbers
 from minimax_cal.simulators.chain import chain_of, fill_history
 from minimax_cal.simulators.elements import parents_of
@@ -243,7 +243,7 @@ def drawn_cases(count: int, seed: int, *, sound: bool = False) -> list[Case]:
 
 def closed_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
     """What remains on the unseen run, arm by arm, and how often intervals hold."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     each = np.array([[one.before, 100.0 * one.after / one.before, 100.0 * one.alone / one.before]
                      for one in found])  # fmt: skip
     for case, one, ends in zip(cases, found, each.tolist(), strict=True):

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -169,16 +169,14 @@ def sign_of(fit: mc.Fit, joint: int) -> float:
     return float(np.sign(values["backlash"][joint]))
 
 
-def rows_of(trial: Trial, result: Result) -> list[tuple[Cell, ...]]:
-    """A row a rung."""
-    out: list[tuple[Cell, ...]] = []
+def rows_of(trial: Trial, result: Result) -> Iterator[tuple[Cell, ...]]:
+    """A row a rung, and with the last what the file does alone."""
+    name = trial.robot if trial.known else f"{trial.robot}, masses unknown"
     for rung in result.gap.rungs:
         off = 1e3 * (rung.holdout_rms_mm - rung.predicted_rms_mm)
-        name = trial.robot if trial.known else f"{trial.robot}, masses unknown"
-        out.append((name, rung.name, rung.holdout_rms_mm, rung.holdout_max_mm,
-                    rung.predicted_rms_mm, off, rung.sag_mrad, math.nan))  # fmt: skip
-    out[-1] = (*out[-1][:-1], result.alone_mm)
-    return out
+        alone = result.alone_mm if rung is result.gap.rungs[-1] else math.nan
+        yield (name, rung.name, rung.holdout_rms_mm, rung.holdout_max_mm, rung.predicted_rms_mm,
+               off, rung.sag_mrad, alone)  # fmt: skip
 
 
 def table_of(trials: Sequence[Trial], results: Sequence[Result]) -> Table:

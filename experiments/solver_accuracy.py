@@ -33,7 +33,7 @@ from experiments.speed import fitted, race
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.robots.robot import load_robot
 from minimax_cal.solvers import minimax
@@ -207,7 +207,7 @@ def shifted_mean(times: Sequence[float]) -> float:
 
 def table_of(group: str, runs: Sequence[Run], reference: dict[str, float]) -> Table:
     """One set of problems: a row a backend and setting."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     keys = dict.fromkeys((run.backend, run.setting) for run in runs)
     for backend, setting in keys:
         mine = [run for run in runs if (run.backend, run.setting) == (backend, setting)]
@@ -248,7 +248,7 @@ def detail(group: str, runs: Sequence[Run]) -> Table:
 
 def overhead(cases: Sequence[Case], backends: Sequence[str], repeats: int) -> Table:
     """Our `solve`, its check included, against qpsolvers.solve_problem on the same data."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for backend in backends:
         times = []
         for case in cases:
@@ -274,7 +274,7 @@ def subgradient(cases: Sequence[Case], most: int) -> tuple[Table, dict[str, Arra
     marks = [10**k for k in range(1, 7) if 10**k <= most]
     reference = references(cases)
     curves: dict[str, Array] = {}
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for method in METHODS:
         reach = [mark for mark in marks if method == "restarted" or mark <= most // 10]
         errors = np.full((len(cases), len(marks)), np.nan)
@@ -323,7 +323,7 @@ def sqp_values(backends: Sequence[str], seed: int) -> Table:
     data = simulate(robot, 100, 3, seed).data
     model, state = fitted(robot, data)
     problem = minimax_problem(model, state, measured_distances(data), "two-sided", "target")
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     best = np.nan
     for backend in backends:
         loose = backend.startswith("subgradient")

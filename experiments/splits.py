@@ -22,7 +22,7 @@ from experiments.record import canvas
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.measurements import Measurements
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ def robots_of(found: dict[Job, Held]) -> Sequence[str]:
 
 def table_of(found: dict[Job, Held]) -> Table:
     """Median, quartiles and wins."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for robot in robots_of(found):
         for way in WAYS:
             for number, measure in enumerate(MEASURES):
