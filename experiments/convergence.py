@@ -1,13 +1,13 @@
 """From how far the four least-squares methods converge: paper S, Table 2 and Fig. 3.
 
-    python -m experiments.convergence [--quick] [--base-angle RAD] [--out FOLDER] ...
+    python -m experiments.convergence [--quick] [--out FOLDER] ...
 
 A simulated IRB 2600, 60 random configurations, one target; measurement noise, errors of all
 parameters and of the transmissions.  3969 starts: theta_2 and alpha_3 off by -3.1 ... 3.1 rad on a
 grid, base and target at their identity and origin, everything else nominal.  The paper prints
 neither the true base nor the sizes of its errors, nor its unit of length, nor the rule of its
-damping; here the base is turned by --base-angle about a random axis, the errors are those of
-`Setting`, and damping is Marquardt's.
+damping; here the base is turned about a random axis and the errors are those of `Setting`, and
+damping is Marquardt's.
 
 Every method runs to the letter on the paper's parameters (all, redundant ones included,
 pseudo-inverse) in millimetres, those without separation in metres too: there the unit matters.  The
@@ -23,7 +23,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
-import click
 import numpy as np
 
 from experiments import pseudo_inverse
@@ -428,9 +427,9 @@ class Found:
     setting: Setting
 
 
-def study_of(study: Study, base_angle: float = 0.3) -> Found:
+def study_of(study: Study) -> Found:
     """Every variant on its starts."""
-    setting = Setting(seed=study.seed + 1, base_angle=base_angle)
+    setting = Setting(seed=study.seed + 1)
     least = least_cost(setting)
     cap = 100 if study.quick else CAP
 
@@ -469,7 +468,6 @@ def save(study: Study, found: Found) -> None:
 
 
 @study_options("convergence")
-@click.option("--base-angle", type=float, default=0.3, show_default=True, metavar="RAD")
-def main(study: Study, base_angle: float) -> None:
+def main(study: Study) -> None:
     """Convergence of NLGN, NLLM, SNLGN, SNLLM from off starts: paper S, Table 2, Fig. 3."""
-    save(study, study_of(study, base_angle))
+    save(study, study_of(study))

@@ -395,27 +395,6 @@ def positions_table(found: dict[str, Runs]) -> Table:
     )
 
 
-def each_table(case: Case, runs: Runs) -> Table:
-    """Every parameter of one case."""
-    low, high = band(len(runs.error))
-    shares = [coverage(runs, kind) for kind in range(len(KINDS))]
-    rows = []
-    for i, name in enumerate(runs.names):
-        true = float(runs.error[:, i].std())
-        typical = np.sqrt((runs.sigma[:, :, i] ** 2).mean(axis=0)) / true
-        good = "" if low <= shares[0][i] <= high else "yes"
-        covered = (100.0 * float(share[i]) for share in shares)
-        rows.append((name, 1e6 * true, *covered, *map(float, typical), good))
-    return Table.made(
-        f"{case.name}: {len(runs.error)} runs; 99.9 % band {100 * low:.1f} to {100 * high:.1f} %",
-        rows,
-        "parameter | scatter um or urad .2f",
-        *(f"covered by {kind} % .1f" for kind in KINDS),
-        *(f"sigma by {kind} / scatter .3f" for kind in KINDS),
-        "outside",
-    )
-
-
 def held_table(found: dict[str, Runs], laws: dict[tuple[str, int], Array]) -> Table:
     """Coverage of the intervals of held-out RMS and largest error."""
     sources: list[tuple[str, int, Array]] = []
@@ -512,11 +491,9 @@ def batches(case: Case, seed: int, count: int, replicates: int = 0) -> list[Batc
 
 @study_options("coverage")
 @click.option("--runs", "count", type=click.IntRange(4), default=400, show_default=True)
-@click.option("--resampled", "again", type=click.IntRange(1), default=60, show_default=True,
-              help="Runs that are bootstrapped too.")  # fmt: skip
-def main(study: Study, count: int, again: int) -> None:
+def main(study: Study, count: int) -> None:
     """Coverage of the intervals of parameters, positions and held-out accuracy."""
-    replicates = 300
+    again, replicates = 60, 300  # runs that are bootstrapped too
     if study.quick:
         count, again, replicates = 6, 2, 30
         click.echo(
@@ -545,7 +522,6 @@ def main(study: Study, count: int, again: int) -> None:
         positions_table(found),
         held_table(found, laws),
         bootstrap_table({name: (pair[0], pair[1]) for name, pair in boots.items()}),
-        *(each_table(case, found[case.name]) for case in CASES if case.share == 1.0),
     ]
     odd = {name: runs.odd for name, runs in found.items() if runs.odd}
     for name, number in odd.items():

@@ -215,17 +215,13 @@ def middle(of: Array) -> float:
 
 @study_options("external")
 @click.option("--arms", default=",".join((*REAL, *SIMULATED)), show_default=True)
-@click.option("--ways", default=",".join(WAYS), show_default=True)
-@click.option("--halves", type=int, default=HALVES, show_default=True)
-def main(study: Study, arms: str, ways: str, halves: int) -> None:
+def main(study: Study, arms: str) -> None:
     """Claimed accuracy beside that on poses set aside."""
-    named = asked_for(arms)
-    if study.quick:
-        named, halves = [SIMULATED[0]], 1
+    named, halves = ([SIMULATED[0]], 1) if study.quick else (asked_for(arms), HALVES)
     jobs = [
         Job(arm, split, way, study.seed + seed)
         for arm in named
-        for way in ways.split(",")
+        for way in WAYS
         for split, seed in list(splits(arm, halves))[:: 4 if study.quick else 1]
     ]
     claims = study.sweep(run, jobs, "poses set aside")

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 
 import minimax_cal as mc
@@ -210,8 +209,7 @@ def real_table(found: Sequence[Judged]) -> Table:
         each = np.array([getattr(one, name) for one in found])
         rows.append((said, *np.sqrt((each**2).mean(axis=0)).tolist()))
     title = f"UR10e: RMS current [A] under measured motion, {len(found)} runs left out, all rows"
-    return Table(title, ("model", *(f"J{j + 1}" for j in range(n))), tuple(rows),
-                 ("", *[".3g"] * n))  # fmt: skip
+    return Table.made(title, rows, "model", *(f"J{j + 1} .3g" for j in range(n)))
 
 
 @study_options("motion_gap")
@@ -237,6 +235,4 @@ def main(study: Study) -> None:
         tables.append(real_table(judged))
         content["real"] = [{"run": one.name, **{name: getattr(one, name).tolist() for name in SAID}}
                            for one in judged]  # fmt: skip
-    elif not study.quick:
-        click.echo(f"{REAL}: its logs are not on this machine; only simulated arms", err=True)
     study.save(tables, content)

@@ -14,7 +14,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import click
 import numpy as np
 
 import minimax_cal as mc
@@ -172,8 +171,6 @@ def names_table(arm: str, told: Sequence[Told]) -> Table:
 def main(study: Study) -> None:
     """Torques along trajectories, judged by runs that no fit saw."""
     arms = [arm for arm in ARMS if arm == SIMULATED or here(arm)]
-    if REAL not in arms:
-        click.echo(f"{REAL}: its logs are not on this machine; only the simulated arm", err=True)
     tables, content = list[Table](), dict[str, object]()
     for arm in arms[-1:] if study.quick else arms:
         count = RUNS if arm == SIMULATED else len(logs_of(arm, study.seed)[1])

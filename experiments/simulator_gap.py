@@ -18,7 +18,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import click
 import numpy as np
 
 import minimax_cal as mc
@@ -191,11 +190,10 @@ def table_of(trials: Sequence[Trial], results: Sequence[Result]) -> Table:
 
 
 @study_options("simulator_gap")
-@click.option("--poses", type=int, default=160, show_default=True)
-def main(study: Study, poses: int) -> None:
+def main(study: Study) -> None:
     """How far simulated arms are from real ones, before and after."""
     names = ("ur10",) if study.quick else ("ur10", "irb2600", "seven_axes")
-    poses = 50 if study.quick else poses
+    poses = 50 if study.quick else 160
     trials = [Trial(name, poses, study.seed + i) for i, name in enumerate(names)]
     trials += [] if study.quick else [Trial("ur10", poses, study.seed, known=False)]
     results = study.sweep(run, trials, "arms")

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import track
 
 import minimax_cal
 import qp_backends
@@ -123,14 +123,8 @@ def part(function: Callable[[J], R], job: J, code: str) -> R:
 def progress(items: Iterator[R], total: int, description: str) -> Iterator[R]:
     """The same items, with a bar and the time left on stderr if that is a terminal."""
     console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        yield from bar.track(items, total=total, description=description)
+    off = not console.is_terminal
+    yield from track(items, description, total, console=console, disable=off)
 
 
 # ---- where jobs run --------------------------------------------------------------------------
