@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,15 +43,18 @@ from experiments.scoring import (
     asked,
     blind_study,
     chosen,
+    has,
     headline,
     is_right,
     match,
     misses,
     number_of,
+    of,
     pairing,
     save,
     scored,
     share_of,
+    verdict_is,
     verdicts,
 )
 from experiments.sweep import Study
@@ -286,53 +290,48 @@ def close(row: Row) -> bool:
 
 def criteria(rows: Sequence[Row]) -> list[Criterion]:
     """What the diagnosis is held to, and what is only shown."""
-
-    def of(*conditions: str) -> list[Row]:
-        return [row for row in rows if row["condition"] in conditions]
-
+    some = partial(of, rows)
     usual = {"poses": 100, "jitter": Case.jitter, "noise": 1.0}
-    seen = [row for row in of(*ALONE) if row["lambda"] >= VISIBLE]
+    seen = [row for row in some(*ALONE) if row["lambda"] >= VISIBLE]
     plain = [row for row in seen if row["telling"] >= SEPARABLE]
     murky = [row for row in seen if row["telling"] < SEPARABLE]
-    outside = of("outside")
+    outside = some("outside")
     beyond = [row for row in outside if row["telling"] >= VISIBLE]
-    told = [row for row in of("pair") if row["telling"] >= SEPARABLE]
-    three = [row for row in of("triple") if row["telling"] >= SEPARABLE]
-    judged = [row for row in of(*FITTED) if np.isfinite(row["oracle_mm"])]
+    told = [row for row in some("pair") if row["telling"] >= SEPARABLE]
+    three = [row for row in some("triple") if row["telling"] >= SEPARABLE]
+    judged = [row for row in some(*FITTED) if np.isfinite(row["oracle_mm"])]
 
-    def unknown(row: Row) -> bool:
-        return bool(row["verdict"] == "unknown")
-
+    unknown = verdict_is("unknown")
     return [
-        Criterion("no effect: something named", "false alarm", of("none"), named, 0.03, False),
+        Criterion("no effect: something named", "false alarm", some("none"), named, 0.03, False),
         Criterion(
             "  of these, usual jitter, noise and poses", "",
-            [r for r in of("none") if all(r[k] == v for k, v in usual.items())], named,
+            [r for r in some("none") if all(r[k] == v for k, v in usual.items())], named,
         ),
         Criterion("one effect, lambda >= 50: truth in the set of the first", "not in set", seen,
-                  lambda r: r["in_set"], 0.99),
+                  has("in_set"), 0.99),
         Criterion("  first name right where lambda (1 - rho^2) >= 25", "wrong name", plain, right,
                   0.95),
         Criterion("    and its place exactly", "", plain, lambda r: r["match"] == "exact"),
-        Criterion("  elsewhere: verdict one_of", "", murky, lambda r: r["verdict"] == "one_of"),
+        Criterion("  elsewhere: verdict one_of", "", murky, verdict_is("one_of")),
         Criterion("  elsewhere: first name right", "", murky, right),
         Criterion("  verdict unknown", "", seen, unknown),
         Criterion("  a strange name beside or instead of the truth", "", seen,
-                  lambda r: r["strange"] > 0),
+                  has("strange")),
         Criterion("outside the library, lambda (1 - rho^2) >= 50: unknown", "outside, but named",
                   beyond, unknown, 0.90),
         Criterion("  all of lambda >= 50: unknown", "", outside, unknown),
-        Criterion("true effect deleted: named for sure", "sure without the truth", of("deleted"),
-                  lambda r: r["sure"], 0.15, False),
+        Criterion("true effect deleted: named for sure", "sure without the truth", some("deleted"),
+                  has("sure"), 0.15, False),
         Criterion("  of these, lambda (1 - rho^2) >= 25 of the best other: named for sure", "",
-                  [r for r in of("deleted") if r["telling"] >= SEPARABLE], lambda r: r["sure"]),
-        Criterion("  named for sure, and falsely", "", of("deleted"), false_for_sure, 0.15,
+                  [r for r in some("deleted") if r["telling"] >= SEPARABLE], has("sure")),
+        Criterion("  named for sure, and falsely", "", some("deleted"), false_for_sure, 0.15,
                   False),
-        Criterion("  unknown", "", of("deleted"), unknown),
+        Criterion("  unknown", "", some("deleted"), unknown),
         Criterion("two effects exactly right, each lambda (1 - rho^2) >= 25", "pair", told,
-                  lambda r: r["all_right"], 0.90),
-        Criterion("  all pairs exactly right", "", of("pair"), lambda r: r["all_right"]),
-        Criterion("  all pairs within the sets", "", of("pair"), lambda r: r["all_in_sets"]),
+                  has("all_right"), 0.90),
+        Criterion("  all pairs exactly right", "", some("pair"), has("all_right")),
+        Criterion("  all pairs within the sets", "", some("pair"), has("all_in_sets")),
         Criterion(f"held-out RMS <= {CLOSE} x oracle (fitted with the true effects)", "not close",
                   judged, close, 0.95),
         Criterion("  x that of points without the effect", "", judged,
@@ -340,22 +339,22 @@ def criteria(rows: Sequence[Row]) -> list[Criterion]:
         Criterion("  the oracle itself", "", judged,
                   lambda r: r["oracle_mm"] <= CLOSE * r["known_mm"]),
         Criterion("three effects exactly right, each lambda (1 - rho^2) >= 25", "", three,
-                  lambda r: r["all_right"]),
-        Criterion("  all triples within the sets", "", of("triple"), lambda r: r["all_in_sets"]),
-        Criterion("background of small effects: first name right", "", of("background"), right),
-        Criterion("  truth in the set of the first", "", of("background"), lambda r: r["in_set"]),
-        Criterion("  a name that is not in the background either", "", of("background"),
-                  lambda r: r["strange"] > 0),
-        Criterion("wrong law of a known cause: first name right", "", of("wrong_law"), right),
-        Criterion("  unknown", "", of("wrong_law"), unknown),
-        Criterion("data fault named", "", of("fault"), right),
-        Criterion("crashed", "crash", rows, lambda r: r["verdict"] == "error", 0.0, False),
+                  has("all_right")),
+        Criterion("  all triples within the sets", "", some("triple"), has("all_in_sets")),
+        Criterion("background of small effects: first name right", "", some("background"), right),
+        Criterion("  truth in the set of the first", "", some("background"), has("in_set")),
+        Criterion("  a name that is not in the background either", "", some("background"),
+                  has("strange")),
+        Criterion("wrong law of a known cause: first name right", "", some("wrong_law"), right),
+        Criterion("  unknown", "", some("wrong_law"), unknown),
+        Criterion("data fault named", "", some("fault"), right),
+        Criterion("crashed", "crash", rows, verdict_is("error"), 0.0, False),
     ]  # fmt: skip
 
 
 def no_shares(rows: Sequence[Row]) -> Iterator[tuple[Cell, ...]]:
     """Lines of the headline that are no shares."""
-    seen = [row for row in rows if row["condition"] in ALONE and row["lambda"] >= VISIBLE]
+    seen = [row for row in of(rows, *ALONE) if row["lambda"] >= VISIBLE]
     sizes = np.array([row["set_size"] for row in seen if row["set_size"]], dtype=float)
     times = np.array([row["seconds"] for row in rows], dtype=float)
     for text, values, middle, bound in (
@@ -387,8 +386,7 @@ def said_first(row: Row) -> str:
 
 def confusion(rows: Sequence[Row]) -> Table:
     """Each true effect with its answers, the most frequent first."""
-    single = (*ALONE, "fault")
-    seen = [row for row in rows if row["condition"] in single and row["lambda"] >= VISIBLE]
+    seen = [row for row in of(rows, *ALONE, "fault") if row["lambda"] >= VISIBLE]
     lines = []
     for effect in EFFECTS:
         said = Counter(said_first(row) for row in seen if row["truth"][0][0] == effect)
@@ -403,7 +401,7 @@ def confusion(rows: Sequence[Row]) -> Table:
 
 def per_effect(rows: Sequence[Row]) -> Table:
     """Names and sets of every effect that is visible alone."""
-    seen = [row for row in rows if row["condition"] in ALONE and row["lambda"] >= VISIBLE]
+    seen = [row for row in of(rows, *ALONE) if row["lambda"] >= VISIBLE]
     lines = []
     for effect in LIBRARY:
         own = [row for row in seen if row["truth"][0][0] == effect]
@@ -414,11 +412,11 @@ def per_effect(rows: Sequence[Row]) -> Table:
             lines.append((
                 effect, len(own), share_of(own, lambda r: r["match"] == "exact"),
                 share_of(own, lambda r: r["match"] == "broad"),
-                share_of(own, lambda r: r["in_set"]),
+                share_of(own, has("in_set")),
                 float(np.mean(sized)) if sized else float("nan"),
-                share_of(own, lambda r: r["verdict"] == "one_of"),
-                share_of(own, lambda r: r["verdict"] == "unknown"),
-                share_of(own, lambda r: r["verdict"] == "none"),
+                share_of(own, verdict_is("one_of")),
+                share_of(own, verdict_is("unknown")),
+                share_of(own, verdict_is("none")),
                 float(np.median(rho2)) if rho2 else float("nan"),
                 rivals.most_common(1)[0][0] if rivals else "",
             ))  # fmt: skip
@@ -432,14 +430,14 @@ def per_effect(rows: Sequence[Row]) -> Table:
 
 def by_power(rows: Sequence[Row]) -> list[tuple[float, list[Row]]]:
     """Rows of the condition single by the lambda that was asked for."""
-    single = [row for row in rows if row["condition"] == "single"]
+    single = of(rows, "single")
     powers = sorted({row["asked"] for row in single})
     return [(power, [row for row in single if row["asked"] == power]) for power in powers]
 
 
 SHOWN: tuple[tuple[str, Callable[[Row], bool]], ...] = (
     ("something found", lambda row: row["verdict"] not in ("none", "error")),
-    ("truth in the set", lambda row: bool(row["in_set"])),
+    ("truth in the set", has("in_set")),
     ("first name right", right),
 )
 
@@ -448,7 +446,7 @@ def detectability(rows: Sequence[Row]) -> Table:
     """What is found, against lambda."""
     lines = [
         (power, len(own), *(share_of(own, hit) for _, hit in SHOWN),
-         share_of(own, lambda row: row["verdict"] == "unknown"))
+         share_of(own, verdict_is("unknown")))
         for power, own in by_power(rows)
     ]  # fmt: skip
     title, shown = "detectability: single effects against lambda [%]", [t for t, _ in SHOWN]
@@ -467,8 +465,7 @@ def shrink(rows: Sequence[Row]) -> Table:
         ("said noise floor / true", "said_floor_mm", "floor_mm"),
     ):
         for condition in dict.fromkeys(row["condition"] for row in rows):
-            own = [row for row in rows if row["condition"] == condition]
-            ratio = np.array([row[above] / row[below] for row in own], dtype=float)
+            ratio = np.array([row[above] / row[below] for row in of(rows, condition)], dtype=float)
             ratio = ratio[np.isfinite(ratio)]
             if len(ratio):
                 quantiles = np.quantile(ratio, (0.05, 0.5, 0.95, 0.99))

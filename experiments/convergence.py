@@ -20,7 +20,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -244,18 +244,6 @@ def letter(
 # ---- Table 2 -----------------------------------------------------------------------------------
 
 
-def outcomes(study: Study, setting: Setting, method: str, parameters: str, every: int,
-             cap: int, moved: bool = False) -> list[Outcome]:  # fmt: skip
-    """All starts of one method on one set of parameters."""
-    theta, alpha = (value.tolist() for value in grid(every))
-    jobs = [
-        Job(setting, method, parameters, tuple(theta[i : i + CHUNK]), tuple(alpha[i : i + CHUNK]),
-            cap, moved)
-        for i in range(0, len(theta), CHUNK)
-    ]  # fmt: skip
-    return study.sweep(run, jobs, f"{method}, {parameters}, every {every}")
-
-
 @dataclass(frozen=True)
 class Row:
     """One method on one set of parameters over the grid (all starts, in the grid's order)."""
@@ -284,21 +272,25 @@ class Row:
         )
 
 
-def row_of(found: Sequence[Outcome], method: str, parameters: str, every: int, least: float,
-           poses: int) -> Row:  # fmt: skip
-    """The outcomes of all jobs as one row."""
-    cost = np.concatenate([o.cost for o in found])
-    converged = np.concatenate([o.converged for o in found]).astype(bool)
-    return Row(
-        method,
-        parameters,
-        every,
-        np.concatenate([o.iterations for o in found]),
-        1e3 * np.sqrt(cost / poses),
-        converged,
-        converged & (cost <= least * SAME),
-        sum(o.seconds for o in found),
+def row_of(
+    study: Study, setting: Setting, least: float, method: str, parameters: str, every: int,
+    cap: int, moved: bool = False,
+) -> Row:  # fmt: skip
+    """All starts of one method on one set of parameters.  least: cost of the minimum [m^2]."""
+    theta, alpha = (value.tolist() for value in grid(every))
+    jobs = [
+        Job(setting, method, parameters, tuple(theta[i : i + CHUNK]), tuple(alpha[i : i + CHUNK]),
+            cap, moved)
+        for i in range(0, len(theta), CHUNK)
+    ]  # fmt: skip
+    found = study.sweep(run, jobs, f"{method}, {parameters}, every {every}")
+    iterations, cost, converged = (
+        np.concatenate([getattr(one, name) for one in found])
+        for name in ("iterations", "cost", "converged")
     )
+    rms, minimum = 1e3 * np.sqrt(cost / setting.poses), converged & (cost <= least * SAME)
+    seconds = sum(one.seconds for one in found)
+    return Row(method, parameters, every, iterations, rms, converged, minimum, seconds)
 
 
 COLUMNS = ("method | parameters | starts d | iterations .2f | RMS mm .3f | ms a start .2f | "
@@ -368,8 +360,7 @@ def separable_table(
             other = replace(setting, base_angle=angle)
             least, shares = least_cost(other), list[float]()
             for method in ("snlgn", "snllm"):
-                found = outcomes(study, other, method, "identifiable", every, 500)
-                row = row_of(found, method, "identifiable", every, least, other.poses)
+                row = row_of(study, other, least, method, "identifiable", every, 500)
                 shares.append(100.0 * float(row.minimum.mean()))
             rows.append((first, angle, len(row.minimum), *shares))
     title = (
@@ -430,19 +421,11 @@ class Found:
 def study_of(study: Study) -> Found:
     """Every variant on its starts."""
     setting = Setting(seed=study.seed + 1)
-    least = least_cost(setting)
-    cap = 100 if study.quick else CAP
-
-    def row(parameters: str, method: str, every: int, moved: bool = False) -> Row:
-        found = outcomes(study, setting, method, parameters, every, cap, moved)
-        return row_of(found, method, parameters, every, least, setting.poses)
-
-    rows = [row(*variant, SPARSE if study.quick else 1) for variant in VARIANTS]
-    by = {(row.parameters, row.method): row for row in rows}
-    again = [
-        moved_of(by["all, mm", m], row("all, mm", m, SPARSE if study.quick else 3, moved=True))
-        for m in PAPER
-    ]
+    row = partial(row_of, study, setting, least_cost(setting))
+    cap, every, some = (100, SPARSE, SPARSE) if study.quick else (CAP, 1, 3)
+    rows = [row(method, parameters, every, cap) for parameters, method in VARIANTS]
+    firsts = [row for row in rows if row.parameters == "all, mm"]
+    again = [moved_of(one, row(one.method, one.parameters, some, cap, True)) for one in firsts]
     return Found(rows, again, setting)
 
 

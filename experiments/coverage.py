@@ -440,20 +440,16 @@ def verdicts(found: dict[str, Runs]) -> Table:
         pooled = float(coverage(runs, 0).mean())
         place = float(runs.inside[:, 0, 0].mean())
         out = outside(runs, 0)
-        low, high = band(len(runs.error))
+        (low, high), (least, most) = band(len(runs.error)), POOLED
         for what, value, good in (
-            ("parameters, pooled, in 92-98 %", f"{100 * pooled:.1f} %", between(pooled)),
-            ("predicted positions, pooled, in 92-98 %", f"{100 * place:.1f} %", between(place)),
+            ("parameters, pooled, in 92-98 %", f"{100 * pooled:.1f} %", least <= pooled <= most),
+            ("predicted positions, pooled, in 92-98 %", f"{100 * place:.1f} %",
+             least <= place <= most),
             (f"each parameter in {100 * low:.1f}-{100 * high:.1f} %",
              f"outside: {', '.join(out) or 'none'}", not out),
         ):  # fmt: skip
             rows.append((case.name, what, value, "yes" if good else "NO"))
     return Table.made("sigma as reported", rows, "case | criterion | found | met")
-
-
-def between(share: float) -> bool:
-    """Whether a pooled coverage is right."""
-    return POOLED[0] <= share <= POOLED[1]
 
 
 def figure_of(found: dict[str, Runs]) -> Figure:

@@ -25,13 +25,16 @@ from experiments.scoring import (
     asked,
     blind_study,
     chosen,
+    has,
     headline,
     is_right,
     misses,
+    of,
     pairing,
     save,
     scored,
     share_of,
+    verdict_is,
     verdicts,
 )
 from experiments.sweep import Study
@@ -181,55 +184,50 @@ def separable(row: Row) -> bool:
 
 def criteria(rows: Sequence[Row]) -> list[Criterion]:
     """What the diagnosis is held to, and what is only shown."""
-
-    def of(*conditions: str) -> list[Row]:
-        return [row for row in rows if row["condition"] in conditions]
-
-    sound, plain = of("sound"), [row for row in of("single", "orders") if separable(row)]
-    orders = [row for row in of("orders") if separable(row)]
-    missing = [row for row in of("outside", "mechanism") if row["left"] >= SEEN]
+    sound = of(rows, "sound")
+    plain, orders, pairs, triples = (
+        list(filter(separable, of(rows, *conditions)))
+        for conditions in (("single", "orders"), ("orders",), ("pair",), ("triple",))
+    )
+    missing = [row for row in of(rows, "outside", "mechanism") if row["left"] >= SEEN]
     mechanisms = [row for row in missing if row["condition"] == "mechanism"]
-    pairs, triples = ([row for row in of(c) if separable(row)] for c in ("pair", "triple"))
 
-    def named(row: Row) -> bool:
-        return bool(row["names"])
-
+    named = has("names")
     return [
         Criterion("no fault: nothing confirmed, not unknown", "false alarm", sound,
                   lambda r: not named(r) and r["verdict"] != "unknown", 0.985),
         Criterion("  something confirmed", "", sound, named),
         Criterion("one cause, separable: right", "not right", plain, right, 0.95),
-        Criterion("  a wrong cause confirmed", "", plain, lambda r: r["strange"] > 0),
+        Criterion("  a wrong cause confirmed", "", plain, has("strange")),
         Criterion("  right, but minor: verdict none", "", plain,
                   lambda r: right(r) and r["verdict"] == "none"),
-        Criterion("  verdict unknown", "", plain, lambda r: r["verdict"] == "unknown"),
+        Criterion("  verdict unknown", "", plain, verdict_is("unknown")),
         Criterion("  two orders of one gear", "orders", orders, right, 0.95),
         Criterion("one cause, lambda >= 50: in the sets", "",
-                  [r for r in of("single", "orders") if r["lambda"] >= SEEN],
-                  lambda r: r["in_sets"]),
+                  [r for r in of(rows, "single", "orders") if r["lambda"] >= SEEN],
+                  has("in_sets")),
         Criterion("outside the library, lambda (1 - rho^2) >= 50: unknown or not repeatable",
                   "not unknown", missing,
-                  lambda r: r["verdict"] in ("unknown", "not_repeatable"), 0.80),
+                  verdict_is("unknown", "not_repeatable"), 0.80),
         Criterion("  of these mechanisms and memories", "", mechanisms,
-                  lambda r: r["verdict"] in ("unknown", "not_repeatable")),
-        Criterion("  none", "outside, but none", missing,
-                  lambda r: r["verdict"] == "none", 0.08, False),
-        Criterion("  named for sure", "outside, but named", missing,
-                  lambda r: r["verdict"] == "named", 0.08, False),
+                  verdict_is("unknown", "not_repeatable")),
+        Criterion("  none", "outside, but none", missing, verdict_is("none"), 0.08, False),
+        Criterion("  named for sure", "outside, but named", missing, verdict_is("named"), 0.08,
+                  False),
         Criterion("two causes, separable: right", "pair", pairs, right, 0.90),
         Criterion("three causes, separable: right", "triple", triples, right, 0.80),
         Criterion("of all verdicts named, false", "false name",
                   [r for r in rows if r["verdict"] == "named"],
-                  lambda r: r["strange"] > 0, 0.06, False),
+                  has("strange"), 0.06, False),
         Criterion("held-out RMS more than 5 % above geometry alone", "worse", rows,
                   lambda r: r["final_mm"] > WORSE * r["geometric_mm"], 0.005, False),
-        Criterion("crashed", "crash", rows, lambda r: r["verdict"] == "error", 0.0, False),
+        Criterion("crashed", "crash", rows, verdict_is("error"), 0.0, False),
     ]  # fmt: skip
 
 
 def per_law(rows: Sequence[Row]) -> Table:
     """Separable single causes by their law."""
-    seen = [row for row in rows if row["condition"] in ("single", "orders") and separable(row)]
+    seen = list(filter(separable, of(rows, "single", "orders")))
     lines = []
     for law in INSIDE:
         own = [row for row in seen if row["laws"] == [law]]
@@ -238,8 +236,8 @@ def per_law(rows: Sequence[Row]) -> Table:
                             if row["strange"] and n not in row["truth"])  # fmt: skip
             lines.append((
                 law, len(own), share_of(own, right),
-                share_of(own, lambda r: r["verdict"] == "unknown"),
-                share_of(own, lambda r: r["strange"] > 0),
+                share_of(own, verdict_is("unknown")),
+                share_of(own, has("strange")),
                 ", ".join(name for name, _ in wrong.most_common(2)),
             ))  # fmt: skip
     return Table.made(

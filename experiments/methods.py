@@ -163,18 +163,13 @@ def errors_of(predicted: Array, measured: Array, shape: Array) -> Errors:
     return Errors(distance, orientation_error(seen, computed))
 
 
-def largest(values: Iterable[float]) -> float:
-    """The largest."""
-    return float(max(values))
-
-
 # What is said of a method over its splits: RMS are pooled, the largest is the largest of all.
 FIGURES: Mapping[str, tuple[str, Callable[[Sequence[Errors]], float]]] = {
     "AP RMSE": ("mm", lambda e: 1e3 * rms(np.array([rms(s.distance) for s in e]))),
     "worst SMR": ("mm", lambda e: 1e3 * rms(np.array([max(map(rms, s.distance.T)) for s in e]))),
-    "AP max": ("mm", lambda e: 1e3 * largest(s.distance.max() for s in e)),
+    "AP max": ("mm", lambda e: 1e3 * max(float(s.distance.max()) for s in e)),
     "AO' RMSE": ("mrad", lambda e: 1e3 * rms(np.array([rms(s.angle) for s in e]))),
-    "AO' max": ("mrad", lambda e: 1e3 * largest(s.angle.max() for s in e)),
+    "AO' max": ("mrad", lambda e: 1e3 * max(float(s.angle.max()) for s in e)),
 }
 Results = Mapping[str, Sequence[Outcome]]  # by method, one a split
 Studies = Sequence[tuple[Case, Results]]

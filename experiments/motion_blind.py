@@ -289,17 +289,6 @@ def causes_table(told: Sequence[Told]) -> Table:
     )
 
 
-def time_table(told: Sequence[Told]) -> Table:
-    """CPU time of a diagnosis."""
-    seconds = [one.seconds for one in told]
-    middle, most = float(np.median(seconds)), float(np.max(seconds))
-    return Table.made(
-        "CPU time of a diagnosis [s]",
-        ((len(told), middle, most),),
-        "cases d | median .2f | largest .2f",
-    )
-
-
 def record(one: Told) -> dict[str, object]:
     """A case for JSON."""
     names = ("truth", "verdict", "main", "minor", "unexplained")
@@ -320,6 +309,6 @@ def main(study: Study, arms: int, cases: int) -> None:
     if study.quick:
         arms = cases = QUICK
     told = study.sweep(run, plan(study.seed, arms, cases), "diagnoses")
-    tables = [questions_table(told), causes_table(told), time_table(told)]
+    tables = [questions_table(told), causes_table(told)]
     keys = ("question", "cases", "yes", "percent", "interval", "asked")
     study.save(tables, {"questions": tables[0].records(*keys), "cases": [*map(record, told)]})

@@ -158,6 +158,21 @@ class Criterion:
         return [row for row in self.rows if self.hit(row) != self.good]
 
 
+def of(rows: Sequence[Row], *conditions: str) -> list[Row]:
+    """Rows of some conditions."""
+    return [row for row in rows if row["condition"] in conditions]
+
+
+def verdict_is(*verdicts: str) -> Callable[[Row], bool]:
+    """Whether a row has one of these verdicts."""
+    return lambda row: row["verdict"] in verdicts
+
+
+def has(key: str) -> Callable[[Row], bool]:
+    """Whether something is true of a row, or more than none."""
+    return lambda row: bool(row[key])
+
+
 def headline(criteria: Sequence[Criterion], *more: tuple[Cell, ...]) -> Table:
     """The criteria, and more lines that are no shares."""
     return Table.made(
@@ -177,7 +192,7 @@ def verdicts(rows: Sequence[Row]) -> Table:
     kinds = ("none", "named", "one_of", "unknown", "not_repeatable", "error")
     lines = []
     for condition in dict.fromkeys(row["condition"] for row in rows):
-        own = [row for row in rows if row["condition"] == condition]
+        own = of(rows, condition)
         counts = Counter(row["verdict"] for row in own)
         seconds = float(np.median([row["seconds"] for row in own]))
         lines.append((condition, len(own), *(counts[kind] for kind in kinds), seconds))
