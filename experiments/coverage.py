@@ -32,7 +32,7 @@ from minimax_cal.fitting.uncertainty import (
     position_covariance,
     quantile,
 )
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.bootstrap import bootstrap
 from minimax_cal.measuring.measurements import Measurements, measurements
@@ -274,8 +274,8 @@ def judged(cell: Cell, arm: Cell, case: Case, rng: np.random.Generator) -> Array
     """(sizes, 3) as `held_out`, for each of HELD."""
     q = random_poses(arm.robot, FURTHER, rng)
     error = cell.error(measured(arm, case, q, rng))
-    rms = float(np.sqrt((error**2).sum(axis=-1).mean()))
-    return np.array([held_out(error, n, rms, rng) for n in HELD])
+    size = float(np.sqrt((error**2).sum(axis=-1).mean()))
+    return np.array([held_out(error, n, size, rng) for n in HELD])
 
 
 def held_out(error: Array, n: int, rms: float, rng: np.random.Generator) -> tuple[bool, bool, bool]:
@@ -363,7 +363,7 @@ def parameters_table(found: dict[str, Runs]) -> Table:
             rows.append(
                 (case.name, name, len(runs.error), float(share.mean()),
                  float(share[least]), runs.names[least], float(share[most]), runs.names[most],
-                 len(out), float(np.sqrt(np.mean(score**2))))
+                 len(out), rms(score))
             )  # fmt: skip
     return Table.made(
         "coverage of 95 % intervals of the identified parameters: value +- Student's quantile "

@@ -162,13 +162,11 @@ def rows_of(jobs: Sequence[Job], claims: Sequence[Claim | None]) -> list[tuple[E
     ]  # fmt: skip
 
 
-HEADER = ("arm", "way", "set aside", "seed", "within mm", "beyond typical mm", "beyond worst mm",
-          "external mm", "geometry alone mm", "external / within", "the same, sound",
-          "external / typical",
-          "external / worst", "external / geometry")  # fmt: skip
-NAMES = ("arm", "way", "split", "seed", "within_mm", "typical_mm", "worst_mm", "external_mm",
-         "geometric_mm", "over_within", "over_within_sound", "over_typical",
-         "over_worst", "over_geometric")  # fmt: skip
+COLUMNS = (
+    "arm | way | split | seed d | within_mm .4f | typical_mm .4f | worst_mm .4f | "
+    "external_mm .4f | geometric_mm .4f | over_within .2f | over_within_sound .2f | "
+    "over_typical .2f | over_worst .2f | over_geometric .2f"
+)
 
 
 def summary(jobs: Sequence[Job], claims: Sequence[Claim | None]) -> Table:
@@ -225,6 +223,5 @@ def main(study: Study, arms: str) -> None:
         for split, seed in list(splits(arm, halves))[:: 4 if study.quick else 1]
     ]
     claims = study.sweep(run, jobs, "poses set aside")
-    every = Table("every split", HEADER, tuple(rows_of(jobs, claims)),
-                  ("", "", "", "d", *[".4f"] * 5, *[".2f"] * 5))  # fmt: skip
-    study.save([summary(jobs, claims), every], {"rows": every.records(*NAMES)})
+    every = Table.made("every split", rows_of(jobs, claims), COLUMNS)
+    study.save([summary(jobs, claims), every], {"rows": every.records()})

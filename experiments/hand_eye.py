@@ -36,21 +36,11 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import inverse, transform
 
 
-def left_product(p: Array) -> Array:
-    """Matrix Q(p) with p q = Q(p) q for quaternions (scalar first): (..., 4, 4)."""
-    return product_matrix(p, kinematics.hat(p[..., 1:]))
-
-
-def right_product(p: Array) -> Array:
-    """Matrix W(p) with q p = W(p) q: (..., 4, 4)."""
-    return product_matrix(p, -kinematics.hat(p[..., 1:]))
-
-
-def product_matrix(p: Array, cross: Array) -> Array:
-    """[[s, -v'], [v, s + cross]] of a quaternion (s, v)."""
+def product(p: Array, side: float) -> Array:
+    """Matrix of p q (side 1) or q p (side -1) for quaternions p, scalar first: (..., 4, 4)."""
     out = p[..., :1, None] * np.eye(4)
     out[..., 0, 1:], out[..., 1:, 0] = -p[..., 1:], p[..., 1:]
-    out[..., 1:, 1:] += cross
+    out[..., 1:, 1:] += side * kinematics.hat(p[..., 1:])
     return np.asarray(out)
 
 
@@ -68,7 +58,7 @@ def closed_form(A: Array, B: Array, rounds: int = 20) -> tuple[Array, Array]:
     a, b = (Rotation.from_matrix(T[:, :3, :3]).as_quat(scalar_first=True) for T in (A, B))
     outer = np.einsum("mi,mj->mij", a, b).reshape(-1, 16)  # its Gram matrix holds those products
     weight = np.linalg.svd(outer, full_matrices=False)[0][:, 0]
-    products = np.swapaxes(left_product(a), -1, -2) @ right_product(b)
+    products = np.swapaxes(product(a, 1.0), -1, -2) @ product(b, -1.0)
     x = z = np.zeros(4)
     for _ in range(rounds):
         u, _, vt = np.linalg.svd(np.einsum("m,mij->ij", weight, products))

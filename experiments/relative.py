@@ -28,7 +28,7 @@ from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.positions import position_sigma
 from minimax_cal.fitting.several import RelativeCalibration, relative
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.tables import Table
 from minimax_cal.instruments import Instrument, closures, distances, flange_poses
 from minimax_cal.instruments.closing import CLOSED, reach
@@ -378,7 +378,7 @@ def spot_of(fit: RelativeCalibration) -> Array:
 
 def rms_mm(distance: Array) -> float:
     """Root mean square of distances [m], in millimetres."""
-    return float(1e3 * np.sqrt(np.mean(distance**2)))
+    return 1e3 * rms(distance)
 
 
 # ---- real arms -------------------------------------------------------------------------------

@@ -178,7 +178,7 @@ def headline(criteria: Sequence[Criterion], *more: tuple[Cell, ...]) -> Table:
     return Table.made(
         "blind study: shares [%] with 95 % intervals, and the limits",
         [*(criterion.line() for criterion in criteria), *more],
-        "criterion | runs d | found .1f | from .1f | to .1f | limit | verdict",
+        "criterion | runs d | found .1f | low .1f | high .1f | limit | verdict",
     )
 
 
@@ -270,6 +270,5 @@ def save(
 ) -> None:
     """Leave tables, the first of which is the headline, and the rows."""
     more = [troubles(rows)] if any(row["trouble"] for row in rows) else []
-    names = ("criterion", "runs", "found", "low", "high", "limit", "verdict")
-    content = {"criteria": tables[0].records(*names), "rows": rows}
+    content = {"criteria": tables[0].records(), "rows": rows}
     study.save([*tables, *more], content, figures)

@@ -230,22 +230,6 @@ def table_of(group: str, runs: Sequence[Run], reference: dict[str, float]) -> Ta
     )
 
 
-def detail(group: str, runs: Sequence[Run]) -> Table:
-    """Every problem of a set with the answer of our fallback order."""
-    mine = [run for run in runs if run.backend == ACROSS and run.setting == "ours 1e-6"]
-    names = ("worst", "primal", "dual", "gap", "objective")
-    rows = [
-        (run.case, run.status, *(getattr(run.judged, name) for name in names), 1e3 * run.seconds)
-        for run in mine
-    ]
-    return Table.made(
-        f"{group}, problem by problem: our fallback order at 1e-6",
-        rows,
-        "problem | status | worst relative .1e | primal abs .1e | dual abs .1e | "
-        "gap abs .1e | objective .8g | ms .2f",
-    )
-
-
 def overhead(cases: Sequence[Case], backends: Sequence[str], repeats: int) -> Table:
     """Our `solve`, its check included, against qpsolvers.solve_problem on the same data."""
     rows = []
@@ -446,7 +430,6 @@ def main(study: Study) -> None:
             for row in tables[-1].rows
         ]
         if group == MAROS:
-            tables.append(detail(group, found))
             figures[f"profile_{group}"] = profile(group, found)
     small = problems["calibration, 6 rows"]
     direct_ones = [name for name in DIRECT if name in available()]
