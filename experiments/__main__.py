@@ -91,9 +91,7 @@ def attempt(study: Study, name: str) -> Outcome:
 
 def ending(code: object) -> str:
     """What an exit code or a last message tells of failure; nothing if all went well."""
-    if isinstance(code, int):
-        return f"exit code {code}" if code else ""
-    return code if isinstance(code, str) else ""
+    return f"exit code {code}" if code and isinstance(code, int) else str(code or "")
 
 
 def explained(error: Exception) -> str:

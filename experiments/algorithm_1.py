@@ -22,8 +22,7 @@ from functools import partial
 
 import numpy as np
 
-from experiments.conditions import FOLDERS, ROBOTS
-from experiments.real import here
+from experiments.conditions import ROBOTS, arm_of, robots_here
 from experiments.speed import fitted
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.minimax_problem import (
@@ -79,9 +78,8 @@ def measured(job: Job) -> tuple[Robot, Measurements]:
     if job.arm not in REAL:
         robot = load_robot(job.arm)
         return robot, simulate(robot, 100, 3, job.seed).data
-    _, make, train = ROBOTS[REAL[job.arm]]
-    robot, data = make(job.seed)
-    return robot, split(data, 1.0 - train / data.poses, job.seed)[0]
+    robot, data = arm_of(REAL[job.arm], job.seed)
+    return robot, split(data, 1.0 - ROBOTS[REAL[job.arm]][2] / data.poses, job.seed)[0]
 
 
 def problem_of(job: Job, form: str) -> tuple[MinimaxProblem, State]:
@@ -177,7 +175,7 @@ def course_of(job: Job, backends: Sequence[str] = OURS) -> Course:
 
 def study_of(study: Study) -> dict[Job, Course]:
     """All arms that are here."""
-    arms = [*ARMS, *(arm for arm, name in REAL.items() if here(FOLDERS[name]))]
+    arms = [*ARMS, *(arm for arm, name in REAL.items() if name in robots_here())]
     jobs = [Job(arm, study.seed, OUTER[study.quick]) for arm in arms]
     return dict(zip(jobs, study.sweep(course_of, jobs, "arms"), strict=True))
 

@@ -9,7 +9,6 @@ Euler deviation) and AO' = |log(R_m' R_c)|, each on the training and on the held
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -79,33 +78,29 @@ class Outcome:
     status: str
 
 
-def simulated(seed: int) -> tuple[Robot, Measurements]:
-    """IRB 2600 with geometric errors and the compliance that no geometry holds."""
-    robot = load_robot("irb2600")
-    return robot, simulate(robot, 300, 3, seed, Truth()).data
-
-
-def shared(name: str) -> Callable[[int], tuple[Robot, Measurements]]:
-    """A real robot from shared data."""
-    return lambda seed: real(name)
-
-
-ROBOTS: dict[str, tuple[str, Callable[[int], tuple[Robot, Measurements]], int]] = {
-    "irb2600": ("IRB 2600, simulated", simulated, 100),
-    "irb120": ("IRB 120, real", shared("irb120"), 100),
-    "fanuc": ("FANUC R-2000, real", shared("fanuc_r2000"), 29),
+ROBOTS = {  # what it is called, the folder of a real one, training poses
+    "irb2600": ("IRB 2600, simulated", "", 100),
+    "irb120": ("IRB 120, real", "irb120", 100),
+    "fanuc": ("FANUC R-2000, real", "fanuc_r2000", 29),
 }
-FOLDERS = {"irb120": "irb120", "fanuc": "fanuc_r2000"}  # of the real ones
+
+
+def arm_of(name: str, seed: int) -> tuple[Robot, Measurements]:
+    """A real robot, or an IRB 2600 with the compliance that no geometry holds."""
+    if folder := ROBOTS[name][1]:
+        return real(folder)
+    robot = load_robot(name)
+    return robot, simulate(robot, 300, 3, seed, Truth()).data
 
 
 def robots_here() -> list[str]:
     """Those of `ROBOTS` that are simulated or whose measurements are on this machine."""
-    return [name for name in ROBOTS if name not in FOLDERS or here(FOLDERS[name])]
+    return [name for name, (_, folder, _) in ROBOTS.items() if not folder or here(folder)]
 
 
 def run(job: Job) -> Outcome:
     """Calibrate under one condition and judge it on both sets of poses."""
-    robot, data = ROBOTS[job.robot][1](job.seed)
+    robot, data = arm_of(job.robot, job.seed)
     train, held, _ = split(data, 1.0 - job.train / data.poses, job.seed)
     objective = "sum" if job.condition == "nominal" else job.condition
     fit = mc.calibrate(robot, train, objective, holdout=0.0)

@@ -416,7 +416,7 @@ def held_table(found: dict[str, Runs], laws: dict[tuple[str, int], Array]) -> Ta
     )
 
 
-def bootstrap_table(found: dict[str, tuple[Array, Array]]) -> Table:
+def bootstrap_table(found: dict[str, tuple[Array, ...]]) -> Table:
     """Coverage of the bootstrap's percentiles."""
     rows = tuple(
         (name, len(held), 100.0 * float(held.mean()), 100.0 * float(held.mean(axis=0).min()),
@@ -478,7 +478,7 @@ def figure_of(found: dict[str, Runs]) -> Figure:
 
 def batches(case: Case, seed: int, count: int, replicates: int = 0) -> list[Batch]:
     """The jobs of a case."""
-    size = BATCH if not replicates else max(BATCH // 4, 1)
+    size = BATCH // 4 if replicates else BATCH
     return [
         Batch(case, seed, first, min(size, count - first), replicates)
         for first in range(0, count, size)
@@ -517,7 +517,7 @@ def main(study: Study, count: int) -> None:
         parameters_table(found),
         positions_table(found),
         held_table(found, laws),
-        bootstrap_table({name: (pair[0], pair[1]) for name, pair in boots.items()}),
+        bootstrap_table(boots),
     ]
     odd = {name: runs.odd for name, runs in found.items() if runs.odd}
     for name, number in odd.items():

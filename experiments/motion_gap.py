@@ -224,9 +224,7 @@ def main(study: Study) -> None:
     rested = study.sweep(run, resting, "arms with bristles")
     tables = [closed_table(cases, found), rest_table(resting, rested)]
     content: dict[str, object] = {
-        "cases": [{"arm": case.arm, "withheld": list(case.withheld), "seed": case.seed,
-                   "friction": case.friction, "before_mrad": one.before,
-                   "remains_percent": list(shares(one))}
+        "cases": [{**vars(case), "before_mrad": one.before, "remains_percent": shares(one)}
                   for case, one in zip([*cases, *resting], [*found, *rested], strict=True)]
     }  # fmt: skip
     if not study.quick and here(REAL):

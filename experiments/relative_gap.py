@@ -154,6 +154,6 @@ def main(study: Study) -> None:
         for robot in robots
         for number in range(count)
     ]
-    answers = list(study.sweep(run, jobs))
+    answers = study.sweep(run, jobs)
     table = table_of(jobs, answers)
-    study.save([table], {"answers": [vars(a) for a in answers]}, {})
+    study.save([table], {"answers": [vars(a) for a in answers]})

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
-from experiments.conditions import ROBOTS, robots_here
+from experiments.conditions import ROBOTS, arm_of, robots_here
 from experiments.record import canvas
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
@@ -86,7 +86,7 @@ def held_rows(data: Measurements, job: Job) -> Array:
 
 def run(job: Job) -> Held:
     """Calibrate both ways and judge on the poses held out."""
-    robot, data = ROBOTS[job.robot][1](job.seed + (job.split if job.robot == "irb2600" else 0))
+    robot, data = arm_of(job.robot, job.seed + job.split)
     held = held_rows(data, job)
     out = {}
     for objective in ("sum", "minimax"):

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 
 from experiments import errata, splits
 from experiments.__main__ import STUDIES
-from experiments.conditions import PAPER, Errors
+from experiments.conditions import PAPER, Errors, arm_of
 from experiments.convergence import Row, grid, moved_of
 from experiments.courses import Course, rises
 from experiments.splits import Held
@@ -127,11 +127,11 @@ def test_starts_moved_by_rounding_stand_beside_the_same_starts():
 
 
 def test_splits_hold_every_region_out_once_and_tell_their_spread():
-    data = splits.ROBOTS["irb2600"][1](0)
+    _, data = arm_of("irb2600", 0)
     jobs = [splits.Job("irb2600", "by groups", region, 100, 0) for region in range(splits.REGIONS)]
-    held = np.array([splits.held_rows(data[1], job) for job in jobs])
+    held = np.array([splits.held_rows(data, job) for job in jobs])
     assert (held.sum(axis=0) == 1).all()
-    random = splits.held_rows(data[1], splits.Job("irb2600", "random", 1, 100, 0))
+    random = splits.held_rows(data, splits.Job("irb2600", "random", 1, 100, 0))
     assert (~random).sum() == 100
     found = {job: Held((1.0, 2.0), (0.9 + 0.1 * i, 2.0)) for i, job in enumerate(jobs)}
     s = splits.spread_of(found, "irb2600", "by groups", 0)
