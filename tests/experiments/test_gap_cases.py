@@ -251,7 +251,8 @@ GAIN = ("encoder_gain", "J2")
     ],
 )
 def test_match(said, truth, expected):
-    assert scoring.match(said, truth) == expected
+    case = Case("irb2600", "single")
+    assert blind_gap.score(case, truth_of(truth), answer("named", said))["match"] == expected
 
 
 def test_score_of_single_answers():
