@@ -180,7 +180,7 @@ def main(study: Study) -> None:
         content[arm] = [
             {"run": one.name, "unit": one.unit, "rms_moving": one.reached[-1].tolist(),
              "rms": one.whole[-1].tolist(), "claimed": one.claimed[-1].tolist(),
-             "unexplained": list(one.unexplained),
-             "confirmed": list(one.confirmed)} for one in told
+             "unexplained": one.unexplained,
+             "confirmed": one.confirmed} for one in told
         ]  # fmt: skip
     study.save(tables, content)

@@ -280,9 +280,8 @@ def main(study: Study) -> None:
     content = {
         "cases": [{"arm": case.arm, "seed": case.seed, "elastic": case.elastic,
                    "before_mrad": one.before, "after_mrad": one.after, "alone_mrad": one.alone,
-                   "off": one.off,
-                   "effects": list(one.effects)}
+                   "off": one.off, "effects": one.effects}
                   for case, one in zip(cases, found, strict=True)],
-        "accused": [list(one) for one in wrongly],
+        "accused": wrongly,
     }  # fmt: skip
     study.save(tables, content)

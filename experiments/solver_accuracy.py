@@ -29,7 +29,7 @@ from scipy import sparse
 
 from experiments.qp_cases import MAROS, SETS, Case
 from experiments.record import canvas
-from experiments.speed import fitted, race
+from experiments.speed import fitted
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
 from minimax_cal.ground.arrays import Array
@@ -125,14 +125,19 @@ def dense(matrix: Any) -> Array:
     return np.asarray(matrix.toarray() if hasattr(matrix, "toarray") else matrix)
 
 
+def quietly(call: Callable[[], Any]) -> tuple[Any, float]:
+    """What a call returns, and its seconds; solvers warn about what the judge measures."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        began = time.perf_counter()
+        found = call()
+        return found, time.perf_counter() - began
+
+
 def own_defaults(problem: Problem, name: str) -> tuple[Solution, float]:
     """The answer of a solver with its own defaults, and its seconds."""
     call, answer = direct(problem, name)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # solvers warn about what the judge measures
-        began = time.perf_counter()
-        found = call()
-        seconds = time.perf_counter() - began
+    found, seconds = quietly(call)
     return answer(found), seconds
 
 
@@ -154,17 +159,8 @@ def in_time(pools: list[Pool], problem: Problem, name: str) -> tuple[Solution, f
 def ours(problem: Problem, name: str, tolerance: float) -> tuple[Solution, float]:
     """The answer of our `solve`, or of its fallback order, and its seconds."""
     across = name == ACROSS
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        began = time.perf_counter()
-        solution = solve_qp(
-            problem,
-            "daqp" if across else name,
-            tolerance=tolerance,
-            time_limit=LIMIT,
-            fallback=across,
-        )
-        return solution, time.perf_counter() - began
+    solve = partial(solve_qp, problem, "daqp" if across else name, tolerance=tolerance)
+    return quietly(partial(solve, time_limit=LIMIT, fallback=across))
 
 
 def attempt(case: Case, backend: str, setting: str, pools: list[Pool]) -> Run:
@@ -237,12 +233,10 @@ def overhead(cases: Sequence[Case], backends: Sequence[str], repeats: int) -> Ta
         times = []
         for case in cases:
             ours = partial(solve_qp, case.problem, backend, tolerance=LOOSE, fallback=False)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                spent = race({"ours": ours, "theirs": direct(case.problem, backend)[0]}, repeats)
-            times.append(
-                (1e6 * spent["ours"], 1e6 * spent["theirs"], spent["ours"] / spent["theirs"])
-            )
+            runs = ours, direct(case.problem, backend)[0]
+            spent = [[quietly(run)[1] for run in runs] for _ in range(repeats + 1)]
+            mine, theirs = np.median(spent[1:], axis=0)
+            times.append((1e6 * mine, 1e6 * theirs, mine / theirs))
         rows.append((backend, *np.median(times, axis=0).tolist()))
     return Table.made(
         "our solve with its check at 1e-6 against qpsolvers.solve_problem (small calibration QPs)",
