@@ -6,6 +6,7 @@ python -m experiments all --quick [--out FOLDER] [--json FILE] [--seed N] [--job
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import shlex
@@ -24,115 +25,32 @@ from experiments.sweep import Study, needed, study_options
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.parallel import look_for
 
-STUDIES = {  # name: (module with the command `main`, what it tells)
-    "papers": (
-        "experiments.papers",
-        "Both papers item by item: all tables and figures, and a table of verdicts",
-    ),
-    "convergence": (
-        "experiments.convergence",
-        "From which starts the least-squares methods reach the minimum, and how fast",
-    ),
-    "any_base": ("experiments.any_base", "Starts for a robot whose base may stand anywhere"),
-    "algorithm_1": (
-        "experiments.algorithm_1",
-        "Paper M's Algorithm 1 to the letter, with and without a line search",
-    ),
-    "conditions": (
-        "experiments.conditions",
-        "Errors, training and held out, under each way to fit, simulated and real",
-    ),
-    "splits": (
-        "experiments.splits",
-        "Minimax against the sum over many splits, at random and by groups",
-    ),
-    "methods": ("experiments.methods", "MDH, product of exponentials and minimax side by side"),
-    "courses": (
-        "experiments.courses",
-        "Error against iteration from paper S's start, simulated and real",
-    ),
-    "solver_accuracy": (
-        "experiments.solver_accuracy",
-        "What each QP backend is worth: accuracy, reliability and time",
-    ),
-    "external": (
-        "experiments.external",
-        "Do claimed accuracies hold on poses set aside: halves, regions, ends of the session",
-    ),
-    "blind_gap": (
-        "experiments.blind_gap",
-        "Does a diagnosis name the true cause: sealed arms, wrong laws, deleted causes",
-    ),
-    "machine_gap": (
-        "experiments.machine_gap",
-        "The same on arms as shops have them: more makes, worse conditions, other forms of laws",
-    ),
-    "relative": (
-        "experiments.relative",
-        "What lengths, closures and poses tell beside a tracker, and how true their positions are",
-    ),
-    "relative_gap": (
-        "experiments.relative_gap",
-        "Does a diagnosis of several instruments name the true cause: sockets, wires, whole poses",
-    ),
-    "pixels": (
-        "experiments.pixels",
-        "What cameras tell of an arm: lenses that are wrong, bad starts, pixels that are too weak",
-    ),
-    "coverage": (
-        "experiments.coverage",
-        "Do 95 % intervals hold the truth: parameters, positions, held-out accuracy, bootstrap",
-    ),
-    "one_session": (
-        "experiments.one_session",
-        "Is anything said to have moved within one session, and is a move found",
-    ),
-    "errata": ("experiments.errata", "What is wrong in the papers as printed, by counter-example"),
-    "simulator_gap": (
-        "experiments.simulator_gap",
-        "A simulated arm in MuJoCo: published gains, then corrected step by step, against the fit",
-    ),
-    "motion_real": (
-        "experiments.motion_real",
-        "Torques along trajectories, judged by runs that no fit saw: a real arm, a simulated one",
-    ),
-    "motion_gap": (
-        "experiments.motion_gap",
-        "Does a simulator's model, corrected by logs, move as the arm does on runs it never saw",
-    ),
-    "servos": (
-        "experiments.servos",
-        "Do logs with commands give a model the gains, delays and limits of the arm's drives",
-    ),
-    "motion_blind": (
-        "experiments.motion_blind",
-        "Are causes of torque named rightly: sound arms, causes withheld, laws outside the library",
-    ),
-    "speed": ("experiments.speed", "How fast the fits are, as ratios to peers in the same run"),
-}
+STUDIES = (
+    "papers", "convergence", "any_base", "algorithm_1", "conditions", "splits", "methods",
+    "courses", "solver_accuracy", "external", "blind_gap", "machine_gap", "relative",
+    "relative_gap", "pixels", "coverage", "one_session", "errata", "simulator_gap", "motion_real",
+    "motion_gap", "servos", "motion_blind", "speed",
+)  # fmt: skip
 
 
 def study_command(name: str) -> click.Command:
     """The study called name.  Raises OptionError where there is none."""
     if name not in STUDIES:
         raise OptionError(f"no study {name!r}; choose all or one of {', '.join(STUDIES)}")
-    module = STUDIES[name][0]
-    try:
-        command = import_module(module).main
-    except ModuleNotFoundError as error:
-        if error.name != module:
-            raise
-        raise OptionError(f"study {name} is not there yet ({module})") from error
-    if not isinstance(command, click.Command):
-        raise TypeError(f"{module}.main is not a click command")
+    command: click.Command = import_module(f"experiments.{name}").main
     return command
 
 
+def about(name: str) -> str:
+    """What a study answers: the first line of its module, which is not imported for it."""
+    text = Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8")
+    return (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0]
+
+
 def listing() -> str:
-    """Names and descriptions of the studies."""
-    width = max(map(len, STUDIES))
-    lines = [f"  {name:{width}}  {about}" for name, (_, about) in STUDIES.items()]
-    lines.append(f"  {'all':{width}}  Every study, into one folder with an index.html")
+    """Names of the studies and what they answer."""
+    lines = [f"  {name:16} {about(name)}" for name in STUDIES]
+    lines.append(f"  {'all':16} Every study, into one folder with an index.html")
     return "\n".join(["Usage: python -m experiments NAME [--help]", "", *lines])
 
 
@@ -156,34 +74,24 @@ def stamps(folder: Path) -> dict[Path, tuple[int, int]]:
 
 def attempt(study: Study, name: str) -> Outcome:
     """Run one study of all; what it raises is its outcome.  Files of earlier runs do not count."""
-    about = STUDIES[name][1]
+    before, failure = stamps(study.out / name), ""
     try:
-        command = study_command(name)
-    except OptionError as error:
-        return Outcome(name, about, "skipped", str(error))
-    except Exception as error:  # a study must not end the others
-        return Outcome(name, about, "failed", explained(error))
-    before = stamps(study.out / name)
-    failure = ""
-    try:
-        code = command.main(arguments_for(study, name), name, standalone_mode=False)
-        failure = ending(code)
+        options = arguments_for(study, name)
+        failure = ending(study_command(name).main(options, name, standalone_mode=False))
     except click.Abort:
         raise  # Ctrl-C is meant for all
     except SystemExit as error:
         failure = ending(error.code)
-    except Exception as error:
+    except Exception as error:  # a study must not end the others
         failure = explained(error)
     after = stamps(study.out / name)
     files = tuple(path for path, stamp in after.items() if before.get(path) != stamp)
-    return Outcome(name, about, "failed" if failure else "done", failure, files)
+    return Outcome(name, about(name), "failed" if failure else "done", failure, files)
 
 
 def ending(code: object) -> str:
     """What an exit code or a last message tells of failure; nothing if all went well."""
-    if isinstance(code, int):
-        return f"exit code {code}" if code else ""
-    return code if isinstance(code, str) else ""
+    return f"exit code {code}" if code and isinstance(code, int) else str(code or "")
 
 
 def explained(error: Exception) -> str:

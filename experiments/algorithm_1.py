@@ -19,14 +19,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments import sweep
-from experiments.conditions import FOLDERS, ROBOTS
-from experiments.real import here
-from experiments.record import canvas
+from experiments.conditions import ROBOTS, arm_of, robots_here
 from experiments.speed import fitted
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.minimax_problem import (
@@ -36,7 +32,7 @@ from minimax_cal.fitting.minimax_problem import (
 )
 from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.parameters import State
@@ -45,9 +41,6 @@ from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.minimax import Linear
 from qp_backends import solve as solve_qp
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 ARMS = ("irb2600", "irb120", "ur10e", "meca500")  # simulated
 REAL = {"real irb120": "irb120", "real fanuc": "fanuc"}
@@ -85,9 +78,8 @@ def measured(job: Job) -> tuple[Robot, Measurements]:
     if job.arm not in REAL:
         robot = load_robot(job.arm)
         return robot, simulate(robot, 100, 3, job.seed).data
-    _, make, train = ROBOTS[REAL[job.arm]]
-    robot, data = make(job.seed)
-    return robot, split(data, 1.0 - train / data.poses, job.seed)[0]
+    robot, data = arm_of(REAL[job.arm], job.seed)
+    return robot, split(data, 1.0 - ROBOTS[REAL[job.arm]][2] / data.poses, job.seed)[0]
 
 
 def problem_of(job: Job, form: str) -> tuple[MinimaxProblem, State]:
@@ -183,7 +175,7 @@ def course_of(job: Job, backends: Sequence[str] = OURS) -> Course:
 
 def study_of(study: Study) -> dict[Job, Course]:
     """All arms that are here."""
-    arms = [*ARMS, *(arm for arm, name in REAL.items() if here(FOLDERS[name]))]
+    arms = [*ARMS, *(arm for arm, name in REAL.items() if name in robots_here())]
     jobs = [Job(arm, study.seed, OUTER[study.quick]) for arm in arms]
     return dict(zip(jobs, study.sweep(course_of, jobs, "arms"), strict=True))
 
@@ -191,7 +183,7 @@ def study_of(study: Study) -> dict[Job, Course]:
 def table_of(found: Mapping[Job, Course]) -> Table:
     """RMSE(φ) over the optimum after some outer steps, and of our backends at the end."""
     steps = [step for step in SHOWN if all(step <= job.outer for job in found)]
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for job, course in found.items():
         rows += [
             (job.arm, way, values[0], *(reached(values, step) for step in steps))
@@ -201,12 +193,11 @@ def table_of(found: Mapping[Job, Course]) -> Table:
             (job.arm, name, course.ways["as printed"][0], *[math.nan] * (len(steps) - 1), value)
             for name, value in course.ours.items()
         ]
-    header = ("arm", "way", "start", *(f"step {step}" for step in steps))
-    return Table(
+    return Table.made(
         "Algorithm 1 of paper M: RMSE(φ) over the optimum, minus one; our backends at their end",
-        header,
-        tuple(rows),
-        ("", "", *[".1e"] * (len(steps) + 1)),
+        rows,
+        "arm | way | start .1e",
+        *(f"step {step} .1e" for step in steps),
     )
 
 
@@ -215,31 +206,16 @@ def reached(values: tuple[float, ...], step: int) -> float:
     return values[step] if step < len(values) else math.inf
 
 
-def picture(found: Mapping[Job, Course]) -> Figure:
-    """Course of every arm."""
-    figure = canvas(9.0, 3.6)
-    for axes, way in zip(figure.subplots(1, 2, sharey=True), WAYS, strict=True):
-        for job, course in found.items():
-            axes.semilogy(np.maximum(course.ways[way], 1e-13), label=job.arm)
-        axes.set(title=way, xlabel="outer step", ylabel="RMSE(phi) over the optimum - 1")
-    axes.legend(fontsize="small")
-    return figure
-
-
 def save(study: Study, found: Mapping[Job, Course]) -> None:
-    """Table and picture."""
+    """The table."""
     content = {
         job.arm: {"ways": dict(course.ways), "ours": dict(course.ours)}
         for job, course in found.items()
     }
-    study.save([table_of(found)], content, {"algorithm_1": picture(found)})
+    study.save([table_of(found)], content)
 
 
 @study_options("algorithm_1")
 def main(study: Study) -> None:
     """Paper M's Algorithm 1 to the letter, on simulated and real arms."""
     save(study, study_of(study))
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 import click
 import numpy as np
 
-from experiments import sweep
 from experiments.convergence import SAME, STEP, Setting, problem_of, starts_of
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.tables import Cell, Table
@@ -155,7 +154,3 @@ def save(study: Study, found: dict[float, list[Result]]) -> None:
 def main(study: Study, count: int) -> None:
     """Global convergence from any base pose."""
     save(study, study_of(study, count))
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -12,19 +12,15 @@ holds; the true effect deleted from the library; known causes with distorted law
 
 from __future__ import annotations
 
-import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
-import click
 import numpy as np
 
 import minimax_cal as mc
-from experiments import gap_cases, sweep
 from experiments.gap_cases import (
     ARMS,
     DISTORTED,
@@ -35,23 +31,39 @@ from experiments.gap_cases import (
     Cause,
     Truth,
     make,
-    open_seal,
     places,
     spec,
-    write,
 )
 from experiments.record import canvas, interval
-from experiments.sweep import Study, study_options
+from experiments.scoring import (
+    Criterion,
+    Name,
+    Row,
+    answers,
+    asked,
+    blind_study,
+    chosen,
+    has,
+    headline,
+    is_right,
+    match,
+    misses,
+    number_of,
+    of,
+    pairing,
+    save,
+    scored,
+    share_of,
+    verdict_is,
+    verdicts,
+)
+from experiments.sweep import Study
 from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Cell, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Row = dict[str, Any]
-Name = tuple[str, str]  # effect, place
 
 POWERS = (5.0, 15.0, 30.0, 50.0, 100.0, 300.0, 1000.0, 5000.0)  # detectability lambda
 CLEAR = (100.0, 300.0, 1000.0)
@@ -61,10 +73,8 @@ FITTED = (*ALONE, "pair", "triple")  # conditions that the oracle can fit
 VISIBLE = 50.0 * (1.0 - 1e-6)  # lambda from which an effect must be seen
 SEPARABLE = 25.0  # lambda (1 - rho^2) from which it must be told from its nearest rival
 CLOSE = 1.06  # held-out RMS over the oracle's that is good enough
-MOST_MISSES, MISSES_EACH = 40, 8
 MAP = "joint_error_map"  # that a joint errs by its angle, which is true of these laws:
 OF_ANGLE = ("gear_error", "gear_ripple", "encoder_gain")
-NO_ANSWER = ("none", "unknown", "not_repeatable", "error")
 
 
 # ---- the cases -----------------------------------------------------------------------------------
@@ -172,36 +182,15 @@ def together(rng: np.random.Generator, condition: str, count: int, powers: Seque
 
 
 def run(case: Case) -> Row:
-    """Make the files, let them be diagnosed, then open the seal and score."""
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-        write(make(case), folder)
-        said, seconds = diagnosis(folder, case)
-        truth = open_seal(folder)
-        robot = mc.load_robot(folder / gap_cases.ROBOT)
-        data = mc.read_measurements(folder / gap_cases.DATA)
-    row = score(case, truth, said) | {"seconds": seconds}
+    """Make an arm, let its files be diagnosed, then look at the truth and score."""
+    made = make(case)
+    answer = asked(made, seed=case.seed, exclude=case.delete)
+    row = score(case, made, answer.said) | {"seconds": answer.seconds}
+    known = (case, made, answer.robot, answer.data)
     try:
-        return row | rivals(case, truth, robot, data) | oracle(case, truth, robot, data)
+        return row | rivals(*known) | oracle(*known)
     except Exception as error:  # the judge's trouble is shown, and costs no other run
         return row | {"trouble": f"{type(error).__name__}: {error}"}
-
-
-def diagnosis(folder: Path, case: Case) -> tuple[Row, float]:
-    """What `diagnose` makes of the files, as its JSON, and its time [s]."""
-    began = time.perf_counter()
-    try:
-        found = mc.diagnose(
-            folder / gap_cases.ROBOT,
-            folder / gap_cases.DATA,
-            seed=case.seed,
-            exclude=case.delete,
-            quick=True,  # what is claimed of other poses is not asked here
-        )
-        said: Row = found.to_dict()
-    except Exception as error:  # a crash is an answer too, and a bad one
-        said = {"verdict": "error", "trouble": f"{type(error).__name__}: {error}"}
-    return said, time.perf_counter() - began
 
 
 def rivals(case: Case, truth: Truth, robot: mc.Robot, data: mc.Measurements) -> Row:
@@ -247,129 +236,35 @@ def oracle(case: Case, truth: Truth, robot: mc.Robot, data: mc.Measurements) -> 
     }
 
 
-# ---- scoring an answer ---------------------------------------------------------------------------
-
-
-def match(said: Name, truth: Name) -> str:
-    """exact; broad (one joint for all, or all for one); place (another); or wrong."""
-    if said[0] != truth[0]:
-        return "wrong"
-    if said[1] == truth[1] or truth[0] in FAULTS:
-        return "exact"
-    return "broad" if "all" in (said[1], truth[1]) else "place"
-
-
-def is_right(said: Name, truth: Name) -> bool:
-    """Effect and place agree, where all joints and one of them agree too."""
-    return match(said, truth) in ("exact", "broad")
-
-
-def pairing(truth: Sequence[Name], sets: Sequence[Sequence[Name]]) -> int:
-    """How many truths find an answer of their own: the largest matching."""
-    if not truth:
-        return 0
-    first, rest = truth[0], truth[1:]
-    best = pairing(rest, sets)
-    for i, options in enumerate(sets):
-        if any(is_right(name, first) for name in options):
-            best = max(best, 1 + pairing(rest, [*sets[:i], *sets[i + 1 :]]))
-    return best
-
-
-def answers(said: Row) -> list[list[Name]]:
-    """Each confirmed cause of a diagnosis, before its alternatives."""
-    sure = [effect for effect in said.get("effects", []) if effect.get("established", True)]
-    return [
-        [(str(e["effect"]), str(e["place"])) for e in (one, *one.get("alternatives", []))]
-        for one in sure
-    ]
-
-
 def score(case: Case, truth: Truth, said: Row) -> Row:
     """What an answer is worth, as plain data.  said: the JSON of a diagnosis."""
     sets = answers(said)
     names = [options[0] for options in sets]
-    main = truth.truth[0] if truth.truth else ("", "")
-    gap = said.get("gap", {})
+    first = sets[0] if sets else []
     count = len(truth.truth)
-    known = (*truth.truth, *truth.background)
-    return {
-        "condition": case.condition,
+    main = truth.truth[0] if count else ("", "")
+    nan = float("nan")
+    return scored(case, truth, said, names) | {
         "robot": case.robot,
         "poses": case.poses,
         "jitter": case.jitter,
         "noise": case.noise,
-        "seed": case.seed,
         "asked": max((cause.power for cause in case.causes), default=0.0),
-        "laws": [cause.law for cause in case.causes],
-        "truth": [list(name) for name in truth.truth],
         "lambda": truth.powers[0] if count else 0.0,
-        "verdict": str(said["verdict"]),
-        "names": [list(name) for name in names],
         "first": list(names[0]) if names else [],
-        "set": [list(name) for name in sets[0]] if sets else [],
+        "set": [list(name) for name in first],
         "match": match(names[0], main) if names and count else "",
-        "in_set": bool(sets and count and any(is_right(name, main) for name in sets[0])),
-        "set_size": len(sets[0]) if sets else 0,
+        "in_set": bool(count and any(is_right(name, main) for name in first)),
+        "set_size": len(first),
         "sure": str(said["verdict"]) == "named" and all(len(s) == 1 for s in sets),
-        "all_right": len(names) == count == pairing(truth.truth, [[name] for name in names]),
         "all_in_sets": len(names) == count == pairing(truth.truth, sets),
-        "strange": sum(not any(is_right(name, true) for true in known) for name in names),
-        "final_mm": number_of(gap, "holdout_rms_mm", "final"),
-        "geometric_mm": number_of(gap, "holdout_rms_mm", "geometric"),
-        "said_floor_mm": number_of(gap, "noise_floor_mm"),
+        "said_floor_mm": number_of(said, "gap", "noise_floor_mm"),
         "floor_mm": 1e3 * truth.floor,
-        "telling": float("nan"),
-        "rho2": float("nan"),
-        "rival": ["", ""],
-        "oracle_mm": float("nan"),
-        "known_mm": float("nan"),
-        "trouble": str(said.get("trouble", "")),
+        **{"telling": nan, "rho2": nan, "rival": ["", ""], "oracle_mm": nan, "known_mm": nan},
     }
 
 
-def number_of(content: Any, *keys: str) -> float:
-    """A number deep in a JSON object, NaN where there is none."""
-    for key in keys:
-        content = content.get(key) if isinstance(content, dict) else None
-    return float(content) if isinstance(content, (int, float)) else float("nan")
-
-
 # ---- headline criteria ---------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Criterion:
-    """A share of rows, and the limit that it must keep.
-
-    reason: what a row that does not do its part is listed under.  good: whether a hit is.
-    limit: of the share, NaN for none; the least one if a hit is good, else the largest.
-    """
-
-    text: str
-    reason: str
-    rows: Sequence[Row]
-    hit: Callable[[Row], bool]
-    limit: float = float("nan")
-    good: bool = True
-
-    def line(self) -> tuple[Cell, ...]:
-        """Text, runs, share with its interval, limit and whether it is kept."""
-        n = len(self.rows)
-        hits = sum(map(self.hit, self.rows))
-        share = hits / n if n else float("nan")
-        low, high = interval(hits, n) if n else (share, share)
-        kept = share >= self.limit if self.good else share <= self.limit
-        bound = f"{'>=' if self.good else '<='} {100.0 * self.limit:.3g} %"
-        shown = bound if np.isfinite(self.limit) else ""
-        verdict = ("met" if kept else "MISSED") if shown and n else ""
-        return (self.text, n, 100.0 * share, 100.0 * low, 100.0 * high, shown, verdict)
-
-    def misses(self) -> list[Row]:
-        """Rows that did not do their part, where there is a limit."""
-        if not np.isfinite(self.limit):
-            return []
-        return [row for row in self.rows if self.hit(row) != self.good]
 
 
 def named(row: Row) -> bool:
@@ -395,53 +290,48 @@ def close(row: Row) -> bool:
 
 def criteria(rows: Sequence[Row]) -> list[Criterion]:
     """What the diagnosis is held to, and what is only shown."""
-
-    def of(*conditions: str) -> list[Row]:
-        return [row for row in rows if row["condition"] in conditions]
-
+    some = partial(of, rows)
     usual = {"poses": 100, "jitter": Case.jitter, "noise": 1.0}
-    seen = [row for row in of(*ALONE) if row["lambda"] >= VISIBLE]
+    seen = [row for row in some(*ALONE) if row["lambda"] >= VISIBLE]
     plain = [row for row in seen if row["telling"] >= SEPARABLE]
     murky = [row for row in seen if row["telling"] < SEPARABLE]
-    outside = of("outside")
+    outside = some("outside")
     beyond = [row for row in outside if row["telling"] >= VISIBLE]
-    told = [row for row in of("pair") if row["telling"] >= SEPARABLE]
-    three = [row for row in of("triple") if row["telling"] >= SEPARABLE]
-    judged = [row for row in of(*FITTED) if np.isfinite(row["oracle_mm"])]
+    told = [row for row in some("pair") if row["telling"] >= SEPARABLE]
+    three = [row for row in some("triple") if row["telling"] >= SEPARABLE]
+    judged = [row for row in some(*FITTED) if np.isfinite(row["oracle_mm"])]
 
-    def unknown(row: Row) -> bool:
-        return bool(row["verdict"] == "unknown")
-
+    unknown = verdict_is("unknown")
     return [
-        Criterion("no effect: something named", "false alarm", of("none"), named, 0.03, False),
+        Criterion("no effect: something named", "false alarm", some("none"), named, 0.03, False),
         Criterion(
             "  of these, usual jitter, noise and poses", "",
-            [r for r in of("none") if all(r[k] == v for k, v in usual.items())], named,
+            [r for r in some("none") if all(r[k] == v for k, v in usual.items())], named,
         ),
         Criterion("one effect, lambda >= 50: truth in the set of the first", "not in set", seen,
-                  lambda r: r["in_set"], 0.99),
+                  has("in_set"), 0.99),
         Criterion("  first name right where lambda (1 - rho^2) >= 25", "wrong name", plain, right,
                   0.95),
         Criterion("    and its place exactly", "", plain, lambda r: r["match"] == "exact"),
-        Criterion("  elsewhere: verdict one_of", "", murky, lambda r: r["verdict"] == "one_of"),
+        Criterion("  elsewhere: verdict one_of", "", murky, verdict_is("one_of")),
         Criterion("  elsewhere: first name right", "", murky, right),
         Criterion("  verdict unknown", "", seen, unknown),
         Criterion("  a strange name beside or instead of the truth", "", seen,
-                  lambda r: r["strange"] > 0),
+                  has("strange")),
         Criterion("outside the library, lambda (1 - rho^2) >= 50: unknown", "outside, but named",
                   beyond, unknown, 0.90),
         Criterion("  all of lambda >= 50: unknown", "", outside, unknown),
-        Criterion("true effect deleted: named for sure", "sure without the truth", of("deleted"),
-                  lambda r: r["sure"], 0.15, False),
+        Criterion("true effect deleted: named for sure", "sure without the truth", some("deleted"),
+                  has("sure"), 0.15, False),
         Criterion("  of these, lambda (1 - rho^2) >= 25 of the best other: named for sure", "",
-                  [r for r in of("deleted") if r["telling"] >= SEPARABLE], lambda r: r["sure"]),
-        Criterion("  named for sure, and falsely", "", of("deleted"), false_for_sure, 0.15,
+                  [r for r in some("deleted") if r["telling"] >= SEPARABLE], has("sure")),
+        Criterion("  named for sure, and falsely", "", some("deleted"), false_for_sure, 0.15,
                   False),
-        Criterion("  unknown", "", of("deleted"), unknown),
+        Criterion("  unknown", "", some("deleted"), unknown),
         Criterion("two effects exactly right, each lambda (1 - rho^2) >= 25", "pair", told,
-                  lambda r: r["all_right"], 0.90),
-        Criterion("  all pairs exactly right", "", of("pair"), lambda r: r["all_right"]),
-        Criterion("  all pairs within the sets", "", of("pair"), lambda r: r["all_in_sets"]),
+                  has("all_right"), 0.90),
+        Criterion("  all pairs exactly right", "", some("pair"), has("all_right")),
+        Criterion("  all pairs within the sets", "", some("pair"), has("all_in_sets")),
         Criterion(f"held-out RMS <= {CLOSE} x oracle (fitted with the true effects)", "not close",
                   judged, close, 0.95),
         Criterion("  x that of points without the effect", "", judged,
@@ -449,39 +339,31 @@ def criteria(rows: Sequence[Row]) -> list[Criterion]:
         Criterion("  the oracle itself", "", judged,
                   lambda r: r["oracle_mm"] <= CLOSE * r["known_mm"]),
         Criterion("three effects exactly right, each lambda (1 - rho^2) >= 25", "", three,
-                  lambda r: r["all_right"]),
-        Criterion("  all triples within the sets", "", of("triple"), lambda r: r["all_in_sets"]),
-        Criterion("background of small effects: first name right", "", of("background"), right),
-        Criterion("  truth in the set of the first", "", of("background"), lambda r: r["in_set"]),
-        Criterion("  a name that is not in the background either", "", of("background"),
-                  lambda r: r["strange"] > 0),
-        Criterion("wrong law of a known cause: first name right", "", of("wrong_law"), right),
-        Criterion("  unknown", "", of("wrong_law"), unknown),
-        Criterion("data fault named", "", of("fault"), right),
-        Criterion("crashed", "crash", rows, lambda r: r["verdict"] == "error", 0.0, False),
+                  has("all_right")),
+        Criterion("  all triples within the sets", "", some("triple"), has("all_in_sets")),
+        Criterion("background of small effects: first name right", "", some("background"), right),
+        Criterion("  truth in the set of the first", "", some("background"), has("in_set")),
+        Criterion("  a name that is not in the background either", "", some("background"),
+                  has("strange")),
+        Criterion("wrong law of a known cause: first name right", "", some("wrong_law"), right),
+        Criterion("  unknown", "", some("wrong_law"), unknown),
+        Criterion("data fault named", "", some("fault"), right),
+        Criterion("crashed", "crash", rows, verdict_is("error"), 0.0, False),
     ]  # fmt: skip
 
 
-def headline(rows: Sequence[Row], all_criteria: Sequence[Criterion]) -> Table:
-    """The criteria, and the two that are no shares."""
-    seen = [row for row in rows if row["condition"] in ALONE and row["lambda"] >= VISIBLE]
+def no_shares(rows: Sequence[Row]) -> Iterator[tuple[Cell, ...]]:
+    """Lines of the headline that are no shares."""
+    seen = [row for row in of(rows, *ALONE) if row["lambda"] >= VISIBLE]
     sizes = np.array([row["set_size"] for row in seen if row["set_size"]], dtype=float)
     times = np.array([row["seconds"] for row in rows], dtype=float)
-    lines = [criterion.line() for criterion in all_criteria]
-    for text, values, middle, limit in (
-        ("one effect, lambda >= 50: mean size of the set", sizes, np.mean, 2.0),
-        ("median seconds of a quick diagnosis", times, np.median, 0.5),
+    for text, values, middle, bound in (
+        ("one effect, lambda >= 50: mean size of the set", sizes, np.mean, "<= 2"),
+        ("median seconds of a quick diagnosis", times, np.median, "< 0.5"),
     ):
         value, low, high = spread(values, middle)
-        kept = value <= limit if limit == 2.0 else value < limit
-        lines.append((text, len(values), value, low, high,
-                      f"{'<=' if limit == 2.0 else '<'} {limit:g}",
-                      ("met" if kept else "MISSED") if len(values) else ""))  # fmt: skip
-    return Table.made(
-        "blind study: shares [%] with 95 % intervals, and the limits",
-        lines,
-        "criterion | runs d | found .1f | from .1f | to .1f | limit | verdict",
-    )
+        kept = "met" if value <= float(bound.split()[1]) else "MISSED"
+        yield text, len(values), value, low, high, bound, kept if len(values) else ""
 
 
 def spread(values: Array, middle: Callable[[Array], Any]) -> tuple[float, float, float]:
@@ -497,52 +379,30 @@ def spread(values: Array, middle: Callable[[Array], Any]) -> tuple[float, float,
 # ---- other tables --------------------------------------------------------------------------------
 
 
-def share_of(rows: Sequence[Row], hit: Callable[[Row], Any]) -> float:
-    """Share of rows [%], NaN without any."""
-    return 100.0 * float(np.mean([bool(hit(row)) for row in rows])) if rows else float("nan")
-
-
 def said_first(row: Row) -> str:
     """Effect of the first name, or the verdict without one."""
     return str(row["first"][0]) if row["first"] else str(row["verdict"])
 
 
-def confusion(rows: Sequence[Row]) -> tuple[tuple[str, ...], tuple[str, ...], Array]:
-    """True effects, answers, and how often they came together, of visible single effects."""
-    seen = [
-        row
-        for row in rows
-        if row["condition"] in (*ALONE, "fault") and row["lambda"] >= VISIBLE
-    ]  # fmt: skip
-    counts = Counter((row["truth"][0][0], said_first(row)) for row in seen)
-    answers = {answer for _, answer in counts}
-    columns = [*(e for e in EFFECTS if e in answers or any(t == e for t, _ in counts))]
-    columns += sorted(answers - set(columns) - set(NO_ANSWER))
-    columns += [answer for answer in NO_ANSWER if answer in answers]
-    lines = [effect for effect in EFFECTS if any(t == effect for t, _ in counts)]
-    table = np.array([[counts[line, column] for column in columns] for line in lines])
-    return tuple(lines), tuple(columns), table.reshape(len(lines), len(columns))
-
-
-def confusion_table(rows: Sequence[Row]) -> Table:
-    """The confusion matrix, a line a true effect with its answers, the most frequent first."""
-    lines, columns, counts = confusion(rows)
-
-    def answers(row: Array) -> str:
-        order = [int(i) for i in np.argsort(-row, kind="stable") if row[i]]
-        return ", ".join(f"{columns[i]} {row[i]}" for i in order)
-
+def confusion(rows: Sequence[Row]) -> Table:
+    """Each true effect with its answers, the most frequent first."""
+    seen = [row for row in of(rows, *ALONE, "fault") if row["lambda"] >= VISIBLE]
+    lines = []
+    for effect in EFFECTS:
+        said = Counter(said_first(row) for row in seen if row["truth"][0][0] == effect)
+        often = ", ".join(f"{name} {count}" for name, count in said.most_common())
+        lines += [(effect, said.total(), often)] if said else []
     return Table.made(
         "true effect x first name, visible single effects",
-        ((line, int(c.sum()), answers(c)) for line, c in zip(lines, counts, strict=True)),
+        lines,
         "truth | runs d | first name, and how often",
     )
 
 
 def per_effect(rows: Sequence[Row]) -> Table:
     """Names and sets of every effect that is visible alone."""
-    seen = [row for row in rows if row["condition"] in ALONE and row["lambda"] >= VISIBLE]
-    lines: list[tuple[Cell, ...]] = []
+    seen = [row for row in of(rows, *ALONE) if row["lambda"] >= VISIBLE]
+    lines = []
     for effect in LIBRARY:
         own = [row for row in seen if row["truth"][0][0] == effect]
         sized = [row["set_size"] for row in own if row["set_size"]]
@@ -552,11 +412,11 @@ def per_effect(rows: Sequence[Row]) -> Table:
             lines.append((
                 effect, len(own), share_of(own, lambda r: r["match"] == "exact"),
                 share_of(own, lambda r: r["match"] == "broad"),
-                share_of(own, lambda r: r["in_set"]),
+                share_of(own, has("in_set")),
                 float(np.mean(sized)) if sized else float("nan"),
-                share_of(own, lambda r: r["verdict"] == "one_of"),
-                share_of(own, lambda r: r["verdict"] == "unknown"),
-                share_of(own, lambda r: r["verdict"] == "none"),
+                share_of(own, verdict_is("one_of")),
+                share_of(own, verdict_is("unknown")),
+                share_of(own, verdict_is("none")),
                 float(np.median(rho2)) if rho2 else float("nan"),
                 rivals.most_common(1)[0][0] if rivals else "",
             ))  # fmt: skip
@@ -570,35 +430,34 @@ def per_effect(rows: Sequence[Row]) -> Table:
 
 def by_power(rows: Sequence[Row]) -> list[tuple[float, list[Row]]]:
     """Rows of the condition single by the lambda that was asked for."""
-    single = [row for row in rows if row["condition"] == "single"]
+    single = of(rows, "single")
     powers = sorted({row["asked"] for row in single})
     return [(power, [row for row in single if row["asked"] == power]) for power in powers]
 
 
 SHOWN: tuple[tuple[str, Callable[[Row], bool]], ...] = (
     ("something found", lambda row: row["verdict"] not in ("none", "error")),
-    ("truth in the set", lambda row: bool(row["in_set"])),
+    ("truth in the set", has("in_set")),
     ("first name right", right),
 )
 
 
 def detectability(rows: Sequence[Row]) -> Table:
     """What is found, against lambda."""
-    return Table(
-        "detectability: single effects against lambda [%]",
-        ("lambda", "runs", *(text for text, _ in SHOWN), "unknown"),
-        tuple(
-            (power, len(own), *(share_of(own, hit) for _, hit in SHOWN),
-             share_of(own, lambda row: row["verdict"] == "unknown"))
-            for power, own in by_power(rows)
-        ),
-        (".0f", "d", ".1f", ".1f", ".1f", ".1f"),
-    )  # fmt: skip
+    lines = [
+        (power, len(own), *(share_of(own, hit) for _, hit in SHOWN),
+         share_of(own, verdict_is("unknown")))
+        for power, own in by_power(rows)
+    ]  # fmt: skip
+    title, shown = "detectability: single effects against lambda [%]", [t for t, _ in SHOWN]
+    return Table.made(
+        title, lines, "lambda .0f | runs d", *(f"{t} .1f" for t in shown), "unknown .1f"
+    )
 
 
 def shrink(rows: Sequence[Row]) -> Table:
     """Held-out RMS against the oracle's, and the noise floor that was said against the true one."""
-    lines: list[tuple[Cell, ...]] = []
+    lines = []
     for text, above, below in (
         ("held-out RMS / oracle", "final_mm", "oracle_mm"),
         ("held-out RMS, geometry only / oracle", "geometric_mm", "oracle_mm"),
@@ -606,8 +465,7 @@ def shrink(rows: Sequence[Row]) -> Table:
         ("said noise floor / true", "said_floor_mm", "floor_mm"),
     ):
         for condition in dict.fromkeys(row["condition"] for row in rows):
-            own = [row for row in rows if row["condition"] == condition]
-            ratio = np.array([row[above] / row[below] for row in own], dtype=float)
+            ratio = np.array([row[above] / row[below] for row in of(rows, condition)], dtype=float)
             ratio = ratio[np.isfinite(ratio)]
             if len(ratio):
                 quantiles = np.quantile(ratio, (0.05, 0.5, 0.95, 0.99))
@@ -618,56 +476,6 @@ def shrink(rows: Sequence[Row]) -> Table:
         lines,
         "ratio | condition | runs d | 5 % .3f | 50 % .3f | 95 % .3f | 99 % .3f | largest .3f",
     )
-
-
-def verdicts(rows: Sequence[Row]) -> Table:
-    """How often each verdict was given in each condition."""
-    kinds = ("none", "named", "one_of", "unknown", "not_repeatable", "error")
-    lines = []
-    for condition in dict.fromkeys(row["condition"] for row in rows):
-        own = [row for row in rows if row["condition"] == condition]
-        counts = Counter(row["verdict"] for row in own)
-        seconds = float(np.median([row["seconds"] for row in own]))
-        lines.append((condition, len(own), *(counts[kind] for kind in kinds), seconds))
-    return Table(
-        "verdicts", ("condition", "runs", *kinds, "median s"), tuple(lines),
-        ("", "d", *("d" for _ in kinds), ".2f"),
-    )  # fmt: skip
-
-
-def text_of(names: Sequence[Sequence[str]]) -> str:
-    """Names as effect:place, joined."""
-    return " + ".join(":".join(name) for name in names)
-
-
-def misses(all_criteria: Sequence[Criterion]) -> Table:
-    """The runs behind the limits, some of each reason, for those who mend the diagnosis."""
-    lines: list[tuple[Cell, ...]] = []
-    for criterion in all_criteria:
-        for row in criterion.misses()[:MISSES_EACH]:
-            others = [":".join(name) for name in row["set"][1:4]]
-            said = f"{row['verdict']} {text_of(row['names'])}".strip()
-            said += f" (or {', '.join(others)})" if others else ""
-            lines.append((
-                criterion.reason, f"{row['robot']} {row['poses']} #{row['seed']}",
-                text_of([(law, place) for law, (_, place) in
-                         zip(row["laws"], row["truth"], strict=True)]),
-                row["trouble"][:60] or said, row["lambda"], row["rho2"],
-                row["final_mm"] / row["oracle_mm"],
-            ))  # fmt: skip
-    total = sum(len(criterion.misses()) for criterion in all_criteria)
-    shown = lines[:MOST_MISSES]
-    return Table.made(
-        f"misses: {len(shown)} of {total}",
-        shown,
-        "what | robot, poses, seed | truth | said | lambda .0f | rho^2 .3f | RMS/oracle .3f",
-    )
-
-
-def troubles(rows: Sequence[Row]) -> Table:
-    """What went wrong in the diagnosis or in the judge, the most frequent first."""
-    counts = Counter(row["trouble"][:120] for row in rows if row["trouble"])
-    return Table.made("troubles", counts.most_common(10), "message | runs d")
 
 
 # ---- pictures ------------------------------------------------------------------------------------
@@ -694,101 +502,25 @@ def detectability_picture(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def confusion_picture(rows: Sequence[Row]) -> Figure:
-    """The confusion matrix, each line as shares of its truth."""
-    lines, columns, counts = confusion(rows)
-    figure = canvas(9.5, 7.5)
-    axes = figure.subplots()
-    shares = 100.0 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-    axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=100.0)
-    for (i, j), share in np.ndenumerate(shares):
-        if share:
-            colour = "white" if share > 60.0 else "black"
-            axes.text(j, i, f"{share:.0f}", ha="center", va="center", color=colour, fontsize=8)
-    axes.set_xticks(range(len(columns)), columns, rotation=60, ha="right")
-    axes.set_yticks(range(len(lines)), lines)
-    axes.set(xlabel="first name", ylabel="truth")
-    axes.set_title("share of each truth (%), visible single effects")
-    return figure
-
-
-def shrink_picture(rows: Sequence[Row]) -> Figure:
-    """Distribution of the held-out RMS over the oracle's, before and after naming."""
-    figure = canvas(7, 4.2)
-    axes = figure.subplots()
-    judged = [row for row in rows if np.isfinite(row["oracle_mm"])]
-    for key, text, colour in (
-        ("geometric_mm", "geometry only", COLOURS[2]),
-        ("final_mm", "with what was named", COLOURS[0]),
-    ):
-        ratio = np.sort([row[key] / row["oracle_mm"] for row in judged])
-        ratio = ratio[np.isfinite(ratio)]
-        share = 100.0 * (np.arange(len(ratio)) + 1) / max(1, len(ratio))
-        axes.step(ratio, share, where="post", color=colour, label=text)
-    axes.axvline(CLOSE, color="0.5", ls=":", lw=1)
-    axes.set(xlabel="held-out RMS / oracle's", ylabel="runs with less (%)", xlim=(0.95, 1.6))
-    axes.grid(visible=True, alpha=0.3)
-    axes.legend(frameon=False, loc="lower right")
-    return figure
-
-
 # ---- the study -----------------------------------------------------------------------------------
-
-
-class Conditioned(Protocol):
-    """A case of a condition."""
-
-    @property
-    def condition(self) -> str:
-        """What it is run for."""
-
-
-C = TypeVar("C", bound=Conditioned)
-
-
-def chosen(
-    study: Study, cases: Sequence[C], only: Sequence[str], every: int | None, sparse: int
-) -> list[C]:
-    """Cases of some conditions, each so many-th.  sparse: of --quick.  Raises OptionError."""
-    conditions = tuple(dict.fromkeys(case.condition for case in cases))
-    for name in only:
-        if name not in conditions:
-            raise OptionError(f"--only {name}: choose {', '.join(conditions)}")
-    step = (sparse if study.quick else 1) if every is None else every
-    if step < 1:
-        raise OptionError(f"--every {every}: give a whole number, 1 or more")
-    return [case for case in cases if not only or case.condition in only][::step]
 
 
 SPARSE = 4  # of the cases of --quick, each so many-th by itself
 
 
-@study_options("blind_gap")
-@click.option("--only", multiple=True, help="A condition to run, such as pair; may be repeated.")
-@click.option("--every", type=int, help="Run each N-th case alone [default: 1; with --quick 4].")
+@blind_study("blind_gap")
 def main(study: Study, only: tuple[str, ...], every: int | None) -> None:
     """Blind judgement of diagnose."""
     cases = plan(study.seed, QUICK if study.quick else Size())
     rows = study.sweep(run, chosen(study, cases, only, every, SPARSE), "diagnoses")
     found = criteria(rows)
     tables = [
-        headline(rows, found),
+        headline(found, *no_shares(rows)),
         verdicts(rows),
-        confusion_table(rows),
+        confusion(rows),
         per_effect(rows),
         detectability(rows),
         shrink(rows),
-        misses(found),
-        *([troubles(rows)] if any(row["trouble"] for row in rows) else []),
+        misses(found, lambda row: f"{row['robot']} {row['poses']}", "oracle_mm"),
     ]
-    figures = {
-        "blind_gap_detectability": detectability_picture(rows),
-        "blind_gap_confusion": confusion_picture(rows),
-        "blind_gap_oracle": shrink_picture(rows),
-    }
-    names = ("criterion", "runs", "found", "low", "high", "limit", "verdict")
-    study.save(tables, {"criteria": tables[0].records(*names), "rows": rows}, figures)
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)
+    save(study, tables, rows, {"blind_gap_detectability": detectability_picture(rows)})

@@ -9,21 +9,17 @@ Euler deviation) and AO' = |log(R_m' R_c)|, each on the training and on the held
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import click
 import numpy as np
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.poses import euler_deviation, orientation_error, poses_of, triangle
 from experiments.real import here, real
 from experiments.record import canvas
 from experiments.sweep import Study, study_options
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell as TableCell
+from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.measurements import Measurements
@@ -82,28 +78,29 @@ class Outcome:
     status: str
 
 
-def simulated(seed: int) -> tuple[Robot, Measurements]:
-    """IRB 2600 with geometric errors and the compliance that no geometry holds."""
-    robot = load_robot("irb2600")
+ROBOTS = {  # what it is called, the folder of a real one, training poses
+    "irb2600": ("IRB 2600, simulated", "", 100),
+    "irb120": ("IRB 120, real", "irb120", 100),
+    "fanuc": ("FANUC R-2000, real", "fanuc_r2000", 29),
+}
+
+
+def arm_of(name: str, seed: int) -> tuple[Robot, Measurements]:
+    """A real robot, or an IRB 2600 with the compliance that no geometry holds."""
+    if folder := ROBOTS[name][1]:
+        return real(folder)
+    robot = load_robot(name)
     return robot, simulate(robot, 300, 3, seed, Truth()).data
 
 
-def shared(name: str) -> Callable[[int], tuple[Robot, Measurements]]:
-    """A real robot from shared data."""
-    return lambda seed: real(name)
-
-
-ROBOTS: dict[str, tuple[str, Callable[[int], tuple[Robot, Measurements]], int]] = {
-    "irb2600": ("IRB 2600, simulated", simulated, 100),
-    "irb120": ("IRB 120, real", shared("irb120"), 100),
-    "fanuc": ("FANUC R-2000, real", shared("fanuc_r2000"), 29),
-}
-FOLDERS = {"irb120": "irb120", "fanuc": "fanuc_r2000"}  # of the real ones
+def robots_here() -> list[str]:
+    """Those of `ROBOTS` that are simulated or whose measurements are on this machine."""
+    return [name for name, (_, folder, _) in ROBOTS.items() if not folder or here(folder)]
 
 
 def run(job: Job) -> Outcome:
     """Calibrate under one condition and judge it on both sets of poses."""
-    robot, data = ROBOTS[job.robot][1](job.seed)
+    robot, data = arm_of(job.robot, job.seed)
     train, held, _ = split(data, 1.0 - job.train / data.poses, job.seed)
     objective = "sum" if job.condition == "nominal" else job.condition
     fit = mc.calibrate(robot, train, objective, holdout=0.0)
@@ -128,24 +125,12 @@ def errors_of(cell: Cell, data: Measurements) -> Errors:
 
 def table_of(title: str, found: dict[str, Outcome]) -> Table:
     """Table 3 for one robot, training and held out side by side."""
-    rows: list[tuple[TableCell, ...]] = []
+    rows = []
     for number, (condition, outcome) in enumerate(found.items()):
-        for where, errors in (("training", outcome.train), ("held out", outcome.held)):
-            rows.append(
-                (
-                    f"{number} {condition}",
-                    where,
-                    len(errors.ao),
-                    *errors.sums,
-                    errors.phi,
-                    float(np.sqrt(np.mean(errors.ap**2))),
-                    float(errors.ap.max()),
-                    float(errors.ao.max()),
-                    float(np.sqrt(np.mean(errors.ao_angle**2))),
-                    float(errors.ao_angle.max()),
-                    outcome.status,
-                )
-            )
+        for where, e in (("training", outcome.train), ("held out", outcome.held)):
+            rows.append((f"{number} {condition}", where, len(e.ao), *e.sums, e.phi, rms(e.ap),
+                         float(e.ap.max()), float(e.ao.max()), rms(e.ao_angle),
+                         float(e.ao_angle.max()), outcome.status))  # fmt: skip
     return Table.made(
         title,
         rows,
@@ -212,27 +197,18 @@ def sums_figure(title: str, found: dict[str, Outcome]) -> Figure:
     return figure
 
 
-def claims(robots: Sequence[str], found: dict[str, dict[str, Outcome]]) -> Table:
+def claims(found: dict[str, dict[str, Outcome]]) -> Table:
     """Whether minimax has the smallest RMSE(phi): it must in training, it need not held out."""
-    rows: list[tuple[TableCell, ...]] = []
-    for robot in robots:
-        outcomes = found[robot]
-        for where in ("train", "held"):
-            phi = {name: getattr(outcome, where).phi for name, outcome in outcomes.items()}
+    rows = []
+    for robot, outcomes in found.items():
+        for part, where in (("train", "training"), ("held", "held out")):
+            phi = {name: getattr(outcome, part).phi for name, outcome in outcomes.items()}
             # one target alone is the minimax where it stays the worst: a tie then
             tied = phi["minimax"] <= min(phi.values()) * (1 + 1e-6)
             best = "minimax" if tied else min(phi, key=lambda name: phi[name])
-            others = [value for name, value in phi.items() if name not in ("minimax", "nominal")]
-            rows.append(
-                (
-                    ROBOTS[robot][0],
-                    "training" if where == "train" else "held out",
-                    phi["minimax"],
-                    min(others),
-                    phi["minimax"] / min(others),
-                    best,
-                )
-            )
+            other = min(value for name, value in phi.items() if name not in ("minimax", "nominal"))
+            rows.append((ROBOTS[robot][0], where, phi["minimax"], other, phi["minimax"] / other,
+                         best))  # fmt: skip
     return Table.made(
         "is minimax the smallest RMSE(phi)?",
         rows,
@@ -245,23 +221,17 @@ Found = dict[str, dict[str, Outcome]]  # by robot and condition
 
 def study_of(study: Study) -> Found:
     """Every robot whose measurements are here under every condition."""
-    robots = [name for name in ROBOTS if name not in FOLDERS or here(FOLDERS[name])]
-    for name in ROBOTS:
-        if name not in robots:
-            click.echo(f"{ROBOTS[name][0]}: its measurements are not on this machine", err=True)
-    jobs = [Job(name, c, ROBOTS[name][2], study.seed) for name in robots for c in CONDITIONS]
-    outcomes = study.sweep(run, jobs, "conditions")
-    done = list(zip(jobs, outcomes, strict=True))
-    return {
-        name: {job.condition: outcome for job, outcome in done if job.robot == name}
-        for name in robots
-    }
+    jobs = [Job(name, c, ROBOTS[name][2], study.seed) for name in robots_here() for c in CONDITIONS]
+    found: Found = {job.robot: {} for job in jobs}
+    for job, outcome in zip(jobs, study.sweep(run, jobs, "conditions"), strict=True):
+        found[job.robot][job.condition] = outcome
+    return found
 
 
 def save(study: Study, found: Found) -> None:
     """Tables and pictures."""
     tables = [table_of(ROBOTS[name][0], found[name]) for name in found]
-    summary = claims(list(found), found)
+    summary = claims(found)
     figures = {}
     for name in found:
         figures[f"accuracy_{name}"] = boxes(ROBOTS[name][0], found[name])
@@ -278,7 +248,3 @@ def save(study: Study, found: Found) -> None:
 def main(study: Study) -> None:
     """Single SMR, sum, minimax, pose and worst point: paper M, Table 3, Fig. 2-6."""
     save(study, study_of(study))
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -1,13 +1,13 @@
 """From how far the four least-squares methods converge: paper S, Table 2 and Fig. 3.
 
-    python -m experiments.convergence [--quick] [--base-angle RAD] [--out FOLDER] ...
+    python -m experiments.convergence [--quick] [--out FOLDER] ...
 
 A simulated IRB 2600, 60 random configurations, one target; measurement noise, errors of all
 parameters and of the transmissions.  3969 starts: theta_2 and alpha_3 off by -3.1 ... 3.1 rad on a
 grid, base and target at their identity and origin, everything else nominal.  The paper prints
 neither the true base nor the sizes of its errors, nor its unit of length, nor the rule of its
-damping; here the base is turned by --base-angle about a random axis, the errors are those of
-`Setting`, and damping is Marquardt's.
+damping; here the base is turned about a random axis and the errors are those of `Setting`, and
+damping is Marquardt's.
 
 Every method runs to the letter on the paper's parameters (all, redundant ones included,
 pseudo-inverse) in millimetres, those without separation in metres too: there the unit matters.  The
@@ -20,13 +20,12 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
-import click
 import numpy as np
 
-from experiments import pseudo_inverse, sweep
+from experiments import pseudo_inverse
 from experiments.pseudo_inverse import ROUNDING
 from experiments.record import canvas
 from experiments.speed import identified
@@ -245,18 +244,6 @@ def letter(
 # ---- Table 2 -----------------------------------------------------------------------------------
 
 
-def outcomes(study: Study, setting: Setting, method: str, parameters: str, every: int,
-             cap: int, moved: bool = False) -> list[Outcome]:  # fmt: skip
-    """All starts of one method on one set of parameters."""
-    theta, alpha = (value.tolist() for value in grid(every))
-    jobs = [
-        Job(setting, method, parameters, tuple(theta[i : i + CHUNK]), tuple(alpha[i : i + CHUNK]),
-            cap, moved)
-        for i in range(0, len(theta), CHUNK)
-    ]  # fmt: skip
-    return study.sweep(run, jobs, f"{method}, {parameters}, every {every}")
-
-
 @dataclass(frozen=True)
 class Row:
     """One method on one set of parameters over the grid (all starts, in the grid's order)."""
@@ -285,26 +272,29 @@ class Row:
         )
 
 
-def row_of(found: Sequence[Outcome], method: str, parameters: str, every: int, least: float,
-           poses: int) -> Row:  # fmt: skip
-    """The outcomes of all jobs as one row."""
-    cost = np.concatenate([o.cost for o in found])
-    converged = np.concatenate([o.converged for o in found]).astype(bool)
-    return Row(
-        method,
-        parameters,
-        every,
-        np.concatenate([o.iterations for o in found]),
-        1e3 * np.sqrt(cost / poses),
-        converged,
-        converged & (cost <= least * SAME),
-        sum(o.seconds for o in found),
+def row_of(
+    study: Study, setting: Setting, least: float, method: str, parameters: str, every: int,
+    cap: int, moved: bool = False,
+) -> Row:  # fmt: skip
+    """All starts of one method on one set of parameters.  least: cost of the minimum [m^2]."""
+    theta, alpha = (value.tolist() for value in grid(every))
+    jobs = [
+        Job(setting, method, parameters, tuple(theta[i : i + CHUNK]), tuple(alpha[i : i + CHUNK]),
+            cap, moved)
+        for i in range(0, len(theta), CHUNK)
+    ]  # fmt: skip
+    found = study.sweep(run, jobs, f"{method}, {parameters}, every {every}")
+    iterations, cost, converged = (
+        np.concatenate([getattr(one, name) for one in found])
+        for name in ("iterations", "cost", "converged")
     )
+    rms, minimum = 1e3 * np.sqrt(cost / setting.poses), converged & (cost <= least * SAME)
+    seconds = sum(one.seconds for one in found)
+    return Row(method, parameters, every, iterations, rms, converged, minimum, seconds)
 
 
-HEADER = ("method", "parameters", "starts", "iterations", "RMS mm", "ms a start", "converged %",
-          "to the minimum %")  # fmt: skip
-FORMATS = ("", "", "d", ".2f", ".3f", ".2f", ".2f", ".2f")
+COLUMNS = ("method | parameters | starts d | iterations .2f | RMS mm .3f | ms a start .2f | "
+           "converged % .2f | to the minimum % .2f")  # fmt: skip
 
 
 def table_2(rows: Sequence[Row], setting: Setting) -> Table:
@@ -313,13 +303,12 @@ def table_2(rows: Sequence[Row], setting: Setting) -> Table:
         (f"{method.upper()} (paper)", "all", 3969, *values[:2], 1e3 * values[2], *values[3:])
         for method, values in PAPERS_TABLE.items()
     ]
-    return Table(
+    return Table.made(
         f"convergence from off starts (base turned by {setting.base_angle:g} rad, poses within "
         f"{setting.span:g} rad, noise {1e6 * setting.noise:g} um, errors {1e3 * setting.length:g} "
         f"mm and {1e3 * setting.angle:g} mrad, transmission {1e3 * setting.transmission:g} mrad)",
-        HEADER,
         (*(row.cells() for row in rows), *theirs),
-        FORMATS,
+        COLUMNS,
     )
 
 
@@ -361,56 +350,46 @@ def moved_table(found: Sequence[Moved]) -> Table:
     )
 
 
-def separable_shares(study: Study, setting: Setting, every: int) -> tuple[int, float, float]:
+def separable_table(
+    study: Study, settings: Sequence[tuple[float, Setting]], every: int, columns: str
+) -> Table:
     """How many starts, and which share of them SNLGN and SNLLM bring to the minimum [%]."""
-    least = least_cost(setting)
-    rows = [
-        row_of(
-            outcomes(study, setting, method, "identifiable", every, 500),
-            method,
-            "identifiable",
-            every,
-            least,
-            setting.poses,
-        )
-        for method in ("snlgn", "snllm")
-    ]
-    gauss_newton, levenberg = (100.0 * float(row.minimum.mean()) for row in rows)
-    return len(rows[0].minimum), gauss_newton, levenberg
+    rows = []
+    for first, setting in settings:
+        for angle in (0.0, 0.5):
+            other = replace(setting, base_angle=angle)
+            least, shares = least_cost(other), list[float]()
+            for method in ("snlgn", "snllm"):
+                row = row_of(study, other, least, method, "identifiable", every, 500)
+                shares.append(100.0 * float(row.minimum.mean()))
+            rows.append((first, angle, len(row.minimum), *shares))
+    title = (
+        "separable methods on the identifiable parameters, from the paper's start: share of starts "
+        "that reach the minimum"
+    )
+    return Table.made(title, rows, columns)
 
 
 def span_table(study: Study, setting: Setting, every: int) -> Table:
     """Where the claim of global convergence ends: wider poses have other minima."""
-    rows: list[tuple[Cell, ...]] = []
-    for span in (1.0,) if study.quick else (0.5, 1.0, 1.5, 2.0, np.pi):
-        for angle in (0.0, 0.5):
-            wider = replace(setting, span=span, base_angle=angle)
-            rows.append((span, angle, *separable_shares(study, wider, every)))
-    return Table.made(
-        "separable methods on the identifiable parameters, from the paper's start: share of starts "
-        "that reach the minimum",
-        rows,
+    spans = (1.0,) if study.quick else (0.5, 1.0, 1.5, 2.0, np.pi)
+    return separable_table(
+        study, [(span, replace(setting, span=span)) for span in spans], every,
         "poses within rad .2f | base turned rad .1f | starts d | SNLGN % .1f | SNLLM % .1f",
-    )
+    )  # fmt: skip
 
 
 def seed_table(study: Study, setting: Setting, every: int) -> Table:
     """The separable methods on other simulated arms and poses: how safe the claim is."""
-    rows: list[tuple[Cell, ...]] = []
-    for seed in range(setting.seed, setting.seed + (2 if study.quick else 4)):
-        for angle in (0.0, 0.5):
-            other = replace(setting, seed=seed, base_angle=angle)
-            rows.append((seed, angle, *separable_shares(study, other, max(every, 2))))
-    return Table.made(
-        "separable methods on the identifiable parameters, other simulated arms: share of starts "
-        "that reach the minimum",
-        rows,
+    seeds = range(setting.seed, setting.seed + (2 if study.quick else 4))
+    return separable_table(
+        study, [(seed, replace(setting, seed=seed)) for seed in seeds], max(every, 2),
         "seed d | base turned rad .1f | starts d | SNLGN % .2f | SNLLM % .2f",
-    )
+    )  # fmt: skip
 
 
-def maps(rows: Sequence[Row], what: str) -> Figure:
-    """Paper S, Fig. 3: a value over the grid of deviations, a panel a method."""
+def rms_map(rows: Sequence[Row]) -> Figure:
+    """Paper S, Fig. 3: RMS at the end over the grid of deviations, a panel a method."""
     from matplotlib.colors import LogNorm
 
     figure = canvas(4.2 * len(rows), 4)
@@ -418,31 +397,15 @@ def maps(rows: Sequence[Row], what: str) -> Figure:
     for axes, row in zip(panels, rows, strict=True):
         theta, alpha = grid(row.every)
         side = len(np.unique(theta))
-        values = (row.iterations if what == "iterations" else row.rms_mm).reshape(side, side)
-        values = np.where(row.converged.reshape(side, side), values, np.nan)
+        values = np.where(row.converged, row.rms_mm, np.nan).reshape(side, side)
         known = values[np.isfinite(values)] if np.isfinite(values).any() else np.ones(1)
         least = max(known.min(), 1e-3)
         norm = LogNorm(least, max(known.max(), 10.0 * least))
         edge = (alpha.min(), alpha.max(), theta.min(), theta.max())
         image = axes.imshow(values, origin="lower", extent=edge, norm=norm, cmap="viridis")
         axes.set(title=f"{row.method.upper()}, {row.parameters}", xlabel="alpha_3 off by (rad)")
-        figure.colorbar(image, ax=axes, label=what, shrink=0.8)
+        figure.colorbar(image, ax=axes, label="RMS mm", shrink=0.8)
     panels[0].set_ylabel("theta_2 off by (rad)")
-    return figure
-
-
-def surface(rows: Sequence[Row]) -> Figure:
-    """The RMS at the end over the deviations; starts that do not converge are left out."""
-    figure = canvas(4.2 * len(rows), 4)
-    for number, row in enumerate(rows, start=1):
-        axes = figure.add_subplot(1, len(rows), number, projection="3d")
-        theta, alpha = grid(row.every)
-        side = len(np.unique(theta))
-        height = np.log10(np.where(row.converged, row.rms_mm, np.nan)).reshape(side, side)
-        axes.plot_surface(alpha.reshape(side, side), theta.reshape(side, side), height,
-                          cmap="viridis")  # fmt: skip
-        axes.set(title=row.method.upper(), xlabel="alpha_3 (rad)", ylabel="theta_2 (rad)",
-                 zlabel="log10 RMS mm")  # fmt: skip
     return figure
 
 
@@ -455,61 +418,39 @@ class Found:
     setting: Setting
 
 
-def study_of(study: Study, base_angle: float = 0.3) -> Found:
+def study_of(study: Study) -> Found:
     """Every variant on its starts."""
-    setting = Setting(seed=study.seed + 1, base_angle=base_angle)
-    least = least_cost(setting)
-    cap = 100 if study.quick else CAP
-
-    def row(parameters: str, method: str, every: int, moved: bool = False) -> Row:
-        found = outcomes(study, setting, method, parameters, every, cap, moved)
-        return row_of(found, method, parameters, every, least, setting.poses)
-
-    rows = [row(*variant, SPARSE if study.quick else 1) for variant in VARIANTS]
-    by = {(row.parameters, row.method): row for row in rows}
-    again = [
-        moved_of(by["all, mm", m], row("all, mm", m, SPARSE if study.quick else 3, moved=True))
-        for m in PAPER
-    ]
+    setting = Setting(seed=study.seed + 1)
+    row = partial(row_of, study, setting, least_cost(setting))
+    cap, every, some = (100, SPARSE, SPARSE) if study.quick else (CAP, 1, 3)
+    rows = [row(method, parameters, every, cap) for parameters, method in VARIANTS]
+    firsts = [row for row in rows if row.parameters == "all, mm"]
+    again = [moved_of(one, row(one.method, one.parameters, some, cap, True)) for one in firsts]
     return Found(rows, again, setting)
-
-
-def pictures(rows: Sequence[Row], surfaces: bool) -> dict[str, Figure]:
-    """Fig. 3 for each set of parameters, by file name; surfaces take their time."""
-    figures = {}
-    for parameters in dict.fromkeys(row.parameters for row in rows):
-        chosen = [row for row in rows if row.parameters == parameters]
-        name = parameters.replace(", ", "_")
-        for what in ("iterations", "RMS mm"):
-            figures[f"{what.split()[0].lower()}_{name}"] = maps(chosen, what)
-        if surfaces:
-            figures[f"surface_{name}"] = surface(chosen)
-    return figures
 
 
 def save(study: Study, found: Found) -> None:
     """Table 2, and how the claim of global convergence fares on other arms and wider poses."""
     rows, setting = found.rows, found.setting
-    tables = [
-        table_2(rows, setting),
+    first = table_2(rows, setting)
+    more = [
         moved_table(found.moved),
         seed_table(study, setting, SPARSE if study.quick else 3),
         span_table(study, setting, SPARSE if study.quick else 7),
     ]
-    names = [name.replace(" ", "_").replace("%", "percent") for name in HEADER]
+    names = [name.replace(" ", "_").replace("%", "percent") for name in first.header]
     content = {
         "rows": [dict(zip(names, row.cells(), strict=True)) for row in rows],
         "least_rms_mm": float(1e3 * np.sqrt(least_cost(setting) / setting.poses)),
     }
-    study.save(tables, content, pictures(rows, not study.quick))
+    figures = {
+        f"rms_{name.replace(', ', '_')}": rms_map([row for row in rows if row.parameters == name])
+        for name in dict.fromkeys(row.parameters for row in rows)
+    }
+    study.save([first, *more], content, figures)
 
 
 @study_options("convergence")
-@click.option("--base-angle", type=float, default=0.3, show_default=True, metavar="RAD")
-def main(study: Study, base_angle: float) -> None:
+def main(study: Study) -> None:
     """Convergence of NLGN, NLLM, SNLGN, SNLLM from off starts: paper S, Table 2, Fig. 3."""
-    save(study, study_of(study, base_angle))
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)
+    save(study, study_of(study))

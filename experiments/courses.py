@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments import pseudo_inverse, sweep
+from experiments import pseudo_inverse
 from experiments.convergence import CAP, PAPER, SAME, Setting, flat, grid, letter, measured, nudged
 from experiments.real import here, real
 from experiments.record import canvas
@@ -27,7 +27,6 @@ from experiments.speed import identified
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.saved import evaluate
 from minimax_cal.measuring.measurements import Measurements, measurements
@@ -189,7 +188,7 @@ def longer(study: Study, cap: int) -> dict[Job, Course]:
 
 def course_table(title: str, courses: dict[Job, Course]) -> Table:
     """How each course ended."""
-    rows: list[tuple[TableCell, ...]] = [
+    rows = [
         (
             job.arm,
             f"({job.start[0]:g}, {job.start[1]:g})",
@@ -218,7 +217,7 @@ def rises(course: Course) -> int:
 
 def gain_table(gains: Sequence[Gain]) -> Table:
     """Fig. 7 in numbers."""
-    rows: list[tuple[TableCell, ...]] = []
+    rows = []
     for g in gains:
         pairs = zip(g.nominal, g.calibrated, g.percent, strict=True)
         rows.append((g.arm, *(value for pair in pairs for value in pair)))
@@ -282,7 +281,3 @@ def save(study: Study, found: Found) -> None:
 def main(study: Study) -> None:
     """Error against iteration from the paper's start: paper S, Fig. 4-7."""
     save(study, study_of(study))
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

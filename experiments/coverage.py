@@ -10,8 +10,9 @@ poses.  Cases with model error (compliance) ask for the best fit, which plenty o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
@@ -19,7 +20,6 @@ import numpy as np
 from scipy import stats
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.record import canvas
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.accuracy import chance_of_larger, max_interval, rms_interval
@@ -32,13 +32,13 @@ from minimax_cal.fitting.uncertainty import (
     position_covariance,
     quantile,
 )
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell as TableCell
+from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.bootstrap import bootstrap
 from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.simulate import Truth, gravity, simulate
+from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_poses
 
 if TYPE_CHECKING:
@@ -192,42 +192,49 @@ def in_base(cell: Cell) -> Cell:
     return Cell(cell.robot, np.eye(4), cell.target_names, cell.target_positions)
 
 
-def rng_of(batch: Batch, number: int) -> np.random.Generator:
-    """Random numbers of one run."""
-    return np.random.default_rng([batch.seed, batch.first + number])
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """The arm of a batch, its drawing, and the arm that plenty of poses tell."""
+
+    arm: Cell
+    robot: Robot
+    true: Solved
+    ideal: Cell
+
+    @staticmethod
+    def of(batch: Batch) -> Subject:
+        """The same for every batch of a case and seed."""
+        arm, robot = arm_of(batch.case, batch.seed), mc.load_robot(batch.case.robot)
+        true = reference(arm, batch.case)
+        return Subject(arm, robot, true, Cell.of(robot, true.state, arm.target_names))
+
+    def runs(self, batch: Batch) -> Iterator[tuple[int, np.random.Generator, Measurements]]:
+        """Number, random numbers and measurements of each run."""
+        for number in range(batch.first, batch.first + batch.count):
+            rng = np.random.default_rng([batch.seed, number])
+            q = random_poses(self.robot, batch.case.poses, rng)
+            yield number, rng, measured(self.arm, batch.case, q, rng)
 
 
 def run(batch: Batch) -> Runs:
     """Calibrate some runs and hold their intervals against the truth."""
-    case = batch.case
-    arm, robot = arm_of(case, batch.seed), mc.load_robot(case.robot)
-    true = reference(arm, case)
+    case, one = batch.case, Subject.of(batch)
+    true, robot = one.true, one.robot
     active = true.identification.active
-    ideal = Cell.of(robot, true.state, arm.target_names)
     rows = []
-    for number in range(batch.count):
-        rng = rng_of(batch, number)
-        data = measured(arm, case, random_poses(robot, case.poses, rng), rng)
+    for _, rng, data in one.runs(batch):
         fit = fit_cell(robot, data, Options(objective=case.objective), silent)
         if not np.array_equal(fit.identification.active, active):
             continue
         axes = fit.nominal.rotation
         error = (fit.state.along(axes, robot) - true.state.along(axes, robot))[active]
         told = (fit.uncertainty, known_by_noise(fit))
-        cell = Cell.of(robot, fit.state, arm.target_names)
-        inside = [positions(cell, known, ideal, case, rng) for known in told]
-        rows.append(
-            (
-                error,
-                np.array([known.sigma[active] for known in told]),
-                quantile(LEVEL, told[0].dof),
-                np.array(inside)[:, :3],
-                inside[0][3]
-                if case.compliance == 0.0
-                else whole_arm(cell, told[0], arm, case, rng),
-                judged(cell, arm, case, rng),
-            )
-        )
+        cell = Cell.of(robot, fit.state, one.arm.target_names)
+        inside = np.array([positions(cell, known, one.ideal, case, rng) for known in told])
+        sigma = np.array([known.sigma[active] for known in told])
+        whole = whole_arm(cell, told[0], one.arm, case, rng) if case.compliance else inside[0, 2]
+        rows.append((error, sigma, quantile(LEVEL, told[0].dof), inside, whole,
+                     judged(cell, one.arm, case, rng)))  # fmt: skip
     names = tuple(name for name, on in zip(true.names.all, active, strict=True) if on)
     columns = (np.array(column) for column in zip(*rows, strict=True))
     return Runs(names, batch.count - len(rows), *columns)
@@ -235,22 +242,17 @@ def run(batch: Batch) -> Runs:
 
 def positions(
     cell: Cell, known: Uncertainty, ideal: Cell, case: Case, rng: np.random.Generator
-) -> tuple[float, float, float, float]:
-    """Shares of coordinates whose interval holds the truth, by QUESTIONS; the last one again."""
+) -> tuple[float, float, float]:
+    """Shares of coordinates whose interval holds the truth, by QUESTIONS."""
     q = random_poses(cell.robot, WORKSPACE, rng)
-    off = case.jitter * rng.normal(size=q.shape)
-    still, moved = ideal.predict(q), ideal.predict(q + off)
-    found = cell.predict(q)
-    shares = (
-        inside(found - still, position_covariance(cell, known, q), known),
-        inside(
-            in_base(cell).predict(q) - in_base(ideal).predict(q),
-            position_covariance(cell, known, q, "base"),
-            known,
-        ),
-        inside(found - moved, position_covariance(cell, known, q, jitter=True), known),
+    moved = ideal.predict(q + case.jitter * rng.normal(size=q.shape))
+    found, cover = cell.predict(q), partial(position_covariance, cell, known, q)
+    off_base = in_base(cell).predict(q) - in_base(ideal).predict(q)
+    return (
+        inside(found - ideal.predict(q), cover(), known),
+        inside(off_base, cover("base"), known),
+        inside(found - moved, cover(jitter=True), known),
     )
-    return (*shares, shares[2])
 
 
 def whole_arm(
@@ -272,8 +274,8 @@ def judged(cell: Cell, arm: Cell, case: Case, rng: np.random.Generator) -> Array
     """(sizes, 3) as `held_out`, for each of HELD."""
     q = random_poses(arm.robot, FURTHER, rng)
     error = cell.error(measured(arm, case, q, rng))
-    rms = float(np.sqrt((error**2).sum(axis=-1).mean()))
-    return np.array([held_out(error, n, rms, rng) for n in HELD])
+    size = float(np.sqrt((error**2).sum(axis=-1).mean()))
+    return np.array([held_out(error, n, size, rng) for n in HELD])
 
 
 def held_out(error: Array, n: int, rms: float, rng: np.random.Generator) -> tuple[bool, bool, bool]:
@@ -301,25 +303,20 @@ def drawn(draws: Draws) -> Array:
 
 def resampled(batch: Batch) -> tuple[Array, Array]:
     """(R, p) whether the bootstrap's percentiles hold each parameter; (R,) share of positions."""
-    case = batch.case
-    arm, robot = arm_of(case, batch.seed), mc.load_robot(case.robot)
-    true = reference(arm, case)
-    ideal = Cell.of(robot, true.state, arm.target_names)
-    place = np.flatnonzero(true.identification.active)
+    case, one = batch.case, Subject.of(batch)
+    place = np.flatnonzero(one.true.identification.active)
     held, share = [], []
-    for number in range(batch.count):
-        rng = rng_of(batch, number)
-        data = measured(arm, case, random_poses(robot, case.poses, rng), rng)
-        fit = mc.calibrate(robot, data, case.objective, holdout=0.0)
-        found = bootstrap(fit, batch.replicates, seed=batch.first + number)
+    for number, rng, data in one.runs(batch):
+        fit = mc.calibrate(one.robot, data, case.objective, holdout=0.0)
+        found = bootstrap(fit, batch.replicates, seed=number)
         if not np.array_equal(found.place, place):
             continue
         low, high = found.interval(LEVEL).T
-        truth = true.state.along(fit.nominal.base[:3, :3], robot)[place]
+        truth = one.true.state.along(fit.nominal.base[:3, :3], one.robot)[place]
         held.append((low <= truth) & (truth <= high))
-        q = random_poses(robot, WORKSPACE, rng)
+        q = random_poses(one.robot, WORKSPACE, rng)
         low, high = found.position_interval(q, LEVEL)
-        exact = ideal.predict(q)
+        exact = one.ideal.predict(q)
         share.append(float(np.mean((low <= exact) & (exact <= high))))
     return np.array(held), np.array(share)
 
@@ -355,7 +352,7 @@ def outside(runs: Runs, kind: int) -> list[str]:
 
 def parameters_table(found: dict[str, Runs]) -> Table:
     """Pooled and extreme coverage of the parameters, by case and kind of sigma."""
-    rows: list[tuple[TableCell, ...]] = []
+    rows = []
     for case in CASES:
         runs = found[case.name]
         for kind, name in enumerate(KINDS):
@@ -366,7 +363,7 @@ def parameters_table(found: dict[str, Runs]) -> Table:
             rows.append(
                 (case.name, name, len(runs.error), float(share.mean()),
                  float(share[least]), runs.names[least], float(share[most]), runs.names[most],
-                 len(out), float(np.sqrt(np.mean(score**2))))
+                 len(out), rms(score))
             )  # fmt: skip
     return Table.made(
         "coverage of 95 % intervals of the identified parameters: value +- Student's quantile "
@@ -379,7 +376,7 @@ def parameters_table(found: dict[str, Runs]) -> Table:
 
 def positions_table(found: dict[str, Runs]) -> Table:
     """Pooled coverage of predicted coordinates."""
-    rows: list[tuple[TableCell, ...]] = []
+    rows = []
     for case in CASES:
         runs = found[case.name]
         for kind, name in enumerate(KINDS):
@@ -388,35 +385,14 @@ def positions_table(found: dict[str, Runs]) -> Table:
             real = 100.0 * float(runs.arm.mean()) if kind == 0 else float("nan")
             rows.append((case.name, name, len(runs.error), *map(float, mean),
                          float(spread.max()), real))  # fmt: skip
-    return Table(
+    return Table.made(
         f"coverage of 95 % intervals of predicted coordinates at {WORKSPACE} poses a run.  With "
         "model error the jitter found holds it too: too much for the best fit, all there is for "
         "the real arm (last column: its model error and jitter included)",
-        ("case", "sigma by", "runs", *(f"{name} %" for name in QUESTIONS), "+- %",
-         "new pose, real arm %"),
-        tuple(rows),
-        ("", "", "d", *[".1f"] * 5),
-    )  # fmt: skip
-
-
-def each_table(case: Case, runs: Runs) -> Table:
-    """Every parameter of one case."""
-    low, high = band(len(runs.error))
-    shares = [coverage(runs, kind) for kind in range(len(KINDS))]
-    rows: list[tuple[TableCell, ...]] = []
-    for i, name in enumerate(runs.names):
-        true = float(runs.error[:, i].std())
-        typical = np.sqrt((runs.sigma[:, :, i] ** 2).mean(axis=0)) / true
-        good = "" if low <= shares[0][i] <= high else "yes"
-        covered = (100.0 * float(share[i]) for share in shares)
-        rows.append((name, 1e6 * true, *covered, *map(float, typical), good))
-    return Table(
-        f"{case.name}: {len(runs.error)} runs; 99.9 % band {100 * low:.1f} to {100 * high:.1f} %",
-        ("parameter", "scatter um or urad", *(f"covered by {kind} %" for kind in KINDS),
-         *(f"sigma by {kind} / scatter" for kind in KINDS), "outside"),
-        tuple(rows),
-        ("", ".2f", ".1f", ".1f", ".3f", ".3f", ""),
-    )  # fmt: skip
+        rows,
+        "case | sigma by | runs d",
+        *(f"{name} % .1f" for name in (*QUESTIONS, "+-", "new pose, real arm")),
+    )
 
 
 def held_table(found: dict[str, Runs], laws: dict[tuple[str, int], Array]) -> Table:
@@ -427,11 +403,10 @@ def held_table(found: dict[str, Runs], laws: dict[tuple[str, int], Array]) -> Ta
             held = found[case.name].held
             sources += [(case.name, n, held[:, i]) for i, n in enumerate(HELD)]
     sources += [(f"law: {law}", n, held) for (law, n), held in laws.items()]
-    rows: tuple[tuple[TableCell, ...], ...] = tuple(
-        (name, n, len(held), *(100.0 * float(share) for share in held.mean(axis=0)),
-         100.0 * chance_of_larger(n))
+    rows = [
+        (name, n, len(held), *(100.0 * held.mean(axis=0)).tolist(), 100.0 * chance_of_larger(n))
         for name, n, held in sources
-    )  # fmt: skip
+    ]
     return Table.made(
         "held-out accuracy: 95 % intervals of the RMS and of the largest error of equally many new "
         "poses; how often the next pose is worse than all held-out ones",
@@ -441,7 +416,7 @@ def held_table(found: dict[str, Runs], laws: dict[tuple[str, int], Array]) -> Ta
     )
 
 
-def bootstrap_table(found: dict[str, tuple[Array, Array]]) -> Table:
+def bootstrap_table(found: dict[str, tuple[Array, ...]]) -> Table:
     """Coverage of the bootstrap's percentiles."""
     rows = tuple(
         (name, len(held), 100.0 * float(held.mean()), 100.0 * float(held.mean(axis=0).min()),
@@ -457,7 +432,7 @@ def bootstrap_table(found: dict[str, tuple[Array, Array]]) -> Table:
 
 def verdicts(found: dict[str, Runs]) -> Table:
     """The criterion, for the cases that have to meet it."""
-    rows: list[tuple[TableCell, ...]] = []
+    rows = []
     for case in CASES:
         if not case.asked:
             continue
@@ -465,20 +440,16 @@ def verdicts(found: dict[str, Runs]) -> Table:
         pooled = float(coverage(runs, 0).mean())
         place = float(runs.inside[:, 0, 0].mean())
         out = outside(runs, 0)
-        low, high = band(len(runs.error))
+        (low, high), (least, most) = band(len(runs.error)), POOLED
         for what, value, good in (
-            ("parameters, pooled, in 92-98 %", f"{100 * pooled:.1f} %", between(pooled)),
-            ("predicted positions, pooled, in 92-98 %", f"{100 * place:.1f} %", between(place)),
+            ("parameters, pooled, in 92-98 %", f"{100 * pooled:.1f} %", least <= pooled <= most),
+            ("predicted positions, pooled, in 92-98 %", f"{100 * place:.1f} %",
+             least <= place <= most),
             (f"each parameter in {100 * low:.1f}-{100 * high:.1f} %",
              f"outside: {', '.join(out) or 'none'}", not out),
         ):  # fmt: skip
             rows.append((case.name, what, value, "yes" if good else "NO"))
     return Table.made("sigma as reported", rows, "case | criterion | found | met")
-
-
-def between(share: float) -> bool:
-    """Whether a pooled coverage is right."""
-    return POOLED[0] <= share <= POOLED[1]
 
 
 def figure_of(found: dict[str, Runs]) -> Figure:
@@ -507,7 +478,7 @@ def figure_of(found: dict[str, Runs]) -> Figure:
 
 def batches(case: Case, seed: int, count: int, replicates: int = 0) -> list[Batch]:
     """The jobs of a case."""
-    size = BATCH if not replicates else max(BATCH // 4, 1)
+    size = BATCH // 4 if replicates else BATCH
     return [
         Batch(case, seed, first, min(size, count - first), replicates)
         for first in range(0, count, size)
@@ -516,11 +487,9 @@ def batches(case: Case, seed: int, count: int, replicates: int = 0) -> list[Batc
 
 @study_options("coverage")
 @click.option("--runs", "count", type=click.IntRange(4), default=400, show_default=True)
-@click.option("--resampled", "again", type=click.IntRange(1), default=60, show_default=True,
-              help="Runs that are bootstrapped too.")  # fmt: skip
-def main(study: Study, count: int, again: int) -> None:
+def main(study: Study, count: int) -> None:
     """Coverage of the intervals of parameters, positions and held-out accuracy."""
-    replicates = 300
+    again, replicates = 60, 300  # runs that are bootstrapped too
     if study.quick:
         count, again, replicates = 6, 2, 30
         click.echo(
@@ -548,8 +517,7 @@ def main(study: Study, count: int, again: int) -> None:
         parameters_table(found),
         positions_table(found),
         held_table(found, laws),
-        bootstrap_table({name: (pair[0], pair[1]) for name, pair in boots.items()}),
-        *(each_table(case, found[case.name]) for case in CASES if case.share == 1.0),
+        bootstrap_table(boots),
     ]
     odd = {name: runs.odd for name, runs in found.items() if runs.odd}
     for name, number in odd.items():
@@ -574,7 +542,3 @@ def rows_of(found: dict[str, Runs]) -> list[dict[str, object]]:
         for case in CASES
         for i, kind in enumerate(KINDS)
     ]
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -9,12 +9,11 @@ the truth, found in another way.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from experiments import sweep
 from experiments.conditions import PAPER
 from experiments.pseudo_inverse import arm, joint_rows, least_step, separable_rows
 from experiments.sweep import Study, study_options
@@ -357,12 +356,18 @@ def table() -> Table:
     )
 
 
-@study_options("errata")
-def main(study: Study) -> None:
-    """Errata of both papers, each with its counter-example."""
+def study_of(_: Study) -> Sequence[Erratum]:
+    """All of them."""
+    return ERRATA
+
+
+def save(study: Study, _: Sequence[Erratum]) -> None:
+    """The numbers, and the list."""
     study.save([table()], {"rows": table().records()})
     write_whole(study.out / "list.md", page())
 
 
-if __name__ == "__main__":
-    sweep.start(__file__)
+@study_options("errata")
+def main(study: Study) -> None:
+    """Errata of both papers, each with its counter-example."""
+    save(study, study_of(study))

@@ -17,7 +17,7 @@ import click
 import numpy as np
 
 import minimax_cal as mc
-from experiments import gap_cases, sweep
+from experiments import gap_cases
 from experiments.real import here, real
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.accuracy import accuracy
@@ -162,18 +162,16 @@ def rows_of(jobs: Sequence[Job], claims: Sequence[Claim | None]) -> list[tuple[E
     ]  # fmt: skip
 
 
-HEADER = ("arm", "way", "set aside", "seed", "within mm", "beyond typical mm", "beyond worst mm",
-          "external mm", "geometry alone mm", "external / within", "the same, sound",
-          "external / typical",
-          "external / worst", "external / geometry")  # fmt: skip
-NAMES = ("arm", "way", "split", "seed", "within_mm", "typical_mm", "worst_mm", "external_mm",
-         "geometric_mm", "over_within", "over_within_sound", "over_typical",
-         "over_worst", "over_geometric")  # fmt: skip
+COLUMNS = (
+    "arm | way | split | seed d | within_mm .4f | typical_mm .4f | worst_mm .4f | "
+    "external_mm .4f | geometric_mm .4f | over_within .2f | over_within_sound .2f | "
+    "over_typical .2f | over_worst .2f | over_geometric .2f"
+)
 
 
 def summary(jobs: Sequence[Job], claims: Sequence[Claim | None]) -> Table:
     """How far the claims hold: shares [%] and medians of the ratios."""
-    rows: list[tuple[Entry, ...]] = []
+    rows = []
     pairs = [(job, c) for job, c in zip(jobs, claims, strict=True) if c]
     for arm, way in dict.fromkeys((job.arm, job.way) for job, _ in pairs):
         own = [(job, c) for job, c in pairs if (job.arm, job.way) == (arm, way)]
@@ -215,24 +213,15 @@ def middle(of: Array) -> float:
 
 @study_options("external")
 @click.option("--arms", default=",".join((*REAL, *SIMULATED)), show_default=True)
-@click.option("--ways", default=",".join(WAYS), show_default=True)
-@click.option("--halves", type=int, default=HALVES, show_default=True)
-def main(study: Study, arms: str, ways: str, halves: int) -> None:
+def main(study: Study, arms: str) -> None:
     """Claimed accuracy beside that on poses set aside."""
-    named = asked_for(arms)
-    if study.quick:
-        named, halves = [SIMULATED[0]], 1
+    named, halves = ([SIMULATED[0]], 1) if study.quick else (asked_for(arms), HALVES)
     jobs = [
         Job(arm, split, way, study.seed + seed)
         for arm in named
-        for way in ways.split(",")
+        for way in WAYS
         for split, seed in list(splits(arm, halves))[:: 4 if study.quick else 1]
     ]
     claims = study.sweep(run, jobs, "poses set aside")
-    every = Table("every split", HEADER, tuple(rows_of(jobs, claims)),
-                  ("", "", "", "d", *[".4f"] * 5, *[".2f"] * 5))  # fmt: skip
-    study.save([summary(jobs, claims), every], {"rows": every.records(*NAMES)})
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)
+    every = Table.made("every split", rows_of(jobs, claims), COLUMNS)
+    study.save([summary(jobs, claims), every], {"rows": every.records()})

@@ -1,7 +1,7 @@
 """Measurement files with a known gap between model and robot, for the blind study of `diagnose`.
 
 A `Case` says what is wrong with an arm; `make` builds the arm, lets it be measured and keeps the
-truth; `write` leaves robot.json and data.csv for the diagnosis, and the truth in a file apart.
+truth; `write` leaves robot.json and data.csv for the diagnosis.
 
 The laws here are this file's own and share no code with the library that is judged by them: every
 deviation is finite (offsets go through the forward kinematics, links turn and bend), and they are
@@ -13,18 +13,16 @@ after projection on what no error of the geometry could explain.
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from experiments.real import off_drawing
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import json_text, write_whole
 from minimax_cal.measuring.measurements import Measurements, measurements, write_measurements
 from minimax_cal.robots.robot import Robot, load_robot
 
@@ -43,55 +41,42 @@ class Arm:
     """What the generator knows of a robot beside its geometry.
 
     mass, com: of each link in its own frame, the tool with the last [kg, m].  ratio: of the gears
-    whose ratio the robot file tells, NaN for the others.  ripple: waves a turn of the others.
-    beams: links that may bend.  loaded: joints that carry gravity.  hot: (joint, column of the MDH
-    table) of the lengths that grow.
+    whose ratio the robot file tells, NaN for the others.  beams: links that may bend.  loaded:
+    joints that carry gravity.  upright: joint that a spring may balance.  driven: joints that the
+    motor of another moves, and its number.  ripple: waves a turn of gears of no told ratio.  hot:
+    (joint, column of the MDH table) of the lengths that grow.
     """
 
     mass: tuple[float, ...]
-    com: tuple[tuple[float, float, float], ...]
     ratio: tuple[float, ...]
-    ripple: tuple[float, float]
     beams: tuple[int, ...]
     loaded: tuple[int, ...]
-    hot: tuple[tuple[int, int], ...]
+    upright: str = ""
+    driven: tuple[tuple[str, int], ...] = ()
+    com: tuple[tuple[float, float, float], ...] = ()
+    ripple: tuple[float, float] = (17.0, 24.0)
+    hot: tuple[tuple[int, int], ...] = ()
 
 
-UNKNOWN = float("nan")
+NAN = float("nan")
+WRISTS = (("J3", 2), ("J5", 4), ("J6", 5))
 ARMS = {
     "irb2600": Arm(
-        mass=(95.0, 52.0, 48.0, 22.0, 7.0, 14.0),
-        com=(
-            (-0.11, 0.14, 0.02),
-            (-0.44, 0.02, 0.06),
-            (-0.06, 0.03, 0.12),
-            (0.01, -0.42, 0.01),
-            (0.0, 0.01, 0.05),
-            (0.02, -0.01, 0.05),
-        ),
-        ratio=(121.0, 141.3, 105.5, UNKNOWN, UNKNOWN, UNKNOWN),
-        ripple=(17.0, 24.0),
-        beams=(2, 4),
-        loaded=(2, 3, 5),
+        (95.0, 52.0, 48.0, 22.0, 7.0, 14.0), (121.0, 141.3, 105.5, NAN, NAN, NAN), (2, 4),
+        (2, 3, 5), "J2", WRISTS,
+        com=((-0.11, 0.14, 0.02), (-0.44, 0.02, 0.06), (-0.06, 0.03, 0.12), (0.01, -0.42, 0.01),
+             (0.0, 0.01, 0.05), (0.02, -0.01, 0.05)),
         hot=((1, 1), (2, 0), (4, 1)),
     ),
     "ur10e": Arm(
-        mass=(7.4, 13.1, 4.0, 2.1, 2.0, 4.6),
-        com=(
-            (0.0, 0.02, 0.03),
-            (0.38, 0.0, 0.16),
-            (0.24, 0.0, 0.07),
-            (0.0, 0.01, 0.02),
-            (0.0, 0.01, 0.02),
-            (0.02, -0.01, 0.03),
-        ),
-        ratio=(101.0, 101.0, 101.0, UNKNOWN, UNKNOWN, UNKNOWN),
+        (7.4, 13.1, 4.0, 2.1, 2.0, 4.6), (101.0, 101.0, 101.0, NAN, NAN, NAN), (2, 3),
+        (2, 3, 4, 5), driven=WRISTS,
+        com=((0.0, 0.02, 0.03), (0.38, 0.0, 0.16), (0.24, 0.0, 0.07), (0.0, 0.01, 0.02),
+             (0.0, 0.01, 0.02), (0.02, -0.01, 0.03)),
         ripple=(13.0, 17.0),
-        beams=(2, 3),
-        loaded=(2, 3, 4, 5),
         hot=((1, 1), (2, 0), (3, 0)),
     ),
-}
+}  # fmt: skip
 
 
 # ---- what is asked for, and what comes out -----------------------------------------------------
@@ -122,7 +107,7 @@ class Case:
 
     background: lambda of each of the small effects on all joints, 0 for none.  poses: of the
     training, revisits apart.  jitter: of every joint at every visit [rad].  noise: factor on the
-    instrument's noise.  delete: effects that the diagnosis must do without.
+    instrument's noise.  delete: effects that the diagnosis must do without.  targets: how many.
     """
 
     robot: str
@@ -134,6 +119,7 @@ class Case:
     noise: float = 1.0
     delete: tuple[str, ...] = ()
     seed: int = 0
+    targets: int = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,18 +401,30 @@ def number(place: str) -> int:
     return int(found[1]) - 1
 
 
-def at_joint(world: World, joint: int, dq: Array) -> Deviation:
-    """Joint (from 0) turns by dq (m,) [rad]."""
+def own(world: World, cause: Cause) -> Array:
+    """Values (m,) of the place's joint [rad]."""
+    return np.asarray(world.q[:, number(cause.place)])
+
+
+def at_joint(world: World, place: str, dq: Array) -> Deviation:
+    """The joint of a place turns by dq (m,) [rad]."""
     joints = np.zeros(world.q.shape)
-    joints[:, joint] = dq
+    joints[:, number(place)] = dq
     return replace(rigid(world), joints=joints)
+
+
+def at_base(world: World, turn: Array | float = 0.0, shift: Array | float = 0.0) -> Deviation:
+    """The base turns by rotation vectors and moves, (m, 3) each [rad, m]."""
+    base = np.zeros((len(world.q), 6))
+    base[:, :3], base[:, 3:] = turn, shift
+    return replace(rigid(world), base=base)
 
 
 def at_joints(world: World, place: str, dq: Array, rng: np.random.Generator) -> Deviation:
     """All joints turn by dq (m, n), each by a factor of its own, or the one of the place."""
     factors = rng.uniform(0.6, 1.6, world.q.shape[1])
     if place != "all":
-        return at_joint(world, number(place), dq[:, number(place)])
+        return at_joint(world, place, dq[:, number(place)])
     return replace(rigid(world), joints=dq * factors)
 
 
@@ -463,18 +461,17 @@ def link_bending(world: World, cause: Cause, _: np.random.Generator) -> Deviatio
 
 def gravity_compensator(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
     """A spring from the base to the link turns its joint: dq = k a L sin(q - phi) (1 - s0/s)."""
-    i = number(cause.place)
     a, arm = rng.uniform(0.2, 0.3), rng.uniform(0.5, 0.6)
     rest = rng.uniform(0.4, 0.95) * (arm - a)  # always in tension, shortest near upright
-    angle = world.q[:, i] - rng.normal(0.0, 0.2)
+    angle = own(world, cause) - rng.normal(0.0, 0.2)
     spring = np.sqrt(a**2 + arm**2 - 2.0 * a * arm * np.cos(angle))
-    return at_joint(world, i, a * arm * np.sin(angle) * (1.0 - rest / spring))
+    return at_joint(world, cause.place, a * arm * np.sin(angle) * (1.0 - rest / spring))
 
 
 def wave(world: World, cause: Cause, times: float, rng: np.random.Generator) -> Deviation:
     """dq = sin(times q + phase)."""
-    i = number(cause.place)
-    return at_joint(world, i, np.sin(times * world.q[:, i] + rng.uniform(0.0, 2.0 * np.pi)))
+    phase = rng.uniform(0.0, 2.0 * np.pi)
+    return at_joint(world, cause.place, np.sin(times * own(world, cause) + phase))
 
 
 def gear_error(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
@@ -503,26 +500,23 @@ def turns(arm: Arm, cause: Cause) -> float:
 
 def encoder_gain(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
     """dq = g q."""
-    return at_joint(world, number(cause.place), world.q[:, number(cause.place)])
-
-
-DRIVEN_BY = {"J3": 2, "J5": 4, "J6": 5}  # the joint whose motor moves another joint
+    return at_joint(world, cause.place, own(world, cause))
 
 
 def joint_coupling(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
-    """dq_j = c q_i."""
-    return at_joint(world, number(cause.place), world.q[:, DRIVEN_BY[cause.place] - 1])
+    """A joint turned by the motor of another: dq_j = c q_i."""
+    return at_joint(world, cause.place, world.q[:, dict(world.arm.driven)[cause.place] - 1])
 
 
 def backlash(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
     """dq = b sign(last move) [half the play, rad]."""
-    return at_joint(world, number(cause.place), np.sign(world.move[:, number(cause.place)]))
+    return at_joint(world, cause.place, np.sign(world.move[:, number(cause.place)]))
 
 
 def travel_backlash(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
     """Play that grows with the distance of the last move."""
     move = world.move[:, number(cause.place)]
-    return at_joint(world, number(cause.place), np.sign(move) * (0.3 + np.abs(move) / np.pi))
+    return at_joint(world, cause.place, np.sign(move) * (0.3 + np.abs(move) / np.pi))
 
 
 def settling(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
@@ -542,12 +536,10 @@ def thermal_growth(world: World, _: Cause, rng: np.random.Generator) -> Deviatio
 
 def base_flex(world: World, _: Cause, __: np.random.Generator) -> Deviation:
     """The foot turns by C times the overturning moment [rad/(N m)]."""
-    pose = frames(world.robot, world.q)
-    up = world.robot.up
-    moment = load(world.robot, pose, 0, np.zeros((len(pose), 3)))[1]
-    base = np.zeros((len(pose), 6))
-    base[:, :3] = moment - np.outer(moment @ up, up)
-    return replace(rigid(world), base=base)
+    pose, up = frames(world.robot, world.q), world.robot.up
+    about = pose[:, 1, :3, 3] if world.robot.prismatic[0] else np.zeros((len(pose), 3))
+    moment = load(world.robot, pose, 0, about)[1]
+    return at_base(world, moment - np.outer(moment @ up, up))
 
 
 def frame_drift(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
@@ -608,79 +600,63 @@ def swapped_rows(world: World, _: Cause, rng: np.random.Generator) -> Deviation:
 def two(world: World, cause: Cause, rng: np.random.Generator) -> tuple[Array, Array]:
     """Joint values (m,) of the place's joint and of another [rad]."""
     others = [i for i in range(world.q.shape[1]) if i != number(cause.place)]
-    return world.q[:, number(cause.place)], world.q[:, rng.choice(others)]
+    return own(world, cause), world.q[:, rng.choice(others)]
 
 
 def outside_sum(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
     """dq_j = sin(q_j + q_i + phase)."""
-    own, other = two(world, cause, rng)
-    return at_joint(world, number(cause.place), np.sin(own + other + rng.uniform(0.0, 2.0 * np.pi)))
+    q, other = two(world, cause, rng)
+    return at_joint(world, cause.place, np.sin(q + other + rng.uniform(0.0, 2.0 * np.pi)))
 
 
 def outside_product(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
     """dq_j = q_i q_j."""
-    own, other = two(world, cause, rng)
-    return at_joint(world, number(cause.place), own * other)
+    q, other = two(world, cause, rng)
+    return at_joint(world, cause.place, q * other)
 
 
 def outside_waves(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
     """dq_j = sin(5 q_j + phase) sin(5 q_i + phase)."""
-    own, other = two(world, cause, rng)
+    q, other = two(world, cause, rng)
     phase = rng.uniform(0.0, 2.0 * np.pi, 2)
-    dq = np.sin(5.0 * own + phase[0]) * np.sin(5.0 * other + phase[1])
-    return at_joint(world, number(cause.place), dq)
+    dq = np.sin(5.0 * q + phase[0]) * np.sin(5.0 * other + phase[1])
+    return at_joint(world, cause.place, dq)
 
 
 def outside_step(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
     """dq_j jumps where q_j passes an angle in the middle of its range."""
-    own = world.q[:, number(cause.place)]
-    return at_joint(
-        world, number(cause.place), 1.0 * (own > np.quantile(own, rng.uniform(0.3, 0.7)))
-    )
+    q = own(world, cause)
+    return at_joint(world, cause.place, 1.0 * (q > np.quantile(q, rng.uniform(0.3, 0.7))))
 
 
 def outside_cubic(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
     """dq_j = (torque / its largest)^3."""
     load = torque(world.robot, world.q)[:, number(cause.place)]
-    return at_joint(world, number(cause.place), (load / np.abs(load).max()) ** 3)
+    return at_joint(world, cause.place, (load / np.abs(load).max()) ** 3)
 
 
 def outside_field(world: World, _: Cause, rng: np.random.Generator) -> Deviation:
     """The flange is moved by a smooth random field over the first three joints."""
     waves = rng.normal(0.0, 1.5, (3, 12))
     phase, weight = rng.uniform(0.0, 2.0 * np.pi, 12), rng.normal(size=(12, 3))
-    base = np.zeros((len(world.q), 6))
-    base[:, 3:] = np.cos(world.q[:, :3] @ waves + phase) @ weight
-    return replace(rigid(world), base=base)
+    return at_base(world, shift=np.cos(world.q[:, :3] @ waves + phase) @ weight)
 
 
-LAWS: dict[str, Law] = {
-    "joint_compliance": joint_compliance,
+def named(*laws: Law) -> dict[str, Law]:
+    """Laws by the names of their functions."""
+    return {law.__name__: law for law in laws}
+
+
+LAWS: dict[str, Law] = named(
+    joint_compliance, link_bending, gravity_compensator, gear_error, gear_ripple, encoder_gain,
+    joint_coupling, backlash, settling, thermal_growth, base_flex, frame_drift, tool_flex,
+    target_offset, target_shift, outliers, swapped_rows, outside_sum, outside_product,
+    outside_waves, outside_step, outside_cubic, outside_field,
+)  # fmt: skip
+LAWS |= {
     "joint_compliance/hardening": hardening,
-    "link_bending": link_bending,
-    "gravity_compensator": gravity_compensator,
-    "gear_error": gear_error,
     "gear_error/between": gear_between,
-    "gear_ripple": gear_ripple,
-    "encoder_gain": encoder_gain,
-    "joint_coupling": joint_coupling,
-    "backlash": backlash,
     "backlash/travel": travel_backlash,
-    "settling": settling,
-    "thermal_growth": thermal_growth,
-    "base_flex": base_flex,
-    "frame_drift": frame_drift,
-    "tool_flex": tool_flex,
-    "target_offset": target_offset,
-    "target_shift": target_shift,
-    "outliers": outliers,
-    "swapped_rows": swapped_rows,
-    "outside_sum": outside_sum,
-    "outside_product": outside_product,
-    "outside_waves": outside_waves,
-    "outside_step": outside_step,
-    "outside_cubic": outside_cubic,
-    "outside_field": outside_field,
 }
 FAULTS = {"outliers": 1e-3, "swapped_rows": 1.0}  # amplitude at power 1: they have no lambda
 EFFECTS = tuple(law for law in LAWS if "/" not in law and "outside" not in law)
@@ -689,29 +665,38 @@ DISTORTED = tuple(law for law in LAWS if "/" in law)
 JOINTS = tuple(f"J{i}" for i in range(1, 7))
 
 
-def places(law: str, robot: str) -> tuple[str, ...]:
-    """Where a law can be on a robot."""
-    arm, effect = ARMS[robot], law.partition("/")[0]
-    loaded = tuple(f"J{i}" for i in arm.loaded)
-    targets = ("smr1", "smr2", "smr3")
+def places_of(law: str, arm: Arm, joints: Sequence[str], targets: int) -> tuple[str, ...]:
+    """Where a law can be on an arm with some turning joints and targets."""
+    loaded, spots = tuple(f"J{i}" for i in arm.loaded), tuple(f"smr{i + 1}" for i in range(targets))
+    every = ("all",)
     some = {
-        "joint_compliance": (*loaded, "all"),
+        "joint_compliance": (*loaded, "all") if loaded else (),
         "link_bending": tuple(f"L{i}" for i in arm.beams),
-        "gravity_compensator": ("J2",) if robot == "irb2600" else (),
-        "joint_coupling": tuple(DRIVEN_BY),
-        "settling": ("all", "J1", "J3", "J5"),
-        "thermal_growth": ("all",),
+        "gravity_compensator": (arm.upright,) if arm.upright else (),
+        "joint_coupling": tuple(place for place, _ in arm.driven),
+        "thermal_growth": every,
         "base_flex": ("frame",),
         "frame_drift": ("frame",),
-        "tool_flex": ("all",),
-        "target_offset": (*targets, "all"),
-        "target_shift": targets,
-        "outliers": ("all",),
-        "swapped_rows": ("all",),
+        "tool_flex": every if loaded else (),
+        "target_offset": (*spots, "all") if targets > 1 else every,
+        "target_shift": spots if targets > 1 else (),
+        "outliers": every,
+        "swapped_rows": every,
         "outside_cubic": loaded,
-        "outside_field": ("all",),
+        "outside_field": every,
+        "outside_sway": every,
+        "outside_plate": every if targets > 1 else (),
+        "outside_clearance": loaded,
+        "outside_settling_base": ("frame",) if loaded else (),
     }
-    return some.get(effect, JOINTS)
+    return some.get(law.partition("/")[0], tuple(joints))
+
+
+def places(law: str, robot: str) -> tuple[str, ...]:
+    """Where a law can be on a robot."""
+    return (
+        ("all", "J1", "J3", "J5") if law == "settling" else places_of(law, ARMS[robot], JOINTS, 3)
+    )
 
 
 def spec(robot: str, cause: Cause) -> str:
@@ -720,7 +705,7 @@ def spec(robot: str, cause: Cause) -> str:
     if cause.effect.startswith("gear_"):
         choice = f":turns={turns(ARMS[robot], cause):g}"
     elif cause.effect == "joint_coupling":
-        choice = f":source={DRIVEN_BY[cause.place]}"
+        choice = f":source={dict(ARMS[robot].driven)[cause.place]}"
     return f"{cause.effect}:{cause.place}{choice}"
 
 
@@ -737,13 +722,12 @@ def told_robot(name: str) -> Robot:
 
 def true_robot(told: Robot, rng: np.random.Generator) -> Robot:
     """The arm itself: errors of its geometry, and other masses and centres than told."""
-    n = told.joints
-    mdh = told.mdh + rng.normal(size=(n, 5)) * ([LENGTH] * 2 + [ANGLE] * 3)
+    n, off = told.joints, off_drawing(told, rng, LENGTH, ANGLE)
     factor = 1.0 + WRONG * np.clip(rng.normal(size=n), -2.5, 2.5)
     way = rng.normal(size=(n, 3))
-    off = np.linalg.norm(told.com, axis=1, keepdims=True) * WRONG
-    com = told.com + off * way / np.linalg.norm(way, axis=1, keepdims=True)
-    return replace(told, mdh=mdh, mass=told.mass * factor, com=com)
+    wrong = np.linalg.norm(told.com, axis=1, keepdims=True) * WRONG
+    com = told.com + wrong * way / np.linalg.norm(way, axis=1, keepdims=True)
+    return replace(off, mass=told.mass * factor, com=com)
 
 
 def some_poses(robot: Robot, count: int, rng: np.random.Generator) -> Array:
@@ -775,42 +759,37 @@ def some_spots(rng: np.random.Generator) -> Array:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class Visits:
-    """Every row of a session in its order: joints (m, n) [rad], train (m,), time (m,) [s]."""
-
-    q: Array
-    train: Array
-    time: Array
-
-
-def visits(robot: Robot, poses: int, rng: np.random.Generator) -> Visits:
-    """Training poses, revisits of some of them and held-out poses, in one random order."""
-    q = some_poses(robot, poses + HELD_OUT, rng)
-    again = rng.choice(poses, REVISITS, replace=False)
-    pose = rng.permutation(np.concatenate([np.arange(poses + HELD_OUT), again]))
-    time = np.cumsum(PAUSE * rng.uniform(0.7, 1.3, len(pose)))
-    return Visits(q[pose], pose < poses, time - time[0])
-
-
 def world_of(case: Case, rng: np.random.Generator) -> World:
     """The arm in its place with all its visits."""
     told = told_robot(case.robot)
-    session = visits(told, case.poses, rng)
-    move = np.zeros_like(session.q)
-    move[1:] = np.diff(session.q, axis=0)
+    q = some_poses(told, case.poses + HELD_OUT, rng)
+    return visited(case, told, ARMS[case.robot], q, REVISITS, rng)
+
+
+def visited(
+    case: Case, told: Robot, arm: Arm, q: Array, again: int, rng: np.random.Generator
+) -> World:
+    """An arm in its place: training poses, `again` of them twice, and held-out poses, mixed.
+
+    q: (m, n) the training poses, then the others.
+    """
+    twice = rng.choice(case.poses, again, replace=False)
+    pose = rng.permutation(np.concatenate([np.arange(len(q)), twice]))
+    time = np.cumsum(PAUSE * rng.uniform(0.7, 1.3, len(pose)))
+    q, move = q[pose], np.zeros((len(pose), told.joints))
+    move[1:] = np.diff(q, axis=0)
     return World(
         robot=true_robot(told, rng),
         told=told,
-        arm=ARMS[case.robot],
+        arm=arm,
         base=some_base(rng),
-        spots=some_spots(rng),
-        q=session.q,
-        jitter=case.jitter * rng.normal(size=session.q.shape),
+        spots=some_spots(rng)[: case.targets],
+        q=q,
+        jitter=case.jitter * rng.normal(size=q.shape),
         move=move,
-        time=session.time,
+        time=time - time[0],
         warm=rng.uniform(1000.0, 3000.0),
-        train=session.train,
+        train=pose < case.poses,
     )
 
 
@@ -847,42 +826,58 @@ def small_effects(case: Case, rng: np.random.Generator) -> tuple[Cause, ...]:
     return tuple(map(one, JOINTS)) if case.background > 0.0 else ()
 
 
+See = Callable[[World, Deviation, Array], tuple[Robot, Measurements]]
+
+
 def make(case: Case) -> Sealed:
     """Build the arm of a case and measure it."""
     rng = np.random.default_rng(case.seed)
-    world = world_of(case, rng)
+
+    def see(world: World, whole: Deviation, spread: Array) -> tuple[Robot, Measurements]:
+        y = measure(world, whole)
+        return world.told, measured(world, y + spread[..., None] * rng.normal(size=y.shape), rng)
+
+    return sealed(case, world_of(case, rng), LAWS, see, rng)
+
+
+def sealed(
+    case: Case, world: World, laws: Mapping[str, Law], see: See, rng: np.random.Generator
+) -> Sealed:
+    """Give an arm the causes of a case, each of the size that is asked for, and measure it.
+
+    see: what is told of the arm, and measured; takes what all causes do to it, and the noise of a
+    coordinate (m, k) [m].
+    """
     still = measure(world, rigid(world))
-    away = np.linalg.norm(still, axis=-1)
-    spread = case.noise * (NOISE + NOISE_PER_METRE * away)
+    spread = case.noise * (NOISE + NOISE_PER_METRE * np.linalg.norm(still, axis=-1))
     ruler = judge(world, spread, case.jitter)
-    small = small_effects(case, rng)
-    whole, parts, amplitudes = rigid(world), [], []
-    for cause in (*case.causes, *small):
-        unit = LAWS[cause.law](world, cause, rng)
+    causes, count = (*case.causes, *small_effects(case, rng)), len(case.causes)
+    whole, parts, amplitudes = rigid(world), list[Array](), list[float]()
+    for cause in causes:
+        unit = laws[cause.law](world, cause, rng)
         amplitudes.append(sized(world, ruler, cause, unit))
         whole += unit * amplitudes[-1]
         parts.append(measure(world, unit * amplitudes[-1]) - still)
-    y = measure(world, whole)
-    noisy = y + spread[..., None] * rng.normal(size=y.shape)
-    count = len(case.causes)
-    shape = (count, len(world.spots), len(y), 3)
+    robot, data = see(world, whole, spread)
+    moved = measure(world, whole) - still
+    names = tuple((cause.effect, cause.place) for cause in causes)
     return Sealed(
         case=case,
-        robot=world.told,
-        data=measured(world, case, noisy, rng),
+        robot=robot,
+        data=data,
         true=world.robot,
-        truth=tuple((cause.effect, cause.place) for cause in case.causes),
-        background=tuple((cause.effect, cause.place) for cause in small),
-        displacement=np.moveaxis(y - still, 1, 0),
-        parts=np.array([np.moveaxis(part, 1, 0) for part in parts[:count]]).reshape(shape),
-        powers=tuple(ruler.power(part) for part in parts[:count]),
-        power=ruler.power(y - still),
+        truth=names[:count],
+        background=names[count:],
+        displacement=np.moveaxis(moved, 1, 0),
+        parts=np.moveaxis(np.array(parts[:count]).reshape(count, *moved.shape), 2, 1),
+        powers=tuple(map(ruler.power, parts[:count])),
+        power=ruler.power(moved),
         amplitudes=tuple(amplitudes[:count]),
         floor=ruler.floor,
     )
 
 
-def measured(world: World, case: Case, y: Array, rng: np.random.Generator) -> Measurements:
+def measured(world: World, y: Array, rng: np.random.Generator) -> Measurements:
     """What stands in the file.  y: (m, k, 3) with its noise [m]."""
     warm = -6.0 * np.expm1(-world.time / world.warm)
     _, same = np.unique(world.q, axis=0, return_inverse=True)
@@ -900,27 +895,10 @@ def measured(world: World, case: Case, y: Array, rng: np.random.Generator) -> Me
 
 # ---- files -------------------------------------------------------------------------------------
 
-ROBOT, DATA, TRUTH = "robot.json", "data.csv", "sealed/truth.json"
+ROBOT, DATA = "robot.json", "data.csv"
 
 
 def write(sealed: Sealed, folder: Path) -> None:
-    """Leave robot.json and data.csv for the diagnosis, and the truth in a folder apart."""
-    (folder / TRUTH).parent.mkdir(parents=True, exist_ok=True)
+    """Leave robot.json and data.csv for the diagnosis, and nothing of the truth."""
     sealed.robot.save(folder / ROBOT)
     write_measurements(folder / DATA, sealed.data)
-    content: dict[str, Any] = {name: getattr(sealed, name) for name in Truth.__annotations__}
-    for name in ("displacement", "parts"):
-        content[name] = content[name].tolist()
-    write_whole(folder / TRUTH, json_text(content))
-
-
-def open_seal(folder: Path) -> Truth:
-    """The truth that `write` left."""
-    content = json.loads((folder / TRUTH).read_text("utf-8"))
-    for name in ("truth", "background"):
-        content[name] = tuple((effect, place) for effect, place in content[name])
-    for name in ("displacement", "parts"):
-        content[name] = np.array(content[name], dtype=float)
-    for name in ("powers", "amplitudes"):
-        content[name] = tuple(content[name])
-    return Truth(**content)

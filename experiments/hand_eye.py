@@ -20,12 +20,9 @@ from experiments.poses import (
     Found,
     adjoint,
     exp,
-    fit_of,
     gauss_newton,
-    inverse,
     lever,
     points,
-    pose,
     pose_residual,
     pose_slope,
     poses_of,
@@ -36,23 +33,14 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import Chain
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.transforms import inverse, transform
 
 
-def left_product(p: Array) -> Array:
-    """Matrix Q(p) with p q = Q(p) q for quaternions (scalar first): (..., 4, 4)."""
-    return product_matrix(p, kinematics.hat(p[..., 1:]))
-
-
-def right_product(p: Array) -> Array:
-    """Matrix W(p) with q p = W(p) q: (..., 4, 4)."""
-    return product_matrix(p, -kinematics.hat(p[..., 1:]))
-
-
-def product_matrix(p: Array, cross: Array) -> Array:
-    """[[s, -v'], [v, s + cross]] of a quaternion (s, v)."""
+def product(p: Array, side: float) -> Array:
+    """Matrix of p q (side 1) or q p (side -1) for quaternions p, scalar first: (..., 4, 4)."""
     out = p[..., :1, None] * np.eye(4)
     out[..., 0, 1:], out[..., 1:, 0] = -p[..., 1:], p[..., 1:]
-    out[..., 1:, 1:] += cross
+    out[..., 1:, 1:] += side * kinematics.hat(p[..., 1:])
     return np.asarray(out)
 
 
@@ -70,7 +58,7 @@ def closed_form(A: Array, B: Array, rounds: int = 20) -> tuple[Array, Array]:
     a, b = (Rotation.from_matrix(T[:, :3, :3]).as_quat(scalar_first=True) for T in (A, B))
     outer = np.einsum("mi,mj->mij", a, b).reshape(-1, 16)  # its Gram matrix holds those products
     weight = np.linalg.svd(outer, full_matrices=False)[0][:, 0]
-    products = np.swapaxes(left_product(a), -1, -2) @ right_product(b)
+    products = np.swapaxes(product(a, 1.0), -1, -2) @ product(b, -1.0)
     x = z = np.zeros(4)
     for _ in range(rounds):
         u, _, vt = np.linalg.svd(np.einsum("m,mij->ij", weight, products))
@@ -84,7 +72,7 @@ def closed_form(A: Array, B: Array, rounds: int = 20) -> tuple[Array, Array]:
     rows = np.concatenate([A[:, :3, :3], np.broadcast_to(-np.eye(3), (len(A), 3, 3))], axis=-1)
     right = B[:, :3, 3] @ turn_z.T - A[:, :3, 3]
     shift = np.linalg.lstsq(rows.reshape(-1, 6), right.reshape(-1), rcond=1e-12)[0]
-    return pose(turn_x, shift[:3]), pose(turn_z, shift[3:])
+    return transform(turn_x, shift[:3]), transform(turn_z, shift[3:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +104,7 @@ def twists(arm: Placed, links: Chain, with_links: bool) -> Array:
     still = np.zeros_like(links.x)
     lengths = [np.concatenate([links.x, still], 1), np.concatenate([links.z, still], 1)]
     geometry = np.concatenate([*lengths, np.concatenate([moment, axis], axis=1)])
-    flange = pose(np.moveaxis(links.axes, -1, 0).swapaxes(-1, -2), links.origin.T)
+    flange = transform(np.moveaxis(links.axes, -1, 0).swapaxes(-1, -2), links.origin.T)
     parts = [
         np.moveaxis(geometry, -1, 0).swapaxes(-1, -2)[..., : 5 * n if with_links else 0],
         np.broadcast_to(np.eye(6), (m, 6, 6)),
@@ -166,10 +154,10 @@ class Start:
     found: Found[Placed]
 
 
-def start_of(robot: Robot, train: Measurements, length: float = np.nan) -> Start:
-    """Hand-eye calibration with the nominal geometry.  length: NaN for the triangle's `lever`."""
+def start_of(robot: Robot, train: Measurements) -> Start:
+    """Hand-eye calibration with the nominal geometry."""
     shape = triangle(train.y)
-    measured, length = poses_of(shape, train.y), length if np.isfinite(length) else lever(shape)
+    measured, length = poses_of(shape, train.y), lever(shape)
     found = place(robot.mdh, train.q * robot.sign, robot.prismatic, measured, length)
     return Start(shape, length, measured, found)
 
@@ -177,7 +165,7 @@ def start_of(robot: Robot, train: Measurements, length: float = np.nan) -> Start
 def placed_fit(robot: Robot, shape: Array, found: Found[Placed]) -> Fit:
     """An MDH arm fitted to poses; the SMRs sit in the tool as measured on average."""
     arm, sign, prismatic = found.x, robot.sign, robot.prismatic
-    return fit_of(lambda q: points(arm.poses(q * sign, prismatic), shape), found)
+    return Fit(lambda q: points(arm.poses(q * sign, prismatic), shape), str(found.status))
 
 
 def nominal(robot: Robot, train: Measurements) -> Fit:
@@ -186,8 +174,8 @@ def nominal(robot: Robot, train: Measurements) -> Fit:
     return placed_fit(robot, start.shape, start.found)
 
 
-def mdh_pose(robot: Robot, train: Measurements, length: float = np.nan) -> Fit:
-    """MDH, all parameters, fitted to measured poses.  length: see `start_of`."""
-    start, q = start_of(robot, train, length), train.q * robot.sign
+def mdh_pose(robot: Robot, train: Measurements) -> Fit:
+    """MDH, all parameters, fitted to measured poses."""
+    start, q = start_of(robot, train), train.q * robot.sign
     found = place(robot.mdh, q, robot.prismatic, start.measured, start.length, links=True)
     return placed_fit(robot, start.shape, found)

@@ -13,28 +13,17 @@ from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.tables import Table
 
 TEMPLATE = "index.html.jinja"
-BAR = re.compile(r"(?<!\\)\|")  # between cells; a bar within one is escaped
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a study went: done, failed (with its error) or skipped; files: what it wrote."""
+    """How a study went: done, or failed with its error; files: what it wrote."""
 
     name: str
     description: str
     status: str
     error: str = ""
     files: tuple[Path, ...] = ()
-
-
-@dataclass(frozen=True)
-class Grid:
-    """A table as its study printed it; right: which columns are aligned right."""
-
-    title: str
-    header: tuple[str, ...]
-    right: tuple[bool, ...]
-    rows: tuple[tuple[str, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -55,7 +44,7 @@ def write_index(folder: Path, command: str, made_on: Table, outcomes: Sequence[O
     studies = [
         {
             "outcome": outcome,
-            "grids": grids(outcome),
+            "tables": [path.read_text("utf-8") for path in with_suffix(outcome, ".html")],
             "figures": [
                 (link(folder, path), links(folder, outcome, path.with_suffix(".svg")))
                 for path in with_suffix(outcome, ".png")
@@ -90,33 +79,3 @@ def link(folder: Path, path: Path) -> Link:
 def links(folder: Path, outcome: Outcome, *paths: Path) -> list[Link]:
     """Those of the paths that the study wrote."""
     return [link(folder, path) for path in paths if path in outcome.files]
-
-
-def grids(outcome: Outcome) -> list[Grid]:
-    """The tables in the study's Markdown files."""
-    texts = [path.read_text(encoding="utf-8") for path in with_suffix(outcome, ".md")]
-    return [grid for text in texts for grid in tables_of(text)]
-
-
-def tables_of(text: str) -> list[Grid]:
-    """Tables as `Table.markdown` writes them, in order."""
-    found: list[Grid] = []
-    title, lines = "", list[str]()
-    for line in [*text.splitlines(), ""]:
-        if line.startswith("|"):
-            lines.append(line)
-            continue
-        if len(lines) >= 2:
-            found.append(grid_of(title, lines))
-        lines = []
-        if line.startswith("**") and line.endswith("**"):
-            title = line[2:-2]
-    return found
-
-
-def grid_of(title: str, lines: Sequence[str]) -> Grid:
-    """A table from its lines: header, rule, rows."""
-    header, rule, *rows = [
-        tuple(cell.strip().replace(r"\|", "|") for cell in BAR.split(line)[1:-1]) for line in lines
-    ]
-    return Grid(title, header, tuple(cell.endswith(":") for cell in rule), tuple(rows))

@@ -10,38 +10,37 @@ which its own law explains so much more than the best other that 25 of lambda di
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
-import click
 import numpy as np
 
-import minimax_cal as mc
-from experiments import sweep
-from experiments.blind_gap import (
+from experiments.gap_cases import Cause, Sealed
+from experiments.machines import INSIDE, MAKES, MECHANISMS, OUTSIDE, Asked, make, places
+from experiments.scoring import (
     Criterion,
     Row,
     answers,
+    asked,
+    blind_study,
     chosen,
+    has,
+    headline,
     is_right,
-    number_of,
+    misses,
+    of,
     pairing,
+    save,
+    scored,
     share_of,
-    text_of,
-    troubles,
+    verdict_is,
     verdicts,
 )
-from experiments.gap_cases import Cause
-from experiments.machines import INSIDE, MAKES, MECHANISMS, OUTSIDE, Asked, Made, make, places
-from experiments.sweep import Study, study_options
+from experiments.sweep import Study
 from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
-from minimax_cal.measuring.measurements import write_measurements
+from minimax_cal.ground.tables import Table
 
 POWERS = (50.0, 100.0, 300.0, 1000.0, 5000.0)
 CLEAR = (100.0, 300.0, 1000.0)
@@ -123,67 +122,40 @@ def some_cases(
 # ---- one run -------------------------------------------------------------------------------------
 
 
-def run(asked: Asked) -> Row:
+def run(case: Asked) -> Row:
     """Make the files, let them be diagnosed, and score."""
-    made = make(asked)
-    began = time.perf_counter()
-    said = diagnosed(made)
-    seconds = time.perf_counter() - began
-    return score(asked, made, said, likeness(made)) | {"seconds": seconds}
+    made = make(case)
+    answer = asked(made)
+    return score(case, made, answer.said, likeness(made)) | {"seconds": answer.seconds}
 
 
-def diagnosed(made: Made) -> Row:
-    """The JSON of a diagnosis that sees the files alone."""
-    with TemporaryDirectory() as name:
-        robot, data = Path(name) / "robot.json", Path(name) / "data.csv"
-        made.robot.save(robot)
-        write_measurements(data, made.data)
-        try:
-            return mc.diagnose(robot, data, quick=True).to_dict()
-        except Exception as error:  # a crash is an answer too, and a bad one
-            return {"verdict": "error", "trouble": f"{type(error).__name__}: {error}"}
-
-
-def score(asked: Asked, made: Made, said: Row, alike: tuple[Array, Array]) -> Row:
+def score(case: Asked, made: Sealed, said: Row, alike: tuple[Array, Array]) -> Row:
     """What an answer is worth, as plain data.
 
     said: the JSON of a diagnosis.  alike: as `likeness` tells.
     """
     sets = answers(said)
-    names = [options[0] for options in sets]
     own, other = alike
     power = np.array(made.powers)
-    gap = said.get("gap", {})
-    count = len(made.truth)
-    there = {"outliers": asked.off, "frame_drift": asked.creep}  # and small, but no wrong names
+    there = {"outliers": case.off, "frame_drift": case.creep}  # and small, but no wrong names
+    names = [options[0] for options in sets]
     beside = [name for name in names if name in made.truth or not there.get(name[0])]
-    return {
-        "condition": asked.condition,
-        "asked": [asked.robot, asked.poses, asked.spread, asked.targets,
-                  *(word for word in ("told", "off", "oval", "creep") if getattr(asked, word))],
-        "seed": asked.seed,
-        "laws": [cause.law for cause in asked.causes],
-        "truth": [list(name) for name in made.truth],
+    return scored(case, made, said, beside) | {
+        "asked": [case.robot, case.poses, case.spread, case.targets,
+                  *(word for word in ("told", "off", "oval", "creep") if getattr(case, word))],
         "lambda": float(power.min(initial=np.inf)),
         "telling": float((power * (own - other)).min(initial=np.inf)),
         "left": float((power * (1.0 - np.maximum(own, other))).min(initial=np.inf)),
-        "verdict": str(said["verdict"]),
-        "names": [list(name) for name in beside],
         "tentative": [[str(e["effect"]), str(e["place"])] for e in said.get("effects", [])
                       if not e.get("established", True)],
-        "strange": sum(not any(is_right(n, t) for t in made.truth) for n in beside),
-        "all_right": len(beside) == count == pairing(made.truth, [[n] for n in beside]),
-        "in_sets": pairing(made.truth, sets) == count,
-        "final_mm": number_of(gap, "holdout_rms_mm", "final"),
-        "geometric_mm": number_of(gap, "holdout_rms_mm", "geometric"),
-        "trouble": str(said.get("trouble", "")),
+        "in_sets": pairing(made.truth, sets) == len(made.truth),
     }  # fmt: skip
 
 
-def likeness(made: Made) -> tuple[Array, Array]:
+def likeness(made: Sealed) -> tuple[Array, Array]:
     """(c,) rho^2 of each cause's own law, and of the best other law."""
     own, other = np.zeros(len(made.truth)), np.zeros(len(made.truth))
-    for i, (truth, part) in enumerate(zip(made.truth, made.displacement, strict=True)):
+    for i, (truth, part) in enumerate(zip(made.truth, made.parts, strict=True)):
         found = resemblance(made.robot, made.data, part)
         mine = [rho2 for name, rho2 in found.items() if is_right(name, truth)]
         rest = [rho2 for name, rho2 in found.items() if not is_right(name, truth)]
@@ -212,65 +184,51 @@ def separable(row: Row) -> bool:
 
 def criteria(rows: Sequence[Row]) -> list[Criterion]:
     """What the diagnosis is held to, and what is only shown."""
-
-    def of(*conditions: str) -> list[Row]:
-        return [row for row in rows if row["condition"] in conditions]
-
-    sound, plain = of("sound"), [row for row in of("single", "orders") if separable(row)]
-    orders = [row for row in of("orders") if separable(row)]
-    missing = [row for row in of("outside", "mechanism") if row["left"] >= SEEN]
+    sound = of(rows, "sound")
+    plain, orders, pairs, triples = (
+        list(filter(separable, of(rows, *conditions)))
+        for conditions in (("single", "orders"), ("orders",), ("pair",), ("triple",))
+    )
+    missing = [row for row in of(rows, "outside", "mechanism") if row["left"] >= SEEN]
     mechanisms = [row for row in missing if row["condition"] == "mechanism"]
-    pairs, triples = ([row for row in of(c) if separable(row)] for c in ("pair", "triple"))
 
-    def named(row: Row) -> bool:
-        return bool(row["names"])
-
+    named = has("names")
     return [
         Criterion("no fault: nothing confirmed, not unknown", "false alarm", sound,
                   lambda r: not named(r) and r["verdict"] != "unknown", 0.985),
         Criterion("  something confirmed", "", sound, named),
         Criterion("one cause, separable: right", "not right", plain, right, 0.95),
-        Criterion("  a wrong cause confirmed", "", plain, lambda r: r["strange"] > 0),
+        Criterion("  a wrong cause confirmed", "", plain, has("strange")),
         Criterion("  right, but minor: verdict none", "", plain,
                   lambda r: right(r) and r["verdict"] == "none"),
-        Criterion("  verdict unknown", "", plain, lambda r: r["verdict"] == "unknown"),
+        Criterion("  verdict unknown", "", plain, verdict_is("unknown")),
         Criterion("  two orders of one gear", "orders", orders, right, 0.95),
         Criterion("one cause, lambda >= 50: in the sets", "",
-                  [r for r in of("single", "orders") if r["lambda"] >= SEEN],
-                  lambda r: r["in_sets"]),
+                  [r for r in of(rows, "single", "orders") if r["lambda"] >= SEEN],
+                  has("in_sets")),
         Criterion("outside the library, lambda (1 - rho^2) >= 50: unknown or not repeatable",
                   "not unknown", missing,
-                  lambda r: r["verdict"] in ("unknown", "not_repeatable"), 0.80),
+                  verdict_is("unknown", "not_repeatable"), 0.80),
         Criterion("  of these mechanisms and memories", "", mechanisms,
-                  lambda r: r["verdict"] in ("unknown", "not_repeatable")),
-        Criterion("  none", "outside, but none", missing,
-                  lambda r: r["verdict"] == "none", 0.08, False),
-        Criterion("  named for sure", "outside, but named", missing,
-                  lambda r: r["verdict"] == "named", 0.08, False),
+                  verdict_is("unknown", "not_repeatable")),
+        Criterion("  none", "outside, but none", missing, verdict_is("none"), 0.08, False),
+        Criterion("  named for sure", "outside, but named", missing, verdict_is("named"), 0.08,
+                  False),
         Criterion("two causes, separable: right", "pair", pairs, right, 0.90),
         Criterion("three causes, separable: right", "triple", triples, right, 0.80),
         Criterion("of all verdicts named, false", "false name",
                   [r for r in rows if r["verdict"] == "named"],
-                  lambda r: r["strange"] > 0, 0.06, False),
+                  has("strange"), 0.06, False),
         Criterion("held-out RMS more than 5 % above geometry alone", "worse", rows,
                   lambda r: r["final_mm"] > WORSE * r["geometric_mm"], 0.005, False),
-        Criterion("crashed", "crash", rows, lambda r: r["verdict"] == "error", 0.0, False),
+        Criterion("crashed", "crash", rows, verdict_is("error"), 0.0, False),
     ]  # fmt: skip
-
-
-def headline(found: Sequence[Criterion]) -> Table:
-    """The criteria."""
-    return Table.made(
-        "names on arms as shops have them: shares [%] with 95 % intervals, and the limits",
-        (criterion.line() for criterion in found),
-        "criterion | runs d | found .1f | from .1f | to .1f | limit | verdict",
-    )
 
 
 def per_law(rows: Sequence[Row]) -> Table:
     """Separable single causes by their law."""
-    seen = [row for row in rows if row["condition"] in ("single", "orders") and separable(row)]
-    lines: list[tuple[Cell, ...]] = []
+    seen = list(filter(separable, of(rows, "single", "orders")))
+    lines = []
     for law in INSIDE:
         own = [row for row in seen if row["laws"] == [law]]
         if own:
@@ -278,8 +236,8 @@ def per_law(rows: Sequence[Row]) -> Table:
                             if row["strange"] and n not in row["truth"])  # fmt: skip
             lines.append((
                 law, len(own), share_of(own, right),
-                share_of(own, lambda r: r["verdict"] == "unknown"),
-                share_of(own, lambda r: r["strange"] > 0),
+                share_of(own, verdict_is("unknown")),
+                share_of(own, has("strange")),
                 ", ".join(name for name, _ in wrong.most_common(2)),
             ))  # fmt: skip
     return Table.made(
@@ -289,45 +247,14 @@ def per_law(rows: Sequence[Row]) -> Table:
     )
 
 
-def misses(found: Sequence[Criterion], each: int) -> Table:
-    """The runs behind the limits, for those who mend the diagnosis."""
-    lines: list[tuple[Cell, ...]] = []
-    for criterion in found:
-        for row in criterion.misses()[:each]:
-            truth = [
-                (law, place) for law, (_, place) in zip(row["laws"], row["truth"], strict=True)
-            ]
-            lines.append((
-                criterion.reason, f"{' '.join(map(str, row['asked']))} #{row['seed']}",
-                text_of(truth),
-                row["trouble"][:60] or f"{row['verdict']} {text_of(row['names'])}",
-                row["lambda"], row["telling"], row["final_mm"] / row["geometric_mm"],
-            ))  # fmt: skip
-    return Table.made(
-        "misses, some of each",
-        lines,
-        "what | arm | truth | said | lambda .0f | telling .0f | RMS .3f",
-    )
-
-
 SPARSE = 40  # of the cases of --quick, each so many-th by itself
 
 
-@study_options("machine_gap")
-@click.option("--only", multiple=True, help="A condition to run, such as pair; may be repeated.")
-@click.option(
-    "--every", type=int, help="Run each N-th case alone [default: 1; with --quick 40, in seconds]."
-)
+@blind_study("machine_gap")
 def main(study: Study, only: tuple[str, ...], every: int | None) -> None:
     """Names on arms as shops have them."""
     cases = plan(study.seed, QUICK if study.quick else Size())
     rows = study.sweep(run, chosen(study, cases, only, every, SPARSE), "diagnoses")
     found = criteria(rows)
-    tables = [headline(found), verdicts(rows), per_law(rows), misses(found, 8),
-              *([troubles(rows)] if any(row["trouble"] for row in rows) else [])]  # fmt: skip
-    names = ("criterion", "runs", "found", "low", "high", "limit", "verdict")
-    study.save(tables, {"criteria": tables[0].records(*names), "rows": rows})
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)
+    missed = misses(found, lambda row: " ".join(map(str, row["asked"])), "geometric_mm")
+    save(study, [headline(found), verdicts(rows), per_law(rows), missed], rows, {})

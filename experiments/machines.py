@@ -10,6 +10,7 @@ What a deviation is, how an arm moves and what lambda means stand in `gap_cases`
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -17,17 +18,23 @@ import numpy as np
 
 from experiments import gap_cases
 from experiments.gap_cases import (
+    NAN,
+    WRISTS,
     Arm,
+    Case,
     Cause,
     Deviation,
     Law,
+    Sealed,
     World,
+    at_base,
     at_joint,
     at_joints,
     frames,
     load,
     measure,
     number,
+    own,
     rigid,
     torque,
 )
@@ -36,7 +43,6 @@ from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.robots.gravity import tubes
 from minimax_cal.robots.robot import Robot, load_robot
 
-NAN = float("nan")
 TRIES, NEXT = 5, 1_000_000_000_000  # choices of poses that may show nothing; between their seeds
 HELD_OUT = 60
 REVISITED = 0.1  # of the training poses, measured twice
@@ -47,46 +53,24 @@ RADIAL, ACROSS = 0.5, 1.3  # noise along the line of sight and across it, of wha
 CREEP = 4e-6  # RMS of a base that wanders [m]
 
 
-@dataclass(frozen=True)
-class Make:
-    """What is known of a make of arm.
-
-    masses: of its links [kg].  ratio: of its gears, NaN untold.  beams, loaded: as in `Arm`.
-    upright: joint that a spring may balance, '' for none.  driven: (joint, its driver) of coupled
-    joints.
-    """
-
-    masses: tuple[float, ...]
-    ratio: tuple[float, ...]
-    beams: tuple[int, ...]
-    loaded: tuple[int, ...]
-    upright: str
-    driven: tuple[tuple[str, int], ...]
-
-
-WRISTS = (("J3", 2), ("J5", 4), ("J6", 5))
 ON_RAIL = (("J4", 3), ("J6", 5), ("J7", 6))
 MAKES = {
-    "scara_600": Make((8.0, 5.0, 2.0, 1.5), (50.0, 50.0, NAN, NAN), (1,), (), "", ()),
-    "irb120": Make(
+    "scara_600": Arm((8.0, 5.0, 2.0, 1.5), (50.0, 50.0, NAN, NAN), (1,), ()),
+    "irb120": Arm(
         (4.0, 6.0, 4.0, 2.5, 1.0, 1.0), (120.0, 120.0, 100.0, NAN, NAN, NAN), (2, 4), (2, 3, 5),
-        "", WRISTS,
+        driven=WRISTS,
     ),
-    "ur5e": Make(
-        (4.0, 8.0, 2.8, 1.4, 1.4, 1.2), (NAN, NAN, NAN, NAN, NAN, NAN), (2, 3), (2, 3, 4, 5),
-        "", (),
-    ),
-    "fanuc_r2000ic_165f": Make(
+    "ur5e": Arm((4.0, 8.0, 2.8, 1.4, 1.4, 1.2), (NAN,) * 6, (2, 3), (2, 3, 4, 5)),
+    "fanuc_r2000ic_165f": Arm(
         (350.0, 200.0, 180.0, 90.0, 30.0, 60.0), (NAN, 180.0, 170.0, NAN, NAN, NAN), (2, 4),
         (2, 3, 5), "J2", WRISTS,
     ),
-    "rail": Make(
+    "rail": Arm(
         (400.0, 95.0, 52.0, 48.0, 22.0, 7.0, 14.0), (NAN, 121.0, 141.3, 105.5, NAN, NAN, NAN),
         (3, 5), (3, 4, 6), "J3", ON_RAIL,
     ),
-    "seven": Make(
+    "seven": Arm(
         (4.0, 4.0, 3.0, 2.7, 1.7, 1.8, 1.3), (160.0,) * 4 + (NAN,) * 3, (3, 5), (2, 3, 4, 6),
-        "", (),
     ),
 }  # fmt: skip
 
@@ -122,41 +106,19 @@ def bare(name: str, mdh: Array, prismatic: Array, lower: Array, upper: Array, up
 
 
 @dataclass(frozen=True)
-class Asked:
+class Asked(Case):
     """One arm and its measurement, as plain data.
 
-    spread: of its poses, whole, half or clusters.  told: whether the file tells masses.  targets:
-    how many.  off, oval, creep: whether some points are slightly off, range and angles of the
-    tracker differ, the base wanders.
+    spread: of its poses, whole, half or clusters.  told: whether the file tells masses.  off, oval,
+    creep: whether some points are slightly off, range and angles of the tracker differ, the base
+    wanders.
     """
 
-    robot: str
-    condition: str
-    causes: tuple[Cause, ...] = ()
-    poses: int = 100
     spread: str = "whole"
     told: bool = True
-    targets: int = 3
     off: bool = False
     oval: bool = False
     creep: bool = False
-    jitter: float = 6e-6
-    seed: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Made:
-    """A measured arm: robot and data as told, and the truth.
-
-    truth: (effect, place) of each cause.  displacement: (c, k, m, 3) by each cause [m].
-    powers: (c,) lambda of each.
-    """
-
-    robot: Robot
-    data: Measurements
-    truth: tuple[tuple[str, str], ...]
-    displacement: Array
-    powers: tuple[float, ...]
 
 
 # ---- laws as machines show them ------------------------------------------------------------------
@@ -164,12 +126,9 @@ class Made:
 
 def two_orders(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
     """An eccentric gear: once and twice a turn."""
-    own = world.q[:, number(cause.place)]
-    phase, second = rng.uniform(0.0, 2.0 * np.pi, 2), rng.uniform(0.4, 1.0)
-    return at_joint(
-        world, number(cause.place),
-        np.sin(own + phase[0]) + second * np.sin(2.0 * own + phase[1]),
-    )  # fmt: skip
+    q, phase = own(world, cause), rng.uniform(0.0, 2.0 * np.pi, 2)
+    second = rng.uniform(0.4, 1.0) * np.sin(2.0 * q + phase[1])
+    return at_joint(world, cause.place, np.sin(q + phase[0]) + second)
 
 
 def ripple(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
@@ -189,7 +148,7 @@ def loaded_play(world: World, cause: Cause, _: np.random.Generator) -> Deviation
     i = number(cause.place)
     pull = np.abs(torque(world.robot, world.q)[:, i])
     side = np.sign(world.move[:, i])
-    return at_joint(world, i, side * (1.0 - 0.3 * pull / max(float(pull.max()), 1e-9)))
+    return at_joint(world, cause.place, side * (1.0 - 0.3 * pull / max(float(pull.max()), 1e-9)))
 
 
 def two_constants(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
@@ -213,23 +172,7 @@ def balance(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
     angle = lean - rng.normal(0.0, 0.2) + np.pi * (cause.variant % 2)
     length = np.sqrt(a**2 + arm**2 - 2.0 * a * arm * np.cos(angle))
     rest = rng.uniform(0.4, 0.95) * (arm - a)
-    return at_joint(world, i, np.sin(angle) * (1.0 - rest / length))
-
-
-def driven(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
-    """A joint turned by the motor of another."""
-    source = dict(MAKES[world.told.name].driven)[cause.place]
-    return at_joint(world, number(cause.place), world.q[:, source - 1])
-
-
-def tipping(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
-    """The foot gives way to the overturning moment."""
-    pose = frames(world.robot, world.q)
-    about = pose[:, 1, :3, 3] if world.robot.prismatic[0] else np.zeros((len(pose), 3))
-    moment = load(world.robot, pose, 0, about)[1]
-    base = np.zeros((len(pose), 6))
-    base[:, :3] = moment - np.outer(moment @ world.robot.up, world.robot.up)
-    return replace(rigid(world), base=base)
+    return at_joint(world, cause.place, np.sin(angle) * (1.0 - rest / length))
 
 
 # ---- what no library holds -----------------------------------------------------------------------
@@ -237,19 +180,19 @@ def tipping(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
 
 def worn(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
     """Play in one sector of the joint alone."""
-    i = number(cause.place)
-    low, high = np.quantile(world.q[:, i], np.sort(rng.uniform(0.0, 0.5, 1))[0] + [0.0, 0.4])
-    there = (world.q[:, i] > low) & (world.q[:, i] < high)
-    return at_joint(world, i, np.where(there, np.sign(world.move[:, i]), 0.0))
+    q = own(world, cause)
+    low, high = np.quantile(q, np.sort(rng.uniform(0.0, 0.5, 1))[0] + [0.0, 0.4])
+    side = np.sign(world.move[:, number(cause.place)])
+    return at_joint(world, cause.place, np.where((q > low) & (q < high), side, 0.0))
 
 
 def weary(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
     """A joint that drifts with the work of its last dozen moves."""
-    i, fade, work = number(cause.place), 0.0, []
-    for move in np.abs(world.move[:, i]):
+    fade, work = 0.0, []
+    for move in np.abs(world.move[:, number(cause.place)]):
         fade = 0.92 * fade + move
         work.append(fade)
-    return at_joint(world, i, np.array(work))
+    return at_joint(world, cause.place, np.array(work))
 
 
 def cable(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
@@ -257,15 +200,14 @@ def cable(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
     i = number(cause.place)
     others = rng.choice([j for j in range(world.q.shape[1]) if j != i], 2, replace=False)
     a, b = world.q[:, others].T
-    return at_joint(world, i, np.abs(a) * np.sin(1.5 * b + rng.uniform(0.0, 2.0 * np.pi)))
+    return at_joint(world, cause.place, np.abs(a) * np.sin(1.5 * b + rng.uniform(0.0, 2.0 * np.pi)))
 
 
 def swaying(world: World, _: Cause, rng: np.random.Generator) -> Deviation:
     """A hall that tilts to and fro as the sun and the crane move."""
     t = world.time / world.time.max()
-    base = np.zeros((len(t), 6))
-    base[:, :3] = np.sin(2.0 * np.pi * rng.uniform(2.0, 5.0) * t)[:, None] * rng.normal(size=3)
-    return replace(rigid(world), base=base)
+    wave = np.sin(2.0 * np.pi * rng.uniform(2.0, 5.0) * t)
+    return at_base(world, wave[:, None] * rng.normal(size=3))
 
 
 # ---- mechanisms and memories: directions and pasts that no law of one joint's pose has -----------
@@ -303,9 +245,7 @@ def settling_base(world: World, _: Cause, rng: np.random.Generator) -> Deviation
     keep = rng.uniform(0.8, 0.92)
     for row, now in enumerate(moment):
         past[row] = fade = keep * fade + (1.0 - keep) * now
-    base = np.zeros((len(pose), 6))
-    base[:, :3] = past
-    return replace(rigid(world), base=base)
+    return at_base(world, past)
 
 
 def hysteresis(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
@@ -316,30 +256,31 @@ def hysteresis(world: World, cause: Cause, rng: np.random.Generator) -> Deviatio
     for move in world.move[:, i]:
         wound = float(np.clip(wound + move, -most, most))
         out.append(-wound)
-    return at_joint(world, i, np.array(out))
+    return at_joint(world, cause.place, np.array(out))
 
 
 def two_seats(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
     """A joint that comes to rest on one of two seats, whichever it happens to be."""
-    return at_joint(world, number(cause.place), rng.choice((-1.0, 1.0), len(world.q)))
+    return at_joint(world, cause.place, rng.choice((-1.0, 1.0), len(world.q)))
 
 
+KNOWN = gap_cases.LAWS
 LAWS: dict[str, Law] = {
-    **{name: gap_cases.LAWS[name] for name in (
+    **{name: KNOWN[name] for name in (
         "joint_compliance", "link_bending", "gear_error", "encoder_gain", "backlash", "settling",
         "frame_drift", "tool_flex", "target_offset", "target_shift", "joint_compliance/hardening",
         "outside_sum", "outside_product", "outside_waves", "outside_cubic",
         "outside_field",
     )},
     "gear_error/orders": two_orders,
-    "joint_error_map/step": gap_cases.LAWS["outside_step"],
+    "joint_error_map/step": KNOWN["outside_step"],
     "gear_ripple": ripple,
     "settling/saturating": saturating,
     "backlash/loaded": loaded_play,
     "thermal_growth/two": two_constants,
     "gravity_compensator": balance,
-    "joint_coupling": driven,
-    "base_flex": tipping,
+    "joint_coupling": KNOWN["joint_coupling"],
+    "base_flex": KNOWN["base_flex"],
     "outside_worn": worn,
     "outside_weary": weary,
     "outside_cable": cable,
@@ -359,31 +300,10 @@ INSIDE = tuple(law for law in LAWS if "outside" not in law and law != "joint_com
 
 def places(law: str, make: str, targets: int) -> tuple[str, ...]:
     """Where a law can be on an arm."""
-    known, effect = MAKES[make], law.partition("/")[0]
-    slides = nominal(make).prismatic
-    joints = tuple(f"J{i + 1}" for i, slide in enumerate(slides) if not slide)
-    loaded = tuple(f"J{i}" for i in known.loaded)
-    spots = tuple(f"smr{i + 1}" for i in range(targets))
-    some = {
-        "joint_compliance": (*loaded, "all") if loaded else (),
-        "link_bending": tuple(f"L{i}" for i in known.beams),
-        "gravity_compensator": (known.upright,) if known.upright else (),
-        "joint_coupling": tuple(place for place, _ in known.driven),
-        "settling": ("all", joints[0], joints[1]),
-        "thermal_growth": ("all",),
-        "base_flex": ("frame",),
-        "frame_drift": ("frame",),
-        "tool_flex": ("all",) if loaded else (),
-        "target_offset": (*spots, "all") if targets > 1 else ("all",),
-        "target_shift": spots if targets > 1 else (),
-        "outside_cubic": loaded,
-        "outside_field": ("all",),
-        "outside_sway": ("all",),
-        "outside_plate": ("all",) if targets > 1 else (),
-        "outside_clearance": loaded,
-        "outside_settling_base": ("frame",) if loaded else (),
-    }
-    return some.get(effect, joints)
+    joints = [f"J{i + 1}" for i in np.flatnonzero(~nominal(make).prismatic)]
+    if law.partition("/")[0] == "settling":
+        return "all", joints[0], joints[1]
+    return gap_cases.places_of(law, MAKES[make], joints, targets)
 
 
 # ---- building a case -----------------------------------------------------------------------------
@@ -395,7 +315,7 @@ def told_robot(asked: Asked) -> Robot:
     rng = np.random.default_rng(len(asked.robot))
     _, halfway = tubes(arm.mdh)
     com = halfway + rng.normal(0.0, 0.02, halfway.shape)
-    mass, ratio = np.array(known.masses), np.array(known.ratio)
+    mass, ratio = np.array(known.mass), np.array(known.ratio)
     return replace(arm, name=asked.robot, mass=mass, com=com, ratio=ratio)
 
 
@@ -430,31 +350,12 @@ def some_poses(robot: Robot, count: int, spread: str, rng: np.random.Generator) 
 def world_of(asked: Asked, rng: np.random.Generator) -> World:
     """The arm in its place with all its visits; of clusters whole ones are held out."""
     told = told_robot(asked)
-    count, again = asked.poses, round(REVISITED * asked.poses)
-    q = np.concatenate([some_poses(told, count, asked.spread, rng),
-                        some_poses(told, HELD_OUT, asked.spread, rng)])  # fmt: skip
-    pose = np.concatenate([np.arange(len(q)), rng.choice(count, again, replace=False)])
-    pose = rng.permutation(pose)
-    time = np.cumsum(gap_cases.PAUSE * rng.uniform(0.7, 1.3, len(pose)))
-    q, move = q[pose], np.zeros((len(pose), told.joints))
-    move[1:] = np.diff(q, axis=0)
-    known = MAKES[asked.robot]
-    return World(
-        robot=gap_cases.true_robot(told, rng),
-        told=told,
-        arm=Arm(known.masses, (), known.ratio, (17.0, 24.0), known.beams, known.loaded, ()),
-        base=gap_cases.some_base(rng),
-        spots=gap_cases.some_spots(rng)[: asked.targets],
-        q=q,
-        jitter=asked.jitter * rng.normal(size=q.shape),
-        move=move,
-        time=time - time[0],
-        warm=rng.uniform(1000.0, 3000.0),
-        train=pose < count,
-    )
+    q = [some_poses(told, count, asked.spread, rng) for count in (asked.poses, HELD_OUT)]
+    again = round(REVISITED * asked.poses)
+    return gap_cases.visited(asked, told, MAKES[asked.robot], np.concatenate(q), again, rng)
 
 
-def make(asked: Asked, laws: dict[str, Law] = LAWS) -> Made:
+def make(asked: Asked, laws: Mapping[str, Law] = LAWS) -> Sealed:
     """Build the arm of a case and measure it; where its poses show nothing of a law, others."""
     for more in range(TRIES):
         try:
@@ -464,33 +365,18 @@ def make(asked: Asked, laws: dict[str, Law] = LAWS) -> Made:
     raise ValueError(f"{asked.causes} show nothing at {TRIES} choices of the poses")
 
 
-def made_of(asked: Asked, laws: dict[str, Law]) -> Made:
+def made_of(asked: Asked, laws: Mapping[str, Law]) -> Sealed:
     """The arm of a case by its seed, measured.  Raises Unseen."""
     rng = np.random.default_rng(asked.seed)
-    world = world_of(asked, rng)
-    still = measure(world, rigid(world))
-    away = np.linalg.norm(still, axis=-1)
-    spread = gap_cases.NOISE + gap_cases.NOISE_PER_METRE * away
-    ruler = gap_cases.judge(world, spread, asked.jitter)
-    whole, parts = rigid(world), []
-    for cause in asked.causes:
-        unit = laws[cause.law](world, cause, rng)
-        deviation = unit * gap_cases.sized(world, ruler, cause, unit)
-        whole += deviation
-        parts.append(measure(world, deviation) - still)
-    y = measure(world, whole + creep(world, rng) if asked.creep else whole)
-    y = y + noise(asked, y, spread, rng)
-    if not asked.told:
-        told = replace(world.told, mass=np.full(world.told.joints, NAN),
-                       com=np.full((world.told.joints, 3), NAN))  # fmt: skip
-        world = replace(world, told=told)
-    return Made(
-        robot=world.told,
-        data=measured(world, y),
-        truth=tuple((cause.effect, cause.place) for cause in asked.causes),
-        displacement=np.moveaxis(np.array([*parts]).reshape(-1, *y.shape), 2, 1),
-        powers=tuple(ruler.power(part) for part in parts),
-    )
+
+    def see(world: World, whole: Deviation, spread: Array) -> tuple[Robot, Measurements]:
+        y = measure(world, whole + creep(world, rng) if asked.creep else whole)
+        data = measured(world, y + noise(asked, y, spread, rng))
+        unknown = np.full((world.told.joints, 4), NAN)
+        told = replace(world.told, mass=unknown[:, 0], com=unknown[:, 1:])
+        return world.told if asked.told else told, data
+
+    return gap_cases.sealed(asked, world_of(asked, rng), laws, see, rng)
 
 
 def noise(asked: Asked, y: Array, spread: Array, rng: np.random.Generator) -> Array:
@@ -513,9 +399,7 @@ def creep(world: World, rng: np.random.Generator) -> Deviation:
     """A base that wanders by microns."""
     walk = np.cumsum(rng.normal(size=(len(world.q), 3)), axis=0)
     walk = walk - walk.mean(axis=0)
-    base = np.zeros((len(walk), 6))
-    base[:, 3:] = CREEP * walk / np.sqrt(np.mean(np.sum(walk**2, axis=1)))
-    return replace(rigid(world), base=base)
+    return at_base(world, shift=CREEP * walk / np.sqrt(np.mean(np.sum(walk**2, axis=1))))
 
 
 def measured(world: World, y: Array) -> Measurements:

@@ -11,14 +11,13 @@ oracle that knows the truth says which causes these logs can show at all, and te
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import click
 import numpy as np
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.motion_cases import (
     CAUSES,
     LIBRARY,
@@ -30,7 +29,7 @@ from experiments.motion_cases import (
     Made,
     make,
 )
-from experiments.record import interval
+from experiments.record import rate
 from experiments.sweep import Study, study_options
 from minimax_cal.dynamics.diagnose import family
 from minimax_cal.dynamics.given import MotionKnown
@@ -43,7 +42,7 @@ from minimax_cal.dynamics.scene import Arm, Scene
 from minimax_cal.dynamics.search import Columns, dictionary_of
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 
 VISIBLE = 50.0  # squared size, over the noise, from which a cause must be seen
 SEPARABLE = 25.0  # the same beside the nearest other law, from which it must be told from that
@@ -232,62 +231,40 @@ def plan(seed: int, arms: int, cases: int) -> list[Case]:
     return out
 
 
-def condition(told: Sequence[Told], name: str) -> list[Told]:
-    """The cases of a condition."""
-    return [one for one in told if one.case.condition == name]
-
-
-def separable(told: Sequence[Told]) -> list[Told]:
-    """Single causes that the logs show, and tell from every other law."""
-    return [one for one in condition(told, SINGLE)
-            if one.visible >= VISIBLE and one.separable >= SEPARABLE]  # fmt: skip
-
-
-def clear(told: Sequence[Told]) -> list[Told]:
-    """Laws outside the library that the logs show, whatever one law of the library is fitted."""
-    return [one for one in condition(told, BEYOND) if one.separable >= SEPARABLE]
-
-
-def payloads(told: Sequence[Told]) -> list[Told]:
-    """Payloads that nobody told and the logs show."""
-    return [one for one in separable(told) if one.truth[0][0] == "payload"]
-
-
-QUESTIONS: tuple[tuple[str, Callable[[Sequence[Told]], list[Told]], Callable[[Told], bool], str],
-                 ...] = (
-    ("sound: a cause named or doubted", lambda t: condition(t, SOUND),
-     lambda one: bool(one.main) or one.verdict == "unknown", "<= 3"),
-    ("sound: a minor effect confirmed", lambda t: condition(t, SOUND),
-     lambda one: bool(one.minor), ""),
-    ("single: right", separable, lambda one: one.right, ">= 75"),
-    ("single: right, its family, or not distinguishable from it", separable,
-     lambda one: one.related, ">= 92"),
-    ("single: sure and wrong", separable, lambda one: one.wrong, "<= 4"),
-    ("single: nothing named", separable, lambda one: not one.main, ""),
-    ("payload: the link named, its mass within 3 %", payloads,
-     lambda one: abs(one.mass[0] - one.mass[2]) < 0.03 * one.mass[2], ""),
-    ("payload: the true mass within its 95 % interval", payloads,
-     lambda one: abs(one.mass[0] - one.mass[2]) < SIGMAS * one.mass[1], ""),
-    ("pair: both named, nothing else", lambda t: condition(t, PAIR), lambda one: one.right, ""),
-    ("pair: something named that is not there", lambda t: condition(t, PAIR),
-     lambda one: one.wrong, ""),
-    ("outside: unexplained said", clear, lambda one: one.verdict == "unknown", ">= 80"),
-    ("outside: sure and wrong", clear, lambda one: one.names, "<= 8"),
-)  # fmt: skip
+def shown(told: Sequence[Told], condition: str, least: float) -> list[Told]:
+    """Cases of a condition that the logs show, and tell from every other law of the library."""
+    cases = [one for one in told if one.case.condition == condition]
+    return [one for one in cases if one.visible >= least and one.separable >= SEPARABLE]
 
 
 def questions_table(told: Sequence[Told]) -> Table:
     """Each question, with its interval and what was asked for."""
+    sound, pairs = ([one for one in told if one.case.condition == name] for name in (SOUND, PAIR))
+    single, clear = shown(told, SINGLE, VISIBLE), shown(told, BEYOND, 0.0)
+    paid = [one for one in single if one.truth[0][0] == "payload"]
+    asked: list[tuple[str, list[Told], Iterable[bool], str]] = [
+        ("sound: a cause named or doubted", sound,
+         (bool(one.main) or one.verdict == "unknown" for one in sound), "<= 3"),
+        ("sound: a minor effect confirmed", sound, (bool(one.minor) for one in sound), ""),
+        ("single: right", single, (one.right for one in single), ">= 75"),
+        ("single: right, its family, or not distinguishable from it", single,
+         (one.related for one in single), ">= 92"),
+        ("single: sure and wrong", single, (one.wrong for one in single), "<= 4"),
+        ("single: nothing named", single, (not one.main for one in single), ""),
+        ("payload: the link named, its mass within 3 %", paid,
+         (abs(value - true) < 0.03 * true for value, _, true in (o.mass for o in paid)), ""),
+        ("payload: the true mass within its 95 % interval", paid,
+         (abs(value - true) < SIGMAS * sigma for value, sigma, true in (o.mass for o in paid)), ""),
+        ("pair: both named, nothing else", pairs, (one.right for one in pairs), ""),
+        ("pair: something named that is not there", pairs, (one.wrong for one in pairs), ""),
+        ("outside: unexplained said", clear, (one.verdict == "unknown" for one in clear), ">= 80"),
+        ("outside: sure and wrong", clear, (one.names for one in clear), "<= 8"),
+    ]  # fmt: skip
     rows = []
-    for question, cases, holds, limit in QUESTIONS:
-        own = cases(told)
-        count = sum(holds(one) for one in own)
-        low, high = interval(count, len(own))
-        share = 100.0 * count / len(own) if own else float("nan")
-        rows.append(
-            (question, len(own), count, share, f"{100.0 * low:.0f} to {100.0 * high:.0f}", limit)
-        )
-
+    for question, own, holds, limit in asked:
+        yes = sum(holds)
+        share, low, high = rate(yes, len(own))
+        rows.append((question, len(own), yes, share, f"{low:.0f} to {high:.0f}", limit))
     return Table.made(
         "Torques, blind", rows, "question | cases d | yes d | % .1f | 95 % interval | asked %"
     )
@@ -295,21 +272,16 @@ def questions_table(told: Sequence[Told]) -> Table:
 
 def causes_table(told: Sequence[Told]) -> Table:
     """What is said of each cause that the logs show and tell from others."""
-    rows: list[tuple[Cell, ...]] = []
+    rows, every = [], (*shown(told, SINGLE, VISIBLE), *shown(told, BEYOND, 0.0))
     for name in CAUSES:
-        own = [o for o in (*separable(told), *clear(told)) if o.case.causes[0][0] == name]
+        own = [one for one in every if one.case.causes[0][0] == name]
+        kinds = [
+            (one.right, one.related, one.verdict == "unknown",
+             not one.main and one.verdict != "unknown",
+             one.wrong if name in LIBRARY else one.names) for one in own
+        ]  # fmt: skip
         if own:
-            false = [one.wrong if name in LIBRARY else one.names for one in own]
-            rows.append((
-                name,
-                len(own),
-                sum(one.right for one in own),
-                sum(one.related for one in own),
-                sum(one.verdict == "unknown" for one in own),
-                sum(not one.main and one.verdict != "unknown" for one in own),
-                sum(false),
-            ))  # fmt: skip
-
+            rows.append((name, len(own), *np.sum(kinds, axis=0).tolist()))
     return Table.made(
         "Causes that the logs show",
         rows,
@@ -317,28 +289,14 @@ def causes_table(told: Sequence[Told]) -> Table:
     )
 
 
-def time_table(told: Sequence[Told]) -> Table:
-    """CPU time of a diagnosis."""
-    seconds = [one.seconds for one in told]
-    middle, most = float(np.median(seconds)), float(np.max(seconds))
-    return Table.made(
-        "CPU time of a diagnosis [s]",
-        ((len(told), middle, most),),
-        "cases d | median .2f | largest .2f",
-    )
-
-
 def record(one: Told) -> dict[str, object]:
     """A case for JSON."""
+    names = ("truth", "verdict", "main", "minor", "unexplained")
     return {
-        "condition": one.case.condition, "generator": one.case.generator, "seed": one.case.seed,
-        "causes": [list(cause) for cause in one.case.causes],
-        "truth": [list(name) for name in one.truth], "verdict": one.verdict,
-        "main": [list(name) for name in one.main], "minor": [list(name) for name in one.minor],
-        "alternatives": [list(name) for name in one.others],
-        "unexplained": [list(name) for name in one.unexplained],
+        **{name: getattr(one.case, name) for name in ("condition", "generator", "seed", "causes")},
+        **{name: getattr(one, name) for name in names},
+        "alternatives": one.others, "cpu_s": one.seconds,
         "visible": min(one.visible, 1e12), "separable": min(one.separable, 1e12),
-        "cpu_s": one.seconds,
     }  # fmt: skip
 
 
@@ -351,10 +309,6 @@ def main(study: Study, arms: int, cases: int) -> None:
     if study.quick:
         arms = cases = QUICK
     told = study.sweep(run, plan(study.seed, arms, cases), "diagnoses")
-    tables = [questions_table(told), causes_table(told), time_table(told)]
+    tables = [questions_table(told), causes_table(told)]
     keys = ("question", "cases", "yes", "percent", "interval", "asked")
     study.save(tables, {"questions": tables[0].records(*keys), "cases": [*map(record, told)]})
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

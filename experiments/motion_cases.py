@@ -324,7 +324,29 @@ def warmth(time: Array) -> Array:
 
 # ---- causes --------------------------------------------------------------------------------------
 
-Extra = Callable[[Plant, Motion, Array, Array, int, float, float], Array]
+
+@dataclass(frozen=True, eq=False)
+class At:
+    """What a law of torque knows of a joint, (m,) along the motion.
+
+    size, phase: of the law.  time: since the first run began [s].  load: torque of the rigid body.
+    slip: sign of the speed, over 1e-3 rad/s.  fast: speed over 2 rad/s, the same both ways.
+    """
+
+    size: float
+    phase: float
+    time: Array
+    coulomb: float
+    viscous: float
+    q: Array
+    qd: Array
+    qdd: Array
+    load: Array
+    slip: Array
+    fast: Array
+
+
+Law = Callable[[At, At], Array]  # of a joint and the next one, or the first after the last
 
 
 @dataclass(frozen=True)
@@ -347,30 +369,26 @@ def changed(name: str, low: float, high: float, *, either: bool = False) -> Caus
     return Cause(put)
 
 
-def added(law: Extra, low: float, high: float) -> Cause:
+def added(law: Law, low: float, high: float) -> Cause:
     """Torque at a joint.  low, high: of its size, which the law takes with a phase."""
 
     def put(rng: np.random.Generator, plant: Plant, j: int) -> Plant:
         size, phase = between(rng, low, high), rng.uniform(-np.pi, np.pi)
 
+        def at(j: int, motion: Motion, rigid: Array, time: Array) -> At:
+            q, qd, qdd, load = (of[:, j] for of in (motion.q, motion.qd, motion.qdd, rigid))
+            return At(size, phase, time, plant.coulomb[j], plant.viscous[j], q, qd, qdd, load,
+                      np.tanh(qd / 1e-3), np.abs(qd) / 2.0)  # fmt: skip
+
         def extra(motion: Motion, rigid: Array, time: Array) -> Array:
             out = np.zeros_like(rigid)
-            out[:, j] = law(plant, motion, rigid, time, j, size, phase)
+            beside = (j + 1) % out.shape[1]
+            out[:, j] = law(*(at(k, motion, rigid, time) for k in (j, beside)))
             return out
 
         return replace(plant, more=(*plant.more, extra))
 
     return Cause(put)
-
-
-def slipping(motion: Motion, j: int) -> Array:
-    """(m,) sign of the speed, over 1e-3 rad/s."""
-    return np.tanh(motion.qd[:, j] / 1e-3)
-
-
-def fast(motion: Motion, j: int) -> Array:
-    """(m,) speed over 2 rad/s, the same both ways."""
-    return np.abs(motion.qd[:, j]) / 2.0
 
 
 def bristly(rng: np.random.Generator, plant: Plant, j: int) -> Plant:
@@ -442,34 +460,26 @@ def sloshing(drive: Array, rate: float) -> Array:
     return out
 
 
-def beside(j: int, motion: Motion) -> int:
-    """Another joint: the next, or the first after the last."""
-    return int((j + 1) % motion.q.shape[1])
-
-
 LIBRARY: Mapping[str, Cause] = {
-    "degressive": added(lambda p, m, r, t, j, s, f: s * p.coulomb[j] * slipping(m, j)
-                        * fast(m, j) ** (0.45 + 0.15 * np.sin(f)), 0.4, 2.0),
+    "degressive": added(lambda a, b: a.size * a.coulomb * a.slip
+                        * a.fast ** (0.45 + 0.15 * np.sin(a.phase)), 0.4, 2.0),
     "stribeck": Cause(falling),
     "presliding": Cause(bristly),
-    "asymmetry": added(lambda p, m, r, t, j, s, f: s * p.coulomb[j] * np.sign(f) * fast(m, j),
-                       0.15, 0.6),
-    "load_friction": added(lambda p, m, r, t, j, s, f: s * np.abs(r[:, j]) * slipping(m, j),
-                           0.03, 0.12),
-    "angle_friction": added(lambda p, m, r, t, j, s, f: s * p.coulomb[j] * slipping(m, j)
-                            * np.cos(m.q[:, j] - f), 0.15, 0.6),
-    "warm_up": added(lambda p, m, r, t, j, s, f: s * p.coulomb[j] * slipping(m, j)
-                     * (36.0 - warmth(t)) / 14.0, 0.2, 0.7),
+    "asymmetry": added(lambda a, b: a.size * a.coulomb * np.sign(a.phase) * a.fast, 0.15, 0.6),
+    "load_friction": added(lambda a, b: a.size * np.abs(a.load) * a.slip, 0.03, 0.12),
+    "angle_friction": added(
+        lambda a, b: a.size * a.coulomb * a.slip * np.cos(a.q - a.phase), 0.15, 0.6),
+    "warm_up": added(
+        lambda a, b: a.size * a.coulomb * a.slip * (36.0 - warmth(a.time)) / 14.0, 0.2, 0.7),
     "armature": changed("armature", 0.05, 0.5),
     "drive_gain": changed("gain", 0.02, 0.08, either=True),
-    "torque_offset": added(lambda p, m, r, t, j, s, f: s * p.coulomb[j] * np.sign(f)
-                           * np.ones_like(t), 0.15, 1.0),
-    "torque_ripple": added(lambda p, m, r, t, j, s, f: s * p.coulomb[j]
-                           * np.cos(RATIO * m.q[:, j] - f), 0.1, 0.5),
-    "cable": added(lambda p, m, r, t, j, s, f: s * p.coulomb[j]
-                   * (m.q[:, j] - 0.3 * f), 0.15, 1.0),
-    "gravity_spring": added(lambda p, m, r, t, j, s, f: s * p.coulomb[j]
-                            * np.sin(2.0 * m.q[:, j] - f), 0.15, 1.0),
+    "torque_offset": added(
+        lambda a, b: a.size * a.coulomb * np.sign(a.phase) * np.ones_like(a.time), 0.15, 1.0),
+    "torque_ripple": added(
+        lambda a, b: a.size * a.coulomb * np.cos(RATIO * a.q - a.phase), 0.1, 0.5),
+    "cable": added(lambda a, b: a.size * a.coulomb * (a.q - 0.3 * a.phase), 0.15, 1.0),
+    "gravity_spring": added(
+        lambda a, b: a.size * a.coulomb * np.sin(2.0 * a.q - a.phase), 0.15, 1.0),
     "payload": Cause(carrying, of_masses=True),
     "link_inertia": Cause(heavier, of_masses=True),
     "joint_flexibility": changed("compliance", 5e-5, 1e-3),
@@ -478,29 +488,23 @@ LIBRARY: Mapping[str, Cause] = {
 }  # fmt: skip
 OUTSIDE: Mapping[str, Cause] = {
     "friction that recent motion lowers": added(
-        lambda p, m, r, t, j, s, f: -s * p.coulomb[j] * slipping(m, j)
-        * relaxed(fast(m, j), 3.0), 0.5, 2.0),
+        lambda a, b: -a.size * a.coulomb * a.slip * relaxed(a.fast, 3.0), 0.5, 2.0),
     "damping by another joint's angle": added(
-        lambda p, m, r, t, j, s, f: s * p.viscous[j] * m.qd[:, j]
-        * np.cos(m.q[:, beside(j, m)] - f), 0.3, 1.0),
+        lambda a, b: a.size * a.viscous * a.qd * np.cos(b.q - a.phase), 0.3, 1.0),
     "hysteretic cable": added(
-        lambda p, m, r, t, j, s, f: s * p.coulomb[j] * hysteresis(m.q[:, j], 0.4), 0.3, 1.0),
-    "torque step at a moment": added(
-        lambda p, m, r, t, j, s, f: s * p.coulomb[j] * np.sign(f)
-        * (t > 70.0 + np.abs(f)), 0.3, 1.0),
+        lambda a, b: a.size * a.coulomb * hysteresis(a.q, 0.4), 0.3, 1.0),
+    "torque step at a moment": added(lambda a, b: a.size * a.coulomb * np.sign(a.phase)
+                                     * (a.time > 70.0 + np.abs(a.phase)), 0.3, 1.0),
     "temperature wave": added(
-        lambda p, m, r, t, j, s, f: s * p.coulomb[j] * slipping(m, j)
-        * np.sin(t / 5.0 + f), 0.2, 0.8),
+        lambda a, b: a.size * a.coulomb * a.slip * np.sin(a.time / 5.0 + a.phase), 0.2, 0.8),
     "cogging of no given ratio": added(
-        lambda p, m, r, t, j, s, f: s * p.coulomb[j] * np.cos(HUMS * m.q[:, j] - f), 0.15, 0.6),
-    "sloshing load": added(
-        lambda p, m, r, t, j, s, f: s * sloshing(m.qdd[:, j], 9.0), 0.1, 0.6),
-    "friction of another joint": added(
-        lambda p, m, r, t, j, s, f: s * p.coulomb[j] * slipping(m, beside(j, m)), 0.2, 0.7),
+        lambda a, b: a.size * a.coulomb * np.cos(HUMS * a.q - a.phase), 0.15, 0.6),
+    "sloshing load": added(lambda a, b: a.size * sloshing(a.qdd, 9.0), 0.1, 0.6),
+    "friction of another joint": added(lambda a, b: a.size * a.coulomb * b.slip, 0.2, 0.7),
     "friction by another joint's load": added(
-        lambda p, m, r, t, j, s, f: s * p.coulomb[j] * slipping(m, j)
-        * np.tanh(r[:, beside(j, m)] / max(np.abs(r[:, beside(j, m)]).mean(), 1e-9)), 0.3, 1.0),
+        lambda a, b: a.size * a.coulomb * a.slip
+        * np.tanh(b.load / max(np.abs(b.load).mean(), 1e-9)), 0.3, 1.0),
     "drag by the square of the speed": added(
-        lambda p, m, r, t, j, s, f: s * p.coulomb[j] * m.qd[:, j] * fast(m, j), 0.4, 2.0),
+        lambda a, b: a.size * a.coulomb * a.qd * a.fast, 0.4, 2.0),
 }  # fmt: skip
 CAUSES: Mapping[str, Cause] = {**LIBRARY, **OUTSIDE}

@@ -18,17 +18,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.driven_arms import ARMS, DrivenArm, commands, drawn_arm, drive_along, logged
 from experiments.motion_real import DRIVE_GAIN, RATIO, REAL
 from experiments.real import SHARED, here
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.simulators.motion.ladder import MOTOR
 from minimax_cal.simulators.motion.module import loaded
@@ -160,7 +158,7 @@ SAID = {"before": "URDF", "plain": "corrected file", "full": "with its module",
 
 def rest_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
     """What remains where friction is that of bristles, without and with motors that hold it."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for i in range(0, len(cases), 2):
         plain, motor = found[i : i + 2]
         rows.append((cases[i].arm, plain.before, *shares(plain)[:2], *shares(motor)[:2]))
@@ -176,7 +174,7 @@ def rest_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
 
 def closed_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
     """What remains on the unseen run, case by case, and its median."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for case, one in zip(cases, found, strict=True):
         rows.append((f"{case.arm} {case.seed}: {', '.join(case.withheld)}", one.before,
                      *shares(one)))  # fmt: skip
@@ -206,13 +204,12 @@ def shares(one: Closed) -> tuple[float, float, float, float]:
 def real_table(found: Sequence[Judged]) -> Table:
     """RMS current of the real arm's runs, each judged by a model that did not see it."""
     n = len(found[0].before)
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for name, said in SAID.items():
         each = np.array([getattr(one, name) for one in found])
         rows.append((said, *np.sqrt((each**2).mean(axis=0)).tolist()))
     title = f"UR10e: RMS current [A] under measured motion, {len(found)} runs left out, all rows"
-    return Table(title, ("model", *(f"J{j + 1}" for j in range(n))), tuple(rows),
-                 ("", *[".3g"] * n))  # fmt: skip
+    return Table.made(title, rows, "model", *(f"J{j + 1} .3g" for j in range(n)))
 
 
 @study_options("motion_gap")
@@ -227,9 +224,7 @@ def main(study: Study) -> None:
     rested = study.sweep(run, resting, "arms with bristles")
     tables = [closed_table(cases, found), rest_table(resting, rested)]
     content: dict[str, object] = {
-        "cases": [{"arm": case.arm, "withheld": list(case.withheld), "seed": case.seed,
-                   "friction": case.friction, "before_mrad": one.before,
-                   "remains_percent": list(shares(one))}
+        "cases": [{**vars(case), "before_mrad": one.before, "remains_percent": shares(one)}
                   for case, one in zip([*cases, *resting], [*found, *rested], strict=True)]
     }  # fmt: skip
     if not study.quick and here(REAL):
@@ -238,10 +233,4 @@ def main(study: Study) -> None:
         tables.append(real_table(judged))
         content["real"] = [{"run": one.name, **{name: getattr(one, name).tolist() for name in SAID}}
                            for one in judged]  # fmt: skip
-    elif not study.quick:
-        click.echo(f"{REAL}: its logs are not on this machine; only simulated arms", err=True)
     study.save(tables, content)
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

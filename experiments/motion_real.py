@@ -3,8 +3,7 @@
     python -m experiments.motion_real [--quick] [--out FOLDER] [--json FILE] [--seed N] [--jobs N]
 
 Each run is left out in turn: the others are diagnosed, and the model is judged on that run at every
-step, beside what the diagnosis claims for runs that it left out itself, and what gradient boosting,
-which knows no physics, takes of the rest.  The real arm is a UR10e
+step, beside what the diagnosis claims for runs that it left out itself.  The real arm is a UR10e
 whose motor currents were logged, where its logs are on this machine; the simulated one has friction
 in proportion to the load at joint 2 and a rotor inertia at joint 3 that its file does not know.
 """
@@ -15,21 +14,14 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import click
 import numpy as np
 
 import minimax_cal as mc
-from experiments import sweep
-from experiments.boosting import boost
 from experiments.real import SHARED, here
 from experiments.sweep import Study, study_options
-from minimax_cal.dynamics.evaluate import missed
 from minimax_cal.dynamics.given import runs_of
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
-from minimax_cal.dynamics.rows import prepare
 from minimax_cal.dynamics.run import Run
-from minimax_cal.dynamics.scene import Scene
-from minimax_cal.dynamics.search import Columns
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.robots.robot import Robot, load_robot, robot_from_dict
@@ -59,8 +51,7 @@ class Told:
     """What the others say, and what they reach on the run that was left out.
 
     steps: names of the budget.  claimed, reached: RMS torque (s, n) of moving rows, whole: of all
-    rows that the run has.  boosted: (2, n) of the last step less what boosting foretells, moving
-    rows and all.  confirmed: effects with their places.
+    rows that the run has.  confirmed: effects with their places.
     """
 
     name: str
@@ -69,7 +60,6 @@ class Told:
     claimed: Array
     reached: Array
     whole: Array
-    boosted: Array
     confirmed: tuple[str, ...]
     unexplained: tuple[str, ...]
 
@@ -90,41 +80,9 @@ def run(left: Left) -> Told:
         claimed=np.array([budget[name] for name in names]),
         reached=np.array([step.rms_moving for step in seen.steps]),
         whole=np.array([step.rms for step in seen.steps]),
-        boosted=boosted(found, rest, [runs[left.run]]),
         confirmed=tuple(sorted({f"{e.effect} {e.place}" for e in found.effects if e.established})),
         unexplained=tuple(one.place for one in found.unexplained),
     )
-
-
-def boosted(found: mc.MotionDiagnosis, learn: Sequence[Run], judge: Sequence[Run]) -> Array:
-    """(2, n) RMS that names and boosting miss, of moving rows and of all.
-
-    The trees see joint values, speeds, accelerations, loads and ways since reversals of all joints.
-    """
-    (seen, off, moving), (new, missed_there, moving_there) = (
-        features(found, runs) for runs in (learn, judge)
-    )
-    out = np.empty((2, off.shape[1]))
-    for j in range(off.shape[1]):
-        for number, (mine, there) in enumerate((
-            (moving[:, j], moving_there[:, j]),
-            (np.ones(len(off), dtype=bool), np.ones(len(new), dtype=bool)),
-        )):  # fmt: skip
-            trees = boost(seen[mine], off[mine, j], np.random.default_rng(j))
-            left = missed_there[there, j] - trees.predict(new[there])
-            out[number, j] = np.sqrt(np.mean(left**2))
-    return out
-
-
-def features(found: mc.MotionDiagnosis, runs: Sequence[Run]) -> tuple[Array, Array, Array]:
-    """Of every row what trees see, what the last step misses (R, n), and whether joints move."""
-    logs, model = prepare(runs), found.models[-1]
-    columns = Columns(model.context.in_scene(Scene.of(found.arm, logs)))
-    scene = columns.scene
-    known = (logs.motion.q, logs.motion.qd, logs.motion.qdd, scene.load, scene.since_reversal)
-    every = np.concatenate([part[logs.picked] for part in known], axis=1)
-    bent = scene.bristles.reshape(len(every), -1)
-    return np.concatenate([every, bent], axis=1), missed(model, logs, columns), logs.moving
 
 
 def logs_of(arm: str, seed: int) -> tuple[Robot, Sequence[Run]]:
@@ -184,30 +142,22 @@ def three_joints() -> Robot:
 
 def steps_table(arm: str, told: Sequence[Told]) -> Table:
     """RMS torque on the runs left out, by the steps that every diagnosis has, and at the end."""
+
+    def over_runs(each: Sequence[Array]) -> list[Cell]:
+        return list(np.sqrt(np.mean(np.square(each), axis=0)).tolist())
+
     shared = [name for name in told[0].steps if all(name in one.steps for one in told)]
-    joints = [f"J{j + 1}" for j in range(told[0].reached.shape[1])]
-    rows: list[tuple[Cell, ...]] = []
-    for name in shared:
-        each = np.array([one.reached[one.steps.index(name)] for one in told])
-        rows.append((name, *np.sqrt(np.mean(each**2, axis=0)).tolist()))
-    last = np.array([one.reached[-1] for one in told])
-    whole = np.array([one.whole[-1] for one in told])
+    last = [one.reached[-1] for one in told]
     claimed = np.array([one.claimed[-1] for one in told])
+    rows = [(name, *over_runs([one.reached[one.steps.index(name)] for one in told]))
+            for name in shared]  # fmt: skip
     rows += [
-        ("all effects", *np.sqrt(np.mean(last**2, axis=0)).tolist()),
-        ("all effects, with rows at rest", *np.sqrt(np.mean(whole**2, axis=0)).tolist()),
-        ("and boosting on top", *mean_square(told, 0)),
-        ("and boosting, with rows at rest", *mean_square(told, 1)),
+        ("all effects", *over_runs(last)),
+        ("all effects, with rows at rest", *over_runs([one.whole[-1] for one in told])),
         ("claimed over reached", *np.median(claimed / last, axis=0).tolist()),
     ]
     title = f"{ARMS[arm]}: RMS torque [{told[0].unit}] on each run left out, {len(told)} runs"
-    return Table(title, ("step", *joints), tuple(rows), ("", *[".3g"] * len(joints)))
-
-
-def mean_square(told: Sequence[Told], which: int) -> list[float]:
-    """RMS over runs of what boosting leaves at each joint: of moving rows, or of all."""
-    each = np.array([one.boosted[which] for one in told])
-    return [float(v) for v in np.sqrt(np.mean(each**2, axis=0))]
+    return Table.made(title, rows, "step", *(f"J{j + 1} .3g" for j in range(len(last[0]))))
 
 
 def names_table(arm: str, told: Sequence[Told]) -> Table:
@@ -221,8 +171,6 @@ def names_table(arm: str, told: Sequence[Told]) -> Table:
 def main(study: Study) -> None:
     """Torques along trajectories, judged by runs that no fit saw."""
     arms = [arm for arm in ARMS if arm == SIMULATED or here(arm)]
-    if REAL not in arms:
-        click.echo(f"{REAL}: its logs are not on this machine; only the simulated arm", err=True)
     tables, content = list[Table](), dict[str, object]()
     for arm in arms[-1:] if study.quick else arms:
         count = RUNS if arm == SIMULATED else len(logs_of(arm, study.seed)[1])
@@ -232,12 +180,7 @@ def main(study: Study) -> None:
         content[arm] = [
             {"run": one.name, "unit": one.unit, "rms_moving": one.reached[-1].tolist(),
              "rms": one.whole[-1].tolist(), "claimed": one.claimed[-1].tolist(),
-             "boosted_moving": one.boosted[0].tolist(), "boosted": one.boosted[1].tolist(),
-             "unexplained": list(one.unexplained),
-             "confirmed": list(one.confirmed)} for one in told
+             "unexplained": one.unexplained,
+             "confirmed": one.confirmed} for one in told
         ]  # fmt: skip
     study.save(tables, content)
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

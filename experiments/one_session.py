@@ -25,9 +25,8 @@ import click
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from experiments import sweep
 from experiments.real import here, real
-from experiments.record import interval
+from experiments.record import rate
 from experiments.sweep import Study, study_options
 from minimax_cal.diagnosing.diagnose import diagnose
 from minimax_cal.evidence.noise import orthonormal
@@ -331,13 +330,6 @@ def simulated_jobs(seed: int, count: int) -> Iterator[Job]:
                 yield Job(arm, seed + number, way, AS_NOISE)
 
 
-def share(hits: Sequence[bool]) -> tuple[float, float, float]:
-    """Percent, and the 95 % interval of a share [Clopper and Pearson 1934]."""
-    n, k = len(hits), sum(hits)
-    low, high = interval(k, n)
-    return 100.0 * k / n, 100.0 * low, 100.0 * high
-
-
 def rows_of(jobs: Sequence[Job], results: Sequence[Found]) -> Iterator[tuple[TableCell, ...]]:
     """Rates of both commands, of false alarms and of moves that were found."""
     pairs = list(zip(jobs, results, strict=True))
@@ -360,19 +352,24 @@ def rows_of(jobs: Sequence[Job], results: Sequence[Found]) -> Iterator[tuple[Tab
                     continue
                 right = [joint in named if joint else not named for joint, named in some]
                 other = [bool(set(named) - {joint}) for joint, named in some]
-                yield (kind, cut, command, len(some), *share(right), *share(other))
+                yield (
+                    kind,
+                    cut,
+                    command,
+                    len(some),
+                    *(of for hits in (right, other) for of in rate(sum(hits), len(some))),
+                )
 
 
 @study_options("one_session")
 @click.option("--arms", "count", type=int, default=200, show_default=True, help="Simulated ones.")
-@click.option("--real/--no-real", "with_real", default=True, help="Whether real arms, too.")
 @click.option("--drift/--no-drift", default=True, help="Whether zeros and lengths drift.")
 @click.option("--command", "commands", type=click.Choice(list(COMMANDS)), multiple=True,
               default=tuple(COMMANDS), help="Ask these alone.")  # fmt: skip
-def main(study: Study, count: int, with_real: bool, drift: bool, commands: tuple[str, ...]) -> None:
+def main(study: Study, count: int, drift: bool, commands: tuple[str, ...]) -> None:
     """Rates at which halves of one session are said to differ, and at which a move is found."""
     jobs = list(simulated_jobs(study.seed, 2 if study.quick else count))
-    jobs += list(real_jobs(study.seed)) if with_real and not study.quick else []
+    jobs += [] if study.quick else list(real_jobs(study.seed))
     jobs = [replace(job, commands=commands, drift=drift) for job in jobs]
     results = study.sweep(run, jobs, "halves of a session")
     table = Table.made(
@@ -384,7 +381,3 @@ def main(study: Study, count: int, with_real: bool, drift: bool, commands: tuple
     names = ("arms", "cut", "command", "cuts", "right_percent", "right_low", "right_high",
              "other_percent", "other_low", "other_high")  # fmt: skip
     study.save([table], {"rows": table.records(*names)})
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

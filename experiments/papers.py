@@ -10,14 +10,10 @@ behind it.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -30,84 +26,41 @@ from experiments import (
     errata,
     methods,
     splits,
-    sweep,
     verdicts_m,
     verdicts_s,
 )
-from experiments.real import SHARED
 from experiments.sweep import Study, study_options
-from experiments.verdicts import HEADER, HOLDS, MISSING, NO, Verdict, of_quick, table_of
+from experiments.verdicts import HEADER, MISSING, Verdict, of_quick, table_of
 from minimax_cal.ground.files import write_whole
 
-
-def own(study: Study, name: str) -> Study:
-    """The same options for one of the studies: its own kept parts, a folder of its own."""
-    return replace(study, name=name, out=study.out / name, json=None)
+Judged = Callable[[Any], Iterable[Verdict]]
 
 
-def made_by(
-    module: ModuleType, judged: Callable[[Any], list[Verdict]]
-) -> Callable[[Study], list[Verdict]]:
-    """A study that finds (`study_of`) and saves, and the verdicts on what it found."""
-
-    def make(study: Study) -> list[Verdict]:
-        found = module.study_of(study)
-        module.save(study, found)
-        return judged(found)
-
-    return make
-
-
-def from_methods(study: Study) -> list[Verdict]:
-    """Paper M, Tables 1 and 4."""
-    found = methods.run(study.quick, study.seed, SHARED, study.sweep)
-    tables = [methods.PROPERTIES, methods.PRINTED, methods.claims_table(found)]
-    tables += [methods.accuracy_table(case, results) for case, results in found]
-    study.save(tables, {}, methods.figures(found))
-    return verdicts_m.tables_1_4(found)
-
-
-def from_errata(study: Study) -> list[Verdict]:
-    """Both papers as printed."""
-    study.save([errata.table()], {})
-    write_whole(study.out / "list.md", errata.page())
-    count = len(errata.ERRATA)
-    shown = sum(errata.stands(one) for one in errata.ERRATA)
-    return [
-        Verdict("S, M: the formulas as printed", "errata", f"{count} slips",
-                f"{shown} shown by counter-example", HOLDS if shown == count else NO,
-                "list with proofs: docs/errata.md")
-    ]  # fmt: skip
-
-
-STUDIES: dict[str, Callable[[Study], list[Verdict]]] = {
-    "convergence": made_by(convergence, verdicts_s.table_2),
-    "courses": made_by(courses, verdicts_s.courses),
-    "any_base": made_by(any_base, verdicts_s.anywhere),
-    "conditions": made_by(conditions, verdicts_m.conditions),
-    "methods": from_methods,
-    "splits": made_by(splits, verdicts_m.many_splits),
-    "algorithm_1": made_by(algorithm_1, verdicts_m.to_the_letter),
-    "errata": from_errata,
-}
+def verdicts_of(study: Study, module: ModuleType, judged: Judged) -> Iterable[Verdict]:
+    """Run one of the studies into a folder of its own, and judge what it found."""
+    name = module.__name__.rpartition(".")[2]
+    own = replace(study, name=name, out=study.out / name, json=None)
+    found = module.study_of(own)
+    module.save(own, found)
+    return judged(found)
 
 
 def study_of(study: Study) -> list[Verdict]:
     """All verdicts, paper S first."""
-    found = {name: make(own(study, name)) for name, make in STUDIES.items()}
+    of = partial(verdicts_of, study)
     verdicts = [
         *verdicts_s.model(),
-        *found["convergence"],
-        *found["courses"],
-        *found["any_base"],
+        *of(convergence, verdicts_s.table_2),
+        *of(courses, verdicts_s.courses),
+        *of(any_base, verdicts_s.anywhere),
         *verdicts_s.own_cell(),
-        *found["methods"],
-        *found["conditions"],
-        *found["splits"],
-        *found["algorithm_1"],
+        *of(methods, verdicts_m.tables_1_4),
+        *of(conditions, verdicts_m.conditions),
+        *of(splits, verdicts_m.many_splits),
+        *of(algorithm_1, verdicts_m.to_the_letter),
         *verdicts_m.subproblems(study.quick),
         *verdicts_m.own_cell(),
-        *found["errata"],
+        *of(errata, verdicts_m.slips),
     ]
     return [of_quick(verdict) for verdict in verdicts] if study.quick else verdicts
 
@@ -124,7 +77,3 @@ def main(study: Study) -> None:
     }
     study.save([table], content)
     write_whole(study.out / "verdicts.csv", table.csv())
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

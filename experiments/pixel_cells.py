@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
+from experiments.real import off_drawing
 from minimax_cal.fitting.pixels.camera import Camera
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.fit import gram_of_pixels
@@ -109,13 +110,6 @@ def seen_by(view: View, robot: mc.Robot, q: Array, points: Array, on_flange: boo
     world = np.einsum("mij,kj->mki", own[:, :3, :3], points) + own[:, None, :3, 3]
     local = np.einsum("mji,mkj->mki", camera[:, :3, :3], world - camera[:, None, :3, 3])
     return projected(view, local)
-
-
-def off_drawing(robot: mc.Robot, rng: np.random.Generator, length: float = OFF_LENGTH,
-                angle: float = OFF_ANGLE) -> mc.Robot:  # fmt: skip
-    """A copy of the arm whose links are off their drawing."""
-    scale = np.array([length, length, angle, angle, angle])
-    return robot.with_mdh(robot.mdh + rng.normal(size=robot.mdh.shape) * scale)
 
 
 def looking(rng: np.random.Generator, distance: tuple[float, float], tilt: float) -> Array:

@@ -16,7 +16,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.pixel_cells import (
     BOARD,
     DISTANCE,
@@ -50,7 +49,7 @@ from minimax_cal.fitting.pixels.model import PixelModel
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import directions, from_far, poses_of_images, start_scene
 from minimax_cal.fitting.several.pixel_calibration import fitted
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.stages import silent
 from minimax_cal.ground.tables import Table
 from minimax_cal.instruments import flange_poses
@@ -272,8 +271,8 @@ def ways_table(jobs: Sequence[Job], found: Sequence[Found]) -> Table:
             np.array([getattr(one, name) for one in mine]) for name in ("error", "sigma", "pixels")
         )
         over = error / sigma
-        rows.append((way, root_mean(error), error.max(), *against_bound(mine),
-                     root_mean(sigma), root_mean(over), over.max(), float(pixels.mean()),
+        rows.append((way, rms(error), error.max(), *against_bound(mine),
+                     rms(sigma), rms(over), over.max(), float(pixels.mean()),
                      mine[0].named))  # fmt: skip
     return Table.made(
         "arm errors over the joints' whole range, mm, base and tool fitted",
@@ -284,11 +283,6 @@ def ways_table(jobs: Sequence[Job], found: Sequence[Found]) -> Table:
     )
 
 
-def root_mean(values: Array) -> float:
-    """Root mean square."""
-    return float(np.sqrt((values**2).mean()))
-
-
 def against_bound(found: Sequence[Found]) -> tuple[float, float]:
     """RMS error of fits that reach the bound [mm], and how often their largest is as large."""
     if not all(one.least for one in found):
@@ -296,7 +290,7 @@ def against_bound(found: Sequence[Found]) -> tuple[float, float]:
     rng = np.random.default_rng(0)
     draws = [rng.chisquare(1.0, (DRAWS, len(one.least))) @ np.array(one.least) for one in found]
     largest = max(one.error for one in found)
-    bound = root_mean(np.sqrt([sum(one.least) for one in found]))
+    bound = rms(np.sqrt([sum(one.least) for one in found]))
     return bound, float((np.max(draws, axis=0) >= largest**2).mean())
 
 
@@ -428,7 +422,3 @@ def main(study: Study) -> None:
         ],
     }  # fmt: skip
     study.save(tables, content)
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -20,12 +20,9 @@ from experiments.poses import (
     Found,
     adjoint,
     exp,
-    fit_of,
     gauss_newton,
-    inverse,
     point_slope,
     points,
-    pose,
     pose_residual,
     pose_slope,
 )
@@ -33,6 +30,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.transforms import inverse, transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +117,7 @@ def fit_positions(start: Screws, q: Array, measured: Array) -> Found[Screws]:
 
 def poe_fit(robot: Robot, base: Array, spots: Array, found: Found[Screws]) -> Fit:
     """A POE arm whose base frame stands at `base`, with the SMRs at `spots` (3, 3) in its tool."""
-    return fit_of(lambda q: points(base @ found.x.poses(q * robot.sign), spots), found)
+    return Fit(lambda q: points(base @ found.x.poses(q * robot.sign), spots), str(found.status))
 
 
 def poe_pose(robot: Robot, train: Measurements) -> Fit:
@@ -136,7 +134,7 @@ def poe_position(robot: Robot, train: Measurements, smr: int) -> Fit:
     """POE fitted to one SMR; all three then take their mean place in the moving tool."""
     start, q = start_of(robot, train), train.q * robot.sign
     arm = start.found.x
-    first = screws_of(robot, arm.tool @ pose(np.eye(3), start.shape[smr]))
+    first = screws_of(robot, arm.tool @ transform(np.eye(3), start.shape[smr]))
     to_base = inverse(arm.base)
     y = train.y @ to_base[:3, :3].T + to_base[:3, 3]
     found = fit_positions(first, q, y[:, smr])

@@ -18,10 +18,10 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.judging.iso9283 import formulas
 from minimax_cal.judging.iso9283.formulas import turns_of
 from minimax_cal.robots.kinematics import hat, rotation
+from minimax_cal.robots.transforms import transform
 from minimax_cal.solvers.status import Status
 
 X = TypeVar("X")
-CENTROID = np.zeros(3)  # the origin of a measured pose
 
 
 def triangle(y: Array) -> Array:
@@ -42,20 +42,7 @@ def poses_of(shape: Array, y: Array) -> Array:
 
     shape: (k, 3) centred, its points not on a line.  y: (m, k, 3) [m].
     """
-    return pose(turns_of(shape, y), y.mean(axis=1))
-
-
-def pose(turn: Array, shift: Array) -> Array:
-    """(..., 4, 4) from a rotation (..., 3, 3) and a translation (..., 3) [m]."""
-    out = np.zeros((*turn.shape[:-2], 4, 4), dtype=np.result_type(turn, shift))
-    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = turn, shift, 1.0
-    return out
-
-
-def inverse(T: Array) -> Array:
-    """Inverse of poses (..., 4, 4)."""
-    back = np.swapaxes(T[..., :3, :3], -1, -2)
-    return pose(back, -(back @ T[..., :3, 3, None])[..., 0])
+    return transform(turns_of(shape, y), y.mean(axis=1))
 
 
 def points(T: Array, spots: Array) -> Array:
@@ -66,15 +53,6 @@ def points(T: Array, spots: Array) -> Array:
 def log(turn: Array) -> Array:
     """Rotation vectors (..., 3) of rotations (..., 3, 3) [rad]."""
     return Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(turn.shape[:-1])
-
-
-def position_error(measured: Array, computed: Array, tool: Array = CENTROID) -> Array:
-    """Distance between measured and computed places of a tool point: (m,) [m; M eq. 3].
-
-    tool: (3,) in the frame of the pose [m].
-    """
-    places = [T[..., :3, :3] @ tool + T[..., :3, 3] for T in (measured, computed)]
-    return np.asarray(np.linalg.norm(places[0] - places[1], axis=-1))
 
 
 def orientation_error(measured: Array, computed: Array) -> Array:
@@ -145,7 +123,7 @@ def inverse_left_jacobian(w: Array) -> Array:
 def exp(twist: Array) -> Array:
     """Motion (..., 4, 4) of a unit time with twist (..., 6).  Any dtype."""
     v, w = twist[..., :3], twist[..., 3:]
-    return pose(rotation(w), (left_jacobian(w) @ v[..., None])[..., 0])
+    return transform(rotation(w), (left_jacobian(w) @ v[..., None])[..., 0])
 
 
 def adjoint(T: Array) -> Array:
@@ -160,13 +138,11 @@ def adjoint(T: Array) -> Array:
 class Found(Generic[X]):
     """x: where Gauss-Newton ended.  cost: sum of squares there [m^2].
 
-    parameters, identified: number of columns, and rank of the last Jacobian.
+    identified: rank of the last Jacobian.
     """
 
     x: X
     cost: float
-    iterations: int
-    parameters: int
     identified: int
     status: Status
 
@@ -186,9 +162,8 @@ def gauss_newton(
     step moves the residuals by less than 1e-11 m (root mean square).
     """
     residual, slope = linearise(x)
-    cost, status, taken, rank = float(residual @ residual), Status.ITERATION_LIMIT, 0, 0
-    while taken < iterations:
-        taken += 1
+    cost, status, rank = float(residual @ residual), Status.ITERATION_LIMIT, 0
+    for _ in range(iterations):
         scale = np.linalg.norm(slope, axis=0)
         largest = scale.max()  # a column that is nothing but rounding must not be blown up
         scale = np.where(scale > 1e-9 * largest, scale, largest)
@@ -210,24 +185,12 @@ def gauss_newton(
         if np.linalg.norm(pull) <= 1e-11 * np.sqrt(len(residual)):
             status = Status.CONVERGED
             break
-    return Found(x, cost, taken, slope.shape[1], rank, status)
+    return Found(x, cost, rank, status)
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A calibrated arm: predict (m, n) joints -> (m, 3, 3) points [m], and what it took.
-
-    identified: rank of the Jacobian, or number of parameters freed.
-    """
+    """A calibrated arm: predict (m, n) joints -> (m, 3, 3) points [m], and how the fit ended."""
 
     predict: Callable[[Array], Array]
-    parameters: int
-    identified: int
-    iterations: int
     status: str
-
-
-def fit_of(predict: Callable[[Array], Array], found: Found[X]) -> Fit:
-    """A fit by our Gauss-Newton."""
-    status = str(found.status)
-    return Fit(predict, found.parameters, found.identified, found.iterations, status)

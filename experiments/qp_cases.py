@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from scipy import sparse
@@ -19,6 +18,7 @@ from qp_backends import Problem, Solution
 from qp_backends import solve as solve_qp
 
 SHARED = real.SHARED / "maros_meszaros"
+MAROS = "Maros-Meszaros"
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,47 +86,25 @@ def hard(quick: bool) -> list[Case]:
         room = rng.uniform(0.1, 1.0, m)
         q = rng.normal(size=n)
         open_below = np.full(m, -np.inf)
-        make = partial(problem_of, x=x)
-        cases += [
-            Case(f"degenerate {trial}", make(root @ root.T, rows, q, np.zeros(m))),
-            Case(
-                f"repeated rows {trial}",
-                Problem(
-                    root @ root.T,
-                    q,
-                    np.repeat(rows, 2, axis=0),
-                    *(np.repeat(side, 2) for side in (open_below, at + room)),
-                ),
-            ),
-            Case(
-                f"nearly singular {trial}",
-                Problem(spectrum(rng, n, 1e-9), q, rows, at - room, at + room),
-            ),
-            Case(
-                f"singular {trial}",
-                Problem(root[:, :4] @ root[:, :4].T, q, rows, at - room, at + room),
-            ),
-            Case(
-                f"badly scaled {trial}",
-                scaled(rng, Problem(root @ root.T, q, rows, at - room, at + room)),
-            ),
-            Case(
-                f"infeasible {trial}",
-                Problem(
-                    root @ root.T,
-                    q,
-                    np.vstack([rows, rows[:1]]),
-                    np.append(open_below, at[0] + 2.0),
-                    np.append(at + room, np.inf),
-                ),
-                "infeasible",
-            ),
-            Case(f"unbounded {trial}", unbounded(rng, n), "unbounded"),
-        ]
+        full, below, above = root @ root.T, at - room, at + room
+        twice = [np.repeat(side, 2) for side in (open_below, above)]
+        lowest, highest = np.append(open_below, at[0] + 2.0), np.append(above, np.inf)
+        made = {
+            "degenerate": problem_of(full, rows, np.zeros(m), x),
+            "repeated rows": Problem(full, q, np.repeat(rows, 2, axis=0), *twice),
+            "nearly singular": Problem(spectrum(rng, n, 1e-9), q, rows, below, above),
+            "singular": Problem(root[:, :4] @ root[:, :4].T, q, rows, below, above),
+            "badly scaled": scaled(rng, Problem(full, q, rows, below, above)),
+            "infeasible": Problem(full, q, np.vstack([rows, rows[:1]]), lowest, highest),
+            "unbounded": unbounded(rng, n),
+        }
+        kinds = {name: name for name in ("infeasible", "unbounded")}
+        cases += [Case(f"{name} {trial}", problem, kinds.get(name, "solvable"))
+                  for name, problem in made.items()]  # fmt: skip
     return cases
 
 
-def problem_of(P: Array, rows: Array, q: Array, room: Array, x: Array) -> Problem:
+def problem_of(P: Array, rows: Array, room: Array, x: Array) -> Problem:
     """More active rows than unknowns meet in x, which is the solution."""
     count = len(x) + 5
     y = np.where(np.arange(len(rows)) < count, 1.0, 0.0)
@@ -169,6 +147,6 @@ def unbounded(rng: np.random.Generator, n: int) -> Problem:
 SETS = {
     "calibration, 6 rows": calibration_small,
     "calibration, 303 rows": calibration_large,
-    "Maros-Meszaros": maros_meszaros,
+    MAROS: maros_meszaros,
     "hard": hard,
 }

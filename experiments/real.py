@@ -1,4 +1,4 @@
-"""Real arms and their measurements, where they are on this machine."""
+"""Arms of several studies: off their drawing, or real, where their measurements are here."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 
 import click
+import numpy as np
 
 from minimax_cal.measuring.datasets import FOLDER
 from minimax_cal.measuring.measurements import Measurements, read_measurements
@@ -34,3 +35,9 @@ def real(name: str) -> tuple[Robot, Measurements]:
     return load_robot(SHARED / name / "robot.json"), read_measurements(
         SHARED / name / "measurements.csv"
     )
+
+
+def off_drawing(robot: Robot, rng: np.random.Generator, length: float, angle: float) -> Robot:
+    """A copy of the arm whose links are off their drawing by standard deviations [m, rad]."""
+    scale = [length, length, angle, angle, angle]
+    return robot.with_mdh(robot.mdh + rng.normal(size=robot.mdh.shape) * scale)

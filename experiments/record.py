@@ -68,10 +68,17 @@ def interval(hits: int, n: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def rate(hits: int, n: int) -> tuple[float, float, float]:
+    """A share and its 95 % interval [%]; NaN of none."""
+    low, high = interval(hits, n)
+    return 100.0 * hits / n if n else float("nan"), 100.0 * low, 100.0 * high
+
+
 def save_tables(folder: Path, name: str, tables: Sequence[Table]) -> None:
-    """Write tables as name.md, name.tex and one CSV each, and show them."""
+    """Write tables as name.md, name.tex, name.html and one CSV each, and show them."""
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / f"{name}.md", "\n".join(table.markdown() for table in tables))
+    write_whole(folder / f"{name}.html", "\n".join(table.html() for table in tables))
     write_whole(folder / f"{name}.tex", "\n".join(table.latex() for table in tables))
     for number, table in enumerate(tables, start=1):
         write_whole(folder / f"{name}_{number}.csv", table.csv())

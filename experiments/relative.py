@@ -21,15 +21,15 @@ import click
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from experiments import sweep
-from experiments.real import here, real
+from experiments.real import here, off_drawing, real
 from experiments.record import canvas
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.claims import position_sigma
+from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.several import RelativeCalibration, relative
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.arrays import Array, rms
+from minimax_cal.ground.tables import Table
 from minimax_cal.instruments import Instrument, closures, distances, flange_poses
 from minimax_cal.instruments.poses import WholePoses
 from minimax_cal.instruments.sockets import CLOSED, Visits, reach
@@ -78,9 +78,7 @@ class Arm:
     def of(name: str, seed: int, compliance: float) -> Arm:
         """The same true arm for the same seed, whatever measures it."""
         robot, rng = load_robot(name), np.random.default_rng([seed, 1])
-        sigma = [LENGTH, LENGTH, ANGLE, ANGLE, ANGLE]
-        return Arm(robot, robot.with_mdh(robot.mdh + rng.normal(size=(robot.joints, 5)) * sigma),
-                   compliance)  # fmt: skip
+        return Arm(robot, off_drawing(robot, rng, LENGTH, ANGLE), compliance)
 
     def bent(self, q: Array) -> Array:
         """Joint values that a stiff arm would have where this one is told q."""
@@ -329,55 +327,45 @@ class Outcome:
 
 
 def run(job: Job) -> Outcome:
-    """Simulate, calibrate, and compare with the truth."""
+    """Simulate, calibrate, and compare with the truth; a tracker with one reflector by itself."""
     arm = Arm.of(job.robot, job.seed, job.compliance)
     rng = np.random.default_rng([job.seed, 2, list(KINDS).index(job.kind)])
     checks = random_poses(arm.robot, CHECKS, np.random.default_rng([job.seed, 3]))
-    nominal = position_errors(arm, arm.robot, SPOT, checks, scaled=False)
+    fit: Fit | RelativeCalibration
     if job.kind == "tracker":
-        return tracked(arm, rng, checks, nominal)
-    measured = SIMULATORS[job.kind](arm, rng, POSES, NOISE)
-    fit = relative(arm.robot, measured.data, known_distances=measured.known)
-    found, shape = true_errors(arm, fit.robot, spot_of(fit), checks)
+        q = random_poses(arm.robot, POSES, rng)
+        y = arm.place(q) + NOISE * rng.normal(size=(POSES, 3))
+        fit = calibrate(arm.robot, measurements(q, y), objective="sum")
+        state, spot = fit.cell.state, fit.cell.target_positions[0]
+        numbers, identified = 3 * fit.accuracy["train"].poses, count_of(fit)
+        rank = rank_by_differences(arm, arm.bent(q), np.zeros(6), seen_points)
+        sigma = position_sigma(arm.robot, state.mdh, state.target_positions, fit.covariance)
+    else:
+        measured = SIMULATORS[job.kind](arm, rng, POSES, NOISE)
+        fit = relative(arm.robot, measured.data, known_distances=measured.known)
+        numbers, identified = fit.numbers["train"] + len(measured.known), fit.identified
+        rank, sigma, spot = rank_of(arm, measured), fit.position_sigma, spot_of(fit)
+    found, shape = (
+        position_errors(arm, fit.robot, spot, checks, scaled=scaled) for scaled in (False, True)
+    )
+    nominal = position_errors(arm, arm.robot, SPOT, checks, scaled=False)
     return Outcome(
-        numbers=fit.numbers["train"] + len(measured.known),
+        numbers=numbers,
         parameters=len(fit.parameters),
-        identified=fit.identified,
-        rank=rank_of(arm, measured),
+        identified=identified,
+        rank=rank,
         held_mm=(fit.accuracy["nominal"].rms_mm, fit.accuracy["holdout"].rms_mm),
         true_mm=(rms_mm(nominal), rms_mm(found)),
         shape_mm=rms_mm(shape),
         worst_mm=float(1e3 * found.max()),
-        sigma_mm=1e3 * fit.position_sigma,
+        sigma_mm=1e3 * sigma,
         converged=fit.status == "converged",
     )
 
 
-def tracked(arm: Arm, rng: np.random.Generator, checks: Array, nominal: Array) -> Outcome:
-    """The same with a tracker and one reflector, by `calibrate`."""
-    q = random_poses(arm.robot, POSES, rng)
-    y = arm.place(q) + NOISE * rng.normal(size=(POSES, 3))
-    fit = calibrate(arm.robot, measurements(q, y), objective="sum")
-    found, shape = true_errors(arm, fit.robot, fit.cell.target_positions[0], checks)
-    state = fit.cell.state
-    return Outcome(
-        numbers=3 * fit.accuracy["train"].poses,
-        parameters=len(fit.parameters),
-        identified=sum(p.identifiable for p in fit.parameters),
-        rank=rank_by_differences(arm, arm.bent(q), np.zeros(6), seen_points),
-        held_mm=(fit.accuracy["nominal"].rms_mm, fit.accuracy["holdout"].rms_mm),
-        true_mm=(rms_mm(nominal), rms_mm(found)),
-        shape_mm=rms_mm(shape),
-        worst_mm=float(1e3 * found.max()),
-        sigma_mm=1e3 * position_sigma(arm.robot, state.mdh, state.target_positions, fit.covariance),
-        converged=fit.status == "converged",
-    )
-
-
-def true_errors(arm: Arm, robot: Robot, spot: Array, q: Array) -> tuple[Array, Array]:
-    """Position errors of a calibrated arm, and those with the best scale: (m,) each [m]."""
-    plain = position_errors(arm, robot, spot, q, scaled=False)
-    return plain, position_errors(arm, robot, spot, q, scaled=True)
+def count_of(fit: Fit) -> int:
+    """How many parameters are identified."""
+    return sum(p.identifiable for p in fit.parameters)
 
 
 def spot_of(fit: RelativeCalibration) -> Array:
@@ -389,7 +377,7 @@ def spot_of(fit: RelativeCalibration) -> Array:
 
 def rms_mm(distance: Array) -> float:
     """Root mean square of distances [m], in millimetres."""
-    return float(1e3 * np.sqrt(np.mean(distance**2)))
+    return 1e3 * rms(distance)
 
 
 # ---- real arms -------------------------------------------------------------------------------
@@ -432,10 +420,9 @@ def run_real(job: RealJob) -> RealOutcome:
     fit = calibrate(robot, train, objective="sum", holdout=0.0)
     nominal = after_base(held, robot, fit.nominal.target_positions[0])
     if job.kind == "tracker":
-        identified = sum(p.identifiable for p in fit.parameters)
         held_mm = rms_mm(np.linalg.norm(fit.cell.error(held)[0], axis=1))
         after = after_base(held, fit.robot, fit.cell.target_positions[0])
-        return RealOutcome(train.poses, identified, held_mm, (nominal, after))
+        return RealOutcome(train.poses, count_of(fit), held_mm, (nominal, after))
     other = relative(robot, seen_from(data, job.kind), seed=job.seed, holdout=job.held)
     return RealOutcome(
         train.poses,
@@ -463,14 +450,10 @@ def after_base(data: Measurements, robot: Robot, spot: Array) -> float:
 
 def real_table(found: dict[tuple[str, str], list[RealOutcome]]) -> Table:
     """Real arms by their own points: medians over the hold-outs."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for (robot, kind), some in found.items():
-        held, before, after = (
-            middle(values)
-            for values in zip(*((o.held_mm, *o.position_mm) for o in some), strict=True)
-        )
-        first = some[0]
-        rows.append((REAL[robot], KINDS[kind], first.poses, first.identified, held, before, after))
+        middle = np.median([(o.held_mm, *o.position_mm) for o in some], axis=0).tolist()
+        rows.append((REAL[robot], KINDS[kind], some[0].poses, some[0].identified, *middle))
     return Table.made(
         "real arms, a tracker's points as lengths: medians over the hold-outs",
         rows,
@@ -484,16 +467,12 @@ Found = dict[tuple[str, str, float], list[Outcome]]
 
 def identified_table(found: Found) -> Table:
     """What each kind of measurement can tell."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for (robot, kind, compliance), outcomes in found.items():
         if not compliance:
-            first = outcomes[0]
-            agree = sum(o.rank == o.identified for o in outcomes)
-            told = (first.parameters, first.identified, first.rank)
-            rows.append(
-                (ROBOTS[robot], KINDS[kind], first.numbers, *told, f"{agree}/{len(outcomes)}")
-            )
-
+            one, agree = outcomes[0], sum(o.rank == o.identified for o in outcomes)
+            rows.append((ROBOTS[robot], KINDS[kind], one.numbers, one.parameters, one.identified,
+                         one.rank, f"{agree}/{len(outcomes)}"))  # fmt: skip
     return Table.made(
         "what is identifiable",
         rows,
@@ -509,27 +488,14 @@ def middle(values: Sequence[float]) -> float:
 
 def accuracy_table(found: Found, compliance: float) -> Table:
     """Medians over the seeds of held-out and true errors."""
-    rows: list[tuple[Cell, ...]] = []
-    for (robot, kind, bend), outcomes in found.items():
-        if bend != compliance:
-            continue
-        true = middle([o.true_mm[1] for o in outcomes])
-        tracker = middle([o.true_mm[1] for o in found[robot, "tracker", compliance]])
-        rows.append(
-            (
-                ROBOTS[robot],
-                KINDS[kind],
-                middle([o.held_mm[0] for o in outcomes]),
-                middle([o.held_mm[1] for o in outcomes]),
-                middle([o.true_mm[0] for o in outcomes]),
-                true,
-                true / tracker,
-                middle([o.worst_mm for o in outcomes]),
-                middle([o.shape_mm for o in outcomes]),
-                middle([o.sigma_mm for o in outcomes]),
-                f"{sum(o.converged for o in outcomes)}/{len(outcomes)}",
-            )
-        )
+    rows = []
+    for (robot, kind, bend), some in found.items():
+        if bend == compliance:
+            tracker = middle([o.true_mm[1] for o in found[robot, "tracker", compliance]])
+            each = [(*o.held_mm, *o.true_mm, o.worst_mm, o.shape_mm, o.sigma_mm) for o in some]
+            *held, true, worst, shape, sigma = np.median(each, axis=0).tolist()
+            rows.append((ROBOTS[robot], KINDS[kind], *held, true, true / tracker, worst, shape,
+                         sigma, f"{sum(o.converged for o in some)}/{len(some)}"))  # fmt: skip
     bends = f"joints bend by {1e6 * compliance:g} urad/(N m), not fitted"
     arms = bends if compliance else "stiff arms"
     return Table.made(
@@ -591,7 +557,3 @@ def main(study: Study, seeds: int) -> None:
         ],
     }
     study.save(tables, content, {"relative": figure_of(found)})
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -1,4 +1,4 @@
-"""The diagnosis of several instruments on simulated arms of which the causes are known.
+"""Does a diagnosis of several instruments name the cause?  Arms of which the causes are known.
 
     python -m experiments.relative_gap [--quick] [--out FOLDER] [--seed N] [--jobs N] ...
 
@@ -14,21 +14,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from experiments import sweep
-from experiments.relative import LENGTH, NOISE, SIMULATORS, Arm, Measured
+from experiments.relative import COMPLIANCE, NOISE, SIMULATORS, Arm, Measured
 from experiments.sweep import Study, study_options
 from minimax_cal.diagnosing.instruments import diagnose_relative
 from minimax_cal.fitting.several.kinds import labels_of
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.instruments.file import Given, as_instrument
 from minimax_cal.measuring.measurements import measurements
 from minimax_cal.modelling.simulate import gravity
-from minimax_cal.robots.robot import load_robot
 from minimax_cal.robots.sampling import random_poses
 
-ANGLE = 1.0e-3  # standard deviation of the angles of links [rad]
-COMPLIANCE = 3.0e-7  # of every joint [rad/(N m)]
 RIPPLE, TEETH = 60e-6, 80.0  # amplitude [rad] and waves a turn of the third joint's gear
 OUTSIDE = 150e-6  # amplitude of a turn that two joints give a third [rad]
 ARMS = ("irb2600", "ur10")
@@ -95,17 +91,10 @@ class Answer:
 
 def arm_of(job: Job) -> Imperfect:
     """The arm of a job: the same links for the same seed, whatever measures it."""
-    robot, rng = load_robot(job.robot), np.random.default_rng([job.seed, 1])
-    sigma = [LENGTH, LENGTH, ANGLE, ANGLE, ANGLE]
-    real = robot.with_mdh(robot.mdh + rng.normal(size=(robot.joints, 5)) * sigma)
-    has = {cause: float(cause == job.cause) for cause in CAUSES}
-    return Imperfect(
-        robot,
-        real,
-        COMPLIANCE * has["compliance"],
-        RIPPLE * has["ripple"],
-        OUTSIDE * has["outside"],
-    )
+    sizes = {"compliance": COMPLIANCE, "ripple": RIPPLE, "outside": OUTSIDE}
+    has = (size * (cause == job.cause) for cause, size in sizes.items())
+    plain = Arm.of(job.robot, job.seed, 0.0)
+    return Imperfect(plain.robot, plain.real, *has)
 
 
 def seen(arm: Arm, kind: str, poses: int, rng: np.random.Generator) -> Given:
@@ -135,22 +124,21 @@ def run(job: Job) -> Answer:
 
 def table_of(jobs: list[Job], answers: list[Answer]) -> Table:
     """How often each verdict was given, and wrong names."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     pairs = list(zip(jobs, answers, strict=True))
     for title, kinds in SETS.items():
         for cause in dict.fromkeys(job.called for job in jobs):
             own = [a for job, a in pairs if (job.instruments, job.called) == (kinds, cause)]
             count = [sum(a.verdict == verdict for a in own) for verdict in VERDICTS]
             right, wrong = sum(a.right > 0 for a in own), sum(bool(a.wrong) for a in own)
-            before, after = (float(np.median([getattr(a, end) for a in own]))
-                             for end in ("before", "after"))  # fmt: skip
-            rows.append((title, cause, len(own), *count, right, wrong, before, after))
-    header = ("instruments", "cause", "arms", *(verdict.replace("_", " ") for verdict in VERDICTS),
-              "right cause", "wrong cause", "geometry mm", "final mm")  # fmt: skip
-    return Table(
-        "diagnosis of several instruments", header, tuple(rows),
-        ("", "", *["d"] * 7, ".4f", ".4f"),
-    )  # fmt: skip
+            ends = np.median([(a.before, a.after) for a in own], axis=0).tolist()
+            rows.append((title, cause, len(own), *count, right, wrong, *ends))
+    return Table.made(
+        "diagnosis of several instruments",
+        rows,
+        "instruments | cause | arms d | named d | one of d | none d | unknown d | right cause d | "
+        "wrong cause d | geometry mm .4f | final mm .4f",
+    )
 
 
 @study_options("relative_gap")
@@ -166,10 +154,6 @@ def main(study: Study) -> None:
         for robot in robots
         for number in range(count)
     ]
-    answers = list(study.sweep(run, jobs))
+    answers = study.sweep(run, jobs)
     table = table_of(jobs, answers)
-    study.save([table], {"answers": [vars(a) for a in answers]}, {})
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)
+    study.save([table], {"answers": [vars(a) for a in answers]})

@@ -20,13 +20,12 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.driven_arms import DrivenArm, Motion, commands, drawn_arm, served
 from experiments.sweep import Study, study_options
 from minimax_cal.dynamics.given import MotionKnown
 from minimax_cal.dynamics.run import NOTHING, TORQUE, Run
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.robots.mjcf import mujoco, numbers
 from minimax_cal.simulators.chain import chain_of, fill_history
 from minimax_cal.simulators.elements import parents_of
@@ -244,7 +243,7 @@ def drawn_cases(count: int, seed: int, *, sound: bool = False) -> list[Case]:
 
 def closed_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
     """What remains on the unseen run, arm by arm, and how often intervals hold."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     each = np.array([[one.before, 100.0 * one.after / one.before, 100.0 * one.alone / one.before]
                      for one in found])  # fmt: skip
     for case, one, ends in zip(cases, found, each.tolist(), strict=True):
@@ -281,13 +280,8 @@ def main(study: Study) -> None:
     content = {
         "cases": [{"arm": case.arm, "seed": case.seed, "elastic": case.elastic,
                    "before_mrad": one.before, "after_mrad": one.after, "alone_mrad": one.alone,
-                   "off": one.off,
-                   "effects": list(one.effects)}
+                   "off": one.off, "effects": one.effects}
                   for case, one in zip(cases, found, strict=True)],
-        "accused": [list(one) for one in wrongly],
+        "accused": wrongly,
     }  # fmt: skip
     study.save(tables, content)
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

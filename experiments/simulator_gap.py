@@ -1,4 +1,4 @@
-"""A simulated arm in MuJoCo beside the real one: does the simulator do what the fit says?
+"""Does a simulator do what the fit says?  Published gains, corrected step by step, in MuJoCo.
 
     python -m experiments.simulator_gap [--quick] [--out FOLDER] [--json FILE] [--seed N] ...
 
@@ -14,15 +14,13 @@ from __future__ import annotations
 import math
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import click
 import numpy as np
 
 import minimax_cal as mc
-from experiments import sweep
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.optional import optional
@@ -170,16 +168,14 @@ def sign_of(fit: mc.Fit, joint: int) -> float:
     return float(np.sign(values["backlash"][joint]))
 
 
-def rows_of(trial: Trial, result: Result) -> list[tuple[Cell, ...]]:
-    """A row a rung."""
-    out: list[tuple[Cell, ...]] = []
+def rows_of(trial: Trial, result: Result) -> Iterator[tuple[Cell, ...]]:
+    """A row a rung, and with the last what the file does alone."""
+    name = trial.robot if trial.known else f"{trial.robot}, masses unknown"
     for rung in result.gap.rungs:
         off = 1e3 * (rung.holdout_rms_mm - rung.predicted_rms_mm)
-        name = trial.robot if trial.known else f"{trial.robot}, masses unknown"
-        out.append((name, rung.name, rung.holdout_rms_mm, rung.holdout_max_mm,
-                    rung.predicted_rms_mm, off, rung.sag_mrad, math.nan))  # fmt: skip
-    out[-1] = (*out[-1][:-1], result.alone_mm)
-    return out
+        alone = result.alone_mm if rung is result.gap.rungs[-1] else math.nan
+        yield (name, rung.name, rung.holdout_rms_mm, rung.holdout_max_mm, rung.predicted_rms_mm,
+               off, rung.sag_mrad, alone)  # fmt: skip
 
 
 def table_of(trials: Sequence[Trial], results: Sequence[Result]) -> Table:
@@ -194,11 +190,10 @@ def table_of(trials: Sequence[Trial], results: Sequence[Result]) -> Table:
 
 
 @study_options("simulator_gap")
-@click.option("--poses", type=int, default=160, show_default=True)
-def main(study: Study, poses: int) -> None:
+def main(study: Study) -> None:
     """How far simulated arms are from real ones, before and after."""
     names = ("ur10",) if study.quick else ("ur10", "irb2600", "seven_axes")
-    poses = 50 if study.quick else poses
+    poses = 50 if study.quick else 160
     trials = [Trial(name, poses, study.seed + i) for i, name in enumerate(names)]
     trials += [] if study.quick else [Trial("ur10", poses, study.seed, known=False)]
     results = study.sweep(run, trials, "arms")
@@ -214,7 +209,3 @@ def main(study: Study, poses: int) -> None:
     }
     figures = {"simulator_gap_ladder": simulator_figure(results[0].gap)}
     study.save([table], content, figures, packages=("mujoco",))
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -13,7 +13,6 @@ seconds; solvers with their own defaults, which may know no clock, run in a proc
 from __future__ import annotations
 
 import multiprocessing
-import statistics
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -28,14 +27,13 @@ import qpsolvers
 from rich.progress import track
 from scipy import sparse
 
-from experiments import sweep
-from experiments.qp_cases import SETS, Case
-from experiments.record import canvas, environment, save_figure, save_json, save_tables
+from experiments.qp_cases import MAROS, SETS, Case
+from experiments.record import canvas
 from experiments.speed import fitted
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.robots.robot import load_robot
 from minimax_cal.solvers import minimax
@@ -57,19 +55,14 @@ ACROSS = "fallback order"
 
 @dataclass(frozen=True)
 class Run:
-    """One backend on one problem: worst relative and the absolute residuals, and its claim."""
+    """One backend on one problem: its claim, and what the judge finds."""
 
-    set: str
     case: str
     kind: str
     backend: str
     setting: str
     status: str
-    worst: float
-    primal: float
-    dual: float
-    gap: float
-    objective: float
+    judged: Accuracy
     seconds: float
 
     @property
@@ -77,7 +70,7 @@ class Run:
         """Solved to the judge's satisfaction, or rightly called infeasible or unbounded."""
         if self.kind != "solvable":
             return self.status == self.kind
-        return self.worst <= SOLVED
+        return self.judged.worst <= SOLVED
 
     @property
     def lie(self) -> bool:
@@ -132,14 +125,19 @@ def dense(matrix: Any) -> Array:
     return np.asarray(matrix.toarray() if hasattr(matrix, "toarray") else matrix)
 
 
+def quietly(call: Callable[[], Any]) -> tuple[Any, float]:
+    """What a call returns, and its seconds; solvers warn about what the judge measures."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        began = time.perf_counter()
+        found = call()
+        return found, time.perf_counter() - began
+
+
 def own_defaults(problem: Problem, name: str) -> tuple[Solution, float]:
     """The answer of a solver with its own defaults, and its seconds."""
     call, answer = direct(problem, name)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # solvers warn about what the judge measures
-        began = time.perf_counter()
-        found = call()
-        seconds = time.perf_counter() - began
+    found, seconds = quietly(call)
     return answer(found), seconds
 
 
@@ -161,20 +159,11 @@ def in_time(pools: list[Pool], problem: Problem, name: str) -> tuple[Solution, f
 def ours(problem: Problem, name: str, tolerance: float) -> tuple[Solution, float]:
     """The answer of our `solve`, or of its fallback order, and its seconds."""
     across = name == ACROSS
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        began = time.perf_counter()
-        solution = solve_qp(
-            problem,
-            "daqp" if across else name,
-            tolerance=tolerance,
-            time_limit=LIMIT,
-            fallback=across,
-        )
-        return solution, time.perf_counter() - began
+    solve = partial(solve_qp, problem, "daqp" if across else name, tolerance=tolerance)
+    return quietly(partial(solve, time_limit=LIMIT, fallback=across))
 
 
-def attempt(case: Case, group: str, backend: str, setting: str, pools: list[Pool]) -> Run:
+def attempt(case: Case, backend: str, setting: str, pools: list[Pool]) -> Run:
     """Run one backend in one setting on one problem, and judge it."""
     problem, seconds = case.problem, LIMIT
     solution = Solution(np.zeros(0), np.zeros(0), Status.FAILED, 0.0, backend)
@@ -187,21 +176,8 @@ def attempt(case: Case, group: str, backend: str, setting: str, pools: list[Pool
         solution = replace(solution, status=Status.TIME_LIMIT)
     except Exception as error:  # a third-party solver may raise anything; the row then says failed
         solution = replace(solution, notes=(str(error),))
-    judged = accuracy(problem, solution)
-    return Run(
-        group,
-        case.name,
-        case.kind,
-        backend,
-        setting,
-        solution.status.name.lower(),
-        judged.worst,
-        judged.primal,
-        judged.dual,
-        judged.gap,
-        judged.objective,
-        seconds,
-    )
+    status, judged = solution.status.name.lower(), accuracy(problem, solution)
+    return Run(case.name, case.kind, backend, setting, status, judged, seconds)
 
 
 def references(cases: Sequence[Case]) -> dict[str, float]:
@@ -227,35 +203,20 @@ def shifted_mean(times: Sequence[float]) -> float:
 
 def table_of(group: str, runs: Sequence[Run], reference: dict[str, float]) -> Table:
     """One set of problems: a row a backend and setting."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     keys = dict.fromkeys((run.backend, run.setting) for run in runs)
     for backend, setting in keys:
         mine = [run for run in runs if (run.backend, run.setting) == (backend, setting)]
         solved = [run for run in mine if run.right and run.kind == "solvable"]
+        known = [(r.judged.objective, reference[r.case]) for r in solved]
         off = [
-            abs(run.objective - reference[run.case]) / max(1.0, abs(reference[run.case]))
-            for run in solved
-            if np.isfinite(reference[run.case])
+            abs(value - best) / max(1.0, abs(best)) for value, best in known if np.isfinite(best)
         ]
-
-        def largest(values: Sequence[float]) -> float:
-            return max(values, default=np.nan)
-
-        rows.append(
-            (
-                backend,
-                setting,
-                len(mine),
-                float(100.0 * np.mean([run.right for run in mine])),
-                sum(run.lie for run in mine),
-                largest([run.worst for run in solved]),
-                largest([run.primal for run in solved]),
-                largest([run.dual for run in solved]),
-                largest([run.gap for run in solved]),
-                largest(off),
-                1e3 * shifted_mean([run.seconds for run in mine]),
-            )
-        )
+        worst = [max((getattr(run.judged, name) for run in solved), default=np.nan)
+                 for name in ("worst", "primal", "dual", "gap")]  # fmt: skip
+        rows.append((backend, setting, len(mine), float(100.0 * np.mean([r.right for r in mine])),
+                     sum(run.lie for run in mine), *worst, max(off, default=np.nan),
+                     1e3 * shifted_mean([run.seconds for run in mine])))  # fmt: skip
     return Table.made(
         f"{group}: residuals are the largest over the problems solved",
         rows,
@@ -265,50 +226,18 @@ def table_of(group: str, runs: Sequence[Run], reference: dict[str, float]) -> Ta
     )
 
 
-def detail(group: str, runs: Sequence[Run]) -> Table:
-    """Every problem of a set with the answer of our fallback order."""
-    mine = [run for run in runs if run.backend == ACROSS and run.setting == "ours 1e-6"]
-    rows = tuple(
-        (run.case, run.status, run.worst, run.primal, run.dual, run.gap, run.objective,
-         1e3 * run.seconds)
-        for run in mine
-    )  # fmt: skip
-    return Table.made(
-        f"{group}, problem by problem: our fallback order at 1e-6",
-        rows,
-        "problem | status | worst relative .1e | primal abs .1e | dual abs .1e | "
-        "gap abs .1e | objective .8g | ms .2f",
-    )
-
-
 def overhead(cases: Sequence[Case], backends: Sequence[str], repeats: int) -> Table:
     """Our `solve`, its check included, against qpsolvers.solve_problem on the same data."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for backend in backends:
-        ratios, ours_all, theirs_all = [], [], []
+        times = []
         for case in cases:
-            call, _ = direct(case.problem, backend)
             ours = partial(solve_qp, case.problem, backend, tolerance=LOOSE, fallback=False)
-            mine: list[float] = []
-            theirs: list[float] = []
-            for _ in range(repeats + 1):
-                for run, times in ((ours, mine), (call, theirs)):
-                    began = time.perf_counter()
-                    with warnings.catch_warnings():
-                        warnings.simplefilter("ignore")
-                        run()
-                    times.append(time.perf_counter() - began)
-            ours_all.append(statistics.median(mine[1:]))
-            theirs_all.append(statistics.median(theirs[1:]))
-            ratios.append(ours_all[-1] / theirs_all[-1])
-        rows.append(
-            (
-                backend,
-                1e6 * statistics.median(ours_all),
-                1e6 * statistics.median(theirs_all),
-                statistics.median(ratios),
-            )
-        )
+            runs = ours, direct(case.problem, backend)[0]
+            spent = [[quietly(run)[1] for run in runs] for _ in range(repeats + 1)]
+            mine, theirs = np.median(spent[1:], axis=0)
+            times.append((1e6 * mine, 1e6 * theirs, mine / theirs))
+        rows.append((backend, *np.median(times, axis=0).tolist()))
     return Table.made(
         "our solve with its check at 1e-6 against qpsolvers.solve_problem (small calibration QPs)",
         rows,
@@ -323,7 +252,7 @@ def subgradient(cases: Sequence[Case], most: int) -> tuple[Table, dict[str, Arra
     marks = [10**k for k in range(1, 7) if 10**k <= most]
     reference = references(cases)
     curves: dict[str, Array] = {}
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for method in METHODS:
         reach = [mark for mark in marks if method == "restarted" or mark <= most // 10]
         errors = np.full((len(cases), len(marks)), np.nan)
@@ -345,13 +274,13 @@ def subgradient(cases: Sequence[Case], most: int) -> tuple[Table, dict[str, Arra
         hit = 100.0 * np.mean(np.nanmin(errors, axis=1) <= SOLVED)
         middle = [float(np.median(column)) for column in errors.T]
         rows.append((method, float(hit), float(100.0 * judged_well.mean()), *middle))
-    table = Table(
+    table = Table.made(
         f"restarted averaged PDHG and paper M's subgradient on {len(cases)} calibration QPs: "
         "median error (of the objective, relative to max f, or of the rows) against iterations; "
         "share within 1e-6, and share that the judge finds solved",
-        ("method", "within 1e-6 %", "judged solved %", *(f"{mark:g}" for mark in marks)),
-        tuple(rows),
-        ("", ".1f", ".1f", *[".1e"] * len(marks)),
+        rows,
+        "method | within 1e-6 % .1f | judged solved % .1f",
+        *(f"{mark:g} .1e" for mark in marks),
     )
     return table, {"iterations": np.array(marks, dtype=float), **curves}
 
@@ -372,7 +301,7 @@ def sqp_values(backends: Sequence[str], seed: int) -> Table:
     data = simulate(robot, 100, 3, seed).data
     model, state = fitted(robot, data)
     problem = minimax_problem(model, state, measured_distances(data), "two-sided", "target")
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     best = np.nan
     for backend in backends:
         loose = backend.startswith("subgradient")
@@ -410,13 +339,8 @@ def profile(group: str, runs: Sequence[Run]) -> Figure:
         for name in names
     }
     for number, backend in enumerate(dict.fromkeys(run.backend for run in ours)):
-        ratio = np.sort(
-            [
-                run.seconds / fastest[run.case] if run.right else np.inf
-                for run in ours
-                if run.backend == backend
-            ]
-        )
+        mine = [run for run in ours if run.backend == backend]
+        ratio = np.sort([r.seconds / fastest[r.case] if r.right else np.inf for r in mine])
         share = 100.0 * (np.arange(len(ratio)) + 1) / len(ratio)
         shown = np.isfinite(ratio)
         style = ("-", "--", ":")[number // 10 % 3]
@@ -454,7 +378,7 @@ def backends_here(quick: bool) -> list[str]:
     return [*found, "subgradient", ACROSS] if not quick else [*found, ACROSS]
 
 
-def study(quick: bool) -> tuple[dict[str, list[Run]], dict[str, list[Case]]]:
+def runs_of(quick: bool) -> tuple[dict[str, list[Run]], dict[str, list[Case]]]:
     """All runs by set, and the problems."""
     runs: dict[str, list[Run]] = {}
     problems: dict[str, list[Case]] = {}
@@ -471,7 +395,7 @@ def study(quick: bool) -> tuple[dict[str, list[Run]], dict[str, list[Case]]]:
             for case in cases
         ]
         runs[group] = [
-            attempt(case, group, backend, setting, pools)
+            attempt(case, backend, setting, pools)
             for case, backend, setting in track(jobs, description=group, transient=True)
         ]
     for pool in pools:
@@ -480,46 +404,38 @@ def study(quick: bool) -> tuple[dict[str, list[Run]], dict[str, list[Case]]]:
 
 
 @study_options("solver_accuracy")
-def main(options: Study) -> None:
+def main(study: Study) -> None:
     """Tables and profiles of QP accuracy, reliability and time.
 
     Times are compared, so the runs go one after the other: --jobs and --cluster do not apply.
     """
-    quick, out, json_path, seed = options.quick, options.out, options.json, options.seed
-    runs, problems = study(quick)
-    tables = [environment(available().keys() - {"proxqp", "highs", "subgradient"})]
+    quick = study.quick
+    runs, problems = runs_of(quick)
+    tables: list[Table] = []
+    figures: dict[str, Figure] = {}
     summary: dict[str, object] = {}
     for group, found in runs.items():
         if not found:
             click.echo(f"{group}: no problems here (shared data absent)")
             continue
-        reference = references(problems[group])
-        tables.append(table_of(group, found, reference))
-        if group == "Maros-Meszaros":
-            tables.append(detail(group, found))
-        save_figure(out, "profile_" + group.replace(",", "").replace(" ", "_"),
-                    profile(group, found))  # fmt: skip
+        tables.append(table_of(group, found, references(problems[group])))
         summary[group] = [
             {"backend": row[0], "setting": row[1], "right_percent": row[3], "lies": row[4]}
-            for row in tables[-2 if group == "Maros-Meszaros" else -1].rows
+            for row in tables[-1].rows
         ]
+        if group == MAROS:
+            figures[f"profile_{group}"] = profile(group, found)
     small = problems["calibration, 6 rows"]
     direct_ones = [name for name in DIRECT if name in available()]
     timing = overhead(small[:4] if quick else small[:20], direct_ones, 5 if quick else 21)
     sub, curves = subgradient(small[:4] if quick else small, 10_000 if quick else 100_000)
-    values = sqp_values([*direct_ones, "cvxpy", "subgradient"], seed)
-    tables += [timing, sub, values]
-    save_figure(out, "subgradient", convergence_figure(curves))
-    save_tables(out, "solver_accuracy", tables)
+    values = sqp_values([*direct_ones, "cvxpy", "subgradient"], study.seed)
+    figures["subgradient"] = convergence_figure(curves)
     summary["overhead_ratio"] = {str(row[0]): row[3] for row in timing.rows}
     summary["subgradient_reach_percent"] = {str(row[0]): row[1] for row in sub.rows}
     summary["sqp_above_best"] = {str(row[0]): row[4] for row in values.rows}
-    if json_path:
-        save_json(json_path, summary)
+    packages = available().keys() - {"proxqp", "highs", "subgradient"}
+    study.save([*tables, timing, sub, values], summary, figures, packages)
     lies = [run for found in runs.values() for run in found if run.lie and "ours" in run.setting]
     if lies:
         raise click.ClickException(f"{len(lies)} wrong answers were passed on as right")
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

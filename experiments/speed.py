@@ -12,7 +12,6 @@ pip install ".[peers]".
 from __future__ import annotations
 
 import multiprocessing
-import platform
 import resource
 import statistics
 import subprocess
@@ -31,7 +30,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import minimax_cal as mc
-from experiments import speed_peers, sweep
+from experiments import speed_peers
+from experiments.record import processor
 from experiments.speed_peers import Raw
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting import identify
@@ -404,7 +404,7 @@ def main(study: Study, repeats: int, part: tuple[str, ...]) -> None:
     with threadpool_limits(1):
         seconds, memory = timed(study.seed, repeats, part or PARTS, quick=study.quick)
     over = ratios(seconds)
-    machine = f"{platform.processor() or platform.machine()}, kernels: {choice.kernels().__name__}"
+    machine = f"{processor()}, kernels: {choice.kernels().__name__}"
     numba = choice.kernels() is not plain
     shown = tuple((k, "absent" if v is None else f"{v:.1f}") for k, v in over.items())
     spent = tuple((name, 1e3 * value) for name, value in seconds.items())
@@ -417,7 +417,3 @@ def main(study: Study, repeats: int, part: tuple[str, ...]) -> None:
     ]
     content = {"ratios": over, "seconds": seconds, "memory_gb": memory, "numba": numba}
     study.save(tables, content, packages=("numba", "casadi", "cvxpy", "daqp"))
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -17,14 +17,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
-from experiments import sweep
-from experiments.conditions import FOLDERS, ROBOTS
-from experiments.real import here
+from experiments.conditions import ROBOTS, arm_of, robots_here
 from experiments.record import canvas
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.measurements import Measurements
 
 if TYPE_CHECKING:
@@ -88,7 +86,7 @@ def held_rows(data: Measurements, job: Job) -> Array:
 
 def run(job: Job) -> Held:
     """Calibrate both ways and judge on the poses held out."""
-    robot, data = ROBOTS[job.robot][1](job.seed + (job.split if job.robot == "irb2600" else 0))
+    robot, data = arm_of(job.robot, job.seed + job.split)
     held = held_rows(data, job)
     out = {}
     for objective in ("sum", "minimax"):
@@ -102,7 +100,7 @@ def run(job: Job) -> Held:
 
 def jobs_of(study: Study) -> list[Job]:
     """Random splits and groups of every robot whose measurements are here."""
-    robots = [name for name in ROBOTS if name not in FOLDERS or here(FOLDERS[name])]
+    robots = robots_here()
     count, clusterings = (2, 1) if study.quick else (24, 4)
     number = {"random": count, "by groups": 2 if study.quick else clusterings * REGIONS}
     return [
@@ -150,7 +148,7 @@ def robots_of(found: dict[Job, Held]) -> Sequence[str]:
 
 def table_of(found: dict[Job, Held]) -> Table:
     """Median, quartiles and wins."""
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for robot in robots_of(found):
         for way in WAYS:
             for number, measure in enumerate(MEASURES):
@@ -192,7 +190,3 @@ def save(study: Study, found: dict[Job, Held]) -> None:
 def main(study: Study) -> None:
     """Minimax against the sum over many splits, at random and by groups."""
     save(study, study_of(study))
-
-
-if __name__ == "__main__":
-    sweep.start(__file__)

@@ -8,7 +8,7 @@ depends on, so that the same call goes on from there.  Workers of a cluster must
 one job at a time: start them in the project's folder with
 ``python -m dask worker tcp://host:8786 --nworkers N --nthreads 1``.
 
-A study takes its options from `study_options` and ends with ``start(__file__)``.
+A study takes its options from `study_options`, by which it can also be started.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import track
 
 import minimax_cal
 import qp_backends
@@ -123,14 +123,8 @@ def part(function: Callable[[J], R], job: J, code: str) -> R:
 def progress(items: Iterator[R], total: int, description: str) -> Iterator[R]:
     """The same items, with a bar and the time left on stderr if that is a terminal."""
     console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        yield from bar.track(items, total=total, description=description)
+    off = not console.is_terminal
+    yield from track(items, description, total, console=console, disable=off)
 
 
 # ---- where jobs run --------------------------------------------------------------------------
@@ -318,7 +312,10 @@ class Misuse(click.ClickException):
 
 
 def study_options(name: str) -> Callable[[Callable[..., None]], click.Command]:
-    """Makes a command with the options of every study, its first argument: a `Study`."""
+    """Makes a command with the options of every study, its first argument: a `Study`.
+
+    In the module that ``python -m`` runs it starts the study: the command is its last definition.
+    """
     options = (
         click.option("--quick", is_flag=True, help="A small form of the study."),
         click.option("--json", type=click.Path(path_type=Path), help="Write its figures here."),
@@ -339,6 +336,9 @@ def study_options(name: str) -> Callable[[Callable[..., None]], click.Command]:
     fields = tuple(field.name for field in dataclasses.fields(Study))[1:]
 
     def decorate(function: Callable[..., None]) -> click.Command:
+        if function.__module__ == "__main__" and Path(inspect.getfile(function)).stem == name:
+            start(inspect.getfile(function))
+
         @functools.wraps(function)
         def command(**given: Any) -> None:
             study = Study(name, **{field: given.pop(field) for field in fields})
@@ -355,7 +355,7 @@ def study_options(name: str) -> Callable[[Callable[..., None]], click.Command]:
 
 
 def start(file: str) -> None:
-    """Run the study in this file as ``python -m`` found it: ``start(__file__)``, at its end.
+    """Run the study in this file as ``python -m`` found it.
 
     The module is imported under its own name, since nothing of ``__main__`` reaches a cluster.
     """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -224,57 +224,46 @@ def span(values: Sequence[float], form: str) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def courses(found: Found) -> list[Verdict]:
+def courses(found: Found) -> Iterator[Verdict]:
     """Fig. 4 to 7."""
     ended = [course.minimum for course in found.longer.values()]
     cap = next(iter(found.courses)).cap
-    out = [
-        Verdict("S Fig. 4: NLLM comes back after more iterations", "courses", "guessed, shown",
-                f"{sum(ended)} of {len(ended)} stuck at {cap} are back by {10 * cap}",
-                told(sum(ended) > 0, all(ended)), "", "reproduced: all; in part: some",
-                max(len(ended), 1))
-    ]  # fmt: skip
-    out += [five(found, start) for start in STARTS]
+    yield Verdict("S Fig. 4: NLLM comes back after more iterations", "courses", "guessed, shown",
+            f"{sum(ended)} of {len(ended)} stuck at {cap} are back by {10 * cap}",
+            told(sum(ended) > 0, all(ended)), "", "reproduced: all; in part: some",
+            max(len(ended), 1))  # fmt: skip
+    yield from (five(found, start) for start in STARTS)
     arms = dict.fromkeys(job.arm for job in found.courses if job.arm != SIMULATED)
-    out += [six(found, arm) for arm in arms or [SIMULATED]]
+    yield from (six(found, arm) for arm in arms or [SIMULATED])
     up = {
         method: [rises(c) for j, c in found.courses.items() if j.method == method]
         for method in ("nlgn", "snlgn")
     }
-    out.append(
-        Verdict("S Fig. 5, 6, text: without separation the error oscillates", "courses", "yes",
-                f"rises of the error on a course: NLGN {span(up['nlgn'], 'd')}, "
-                f"SNLGN {span(up['snlgn'], 'd')}",
-                told(sum(up["nlgn"]) > 10 * sum(up["snlgn"])), "",
-                "NLGN's rises more than 10 times SNLGN's, in sum", len(up["nlgn"]))
-    )  # fmt: skip
+    yield Verdict("S Fig. 5, 6, text: without separation the error oscillates", "courses", "yes",
+            f"rises of the error on a course: NLGN {span(up['nlgn'], 'd')}, "
+            f"SNLGN {span(up['snlgn'], 'd')}",
+            told(sum(up["nlgn"]) > 10 * sum(up["snlgn"])), "",
+            "NLGN's rises more than 10 times SNLGN's, in sum", len(up["nlgn"]))  # fmt: skip
     gains = [f"{g.arm} {g.percent[0]:.2f} ({g.percent[1]:.2f} held out)" for g in found.gains]
     middle = float(np.median([g.percent[0] for g in found.gains]))
-    out.append(
-        Verdict("S Fig. 7: position error falls by, %", "courses", "72.46", "; ".join(gains),
-                told(near(middle, 72.46)), "RMS, base and target fitted before too; the paper's "
-                "figure is of training poses", "within 25 % of it on the median arm, in training, "
-                "both ways", len(found.gains))
-    )  # fmt: skip
-    return out
+    yield Verdict("S Fig. 7: position error falls by, %", "courses", "72.46", "; ".join(gains),
+            told(near(middle, 72.46)), "RMS, base and target fitted before too; the paper's "
+            "figure is of training poses", "within 25 % of it on the median arm, in training, "
+            "both ways", len(found.gains))  # fmt: skip
 
 
-def anywhere(found: dict[float, list[Result]]) -> list[Verdict]:
+def anywhere(found: dict[float, list[Result]]) -> Iterator[Verdict]:
     """The base that the paper sets to the identity."""
-    out = []
     for span, results in found.items():
         shares = [
             100.0 * float(np.mean([getattr(result, name) for result in results]))
             for name in ("snlgn", "snllm", "ours")
         ]
-        out.append(
-            Verdict(f"S text: global convergence, tracker anywhere, poses within {span:.2f} rad",
-                    "any_base", "100 / 100 (its own base)", listed(shares, ".1f"),
-                    YES if min(shares[:2]) == 100.0 else told(min(shares[:2]) > 90.0, False),
-                    f"SNLGN / SNLLM / our search from 24 rotations, %; {len(results)} bases",
-                    "reproduced: 100 for both; in part: both above 90", len(results))
-        )  # fmt: skip
-    return out
+        yield Verdict(f"S text: global convergence, tracker anywhere, poses within {span:.2f} rad",
+                "any_base", "100 / 100 (its own base)", listed(shares, ".1f"),
+                YES if min(shares[:2]) == 100.0 else told(min(shares[:2]) > 90.0, False),
+                f"SNLGN / SNLLM / our search from 24 rotations, %; {len(results)} bases",
+                "reproduced: 100 for both; in part: both above 90", len(results))  # fmt: skip
 
 
 def own_cell() -> list[Verdict]:

@@ -1,8 +1,5 @@
 """The comparison of methods: measures of error, splits, and what must hold between methods."""
 
-import pickle
-from collections.abc import Callable, Sequence
-
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -17,10 +14,8 @@ from experiments.methods import (
     FIGURES,
     MINIMAX,
     PARTS,
-    POSE,
     SINGLE,
     Job,
-    Outcome,
     Studies,
     figure_of,
 )
@@ -28,18 +23,16 @@ from experiments.poe import Screws, fit_poses, fit_positions, screws_of
 from experiments.poses import (
     euler_deviation,
     exp,
-    inverse,
     lever,
     orientation_error,
     points,
-    pose,
     poses_of,
-    position_error,
     triangle,
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.sampling import random_poses
+from minimax_cal.robots.transforms import inverse, transform
 
 # ---- methods -------------------------------------------------------------------------------------
 
@@ -67,15 +60,16 @@ def test_poses_of_a_triangle_are_recovered(rng):
 def test_errors_of_known_poses(rng):
     measured = exp(rng.normal(size=(30, 6)))
     turn = rng.normal(size=(30, 3))
-    other = measured @ pose(Rotation.from_rotvec(turn).as_matrix(), np.tile([0.3, 0, 0.4], (30, 1)))
+    other = measured @ transform(
+        Rotation.from_rotvec(turn).as_matrix(), np.tile([0.3, 0, 0.4], (30, 1))
+    )
     assert_allclose(orientation_error(measured, other), np.linalg.norm(turn, axis=1), atol=1e-12)
-    assert_allclose(position_error(measured, other), 0.5, atol=1e-14)
 
 
 def test_euler_angles_exaggerate_near_gimbal_lock():
     def turned(a: float, b: float, c: float) -> Array:
         turn = Rotation.from_euler("xyz", [a, b, c], degrees=True).as_matrix()
-        return pose(turn, np.zeros(3))[None]
+        return transform(turn, np.zeros(3))[None]
 
     assert_allclose(euler_deviation(turned(170, 5, 0), turned(-170, 2, 1)),
                     np.radians([[20, 3, 1]]), atol=1e-12)  # fmt: skip
@@ -110,12 +104,6 @@ def test_every_method_beats_the_nominal_one_held_out(alone):
         assert max(values, key=lambda name: values[name]) == "nominal"
 
 
-def test_absent_data_are_said_to_be_absent(alone):
-    text = "\n".join(table.text(200) for table in methods.tables(alone, []))
-    assert text.count("data absent") == 2 * 2  # title and row, for each real robot
-    assert list(methods.figures(alone)) == ["methods_1"]
-
-
 def test_real_robots_improve_held_out():
     shared("irb120")
     case = methods.cases(quick=True)[1]
@@ -127,41 +115,17 @@ def test_real_robots_improve_held_out():
     assert 0.7 < error["nominal"] < 1.1  # [mm]
     assert error["POE pose"] == pytest.approx(error["MDH pose"], rel=1e-6)
     assert max(error["MDH pose"], error["sum"]) < 0.4
-    assert len(pickle.dumps(outcomes)) > 0  # so that a sweep may keep them
-
-
-def test_weights_are_swept_for_each_case(alone, tmp_path):
-    case, results = alone[0]
-    asked: list[float] = []
-
-    def sweep(function: Callable[[Job], Outcome], jobs: Sequence[Job]) -> list[Outcome]:
-        asked.extend(job.length for job in jobs)
-        return [results[POSE][0] for _ in jobs]
-
-    found = methods.run_weights(quick=True, seed=1, folder=tmp_path, sweep=sweep)
-    assert_allclose(asked, [np.nan, *methods.LENGTHS])
-    assert [(each.label, len(outcomes)) for each, _, outcomes in found] == [(case.label, 1)] * 7
-
-
-def test_a_heavier_weight_favours_orientation(alone, tmp_path):
-    case, results = alone[0]
-    heavy = [methods.outcome_of(Job(case, 0, POSE, 1, tmp_path, length=3.0))]
-    for key, sense in (("AO' RMSE", -1.0), ("AP RMSE", 1.0)):
-        change = figure_of(heavy, key, "training") - figure_of(results[POSE], key, "training")
-        assert sense * change > 0.0
 
 
 def test_command(alone, tmp_path, monkeypatch):
-    case, results = alone[0]
     monkeypatch.setattr(methods, "run", lambda *_: alone)
-    monkeypatch.setattr(methods, "run_weights", lambda *_: [(case, np.nan, results[POSE])])
     out, figures = tmp_path / "out", tmp_path / "figures.json"
     options = ["--quick", "--data", str(tmp_path), "--out", str(out), "--json", str(figures)]
     done = CliRunner().invoke(methods.main, options)
     assert done.exit_code == 0, done.output
-    assert "data absent" in done.output
-    for name in ("methods.md", "methods.tex", "methods_1.csv", "methods_1.png", "methods_1.svg"):
-        assert (out / name).exists()
+    text = (out / "methods.md").read_text(encoding="utf-8")
+    assert text.count("data absent") == 2 * 2  # title and row, for each real robot
+    assert (out / "methods_1.csv").exists()
     assert '"schema": 1' in figures.read_text()
 
 
@@ -199,7 +163,9 @@ def test_exact_poses_are_met(name, independent):
     assert found.status == "converged"
     assert found.identified == independent  # 4 a turning joint, 2 a slide, 6 of the tool
     assert_allclose(found.x.poses(q), poses, rtol=0, atol=1e-10)
-    spot = pose(np.eye(3), np.array([0.1, 0.0, 0.0]))  # off the last axis, to see that it turns
+    spot = transform(
+        np.eye(3), np.array([0.1, 0.0, 0.0])
+    )  # off the last axis, to see that it turns
     seen = (poses @ spot)[:, :3, 3]
     found = fit_positions(Screws(nominal.twists, nominal.tool @ spot), q, seen)
     assert found.identified == independent - 3
@@ -253,7 +219,6 @@ def test_refinement_finds_what_rotations_about_one_axis_leave_open(seed):
 def test_mdh_pose_fit_finds_the_true_robot(robot, clean):
     found = mdh_pose(robot, clean.data)
     assert found.status == "converged"
-    assert found.identified == 30
     q = random_poses(robot, 50, np.random.default_rng(9))
     assert_allclose(found.predict(q), clean.cell.predict(q), rtol=0, atol=1e-9)
 

@@ -207,12 +207,6 @@ def test_withheld_effects_are_named_and_help_on_a_run_that_no_fit_saw(left_out):
     assert np.all(left_out.reached[-1] <= left_out.whole[-1])  # rows at rest only add
 
 
-def test_boosting_takes_little_where_all_has_a_name(left_out):
-    moving, whole = left_out.boosted
-    assert np.all(moving > 0.85 * left_out.reached[-1])
-    assert np.all(whole > 0.85 * left_out.whole[-1])
-
-
 def test_tables_count_runs_and_compare_with_the_claim(left_out):
     table = steps_table(SIMULATED, [left_out, left_out])
     last = dict(zip((row[0] for row in table.rows), table.rows, strict=True))

@@ -3,7 +3,7 @@
 import csv
 import io
 import re
-from itertools import permutations
+from itertools import permutations, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +14,9 @@ from numpy.testing import assert_allclose
 
 from experiments import errata, splits
 from experiments.__main__ import STUDIES
-from experiments.conditions import PAPER, Errors
+from experiments.conditions import PAPER, Errors, arm_of
 from experiments.convergence import Row, grid, moved_of
 from experiments.courses import Course, rises
-from experiments.index import tables_of
 from experiments.splits import Held
 from experiments.verdicts import (
     HEADER,
@@ -128,11 +127,11 @@ def test_starts_moved_by_rounding_stand_beside_the_same_starts():
 
 
 def test_splits_hold_every_region_out_once_and_tell_their_spread():
-    data = splits.ROBOTS["irb2600"][1](0)
+    _, data = arm_of("irb2600", 0)
     jobs = [splits.Job("irb2600", "by groups", region, 100, 0) for region in range(splits.REGIONS)]
-    held = np.array([splits.held_rows(data[1], job) for job in jobs])
+    held = np.array([splits.held_rows(data, job) for job in jobs])
     assert (held.sum(axis=0) == 1).all()
-    random = splits.held_rows(data[1], splits.Job("irb2600", "random", 1, 100, 0))
+    random = splits.held_rows(data, splits.Job("irb2600", "random", 1, 100, 0))
     assert (~random).sum() == 100
     found = {job: Held((1.0, 2.0), (0.9 + 0.1 * i, 2.0)) for i, job in enumerate(jobs)}
     s = splits.spread_of(found, "irb2600", "by groups", 0)
@@ -147,14 +146,17 @@ LOOSE, TINY = 0.05, 1e-5  # of a number on another machine; below: rounding
 MOVED = "S Table 2: % of starts, each moved by a unit of rounding"
 POINTS = 3.0  # percent points of 441 starts that rounding may send another way
 ROUNDED = ("S Fig. 5", "S Fig. 6")  # ways of single starts, which rounding decides on each machine
+BAR = re.compile(r"(?<!\\)\|")  # between cells; a bar within one is escaped
 RULE = re.compile(r"(?:; |^)rule: .*$")
 SPAN = re.compile(rf"({NUMBER.pattern})(?: to ({NUMBER.pattern}))?")
 TIMES, COUNT = 3.0, 6.0  # spans over nine copies of a start meet within this factor, or so many
 
 
 def rows_of_page() -> list[tuple[str, ...]]:
-    (grid,) = [g for g in tables_of(PAGE.read_text(encoding="utf-8")) if g.header == HEADER]
-    return list(grid.rows)
+    lines = PAGE.read_text(encoding="utf-8").splitlines()
+    first = lines.index(f"| {' | '.join(HEADER)} |") + 2
+    rows = (BAR.split(row)[1:-1] for row in takewhile(lambda line: line[:1] == "|", lines[first:]))
+    return [tuple(cell.strip().replace(r"\|", "|") for cell in row) for row in rows]
 
 
 def test_the_page_has_no_item_that_is_not_covered_but_for_hardware():

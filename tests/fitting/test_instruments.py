@@ -28,7 +28,6 @@ from experiments.relative import (
     run_real,
     seen_from,
     spot_of,
-    true_errors,
 )
 from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.several import RelativeCalibration, relative
@@ -758,7 +757,7 @@ def calibrated(name: str, kind: str, seed: int, **options) -> tuple[RelativeCali
     seen = SIMULATORS[kind](arm, np.random.default_rng([seed, 6]), 100, NOISE)
     fit = relative(arm.robot, seen.data, known_distances=seen.known, **options)
     q = random_poses(arm.robot, 300, np.random.default_rng(1))
-    plain, _ = true_errors(arm, fit.robot, spot_of(fit), q)
+    plain = position_errors(arm, fit.robot, spot_of(fit), q, scaled=False)
     return fit, rms_mm(plain) / (1e3 * fit.position_sigma)
 
 
