@@ -277,7 +277,8 @@ def dependence(one: Dependence) -> str:
 
 def away(found: Diagnosis) -> str:
     """How the model does on whole parts that were held out."""
-    text = found.beyond.sentence()
+    again = any(f.established and not f.rows for f in found.effects)
+    text = found.beyond.sentence(", effects sought again" if again else "")
     if not math.isfinite(found.refused):
         return text
     return text.removesuffix(".") + (

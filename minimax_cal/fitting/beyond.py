@@ -130,8 +130,11 @@ class Beyond(Record):
         """Largest RMS of geometry alone."""
         return max((fold.geometric_mm for fold in self.folds), default=math.nan)
 
-    def sentence(self) -> str:
-        """For the headline, empty where there is no claim and no joint that is the cause."""
+    def sentence(self, how: str = "") -> str:
+        """For the headline, empty where there is no claim and no joint that is the cause.
+
+        how: what parts are predicted by, where effects are not kept.
+        """
         if not self.worst:
             return (
                 f"Outside the measured region nothing is claimed: {self.reason}."
@@ -147,8 +150,8 @@ class Beyond(Record):
             less = f"; without outliers worst part {worst}"
         return (
             f"Outside the measured region, {parts} left out in turn and predicted from the rest"
-            f"{self.kept}: RMS {self.typical_mm:.3f} mm, worst part {self.worst_mm:.3f} mm RMS "
-            f"({self.worst.where}), largest error {self.largest_mm:.3f} mm{less}."
+            f"{self.kept or how}: RMS {self.typical_mm:.3f} mm, worst part {self.worst_mm:.3f} "
+            f"mm RMS ({self.worst.where}), largest error {self.largest_mm:.3f} mm{less}."
         )
 
     def table(self) -> Table:

@@ -79,7 +79,9 @@ def remaining_table(found: Diagnosis) -> Table:
             *((name_structure(one.name), one.rms_mm, name_chance(one.p)) for one in left.depends),
             ("explained by nothing", left.unexplained_mm, "-"),
         ]
-    return Table.made("remaining error", rows, "part | RMS mm .4f | p-value")
+    return Table.made(
+        "remaining error; motions overlap: the first counts", rows, "part | RMS mm .4f | p-value"
+    )
 
 
 def bare_scene() -> Scene:

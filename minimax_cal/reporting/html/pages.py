@@ -21,7 +21,7 @@ from minimax_cal.reporting.html.scene import workspace
 from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.reporting.tables import remaining_table, where_tables
 
-SHEET_ROWS = 54  # of tables on a printed page; the appendix has what is longer
+SHEET_ROWS = 50  # of tables on a printed page; the appendix has what is longer
 NO_POSES = "The file holds no poses, so that nothing can be drawn; write it again with its poses."
 OBJECTIVES = {
     "sum": "the sum of all squared errors as small as possible",
@@ -30,11 +30,9 @@ OBJECTIVES = {
     "pose": "errors of position and orientation together as small as possible",
 }
 REASONS = {
-    Because.SAME_MOTION: "A parameter with the same motion as others moves every target in the "
-    "same way as these do, at all poses: only their sum can be known, and it is in the parameter "
-    "that was kept free. Nothing is lost for the positions of the targets.",
-    Because.NOT_TOLD: "Where these poses do not tell it from others, the parameter could be known "
-    "with more poses, or over a wider range of the joints.",
+    Because.SAME_MOTION: "Parameters with the same motion move every target alike: only their sum "
+    "can be known, and is in the one that was kept free. Positions lose nothing.",
+    Because.NOT_TOLD: "More poses, or a wider range of the joints, may tell the others.",
     Because.NO_MOTION: "A parameter that moves no measured point has no effect on them.",
     Because.FIXED: "Some were kept nominal on purpose.",
 }
