@@ -169,7 +169,8 @@ class Finding(Record):
     @property
     def evidence(self) -> str:
         """Whether it is confirmed, and the frequency that decides."""
-        said = "confirmed" if self.established else "possible"
+        sure = "one of these" if self.alternatives else "confirmed"
+        said = sure if self.established else "possible"
         return said if self.rows or math.isnan(self.again) else f"{said}, {self.again:.2f}"
 
     @property
@@ -714,7 +715,7 @@ class Diagnosis(Explained, Result):
         title = f"effects found, step by step; p-values below {LEVEL:g} are significant"
         every = Table.made(title, rows, FOUND)
         plain = every.only(*range(len(every.header) - 1))  # without what says one thing
-        return plain if all(f.established for f in found) else every
+        return plain if all(f.evidence.startswith("confirmed") for f in found) else every
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result, but for those of where the errors lie."""

@@ -143,9 +143,8 @@ def subsampled(findings: Sequence[Finding]) -> str:
         return ""
     each = "Each was found" if len(findings) > 1 else "Found"
     least = "at least " if len(findings) > 1 and often < 1.0 else ""
-    return (
-        f"{each} again in {least}{100.0 * often:.0f} % of the subsamples of the poses: confirmed."
-    )
+    sure = "one of them is confirmed" if any(f.alternatives for f in findings) else "confirmed"
+    return f"{each} again in {least}{100.0 * often:.0f} % of the subsamples of the poses: {sure}."
 
 
 def cause_of(same: Sequence[Finding], *, first: bool) -> str:

@@ -88,6 +88,8 @@ def test_every_verdict_opens_the_words(found: Diagnosis) -> None:
         changed = replace(found, verdict=verdict)
         if verdict == "one_of":
             changed = replace(changed, effects=(first, *found.effects[1:]))
+            assert "one of them is confirmed" in changed.headline()  # not the one that is named
+            assert changed.main[0].evidence.startswith("one of these")
         first_words = "Main causes" if verdict == "unknown" else OPENINGS[verdict]
         if verdict in ("none", "not_repeatable"):
             changed = replace(changed, effects=())
