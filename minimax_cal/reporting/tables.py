@@ -74,8 +74,9 @@ def remaining_table(found: Diagnosis) -> Table:
     """What the last step leaves, by where it comes from."""
     left, rows = found.remaining, []
     if left:
+        known = np.isfinite(left.noise_mm)
         rows = [
-            (f"noise ({left.noise_from})", left.noise_mm, "-"),
+            (f"noise ({left.noise_from})" if known else "noise, not known", left.noise_mm, "-"),
             *((name_structure(one.name), one.rms_mm, name_chance(one.p)) for one in left.depends),
             ("explained by nothing", left.unexplained_mm, "-"),
         ]

@@ -181,6 +181,8 @@ def test_the_remaining_error_is_given_in_its_parts(found):
     assert "0.050 mm is measurement noise (repeated poses), 0.200 mm is a motion of" in text
     assert text.endswith("joint 3 that depends on its load (p < 0.005), 0.100 mm is unexplained.")
     assert [row[1] for row in remaining_table(parts).rows] == [0.05, 0.2, 0.1]
+    unsure = replace(parts, remaining=replace(parts.remaining, noise_mm=float("nan")))
+    assert remaining_table(unsure).rows[0][0] == "noise, not known"
     none = replace(left, depends=(), noise_mm=0.02, noise_from=DISTANCES)
     (text,) = [text for text in replace(found, remaining=none, floor_known=False).reasons
                if text.startswith("Remaining error")]  # fmt: skip
