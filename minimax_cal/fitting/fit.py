@@ -52,7 +52,7 @@ from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted
 from minimax_cal.modelling.effects.words import name_effect
-from minimax_cal.modelling.frames import frames_of, tables_of, with_effects
+from minimax_cal.modelling.frames import WHOLE, frames_of, in_words, tables_of, with_effects
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, model_of, pose_weights
 from minimax_cal.modelling.parameters import Names
@@ -446,11 +446,10 @@ class Fit(Result):
             [row for row in self.accuracy_rows() if row[1] != 0],
             "error at | poses d | RMS mm .3f | 95 % low .3f | 95 % high .3f | max mm .3f",
         )
-        frames = self.frames
-        placed, _ = frames_tables({name: frames[name] for name in PLACED if name in frames}, "")
-        return first, replace(
-            placed, title="base in the instrument's frame, tool in the flange's; Rz(A) Ry(B) Rx(C)"
-        )
+        frames, of = self.frames, "" if self.geometric is self.cell else WHOLE
+        shown = {name: frames[name + of] for name in PLACED if name + of in frames}
+        where = f"base in the instrument's frame, tool in the flange's{in_words(of)}"
+        return first, replace(frames_tables(shown, "")[0], title=f"{where}; Rz(A) Ry(B) Rx(C)")
 
     def accuracy_rows(self) -> Iterator[tuple[object, ...]]:
         """New poses, inside and outside the measured region, then those of the fit."""

@@ -13,8 +13,8 @@ from minimax_cal.robots.transforms import Frame, frames_tables, inverse, nearest
 
 FLAT = 0.02  # width over length of reflectors from which their turn is told; as `checks.collinear`
 # of the frames' names
-DRAWN, CORRECTION, EFFECTS, SESSION = "_nominal", "_correction", "_with_effects", "session "
-IN_WORDS = {DRAWN: " of the drawn arm", CORRECTION: " correction", EFFECTS: ", with effects"}
+DRAWN, CORRECTION, WHOLE, SESSION = "_nominal", "_correction", "_with_effects", "session "
+IN_WORDS = {DRAWN: " of the drawn arm", CORRECTION: " correction", WHOLE: ", with effects"}
 
 
 def frames_of(cell: Cell, nominal: Cell | None) -> dict[str, Frame]:
@@ -57,7 +57,7 @@ def tools(after: Array, before: Array) -> tuple[Array | None, Array | None]:
 def with_effects(frames: Mapping[str, Frame]) -> dict[str, Frame]:
     """The frames that a fit with effects changes, under names that say so."""
     fixed = (DRAWN, SESSION)
-    return {f"{n}{EFFECTS}": f for n, f in frames.items() if not any(part in n for part in fixed)}
+    return {f"{n}{WHOLE}": f for n, f in frames.items() if not any(part in n for part in fixed)}
 
 
 def is_thin(centred: Array) -> bool:

@@ -97,7 +97,8 @@ def test_the_robot_is_of_geometry_alone(fit, saved, robot, noisy):
 
 def test_the_report_is_the_same(fit, saved):
     one, other = (
-        render(compose(read_sources([each]), Wording("2026-01-31"))) for each in (fit, saved)
+        render(compose(read_sources([each]), Wording("2026-01-31", appendix=True)))
+        for each in (fit, saved)
     )
     strip = lambda page: [x for x in page.splitlines() if "SHA" not in x and "not saved" not in x]  # noqa: E731
     assert strip(one) == strip(other)
@@ -114,7 +115,9 @@ def test_every_fact_is_in_the_file_and_shown_everywhere(fit, tmp_path):
     assert f"{fit.iterations} iterations" in said
     fit.save(tmp_path / "fit.json")
     assert said in fit.summary(10_000)
-    assert said in html.unescape(render(compose(read_sources([fit]), Wording("2026-01-31"))))
+    assert said in html.unescape(
+        render(compose(read_sources([fit]), Wording("2026-01-31", appendix=True)))
+    )
     assert said in fit_words(*mark(tmp_path / "fit.json"))
 
 

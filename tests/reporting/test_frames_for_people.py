@@ -157,6 +157,9 @@ def test_frames_with_effects_stand_beside_those_of_geometry(robot, noisy):
     one = fit.parameters["base_x"]  # of the table, which is of the fit with effects
     assert moved == pytest.approx(1e3 * (one.value - one.nominal), abs=1e-9)
     assert "base correction, with effects" in fit.summary(200)
+    shown = fit.first_tables()[1]  # goes with the accuracy and the parameters beside it
+    assert "with effects" in shown.title
+    assert_allclose(shown.rows[0][1:4], whole, rtol=1e-9)
 
 
 def test_links_of_a_robot_are_in_degrees(answered, says):
