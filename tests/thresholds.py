@@ -44,8 +44,8 @@ def numbers(module: str) -> Numbers:
     path, out = ROOT / f"{module.replace('.', '/')}.py", Numbers()
     for node in ast.parse(path.read_text()).body if path.exists() else []:
         if isinstance(node, ast.Assign):
-            (target,), value = node.targets, node.value
-            pairs = [(target, value)]
+            target, value = node.targets[0], node.value
+            pairs = [(each, value) for each in node.targets]
             if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
                 pairs = list(zip(target.elts, value.elts, strict=True))
             named = [(t.id, v) for t, v in pairs if isinstance(t, ast.Name) and t.id.isupper()]

@@ -209,7 +209,7 @@ def test_a_report_has_it_beside_a_calibration(made, tmp_path):
     poses = mc.simulate(three_joints(), 30, seed=1).data
     mc.calibrate(three_joints(), poses, "sum").save(tmp_path / "fit.json")
     page = tmp_path / "report.html"
-    assert run("report", tmp_path / "fit.json", made.text, "-o", page, "-q") == 0
+    assert run("report", tmp_path / "fit.json", made.text, "--appendix", "-o", page, "-q") == 0
     text = page.read_text()
     assert "held out (run2)" in text
     assert "friction in proportion to the load" in text
