@@ -359,7 +359,9 @@ def decoded(path: Path) -> tuple[str, str]:
         with suppress(UnicodeError):
             if can_be(codec, raw):
                 text = raw.decode(codec)
-                return text.replace("\r\n", "\n").replace("\r", "\n"), name
+                if "\r" in text:
+                    text = text.replace("\r\n", "\n").replace("\r", "\n")
+                return text, name
     raise DataError(f"{path}: is not a text file; expected rows of numbers")
 
 
@@ -411,7 +413,7 @@ def trimmed(row: Row) -> Row:
 
 def is_number(cell: str) -> bool:
     """Whether a cell is a number with either decimal sign."""
-    return any(pattern.fullmatch(cell) for pattern in (POINT, COMMA, THOUSANDS))
+    return bool(POINT.fullmatch(cell) or COMMA.fullmatch(cell) or THOUSANDS.fullmatch(cell))
 
 
 def is_header(row: Row) -> bool:
