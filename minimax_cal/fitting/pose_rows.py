@@ -125,5 +125,9 @@ def errors_of(cell: Cell | None, data: Measurements, told: Array) -> Array:
     if cell is None or not data.poses:
         return told
     exact = cell.error(data)
-    same = np.nanmax(np.abs(exact - told), initial=0.0) <= NEAR
-    return exact if same else told
+    return exact if comes_back(exact, told) else told
+
+
+def comes_back(exact: Array, told: Array) -> bool:
+    """Whether errors (k, m, 3), worked out from a file's columns, are those that it tells [m]."""
+    return bool(np.nanmax(np.abs(exact - told), initial=0.0) <= NEAR)

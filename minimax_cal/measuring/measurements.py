@@ -98,10 +98,13 @@ class Measurements:
 
     def called(self, line: int) -> str:
         """The row of a line as people call it: pose P201 where the file names it, else line 202."""
-        names = self.columns.get("pose")
         at = np.flatnonzero(self.line == line)
-        name = str(names[at[0]]).strip() if names is not None and at.size else ""
-        return f"pose {name}" if name else f"line {line}"
+        return self.row_called(int(at[0])) if at.size else f"line {line}"
+
+    def row_called(self, row: int) -> str:
+        """As `called`, of a row by its index."""
+        name = str(self.columns["pose"][row]).strip() if "pose" in self.columns else ""
+        return f"pose {name}" if name else f"line {self.line[row]}"
 
     def list_rows(self, rows: Array, most: int = 8) -> str:
         """Rows as people call them: poses P201, P202, else lines 202, 203; the first few.

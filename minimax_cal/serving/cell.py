@@ -62,7 +62,7 @@ def points_of(
         outside = 1e3 * np.linalg.norm(cell.error(whole), axis=-1)
     except CalibrationError:  # the poses of other measurements
         outside = np.full((len(whole.target_names), whole.poses), np.nan)
-    poses_called = called(whole)
+    poses_called = [whole.row_called(row) for row in range(whole.poses)]
     names = {name: target_called(whole, name) for name in whole.target_names}
     out = []
     for row, column in np.argwhere(whole.seen):
@@ -76,13 +76,6 @@ def points_of(
         name = names[target]
         out.append(Point(line, target, before, after, use, suspect, poses_called[row], name))
     return tuple(out)
-
-
-def called(data: Measurements) -> list[str]:
-    """Every row as people call it, as `Measurements.called` does one."""
-    names = data.columns.get("pose", np.full(data.poses, ""))
-    pairs = zip(names.tolist(), data.line.tolist(), strict=True)
-    return [f"pose {name}" if name else f"line {line}" for name, line in pairs]
 
 
 def target_called(data: Measurements, target: str) -> str:
@@ -102,11 +95,10 @@ def view_of(fit: str, moment: int, size: int) -> dict[str, Any]:
     space = space_of(poses, cell)
     target, pose = np.nonzero(np.isfinite(space.points[..., 0]).T)
     lines, names = poses.data.line[space.chosen[pose]], poses.data.target_names
-    every = dict(zip(poses.data.line, called(poses.data), strict=True))
     keys = [f"{line}:{names[k]}" for line, k in zip(lines, target, strict=True)]
     sizes = np.linalg.norm(space.after[pose, target], axis=-1)
     before = np.linalg.norm(space.before[pose, target], axis=-1)
-    known = {int(line): every[line] for line in set(lines)}
+    known = {int(line): poses.data.called(line) for line in set(lines)}
     more = {"keys": keys, "called": known, "size": [round(float(s), 4) for s in sizes],
             "size_before": [round(float(s), 4) for s in before]}  # fmt: skip
     return {**drawn, "arms": {**drawn["arms"], **more}}

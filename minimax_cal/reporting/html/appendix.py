@@ -7,9 +7,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.pose_rows import comes_back
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.tables import Table, filled
+from minimax_cal.ground.words import capitalise
 from minimax_cal.judging.iso9283 import iso9283
 from minimax_cal.modelling.effects.words import name_parameter, name_step
 from minimax_cal.reporting.html.content import Block, Blocks, Section, caveat, missing, text
@@ -21,7 +23,7 @@ from minimax_cal.reporting.html.more_charts import (
     curve_chart,
 )
 from minimax_cal.reporting.html.pages import NO_POSES, names_of
-from minimax_cal.reporting.html.sources import Sources, follows
+from minimax_cal.reporting.html.sources import Sources
 
 STRONG, MOST_ROWS = 0.5, 12  # correlations that have a row of their own, and how many
 
@@ -124,7 +126,7 @@ def iso_tables(fit: Fit) -> tuple[Table, ...]:
     """The tables of the values, none without poses.  Raises CalibrationError."""
     if not fit.data.poses:
         return ()
-    if not follows(fit.cell, fit.data, fit.error):
+    if not comes_back(fit.cell.error(fit.data), fit.error):
         raise CalibrationError(
             "the fit's effects need columns of the measurements that its file does not hold"
         )
@@ -141,7 +143,7 @@ def simulator(sources: Sources) -> Blocks:
         out += [caveat(f"Not in the model: {lost}.") for lost in gap.left_out]
     if motion := sources.motion:
         out += motion.tables()
-        out += [text(f"{said[0].upper()}{said[1:]}.") for said in motion.sentences()]
+        out += [text(f"{capitalise(said)}.") for said in motion.sentences()]
     written = (arm.written for arm in (gap, motion) if arm)
     return [*out, *(text(f"The corrected model is {name}.") for name in written if name)]
 

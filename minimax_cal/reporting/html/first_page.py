@@ -15,6 +15,7 @@ from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.checks import wild
 from minimax_cal.fitting.crossed import intervals_of
 from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.pose_rows import comes_back
 from minimax_cal.fitting.set_aside import aside_sentence
 from minimax_cal.fitting.several import RelativeCalibration
 from minimax_cal.ground.errors import CalibrationError, OptionError
@@ -47,7 +48,7 @@ from minimax_cal.reporting.html.delivered import Row, governing, rows_of
 from minimax_cal.reporting.html.error_charts import cumulative
 from minimax_cal.reporting.html.more_charts import budget_chart, waterfall
 from minimax_cal.reporting.html.pages import names_of, split_reasons
-from minimax_cal.reporting.html.sources import Sources, follows, named
+from minimax_cal.reporting.html.sources import Sources, named
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.status import Status
 
@@ -355,7 +356,7 @@ def worst_joint(sources: Sources) -> Iterator[str]:
         cell, data, error = fit.cell, fit.data, fit.error
     elif gap and gap.cells and gap.cells[-1].effects.terms:
         cell, data, error = gap.cells[-1], gap.data, gap.errors[1]
-    if cell is None or data is None or not (data.poses and follows(cell, data, error)):
+    if cell is None or data is None or not (data.poses and comes_back(cell.error(data), error)):
         return
     turn = np.degrees(cell.effects.turn(cell.scene(with_history(data))))
     turn[:, data.sliding] = 0.0

@@ -29,8 +29,6 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.simulators.motion.result import MotionGap
 from minimax_cal.simulators.result import SimulatorGap
 
-SAME = 1e-6  # a file's own errors come back to this [m]
-
 Result = (
     Fit
     | Diagnosis
@@ -138,11 +136,6 @@ def named(sources: Sources) -> list[tuple[str, Fit | Diagnosis | RelativeCalibra
     """The results with what they are."""
     every = (("calibration", sources.fit), ("diagnosis", sources.gap), (RELATIVE, sources.relative))
     return [(kind, result) for kind, result in every if result]
-
-
-def follows(cell: Cell, data: Measurements, error: Array) -> bool:
-    """Whether errors come back from the columns of a file; its effects need others where not."""
-    return bool(np.nanmax(np.abs(cell.error(data) - error), initial=0.0) <= SAME)
 
 
 def read_sources(results: Sequence[Result]) -> Sources:
