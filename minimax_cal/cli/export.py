@@ -47,8 +47,9 @@ def export_command(fit: str, kind: str, to: Output, **chosen: Any) -> int:
     made = exported(fit, kind, to.output, ExportOptions(**chosen))
     if to.output or not to.as_json:
         written(made.file, to.output)
-    to.notice(*made.file.notices, *([made.delivered.sentence()] if made.delivered else []))
-    to.wrote(to.output)
+    own = [made.delivered.sentence()] if made.delivered else []
+    to.notice(*made.file.notices, *own)
+    to.wrote(to.output, accuracy="".join(own))
     if to.as_json:
         click.echo(json_text(made.to_dict()), nl=False)
     elif not to.output:

@@ -356,11 +356,11 @@ class Output:
             )
         return quoted if safe else text
 
-    def wrote(self, *paths: Path | str | None) -> None:
-        """Say on stderr which files were written, whatever their names."""
+    def wrote(self, *paths: Path | str | None, **more: str) -> None:
+        """Say on stderr which files were written, whatever their names.  more: for programs."""
         for path in paths:
             if path and not self.quiet:
-                tell("written", str(path))
+                tell("written", str(path), **more)
 
     def deliver(
         self,

@@ -15,6 +15,7 @@ from minimax_cal.cli.options import (
     Output,
     command,
     options_from,
+    show,
     with_output,
 )
 from minimax_cal.cli.stderr import complain
@@ -44,5 +45,7 @@ def report_command(
     found = signed(results, path, Chosen(**chosen), pdf, to.notice)
     for line in found.lines():
         click.echo(line)
-    to.wrote(path, pdf)
+    click.echo()
+    show(*found.tables())
+    to.wrote(path, pdf, looks=found.look)
     return complain(found.complaint) if found.complaint else 0

@@ -715,7 +715,7 @@ class Diagnosis(Explained, Result):
         title = f"effects found, step by step; p-values below {LEVEL:g} are significant"
         every = Table.made(title, rows, FOUND)
         plain = every.only(*range(len(every.header) - 1))  # without what says one thing
-        return plain if all(f.evidence.startswith("confirmed") for f in found) else every
+        return plain if all(f.established and not f.alternatives for f in found) else every
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result, but for those of where the errors lie."""

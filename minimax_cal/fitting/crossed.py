@@ -91,7 +91,7 @@ def intervals_of(error: Array, group: Array, seed: int) -> tuple[Interval, Inter
 
 
 def few_poses(train: Measurements, parameters: int) -> str:
-    """A warning where the poses are too few for the parameters, else nothing.
+    """Why the poses are too few for the parameters, else nothing.
 
     With n numbers and p parameters the mean square on new poses is (n + p) / (n - p) times that of
     the poses of the fit.
@@ -106,7 +106,7 @@ def few_poses(train: Measurements, parameters: int) -> str:
     if numbers > parameters:
         growth = f"about {math.sqrt((numbers + parameters) / (numbers - parameters)):.1f}"
     return (
-        f"too few poses: {len(first)} training poses tell {numbers} numbers for {parameters} free "
+        f"{len(first)} training poses tell {numbers} numbers for {parameters} free "
         f"parameters, so that errors on new poses are {growth} times those of training; measure at "
         f"{more} poses or more, fix parameters, or tell what is known of them as priors"
     )

@@ -257,7 +257,7 @@ def alarms(robot: Robot, poses: Parts, solved: Solved, nominal_error: Array) -> 
     """Why the result should not be used as it is.  nominal_error: (k, training poses, 3) [m]."""
     free = solved.identification.active & (solved.estimator.model.prior.weight == 0.0)
     if few := few_poses(poses.train, int(free.sum())):
-        yield few
+        yield f"too few poses: {few}"
     yield from doubts(robot, solved, nominal_error)
 
 

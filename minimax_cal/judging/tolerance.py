@@ -48,7 +48,7 @@ class Claim:
     name: inside or outside.  before: of the nominal arm [mm], by kind.  poses: that count by
     themselves.  where: in words.  reason: why there is no claim, if there is none.  open: what
     could not be judged, so that nothing is passed by the rest; empty where all was.  sets:
-    the poses of RMS and of the largest in two words, for a table.
+    how many poses RMS and largest are of.
     refused: why nothing is passed, whatever the numbers; empty where it may be.
     """
 
@@ -60,7 +60,7 @@ class Claim:
     before: tuple[float, float] = (math.nan, math.nan)
     reason: str = ""
     open: str = ""
-    sets: tuple[str, str] = ("", "")
+    sets: tuple[int, int] = (0, 0)
     refused: str = ""
 
     def bound(self, kind: str) -> Bound:
@@ -120,12 +120,10 @@ def within(
     intervals: tuple[Interval, Interval] = (UNKNOWN, UNKNOWN),
     poses: int | None = None,
     missed: int = 0,
-    kind: str = "held out",
 ) -> Claim:
     """The claim for poses between the measured ones.
 
-    name: of these poses, in words.  missed: how many more no fit without them judges.  kind: how
-    they came to be judged.
+    name: of these poses, in words.  missed: how many more no fit without them judges.
     """
     rms, largest = intervals
     return Claim(
@@ -137,7 +135,7 @@ def within(
         (before.rms_mm, before.max_mm),
         "" if after.poses else "no pose was held out",
         f"{missed} poses, which the fit needs, could not be judged" if missed else "",
-        (f"{after.poses} {kind}",) * 2,
+        (after.poses, after.poses),
     )
 
 
@@ -158,7 +156,7 @@ def beyond(found: Beyond) -> Claim:
         f"outside the measured region, in the worst part that was held out ({worst.where}, "
         f"{worst.poses} poses{of}{kept})",
         open=open_of(found),
-        sets=(f"{worst.poses} left out", f"{far.poses} left out"),
+        sets=(worst.poses, far.poses),
     )
 
 

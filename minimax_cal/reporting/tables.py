@@ -25,11 +25,15 @@ def numbers(entry: Mapping[str, Any], *keys: str) -> list[float]:
     return [number(entry[key]) for key in keys]
 
 
-def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
+def where_tables(
+    where: Mapping[str, Any], turned: Mapping[str, tuple[float, str]] | None = None
+) -> tuple[Table, ...]:
     """Where the geometric errors lie: targets, joints, regions, and what they follow.
 
-    where: as in the JSON of a diagnosis.
+    where: as in the JSON of a diagnosis.  turned: how far effects turn a joint at most [mrad], and
+    at which pose, by the joint's name.
     """
+    most = turned or {}
 
     def what(entry: Mapping[str, Any]) -> tuple[str, float, str]:
         share, p = number(entry.get("share")), number(entry.get("p"))
@@ -41,10 +45,11 @@ def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
         for entry in where["by_target"]
     )  # fmt: skip
     joints = (
-        (entry["joint"], unit, *numbers(entry, f"rms_{unit}"), *what(entry))
+        (entry["joint"], unit, *numbers(entry, f"rms_{unit}"), *what(entry),
+         *most.get(str(entry["joint"]), ("", "")))
         for entry in where["by_joint"]
         for unit in ("mm" if "rms_mm" in entry else "mrad",)
-    )
+    )  # fmt: skip
     regions = (
         (cell["region"], *map(number, (*cell["radius_mm"], *cell["height_mm"])), cell["points"],
          number(cell["rms_mm"]))
@@ -56,11 +61,15 @@ def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
         if trend
     )
     left, follows = "error after geometry,", "follows | % of it .0f | p-value"
+    by_joint = Table.made(
+        f"{left} as rotations of each joint alone",
+        joints,
+        f"joint | unit | RMS .4f | {follows} | all effects turn it at most mrad .4f | at",
+    )
     shown = filled(
         Table.made(f"{left} by target", targets, "target | points d | RMS mm .4f | max mm .4f | "
                    f"mean along the line of sight mm +.4f | {follows}"),
-        Table.made(f"{left} as rotations of each joint", joints,
-                   f"joint | unit | RMS .4f | {follows}"),
+        by_joint if most else by_joint.only(*range(6)),
         Table.made(f"{left} by region", regions, "region | from the base axis mm .0f | to mm .0f | "
                    "height from mm .0f | to mm .0f | points d | RMS mm .4f"),
         Table.made(f"{left} by time", trends, f"by | where | {follows}"),

@@ -54,7 +54,6 @@ WHAT = {
     MJCF: "the calibrated robot for MuJoCo",
     CORRECTED: "the joint targets, corrected",
 }
-BANNERS = {"passed without": "unstated", "passed": "passed", "not passed": "failed"}  # how it looks
 Panel = dict[str, Any]
 Tile = tuple[str, str, str]  # name, before, after
 
@@ -264,8 +263,8 @@ def verdict_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None
     record = record_of(at, "judge")
     if not record or record.code:
         return None
-    verdict, *lines = record.told.splitlines() or [""]
-    kind = next((kind for said, kind in BANNERS.items() if verdict.startswith(said)), "unstated")
+    verdict, *lines = paragraph(at, "judge").splitlines() or [""]
+    kind = record.more.get("looks", "unstated")
     return {"verdict": capitalise(verdict), "kind": kind, "lines": lines, "base": base(at)}
 
 
@@ -315,9 +314,8 @@ def accuracy_of(at: Session, name: str) -> str:
         return ""
     step = next(step for step, one in STEPS.items() if one.writes == name)
     record = record_of(at, step)
-    notices = record.notices if record and not record.code else ()
-    exported = (text for text in notices if text.startswith(f"{step} "))
-    return paragraph(at, step) or next(exported, "")
+    told = record.more.get("accuracy", "") if record and not record.code else ""
+    return paragraph(at, step) or told
 
 
 def base(at: Session) -> str:

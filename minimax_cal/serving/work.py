@@ -31,7 +31,10 @@ MOST_LINE = 1 << 20  # bytes of a line on stderr
 
 @dataclass(frozen=True)
 class Record:
-    """How a step ended.  inputs: SHA-256 of the files that its commands read.  told: its stdout."""
+    """How a step ended.  inputs: SHA-256 of the files that its commands read.  told: its stdout.
+
+    more: what it said of the file that it wrote, beside its name.
+    """
 
     commands: tuple[str, ...]
     code: int
@@ -40,6 +43,7 @@ class Record:
     notices: tuple[str, ...] = ()
     error: str = ""
     inputs: Mapping[str, str] = field(default_factory=dict)
+    more: Mapping[str, str] = field(default_factory=dict)
 
 
 def record_of(at: Session, step: str) -> Record | None:
@@ -66,6 +70,7 @@ class Job:
     notices: list[str] = field(default_factory=list)
     other: deque[str] = field(default_factory=lambda: deque(maxlen=MOST_LINES))
     error: str = ""
+    more: dict[str, str] = field(default_factory=dict)
     process: asyncio.subprocess.Process | None = None
     cancelled: bool = False
     task: asyncio.Task[None] | None = None
@@ -87,6 +92,8 @@ class Job:
         elif kind == "notice":
             if len(self.notices) < MOST_LINES:
                 self.notices.append(text)
+        elif kind == "written":
+            self.more |= {k: str(v) for k, v in event.items() if k not in ("event", "text")}
         elif not kind and text:
             self.other.append(one_line(text))
 
@@ -218,7 +225,7 @@ def kept(job: Job, code: int, told: str, inputs: dict[str, str]) -> None:
     """Write how a step ended, and its commands into the session's script."""
     seconds = round(time.monotonic() - job.began, 1)
     commands = tuple(command.line() for command in job.commands)
-    record = Record(commands, code, seconds, told, tuple(job.notices), job.error, inputs)
+    record = Record(commands, code, seconds, told, tuple(job.notices), job.error, inputs, job.more)
     write_whole(job.at.folder / LOG / f"{job.step}.json", json_text(plain(record)))
     script = job.at.folder / SCRIPT
     text = script.read_text("utf-8") if script.exists() else start_of(job.at.folder)

@@ -44,14 +44,10 @@ def rendered(wording: Wording, *paths: Path) -> Seen:
 
 
 def rows(seen: Seen) -> dict[str, list[str]]:
-    """The table of the result by what its first cells name, their poses before the rest."""
-    every = [row for title, found in seen.tables.items()
-             if title.startswith(("Model: ", "Result by")) for row in found]  # fmt: skip
-    names = [row[0].partition(" (") for row in every]
-    return {
-        name: [poses.removesuffix(")"), *row[1:]]
-        for (name, _, poses), row in zip(names, every, strict=True)
-    }
+    """The table of the result: after what an error is of, and which, the cells of its row."""
+    title, every = next((t, found) for t, found in seen.tables.items() if t.endswith(" [mm]"))
+    first = 2 if title.startswith("Result by") else 1
+    return {", ".join(row[:first]): row[first:] for row in every}
 
 
 def test_requirement_result_and_verdict(whole, tmp_path, says):
@@ -64,13 +60,14 @@ def test_requirement_result_and_verdict(whole, tmp_path, says):
     ):
         told = ("report", whole, "--tolerance", f"rms {size:.6f}", "-o", out)
         stdout, stderr = says(*told, code=code)
-        where = " inside the measured region" * (not code)
+        where = f"{' inside the measured region' * (not code)} for corrected targets"
         assert stdout.splitlines()[0] == f"{verdict}{where}"
+        assert re.search(f"RMS, inside +{fit.within.after.poses} ", stdout)
         assert f"written: {out}" in stderr
         assert ("error: RMS error at most" in stderr) == bool(code)
         seen = Seen(out.read_text())
-        poses, before, after, limit, asked, said = rows(seen)["corrected targets: RMS, inside"]
-        assert poses == f"{fit.within.after.poses} cross-validated"
+        poses, before, after, limit, asked, said = rows(seen)["corrected targets, RMS, inside"]
+        assert poses == f"{fit.within.after.poses}"
         assert (before, after) == (f"{fit.within.before.rms_mm:.3f}",
                                    f"{fit.within.after.rms_mm:.3f}")  # fmt: skip
         assert (limit, asked, said) == (f"{low:.3f} to {high:.3f}", f"{size:.3g}", verdict)
@@ -85,7 +82,7 @@ def test_beyond_is_asked_of_the_worst_part(whole, tmp_path, refuses, says):
     told = ("report", whole, "--tolerance", f"rms {size:.6f}", "-o", out, "-q")
     assert says(*told).out.startswith("passed")
     assert says(*told, "--tolerance-for", "outside", code=1).out.startswith("not passed")
-    row = rows(Seen(out.read_text()))["corrected targets: RMS, worst region"]
+    row = rows(Seen(out.read_text()))["corrected targets, RMS, worst region"]
     assert row[-1] == "not passed"
     refuses("choose inside or outside", *told, "--tolerance-for", "above")
 
@@ -106,12 +103,12 @@ def test_an_arm_of_half_its_lengths_is_not_signed_unseen(robot, tmp_path, says):
 
 def test_the_page_says_which_model_is_signed(results, whole):
     plain = rendered(WORDING, results / "fit.json", results / "gap.json")
-    assert any(title == "Model: geometry alone" for title in plain.tables)
+    assert any(title == "Model: geometry alone [mm]" for title in plain.tables)
     text = plain.text["verdict"]
     assert "Signed is the calibration (geometry alone)" in text
     assert "Main cause: joint compliance of the whole arm (gearboxes wind up" in text
     both = rendered(WORDING, whole, results / "gap.json")
-    assert "corrected targets: RMS, inside" in rows(both)
+    assert "corrected targets, RMS, inside" in rows(both)
     assert "Signed is the calibration" not in both.text["verdict"]
     # all that these data tell of the noise is that of the instrument
     assert "is the instrument's noise" in both.text["budget"]
@@ -136,13 +133,24 @@ def test_the_worst_joint_is_the_one_that_effects_turn_most(whole, results):
     assert not list(worst_joint(read_sources([results / "fit.json"])))  # geometry turns none
 
 
+def test_pages_say_how_far_effects_turn_a_joint_and_by_which_parameters(whole, results):
+    fit, seen = mc.load_fit(whole), rendered(WORDING, whole, results / "gap.json")
+    turn = 1e3 * np.abs(fit.cell.effects.turn(fit.cell.scene(with_history(fit.data))))
+    joints = seen.tables["error after geometry, as rotations of each joint alone"][1:]
+    assert [row[-2] for row in joints] == [f"{most:.4f}" for most in turn.max(axis=0)]
+    assert [row[-1] for row in joints] == [f"line {fit.data.line[i]}" for i in turn.argmax(axis=0)]
+    effects = next(rows for title, rows in seen.tables.items() if "beyond geometry" in title)
+    known = [p for p in fit.parameters if p.of_effect and p.identifiable]
+    assert all(f"{p.value:.4g}" in str(effects) for p in known)
+
+
 def test_rungs_of_a_diagnosis(results, tmp_path):
     gap = load_diagnosis(results / "gap.json")
     for number, step in ((0, gap.ladder[0]), (1, gap.ladder[1]), (None, gap.ladder[-1])):
         wording = Wording("2026-11-21", rung=number)
         found = rows(rendered(wording, results / "gap.json"))
-        found = found.get("RMS, inside") or found["corrected targets: RMS, inside"]
-        assert found[0] == f"{step.holdout.poses} held out"
+        found = found.get("RMS, inside") or found["corrected targets, RMS, inside"]
+        assert found[0] == f"{step.holdout.poses}"
         assert found[2] == f"{step.holdout.rms_mm:.3f}"
     with pytest.raises(mc.OptionError, match="no step 7"):
         mc.report(gap, tmp_path / "a.html", rung=7)
@@ -265,17 +273,18 @@ def test_the_page_and_the_command_say_for_which_file(fit, between, tmp_path, ref
     assert any(
         "hold for joint targets corrected by minimax-cal compensate" in line for line in rest
     )
-    assert any(line.startswith("urdf: not passed: urdf holds geometry alone") for line in rest)
+    assert any(line.startswith("Urdf file: fitted without ") for line in rest)
+    assert any(re.match(" +urdf file +.* not passed", line) for line in rest)
     page = (tmp_path / "page.html").read_text()
     assert "Result by deliverable" in page
     first, *rest = says(
         *asked, "--deliver", "urdf", "--deliver", "ros-yaml", code=1
     ).out.splitlines()
-    assert first == NOT_PASSED
+    assert first == f"{NOT_PASSED} for urdf file"
     assert any(
         "hold for the urdf file of minimax-cal export (geometry alone)" in line for line in rest
     )
-    assert sum(line.startswith(("urdf: ", "ros-yaml: ")) for line in rest) == 2
+    assert sum(line.startswith(("Urdf file: ", "Ros-yaml file: ")) for line in rest) == 2
     refuses("no such format; choose one of urdf", *asked, "--deliver", "step")
 
 
@@ -319,6 +328,15 @@ def test_passed_only_without_them_is_said_in_the_verdict_line(files, says):
     assert f"Passed {said}: {NOT_PASSED}" in verdict
     assert f"RMS, inside, with {2 * BAD} points set aside" in verdict
     assert "Why: looks odd (10)" in verdict
+
+
+def test_outliers_that_were_kept_are_named(files):
+    fit = mc.load_fit(files / "poses.json")
+    text = rendered(WORDING, files / "poses.json").text["verdict"]
+    assert f"{len(fit.suspects)} outliers were kept" in text
+    worst = max(fit.suspects, key=lambda one: one.distance)
+    assert f"line {worst.line} {worst.target} {1e3 * worst.distance:.2f} mm" in text
+    assert "kept, as" not in rendered(WORDING, files / "used.json").text["verdict"]
 
 
 def test_with_room_enough_it_is_passed_with_them_too(files):

@@ -252,7 +252,7 @@ def test_the_first_page_is_one_sheet_with_all_that_is_signed(driver, results, tm
     scheme(driver, "light")
     driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
     assert box[1] < A4[1]
-    for word in (sources.robot, "26-104711", "required mm", "0.2", "Not passed",
+    for word in (sources.robot, "26-104711", "required", "0.2", "Not passed",
                  "Main cause", "signature", "Checked", "A. Smith"):  # fmt: skip
         assert word in text, word
     assert "Contents" not in text

@@ -211,11 +211,12 @@ def test_names_from_files_are_only_text(server, poses):
 def test_a_requirement_is_judged_by_the_report(server, fitted):
     server.choose(fitted, rms=50.0)
     state = server.run(fitted, "judge")
-    assert ">Passed inside the measured region</p>" in state["panels"]["verdict"]
+    told = state["panels"]["verdict"]
+    assert 'banner passed">Passed inside the measured region</p>' in told
     server.choose(fitted, rms=1e-6)
     assert server.state(fitted)["steps"]["judge"]["state"] == "old"
     state = server.run(fitted, "judge")
-    assert ">Not passed</p>" in state["panels"]["verdict"]
+    assert 'banner failed">Not passed</p>' in state["panels"]["verdict"]
     assert state["steps"]["judge"] | {"state": "done", "error": ""} == state["steps"]["judge"]
     look = server.ask("GET", f"{fitted}/file/report.html?look")
     assert look.headers["content-type"].startswith("text/html")

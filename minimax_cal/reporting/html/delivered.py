@@ -52,22 +52,19 @@ class Row:
         return SHORT if to == COMPENSATED else f"{to} file"
 
     def said(self) -> str:
-        """What it holds of the full model, in a sentence."""
-        own = self.delivered
+        """What it holds of the whole model, and how well that does, in a sentence."""
+        own, whole = self.delivered, "the whole model"
         if own.reason:
             return f"{own.sentence()}."
-        out = f"fitted without {own.lacks}, which it leaves out" if own.lacks else "the whole model"
-        return f"{capitalise(self.short)}: {out}."
+        if own.lacks:
+            size = "" if math.isnan(own.whole.rms) else f" ({own.whole.rms:.3f} mm RMS)"
+            whole = f"fitted without {own.lacks}, which only {whole} holds{size}"
+        return f"{capitalise(self.short)}: {whole}."
 
     @property
     def verdict(self) -> str:
         """passed, not passed or not stated; empty without a requirement."""
         return overall(self.judged) if self.judged else ""
-
-    def line(self) -> str:
-        """For a terminal."""
-        verdict = f"{self.verdict}: " if self.verdict else ""
-        return f"{self.delivered.format}: {verdict}{self.delivered.sentence()}"
 
 
 def rows_of(

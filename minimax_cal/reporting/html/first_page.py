@@ -13,14 +13,13 @@ from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.accuracy import NO_ENDS, Accuracy
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.checks import wild
-from minimax_cal.fitting.crossed import intervals_of
+from minimax_cal.fitting.crossed import few_poses, intervals_of
 from minimax_cal.fitting.fit import Fit
-from minimax_cal.fitting.pose_rows import comes_back
 from minimax_cal.fitting.set_aside import aside_sentence
 from minimax_cal.fitting.several import RelativeCalibration
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.tables import Table
-from minimax_cal.ground.words import capitalise
+from minimax_cal.ground.words import capitalise, name_first
 from minimax_cal.judging.tolerance import (
     KINDS,
     NOT_PASSED,
@@ -47,7 +46,7 @@ from minimax_cal.reporting.html.content import Block, Figure, Note, caveat, text
 from minimax_cal.reporting.html.delivered import Row, governing, rows_of
 from minimax_cal.reporting.html.error_charts import cumulative
 from minimax_cal.reporting.html.more_charts import budget_chart, waterfall
-from minimax_cal.reporting.html.pages import names_of, split_reasons
+from minimax_cal.reporting.html.pages import names_of, split_reasons, turned
 from minimax_cal.reporting.html.sources import Sources, named
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.status import Status
@@ -106,16 +105,19 @@ class Signed:
 
     @property
     def sentence(self) -> str:
-        """The verdict and where it holds; that it holds only without points set aside."""
+        """Of what which verdict, and where it holds; that it does only without points set aside."""
+        if not self.verdict:
+            return NO_LIMIT
+        of = f" for {self.row.short}" if self.row else ""
         if self.verdict != PASSED:
-            return self.verdict or NO_LIMIT
+            return f"{self.verdict}{of}"
         if not self.only_without:
-            return f"{PASSED} {self.which} the measured region"
+            return f"{PASSED} {self.which} the measured region{of}"
         with_all = overall(self.judged_with)
         worst = next(one for one in self.judged_with if one.verdict == with_all)
         them = "it" if len(self.set_aside) == 1 else "them"
         return (
-            f"{PASSED} without {counted(self.set_aside)}; with {them} "
+            f"{PASSED}{of} without {counted(self.set_aside)}; with {them} "
             f"{KINDS[worst.limit.kind]} {worst.bound.value:.3f} mm: {with_all}"
         )
 
@@ -128,14 +130,24 @@ class Signed:
             [other] if self.wild else []
         )
 
+    @property
+    def look(self) -> str:
+        """How the verdict looks: passed, failed or unstated."""
+        kind = {PASSED: "passed", NOT_PASSED: "failed"}.get(self.verdict, "unstated")
+        return "unstated" if self.only_without else kind
+
     def lines(self) -> list[str]:
-        """For a terminal."""
+        """For a terminal, beside the table."""
         said = [one.sentence() for one in self.judged]
         if not self.judged:
             return [self.sentence, *self.aside]
         told = [self.holds_for] if self.row else []
-        rows = [row.line() for row in self.rows]
+        rows = [row.said() for row in self.rows]
         return [self.sentence, *said, *self.aside, *told, *rows, *self.besides]
+
+    def tables(self) -> tuple[Table, ...]:
+        """For a terminal."""
+        return (result_table(self),)
 
     @property
     def complaint(self) -> str:
@@ -257,7 +269,6 @@ def claims_of(fit: Fit) -> tuple[Claim, ...]:
         (seen.rms, seen.largest),
         seen.poses,
         seen.missed,
-        "cross-validated" if fit.error_crossed.size else "held out",
     )
     if not held:
         inside = Claim("inside", inside.rms, inside.largest, 0, seen.where, inside.before,
@@ -308,8 +319,7 @@ def claim_of_parts(sources: Sources) -> Claim:
 
 def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
     """Verdict, cause, results, what was set aside, and a picture."""
-    kind = {PASSED: "passed", NOT_PASSED: "failed"}.get(found.verdict, "unstated")
-    kind = "unstated" if found.only_without else kind
+    kind = found.look
     alarm = "caveat" if kind == "passed" else "warning"  # nothing is red under what is passed
     lines: list[Block] = [
         Note(capitalise(found.sentence), f"banner {kind}" if found.verdict else "text"),
@@ -321,6 +331,7 @@ def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
     ]
     if sources.results or sources.relative:
         lines += [Note(said, alarm) for said in found.aside] or [text(NOTHING_ASIDE)]
+        lines += [Note(said, alarm) for said in kept(sources)]
     lines += [text(one.sentence() + ".") for one in found.judged if not one.plain]
     lines += [text(which) for which in which_is_which(sources, found)]
     lines += [Note(notice, alarm) for notice in sources.notices]
@@ -334,13 +345,15 @@ def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
 def because(sources: Sources) -> Iterator[Note]:
     """The cause with its share, and the joint that it turns most; how to find it where unknown."""
     fit = sources.fit
-    few = [said for said in fit.notices if said.startswith("too few poses")] if fit else []
+    few = (
+        few_poses(fit.train, int(fit.identification.active.sum())) if fit and fit.data.poses else ""
+    )
     if found := sources.gap or sources.causes:
         (first, *others), _ = split_reasons(found)
         yield Note(first, "verdict")
         yield from [text(" ".join(others))] if others else []
     elif few:
-        yield text(f"What limits it now: {few[0].removeprefix('too few poses: ')}.")
+        yield text(f"What limits it now: {few}.")
     elif fit and fit.cell.effects.causes:
         yield text(f"The model holds {model_of(fit)}; what each explains is in the diagnosis.")
     else:
@@ -350,26 +363,28 @@ def because(sources: Sources) -> Iterator[Note]:
 
 def worst_joint(sources: Sources) -> Iterator[str]:
     """The joint that effects turn most, in degrees, and the pose; nothing where none turns one."""
-    fit, gap = sources.fit, sources.gap
-    cell, data, error = None, None, np.zeros(0)
-    if fit and fit.cell.effects.terms:
-        cell, data, error = fit.cell, fit.data, fit.error
-    elif gap and gap.cells and gap.cells[-1].effects.terms:
-        cell, data, error = gap.cells[-1], gap.data, gap.errors[1]
-    if cell is None or data is None or not (data.poses and comes_back(cell.error(data), error)):
-        return
-    turn = np.degrees(cell.effects.turn(cell.scene(with_history(data))))
-    turn[:, data.sliding] = 0.0
-    pose, joint = np.unravel_index(np.argmax(np.abs(turn)), turn.shape)
-    if turn[pose, joint]:
+    for data, turn in turned(sources):
+        pose, joint = np.unravel_index(np.argmax(turn), turn.shape)
         at = ", ".join(
             f"{1e3 * q:.0f} mm" if slides else f"{np.degrees(q):.0f}"
             for q, slides in zip(data.q[pose], data.sliding, strict=True)
         )
+        most = turn[pose, joint]
         yield (
-            f"Worst joint: joint {joint + 1}, turned {abs(turn[pose, joint]):.3f} degrees by all "
-            f"effects at its worst pose ({data.called(data.line[pose])}; joints at {at} deg)."
+            f"Worst joint: joint {joint + 1}, turned {np.degrees(most):.3f} degrees "
+            f"({1e3 * most:.2f} mrad) by all effects at its worst pose "
+            f"({data.row_called(int(pose))}; joints at {at} deg)."
         )
+
+
+def kept(sources: Sources) -> Iterator[str]:
+    """Which points stand out and yet take part."""
+    if sources.fit and sources.fit.suspects:
+        fit = sources.fit
+        most = sorted(fit.suspects, key=lambda one: -one.distance)
+        names = [f"{fit.data.called(s.line)} {s.target} {1e3 * s.distance:.2f} mm" for s in most]
+        many = "1 outlier was" if len(names) == 1 else f"{len(names)} outliers were"
+        yield f"{many} kept, as nothing tells that they are wrong: {name_first(names, MAX_NAMED)}."
 
 
 def picture(sources: Sources, found: Signed) -> Figure:
@@ -385,7 +400,7 @@ def picture(sources: Sources, found: Signed) -> Figure:
 
 def result_table(found: Signed) -> Table:
     """Of each deliverable: before, result, its 95 % interval, what is required, verdict."""
-    groups = [(f"{row.short}: ", row.claims, row.judged) for row in found.rows]
+    groups = [(row.short, row.claims, row.judged) for row in found.rows]
     groups = groups or [("", found.claims, found.judged)]
     rows: list[tuple[object, ...]] = []
     for name, claims, judged in groups:
@@ -395,21 +410,22 @@ def result_table(found: Signed) -> Table:
             if claim.reason and not inside:
                 continue
             for i, (kind, title) in enumerate(KINDS.items()):
-                bound, seen = claim.bound(kind), f" ({claim.sets[i]})" if claim.sets[i] else ""
                 which = "inside" if inside else "worst region" if kind == "rms" else "outside"
                 asked = said.get(kind, ()) if claim.name == found.which else ()
-                rows.append((f"{name}{title}, {which}{seen}", *ends(claim.before[i], bound),
-                             *(asked or (None, ""))))  # fmt: skip
+                sizes = ends(claim.before[i], claim.bound(kind))
+                poses = claim.sets[i] or ""
+                rows.append((name, f"{title}, {which}", poses, *sizes, *(asked or (None, ""))))
     if (all_of := found.with_them) is not None:
         rows += [
-            (f"{groups[0][0]}{title}, inside, with {len(found.set_aside)} points set aside",
+            (groups[0][0], f"{title}, inside, with {len(found.set_aside)} points set aside", "",
              *ends(before, all_of.bound(kind)), None, "")
             for (kind, title), before in zip(KINDS.items(), all_of.before, strict=True)
         ]  # fmt: skip
-    columns = "before mm .3f | result mm .3f | 95 % interval mm | required mm .3g | verdict"
-    title = "Result by deliverable" if found.rows else f"Model: {found.model}"
-    every = Table.made(title, rows, f"error of position (poses) | {columns}")
-    return every if found.judged else every.only(*range(4))
+    columns = "before .3f | result .3f | 95 % interval | required .3g | verdict"
+    title = f"{'Result by deliverable' if found.rows else f'Model: {found.model}'} [mm]"
+    every = Table.made(title, rows, f"of | error of position | poses d | {columns}")
+    first, last = (0 if found.rows else 1), (8 if found.judged else 6)
+    return every.only(*range(first, last))
 
 
 def ends(before: float, bound: Bound) -> tuple[float, float, str]:

@@ -59,7 +59,11 @@ class MotionSource:
         """For a terminal."""
         return [self.found.headline()]
 
-    complaint = ""  # nothing is required of torques
+    complaint = look = ""  # nothing is required of torques
+
+    def tables(self) -> tuple[Table, ...]:
+        """For a terminal."""
+        return ()
 
 
 def motion_of(results: Sequence[Result]) -> MotionSource | None:

@@ -2,26 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 
+import numpy as np
+
 from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
 from minimax_cal.diagnosing.result import Diagnosis
-from minimax_cal.diagnosing.sentences import causes_first
+from minimax_cal.diagnosing.sentences import away, causes_first
 from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.found import parameter_table
 from minimax_cal.fitting.identify import Because
+from minimax_cal.fitting.pose_rows import comes_back
 from minimax_cal.fitting.several import RelativeCalibration
+from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.records import reading
 from minimax_cal.ground.tables import Table, filled
+from minimax_cal.ground.words import capitalise
+from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.frames import tables_of
-from minimax_cal.reporting.html.content import Block, Blocks, missing, text
+from minimax_cal.reporting.html.content import Block, Blocks, Note, missing, text
 from minimax_cal.reporting.html.error_charts import Names, against_joints
 from minimax_cal.reporting.html.scene import workspace
-from minimax_cal.reporting.html.sources import Sources
+from minimax_cal.reporting.html.sources import Sources, named
 from minimax_cal.reporting.tables import remaining_table, where_tables
 
 SHEET_ROWS = 50  # of tables on a printed page; the appendix has what is longer
+SHOWN_LEFT = 4  # rows of what the remaining error follows
+SHEET_NOTICES = 5  # as many fit on the page of the budget; the appendix has all
+BELOW = 9  # rows that the sentences below the parameters need
+LINE = 90  # letters of a line of a table's sentence
 NO_POSES = "The file holds no poses, so that nothing can be drawn; write it again with its poses."
 OBJECTIVES = {
     "sum": "the sum of all squared errors as small as possible",
@@ -59,15 +73,20 @@ def budget(sources: Sources) -> Blocks:
     fit, gap, told, causes = sources.fit, sources.gap, sources.relative, sources.causes
     blocks: list[Block] = []
     if gap:
-        blocks += map(text, split_reasons(gap)[1])
-        blocks += filled(*gap.first_tables(), gap.effects_table(), remaining_table(gap))
+        said = split_reasons(gap)[1]  # outside, the first page says how what is signed does
+        blocks += [text(one) for one in said if not (fit and one == away(gap))]
+        left = remaining_table(gap).brief(rows=SHOWN_LEFT)
+        blocks += filled(*gap.first_tables(), gap.effects_table(), left)
     elif fit:
         blocks += filled(fit.first_tables()[0], fit.accuracy_table(), fit.beyond.table())
     elif told:
         blocks += [text(told.headline()), *told.first_tables()]
         blocks += causes.first_tables() if causes else ()
     arms = (sources.simulator, sources.motion)
-    return [*blocks, *(text(f"In the simulator: {arm.headline()}") for arm in arms if arm)]
+    blocks += [text(f"In the simulator: {arm.headline()}") for arm in arms if arm]
+    every = dict.fromkeys(one for _, result in named(sources) for one in result.notices)
+    blocks += [Note(capitalise(f"{one}."), "notice") for one in list(every)[:SHEET_NOTICES]]
+    return blocks
 
 
 # ---- where ---------------------------------------------------------------------------------------
@@ -85,10 +104,38 @@ def where(sources: Sources) -> Blocks:
         drawn.append(missing(NO_POSES))
     if gap and gap.where:
         with reading("diagnosis", "where"):
-            drawn += where_tables(gap.where)
+            drawn += where_tables(gap.where, turns_of(sources))
     elif poses:
         drawn.append(against_joints(poses, names))
     return drawn
+
+
+def turned(sources: Sources) -> Iterator[tuple[Measurements, Array]]:
+    """The poses, and how far all effects turn each joint there: (m, n), 0 of one that slides [rad].
+
+    Nothing where none turns one, or the file does not tell.
+    """
+    fit, gap = sources.fit, sources.gap
+    if fit:
+        cell, data, error = fit.cell, fit.data, fit.error
+    elif gap and gap.cells:
+        cell, data, error = gap.cells[-1], gap.data, gap.errors[1]
+    else:
+        return
+    if cell.effects.terms and data.poses and comes_back(cell.error(data), error):
+        turn = np.abs(cell.effects.turn(cell.scene(with_history(data))))
+        turn[:, data.sliding] = 0.0
+        if turn.any():
+            yield data, turn
+
+
+def turns_of(sources: Sources) -> dict[str, tuple[float, str]]:
+    """How far effects turn each joint at most [mrad], and at which pose."""
+    return {
+        f"J{i + 1}": (1e3 * float(turn[pose, i]), data.row_called(int(pose)))
+        for data, turn in turned(sources)
+        for i, pose in enumerate(turn.argmax(axis=0))
+    }
 
 
 def parts_of(told: RelativeCalibration) -> list[Table]:
@@ -105,23 +152,52 @@ def parameters(sources: Sources) -> Blocks:
     """What was identified, how surely, and what was not."""
     fit, gap, told = sources.fit, sources.gap, sources.relative
     if fit:
-        tables = (fit.first_tables()[1], fit.parameter_table(), fit.effect_table())
-        return [*on_a_sheet(tables), *identified(fit)]
+        known = parameter_table(p for p in fit.parameters if p.identifiable)
+        known = known.only(*range(len(known.header) - 1))  # none of these has a reason
+        tables = (fit.first_tables()[1], replace(known, title="parameters identified"))
+        return [
+            *filled(*tables, effects_of(fit, SHEET_ROWS - BELOW - len(known.rows))),
+            *identified(fit),
+        ]
     if gap:
-        return filled(*tables_of(gap.frames)[:1], by_effect(gap.parameter_table()))
+        return filled(*tables_of(gap.frames)[:1], by_effect(gap.parameter_table(), SHEET_ROWS))
     return on_a_sheet((told.tables()[-1], *tables_of(told.frames)[:1])) if told else ()
 
 
-def by_effect(table: Table) -> Table:
-    """Parameters of effects, too many for a page, as a row an effect."""
-    if len(table.rows) <= SHEET_ROWS:
+def effects_of(fit: Fit, room: int) -> Table:
+    """Parameters of the effects of a calibration, as far as so many lines hold them."""
+    rows = []
+    for name, unit, *sizes in fit.effect_table().cells():
+        effect, _, parameter = name.rpartition(", ")
+        rows.append((effect, parameter, *sizes[:2], unit))
+    known = [row for row in rows if row[3] != "-" or row[1] == "RMS"]
+    columns = "effect | parameter | value | sigma | unit"
+    table = Table.made("effects beyond geometry", known, columns)
+    return by_effect(table, room)
+
+
+def by_effect(table: Table, room: int) -> Table:
+    """Parameters of effects, too many for so many lines, as a row an effect: the first that fit.
+
+    table: effect, parameter, value, sigma, unit.
+    """
+    if len(table.rows) <= room:
         return table
-    said = "{1} {2} (sigma {3}) {4}".format
-    rows = (
-        (effect, "; ".join(said(*row) for row in same))
-        for effect, same in groupby(table.cells(), key=itemgetter(0))
-    )
-    return Table.made(table.title, rows, "effect | parameters")
+    rows, every = list[tuple[str, str]](), groupby(table.cells(), key=itemgetter(0))
+    for effect, same in every:
+        own = list(same)
+        said = "; ".join(
+            f"{', '.join(f'{row[1]} {row[2]} ({row[3]})' for row in own if row[4] == unit)}"
+            f"{f' {unit}' if unit != '1' else ''}"
+            for unit in dict.fromkeys(row[4] for row in own)
+        )
+        room -= max(1, math.ceil(len(said) / LINE))
+        if rows and room < 0:
+            break
+        rows.append((effect, said))
+    more = len({row[0] for row in table.cells()}) - len(rows)
+    rest = f"; {more} smaller ones are in the appendix" if more else ""
+    return Table.made(f"{table.title}: value (sigma){rest}", rows, "effect | parameters")
 
 
 def on_a_sheet(tables: Sequence[Table]) -> list[Table]:
@@ -134,7 +210,12 @@ def on_a_sheet(tables: Sequence[Table]) -> list[Table]:
 def identified(fit: Fit) -> Blocks:
     """What was asked for, how much of it the data determined, and why not the rest."""
     known, count = sum(p.identifiable for p in fit.parameters), len(fit.parameters)
-    rest = " The others keep their nominal values." if known < count else ""
+    alike = dict[str, list[str]]()
+    for one in fit.parameters:
+        if not (one.identifiable or one.of_effect):
+            alike.setdefault(one.why_not, []).append(one.title)
+    said = "; ".join(f"{', '.join(names)} ({why})" for why, names in alike.items())
+    rest = f" Kept nominal: {said}." if said else ""
     given = {p.because for p in fit.parameters if not p.identifiable}
     return [
         text(
@@ -142,7 +223,7 @@ def identified(fit: Fit) -> Blocks:
             f"{rest} Objective: {OBJECTIVES.get(fit.objective, fit.objective)}. Lengths in mm, "
             "angles in degrees, changes and sigmas of angles in mrad; base_x to base_rz correct "
             "the base along its own axes. Sigma is the standard deviation by measurement noise "
-            "and the scatter of the residuals; a dash: the parameter was kept."
+            "and the scatter of the residuals."
         ),
         *(text(words) for kind, words in REASONS.items() if kind in given),
     ]
