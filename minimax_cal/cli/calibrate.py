@@ -146,7 +146,8 @@ def advice(
         diagnose = f"minimax-cal diagnose {robot} {' '.join(map(str, data))}"
         yield f"Next, to find the cause of the remaining {left}", diagnose
     if written and fit.status is Status.CONVERGED:
-        alone = "" if fit.cell.effects.terms else " by geometry alone"
+        part = " (it tells what it holds of the effects, and how well that does)"
+        alone = part if fit.cell.effects.terms else " by geometry alone"
         correct = f"minimax-cal compensate {written} targets.csv -o corrected.csv"
         yield f"To correct joint targets, or a program, for the controller{alone}", correct
         write, file = "To write a file for MuJoCo, or --to urdf, dh-csv and others", "--to mjcf"

@@ -26,7 +26,7 @@ from minimax_cal.diagnosing.causes import (
 from minimax_cal.diagnosing.error_maps import error_maps
 from minimax_cal.diagnosing.established import often
 from minimax_cal.diagnosing.folds import beyond_of
-from minimax_cal.diagnosing.foot import foot_notices
+from minimax_cal.diagnosing.foot import asked_foot, foot_notices, foot_tells
 from minimax_cal.diagnosing.gap import (
     FAULTS,
     Judges,
@@ -255,6 +255,8 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     floor = whole.beneath(judge.rms_mm)  # noise is part of what is left
     share, interval = closed(kept, last, floor, options.seed)
     effects = [*valued(spoken.effects, kept), *valued(spoken.effects, ladder)[ladder.sure :]]
+    foot = tuple(foot_tells(kept.last, clean.data))
+    effects = [*asked_foot(effects, foot)]
     findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.least)
     step_of(REMAINING)
     known = known_noise(kept.last, whole, clean.data, robot.repeatability)
@@ -263,7 +265,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     told = explanation(findings, causes, known, study.fit.status, failed=bool(wrong))
     left = () if told["verdict"] == "not_repeatable" else causes.left  # it scatters, that is all
     error = kept.last.cell.error(clean.data)
-    most = known.highest if told["structure_in"] == ABOVE_NOISE else math.inf
+    most = floor.value if told["structure_in"] == ABOVE_NOISE else math.inf
     rest, complete = remaining_of(left, judge.rms_mm, clean.data, error, most)
     more = ladder.last.cell if len(steps) > count else None
     return Diagnosis(
@@ -282,6 +284,8 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
             *asked.data.notices,
             *notices,
             *notices_of(study, clean, kept, late, effects),
+            *foot_notices(foot),
+            *doubts(study.robot, study.fit, study.nominal.error(study.data)),
             *filter(None, [wrong]),
         ),
         provenance=Provenance.of(robot, asked.data, vars(options)),
@@ -315,8 +319,6 @@ def notices_of(
     yield from contradictions(every, ladder.last.cell.error(every))
     yield from session_notices(study, effects)
     yield from study.fit.notices
-    yield from foot_notices(ladder.last, clean.data)
-    yield from doubts(study.robot, study.fit, study.nominal.error(study.data))
 
 
 def in_rungs(study: Study, causes: Causes, progress: Progress) -> tuple[Causes, Causes, Ladder]:

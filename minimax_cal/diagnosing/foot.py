@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from minimax_cal.diagnosing.joint import Joint
+from minimax_cal.diagnosing.result import Finding
 from minimax_cal.evidence.limits import DISAGREE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
@@ -94,8 +95,8 @@ def motion(scene: Scene, term: Term) -> Array:
     return np.asarray((field[..., np.argmax(clock)] - field[..., np.argmin(clock)]).T)
 
 
-def foot_notices(fit: Joint, data: Measurements) -> Iterator[str]:
-    """Whether the reflectors on the foot confirm the laws of a fit that move it."""
+def foot_tells(fit: Joint, data: Measurements) -> Iterator[tuple[Term, str, str]]:
+    """Laws of a fit that move the foot, how far its reflectors say, and where they contradict."""
     scene, at = seen_foot(fit.cell, data), fit.model.names.geometric
     for term in fit.terms:
         count = len(term.columns(fit.study.scene).names)
@@ -109,12 +110,26 @@ def foot_notices(fit: Joint, data: Measurements) -> Iterator[str]:
         sigma = np.hypot(own_sigma, told.sigma)
         wrong = np.abs(value - told.value) > DISAGREE * sigma
         shown = ", ".join(
-            f"{axis} {1e6 * a:+.0f} +- {1e6 * u:.0f} um named, "
-            f"{1e6 * b:+.0f} +- {1e6 * s:.0f} um measured"
+            f"{axis} {1e6 * b:+.0f} +- {1e6 * s:.0f} um, by the fit "
+            f"{1e6 * a:+.0f} +- {1e6 * u:.0f} um"
             for axis, a, u, b, s in zip(
                 "xyz", value, own_sigma, told.value, told.sigma, strict=True
             )
         )
-        odd = ", ".join(np.array(list("xyz"))[wrong])
+        yield term, shown, ", ".join(np.array(list("xyz"))[wrong])
+
+
+def foot_notices(told: Iterable[tuple[Term, str, str]]) -> Iterator[str]:
+    """Whether the reflectors on the foot confirm laws.  told: as of `foot_tells`."""
+    for term, shown, odd in told:
         verdict = f"they contradict it in {odd}" if odd else "they agree with it"
         yield f"{name_effect(*term.key)}: the reflectors on the foot moved by {shown}: {verdict}"
+
+
+def asked_foot(
+    findings: Iterable[Finding], told: Iterable[tuple[Term, str, str]]
+) -> Iterator[Finding]:
+    """The findings, with what the reflectors on the foot contradict."""
+    odd = {term.key: f"in {axes} by the reflectors on the foot" for term, _, axes in told if axes}
+    for found in findings:
+        yield replace(found, contradicted=odd.get(found.term.key, ""))

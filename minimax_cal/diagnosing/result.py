@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -119,6 +119,7 @@ class Finding(Record):
     whether it is below 5 % of the squared held-out error that geometry leaves.  extends: False
     where the effects together make regions that are left out worse than geometry alone.
     curve: (3, g) of an error map: joint value, turn, sigma [rad].
+    contradicted: by what that was measured besides; empty where nothing does.
     shown: the terms that the data ask for, where `terms` are the whole law that these belong to.
     """
 
@@ -139,6 +140,7 @@ class Finding(Record):
     again: Annotated[float, Fact(key="frequency")] = 1.0
     extends: Annotated[bool, APART] = True
     minor: bool = False
+    contradicted: str = ""
     curve: Annotated[Array, APART] = field(default_factory=lambda: np.zeros((3, 0)))
     shown: Annotated[tuple[Term, ...], APART] = ()
 
@@ -171,7 +173,8 @@ class Finding(Record):
         """Whether it is confirmed, and the frequency that decides."""
         sure = "one of these" if self.alternatives else "confirmed"
         said = sure if self.established else "possible"
-        return said if self.rows or math.isnan(self.again) else f"{said}, {self.again:.2f}"
+        often = "" if self.rows or math.isnan(self.again) else f", {self.again:.2f}"
+        return f"{said}{often}{f', contradicted {self.contradicted}' if self.contradicted else ''}"
 
     @property
     def term(self) -> Term:
@@ -380,10 +383,7 @@ class Explained:
     not_testable: effects, and what the data lack for them.
     meets_floor: whether the remaining error is down to the known noise, None where that is not
     known.
-    Of a class: SHARE: of which squared error the effects' shares are.
     """
-
-    SHARE: ClassVar[str] = "that geometry leaves"
 
     status: Status
     verdict: Annotated[str, Fact(among=VERDICTS)]
@@ -398,6 +398,11 @@ class Explained:
     def excess(self) -> str:
         """How far the remaining error is above the known noise, in words."""
         raise NotImplementedError
+
+    @property
+    def shares_of(self) -> str:
+        """Of which squared error the effects' shares are."""
+        return "that geometry leaves"
 
     @property
     def main(self) -> list[Finding]:
@@ -475,7 +480,6 @@ class Diagnosis(Explained, Result):
 
     KIND = "diagnosis"
     COMMAND = "diagnose"
-    SHARE = "above noise"
 
     robot: str
     ladder: Annotated[tuple[Step, ...], Fact(key="gap.ladder", fewest=2)]
@@ -550,7 +554,13 @@ class Diagnosis(Explained, Result):
         """What the last step leaves, against the noise beneath it."""
         joints = "" if self.floor.source == REPEATS else ", with what sound joints add"
         low, high = self.tested
-        return f"at least {low:.3f} mm against at most {high:.3f} mm ({self.floor.source}{joints})"
+        noise = f"at most {high:.3f} mm ({self.floor.source}{joints})"
+        return f"at least {low:.3f} mm on the poses of the fit against {noise}"
+
+    @property
+    def shares_of(self) -> str:
+        """Of which squared error shares are: where noise has but an upper bound, of all."""
+        return f"{super().shares_of}{' above noise' if self.floor.certain else ''}"
 
     @property
     def by_rung(self) -> list[Finding]:
@@ -715,7 +725,8 @@ class Diagnosis(Explained, Result):
         title = f"effects found, step by step; p-values below {LEVEL:g} are significant"
         every = Table.made(title, rows, FOUND)
         plain = every.only(*range(len(every.header) - 1))  # without what says one thing
-        return plain if all(f.established and not f.alternatives for f in found) else every
+        one = all(f.established and not (f.alternatives or f.contradicted) for f in found)
+        return plain if one else every
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result, but for those of where the errors lie."""

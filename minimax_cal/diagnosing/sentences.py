@@ -22,7 +22,8 @@ from minimax_cal.solvers.status import Status
 Named = Finding | Alternative
 NOTHING_MM = 5e-4  # of a length that is reported to three digits
 MAX_NAMED_MINOR = 2  # more minor effects than this are counted, not listed
-NOT_VISITED = "it is not known whether the rest is the arm's repeatability"
+NOT_VISITED = "it is not known how much of the rest is the arm's repeatability"
+FOUND_WITHOUT = ", by effects found without them too (a cautious figure)"
 SCATTERS = "Visits to one pose scatter more than the instrument and sound joints do."
 CONTRADICTED = (
     "Unexplained: the best fit contradicts the measurements. It is no calibration of this arm, and "
@@ -77,7 +78,7 @@ def explained(found: Explained) -> tuple[str, ...]:
 
 def causes_first(found: Explained) -> tuple[str, ...]:
     """What comes first: the causes, or that the most is unexplained."""
-    causes = (listed(title_of(found), found.main, found.SHARE), subsampled(found.main))
+    causes = (listed(title_of(found), found.main, found.shares_of), subsampled(found.main))
     return (opening(found), *causes) if is_partial(found) else (*causes, opening(found))
 
 
@@ -143,7 +144,10 @@ def subsampled(findings: Sequence[Finding]) -> str:
         return ""
     each = "Each was found" if len(findings) > 1 else "Found"
     least = "at least " if len(findings) > 1 and often < 1.0 else ""
-    sure = "one of them is confirmed" if any(f.alternatives for f in findings) else "confirmed"
+    loose = [f for f in findings if f.alternatives]
+    sure = "one of them is confirmed" if loose == list(findings) else "confirmed"
+    if loose and loose != list(findings):
+        sure = f"confirmed, {names_of(loose, ' and ')} as one of several"
     return f"{each} again in {least}{100.0 * often:.0f} % of the subsamples of the poses: {sure}."
 
 
@@ -231,13 +235,13 @@ def shrunk(found: Diagnosis) -> str:
 
 
 def closed_words(found: Diagnosis) -> str:
-    """How much of the error above noise is explained, and how sure that is."""
+    """How much of the error is explained, and how sure that is."""
     low, high = (100.0 * end for end in found.closed_ci)
     ends = f" (95 % interval {low:.0f} to {high:.0f} %)" if found.has_interval else ""
     share = f"{100.0 * found.closed:.0f} %"
     if not (found.floor.certain or share == "100 %"):  # reported as if noise were zero
         share = f"at least {share}"
-    return f"{share} of the squared error above noise is explained{ends}"
+    return f"{share} of the squared error {found.shares_of} is explained{ends}"
 
 
 def without_far(found: Diagnosis) -> str:
@@ -277,7 +281,7 @@ def dependence(one: Dependence) -> str:
 def away(found: Diagnosis) -> str:
     """How the model does on whole parts that were held out."""
     again = any(f.established and not f.rows for f in found.effects)
-    text = found.beyond.sentence(", effects sought again" if again else "")
+    text = found.beyond.sentence(FOUND_WITHOUT if again else "")
     if not math.isfinite(found.refused):
         return text
     return text.removesuffix(".") + (

@@ -47,8 +47,8 @@ class Claim:
 
     name: inside or outside.  before: of the nominal arm [mm], by kind.  poses: that count by
     themselves.  where: in words.  reason: why there is no claim, if there is none.  open: what
-    could not be judged, so that nothing is passed by the rest; empty where all was.  sets:
-    how many poses RMS and largest are of.
+    could not be judged, so that nothing is passed by the rest; empty where all was.  sets: how many
+    poses RMS and largest are of; regions: where these are; kept: that effects were given, a clause.
     refused: why nothing is passed, whatever the numbers; empty where it may be.
     """
 
@@ -61,6 +61,8 @@ class Claim:
     reason: str = ""
     open: str = ""
     sets: tuple[int, int] = (0, 0)
+    regions: tuple[str, str] = ("", "")
+    kept: str = ""
     refused: str = ""
 
     def bound(self, kind: str) -> Bound:
@@ -147,16 +149,17 @@ def beyond(found: Beyond) -> Claim:
         return Claim("outside", nothing, nothing, 0, "", reason=found.reason)
     far = max(found.folds, key=lambda fold: fold.max_mm)
     of = f"; {found.judged} could be judged" if found.judged else ""
-    kept = "; with the same effects" if found.sought is False else ""
     return Claim(
         "outside",
         Bound(worst.rms_mm, found.rms_high_mm),
         Bound(far.max_mm, found.max_high_mm),
         worst.poses,
         f"outside the measured region, in the worst part that was held out ({worst.where}, "
-        f"{worst.poses} poses{of}{kept})",
+        f"{worst.poses} poses{of}{found.kept.replace(',', ';')})",
         open=open_of(found),
         sets=(worst.poses, far.poses),
+        regions=(worst.where, far.where),
+        kept=found.kept,
     )
 
 

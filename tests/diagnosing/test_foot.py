@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import minimax_cal as mc
-from minimax_cal.diagnosing.foot import foot_notices
+from minimax_cal.diagnosing.foot import asked_foot, foot_notices, foot_tells
 from minimax_cal.diagnosing.joint import Joint, joint
+from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import studied
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
@@ -54,18 +55,26 @@ def drifting(sees: bool, term: Term) -> tuple[Joint, Measurements]:
 @pytest.mark.parametrize("term", [ONE, TWO])
 def test_reflectors_that_move_confirm_a_drift(term: Term) -> None:
     """Of one course and of two, whose twelve parameters were a traceback."""
-    (notice,) = foot_notices(*drifting(True, term))
+    told = [*foot_tells(*drifting(True, term))]
+    (notice,) = foot_notices(told)
+    found = Finding((term,), (), (), (), (), again=1.0)
+    assert [one.evidence for one in asked_foot([found], told)] == ["confirmed, 1.00"]
     assert "they agree with it" in notice
     assert "x +" in notice
 
 
 @pytest.mark.parametrize("term", [ONE, TWO])
 def test_reflectors_that_stand_contradict_it(term: Term) -> None:
-    (notice,) = foot_notices(*drifting(False, term))
+    told = [*foot_tells(*drifting(False, term))]
+    (notice,) = foot_notices(told)
     assert "they contradict it in x" in notice
+    other = Finding((Term("backlash", "J1"),), (), (), (), (), again=1.0)
+    found = [*asked_foot([replace(other, terms=(term,)), other], told)]
+    assert found[0].evidence.startswith("confirmed, 1.00, contradicted in x")
+    assert found[1].evidence == "confirmed, 1.00"
 
 
 def test_without_reflectors_nothing_is_said() -> None:
     fit, data = drifting(True, ONE)
     columns = {name: column for name, column in data.columns.items() if name[:4] != "base"}
-    assert not list(foot_notices(fit, replace(data, columns=columns)))
+    assert not list(foot_tells(fit, replace(data, columns=columns)))

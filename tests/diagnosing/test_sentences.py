@@ -88,7 +88,7 @@ def test_every_verdict_opens_the_words(found: Diagnosis) -> None:
         changed = replace(found, verdict=verdict)
         if verdict == "one_of":
             changed = replace(changed, effects=(first, *found.effects[1:]))
-            assert "one of them is confirmed" in changed.headline()  # not the one that is named
+            assert "at joint 2 as one of several" in changed.headline()  # not the one that is named
             assert changed.main[0].evidence.startswith("one of these")
         first_words = "Main causes" if verdict == "unknown" else OPENINGS[verdict]
         if verdict in ("none", "not_repeatable"):
@@ -108,7 +108,7 @@ def test_causes_stand_by_their_share_and_tables_in_the_order_of_the_ladder(
     assert causes.startswith("Main causes: joint compliance at joint 2 (")
     places = [causes.index(f", {share} %") for share in (60, 20, 12)]
     assert places == sorted(places)
-    assert causes.endswith("12 % of the squared error above noise.")
+    assert causes.endswith("12 % of the squared error that geometry leaves.")
     assert [row[0] for row in found.effects_table().rows] == IN_WORDS
     assert [row[0] for row in found.parameter_table().rows] == IN_WORDS
     assert [step.name for step in found.ladder[2:]] == [f"+ {name}" for name in LADDER]

@@ -82,7 +82,7 @@ def unsettled(data: Measurements) -> tuple[Fault, ...]:
     if lagging:
         who = "qread was read" if middle > 0.0 else "q looks read"
         says += f"; {who} before the arm had settled ({100 * found.explained:.0f} % lies along the "
-        says += f"last move, {1e3 * abs(middle):.2g} of a thousandth of it)"
+        says += f"last move, {100.0 * abs(middle):.2g} % of it)"
     says += "; q is used as commanded" if middle >= 0.0 else "; give the commanded joints as q"
     return (
         Fault(

@@ -23,7 +23,7 @@ from minimax_cal.judging.tolerance import (
 from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.solvers.status import Status
 
-USUAL = (COMPENSATED, "urdf")  # where none is named: all that joints correct, and no effect
+USUAL = (COMPENSATED, "urdf", "mjcf")  # where none is named: all that joints correct, and no effect
 NOWHERE = Bound(math.nan, math.nan)
 CORRECTED = "joint targets corrected by minimax-cal compensate"
 SHORT = "corrected targets"
@@ -52,14 +52,11 @@ class Row:
         return SHORT if to == COMPENSATED else f"{to} file"
 
     def said(self) -> str:
-        """What it holds of the whole model, and how well that does, in a sentence."""
-        own, whole = self.delivered, "the whole model"
+        """What it does not hold of the whole model, in a sentence."""
+        own, name = self.delivered, capitalise(self.short)
         if own.reason:
             return f"{own.sentence()}."
-        if own.lacks:
-            size = "" if math.isnan(own.whole.rms) else f" ({own.whole.rms:.3f} mm RMS)"
-            whole = f"fitted without {own.lacks}, which only {whole} holds{size}"
-        return f"{capitalise(self.short)}: {whole}."
+        return f"{name}: {f'cannot hold {own.lacks}' if own.lacks else 'the whole model'}."
 
     @property
     def verdict(self) -> str:
@@ -111,6 +108,15 @@ def rows_of(
             chosen = Claim(which, NOWHERE, NOWHERE, 0, "", reason=why)
         out.append(Row(found, claims, tuple(judge(limit, chosen) for limit in limits)))
     return tuple(out)
+
+
+def whole(rows: Sequence[Row]) -> str:
+    """How the whole model does beside its deliverables, and what makes these."""
+    size = rows[0].delivered.whole
+    has = "" if math.isnan(size.rms) else (
+        f"The whole model has RMS {size.rms:.3f} mm, largest {size.largest:.3f} mm. "
+    )  # fmt: skip
+    return f"{has}minimax-cal compensate corrects targets, minimax-cal export writes files."
 
 
 def claim_of_file(claim: Claim, made: Delivered) -> Claim:

@@ -43,7 +43,7 @@ from minimax_cal.modelling.cell import Cell as Arm
 from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.parameters import Names, links_of
 from minimax_cal.reporting.html.content import Block, Figure, Note, caveat, text
-from minimax_cal.reporting.html.delivered import Row, governing, rows_of
+from minimax_cal.reporting.html.delivered import Row, governing, rows_of, whole
 from minimax_cal.reporting.html.error_charts import cumulative
 from minimax_cal.reporting.html.more_charts import budget_chart, waterfall
 from minimax_cal.reporting.html.pages import names_of, split_reasons, turned
@@ -142,8 +142,12 @@ class Signed:
         if not self.judged:
             return [self.sentence, *self.aside]
         told = [self.holds_for] if self.row else []
-        rows = [row.said() for row in self.rows]
-        return [self.sentence, *said, *self.aside, *told, *rows, *self.besides]
+        return [self.sentence, *said, *self.aside, *told, *self.held, *self.besides]
+
+    @property
+    def held(self) -> list[str]:
+        """What each deliverable holds, and what the whole model does; empty without any."""
+        return [*(row.said() for row in self.rows), whole(self.rows)] if self.rows else []
 
     def tables(self) -> tuple[Table, ...]:
         """For a terminal."""
@@ -326,12 +330,13 @@ def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
         *because(sources),
         result_table(found),
         text(basis(found)),
-        *(text(row.said()) for row in found.rows),
+        *([text(" ".join(found.held))] if found.held else []),
         *(Note(f"{said}.", alarm) for said in found.besides),
     ]
     if sources.results or sources.relative:
-        lines += [Note(said, alarm) for said in found.aside] or [text(NOTHING_ASIDE)]
-        lines += [Note(said, alarm) for said in kept(sources)]
+        lines += [Note(said, alarm) for said in found.aside]
+        none = () if found.aside else (NOTHING_ASIDE,)
+        lines += [text(" ".join(said))] if (said := (*none, *kept(sources))) else []
     lines += [text(one.sentence() + ".") for one in found.judged if not one.plain]
     lines += [text(which) for which in which_is_which(sources, found)]
     lines += [Note(notice, alarm) for notice in sources.notices]
@@ -384,7 +389,8 @@ def kept(sources: Sources) -> Iterator[str]:
         most = sorted(fit.suspects, key=lambda one: -one.distance)
         names = [f"{fit.data.called(s.line)} {s.target} {1e3 * s.distance:.2f} mm" for s in most]
         many = "1 outlier was" if len(names) == 1 else f"{len(names)} outliers were"
-        yield f"{many} kept, as nothing tells that they are wrong: {name_first(names, MAX_NAMED)}."
+        where = name_first(names, MAX_NAMED)
+        yield f"{many} kept, and new poses may have such: {where}."
 
 
 def picture(sources: Sources, found: Signed) -> Figure:
@@ -404,27 +410,31 @@ def result_table(found: Signed) -> Table:
     groups = groups or [("", found.claims, found.judged)]
     rows: list[tuple[object, ...]] = []
     for name, claims, judged in groups:
-        said = {one.limit.kind: (one.limit.size_mm, one.verdict) for one in judged}
+        said = {one.limit.kind: one.verdict for one in judged}
         for claim in claims:
             inside = claim.name == "inside"
             if claim.reason and not inside:
                 continue
             for i, (kind, title) in enumerate(KINDS.items()):
-                which = "inside" if inside else "worst region" if kind == "rms" else "outside"
-                asked = said.get(kind, ()) if claim.name == found.which else ()
+                if not inside and i and name != groups[0][0]:
+                    continue  # in the words of `export`; the page has no room for all
+                which = "inside" if inside else f"outside ({claim.regions[i]})"
+                verdict = said.get(kind, "") if claim.name == found.which else ""
                 sizes = ends(claim.before[i], claim.bound(kind))
                 poses = claim.sets[i] or ""
-                rows.append((name, f"{title}, {which}", poses, *sizes, *(asked or (None, ""))))
+                rows.append((name, f"{title}, {which}", poses, *sizes, verdict))
     if (all_of := found.with_them) is not None:
         rows += [
             (groups[0][0], f"{title}, inside, with {len(found.set_aside)} points set aside", "",
-             *ends(before, all_of.bound(kind)), None, "")
+             *ends(before, all_of.bound(kind)), "")
             for (kind, title), before in zip(KINDS.items(), all_of.before, strict=True)
         ]  # fmt: skip
-    columns = "before .3f | result .3f | 95 % interval | required .3g | verdict"
+    columns = "before .3f | result .3f | 95 % interval | verdict"
     title = f"{'Result by deliverable' if found.rows else f'Model: {found.model}'} [mm]"
+    limits = [f"{KINDS[one.limit.kind]} at most {one.limit.size_mm:g}" for one in found.judged]
+    title += f"; required: {', '.join(limits)}" if limits else ""
     every = Table.made(title, rows, f"of | error of position | poses d | {columns}")
-    first, last = (0 if found.rows else 1), (8 if found.judged else 6)
+    first, last = (0 if found.rows else 1), (7 if found.judged else 6)
     return every.only(*range(first, last))
 
 
@@ -437,15 +447,15 @@ def ends(before: float, bound: Bound) -> tuple[float, float, str]:
 def basis(found: Signed) -> str:
     """What the numbers rest on."""
     inside = found.claims[0]
-    out = f"Inside the measured region: {inside.where}. "
+    out = f"Inside: {inside.where}. "
     away = found.claims[1] if len(found.claims) > 1 else None
     if away and not away.reason:
-        out += f"Outside: {away.where.removeprefix('outside the measured region, in ')}. "
+        out += f"Outside: whole parts held out in turn{away.kept}, the worst. "
     elif away:
         out += f"Outside them nothing is claimed: {away.reason}. "
     out += (
-        "With 95 % confidence the RMS of such poses, and the largest error of as many new ones, "
-        "lie in the intervals, whose upper ends are compared with the requirement."
+        "With 95 % confidence RMS, and largest error of as many new poses, stay below the upper "
+        "ends, which are compared with the requirement."
     )
     told = [claim for claim in found.claims if not claim.reason]
     if any(math.isnan(claim.bound(kind).high) for claim in told for kind in KINDS):

@@ -108,7 +108,7 @@ def budget_chart(
         margin={"l": 56, "r": 12, "t": 8, "b": 44}, showlegend=False,
     )  # fmt: skip
     title = f"Held-out RMS error: {held[0]:.3f} mm, in the end {held[-1]:.3f} mm"
-    says = "The whole model on held-out poses, step by step; the dotted line is the noise floor."
+    says = "The whole model on held-out poses, step by step; the dotted line is the noise, at most."
     return figure(name, title, says, traces, layout, 72 + 22 * len(steps))
 
 

@@ -36,6 +36,10 @@ SHOWN_LEFT = 4  # rows of what the remaining error follows
 SHEET_NOTICES = 5  # as many fit on the page of the budget; the appendix has all
 BELOW = 9  # rows that the sentences below the parameters need
 LINE = 90  # letters of a line of a table's sentence
+BEFORE_EFFECTS = (
+    "The tables are of what geometry leaves, before any effect. Geometry is fitted beside the "
+    "effects, so that base, tool and links may take a part of a joint's turn back."
+)
 NO_POSES = "The file holds no poses, so that nothing can be drawn; write it again with its poses."
 OBJECTIVES = {
     "sum": "the sum of all squared errors as small as possible",
@@ -45,7 +49,7 @@ OBJECTIVES = {
 }
 REASONS = {
     Because.SAME_MOTION: "Parameters with the same motion move every target alike: only their sum "
-    "can be known, and is in the one that was kept free. Positions lose nothing.",
+    "can be known, and is in the one that was kept free. Positions of the targets lose nothing.",
     Because.NOT_TOLD: "More poses, or a wider range of the joints, may tell the others.",
     Because.NO_MOTION: "A parameter that moves no measured point has no effect on them.",
     Because.FIXED: "Some were kept nominal on purpose.",
@@ -103,6 +107,7 @@ def where(sources: Sources) -> Blocks:
     else:
         drawn.append(missing(NO_POSES))
     if gap and gap.where:
+        drawn.append(text(BEFORE_EFFECTS))
         with reading("diagnosis", "where"):
             drawn += where_tables(gap.where, turns_of(sources))
     elif poses:
@@ -215,6 +220,8 @@ def identified(fit: Fit) -> Blocks:
         if not (one.identifiable or one.of_effect):
             alike.setdefault(one.why_not, []).append(one.title)
     said = "; ".join(f"{', '.join(names)} ({why})" for why, names in alike.items())
+    lost = sum(p.of_effect and not p.identifiable for p in fit.parameters)
+    said += f"{'; ' * bool(said)}{lost} of effects" if lost else ""
     rest = f" Kept nominal: {said}." if said else ""
     given = {p.because for p in fit.parameters if not p.identifiable}
     return [

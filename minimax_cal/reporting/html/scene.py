@@ -213,14 +213,15 @@ def scene_axes(space: Space) -> dict[str, Any]:
 
 
 def still(space: Space, poses: Poses, names: Names, where: str) -> str:
-    """The view on paper: errors after, magnified, and the arm at the worst pose."""
+    """The view on paper: errors after, magnified, and the arm where the largest is."""
     times = magnification(space, space.after)
     seen = np.isfinite(space.points[..., 0])
     start = space.points[seen]
     worst = int(np.argmax(of_poses(poses.after)[space.chosen]))
+    called = poses.data.called(poses.data.line[space.chosen[worst]])
     words = (
         f"errors {names[1]}, magnified {times} times",
-        f"arm at the worst pose ({poses.data.called(poses.data.line[space.chosen[worst]])})",
+        f"arm at the pose of the largest error ({called})",
         where,
     )
     picture = Drawing(

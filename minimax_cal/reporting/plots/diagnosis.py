@@ -136,7 +136,7 @@ def verdict_of(diagnosis: Diagnosis) -> str:
     """The verdict in a few words."""
     names = [f.name for f in diagnosis.main]
     shares = sum(f.share for f in diagnosis.main if f.share > 0.0)
-    share = f"{100.0 * shares:.0f} % of the squared error {diagnosis.SHARE}"
+    share = f"{100.0 * shares:.0f} % of the squared error {diagnosis.shares_of}"
     found = f"{name_first(names, 3)} explains {share}"
     return {
         "none": "no cause beyond geometry and noise",
