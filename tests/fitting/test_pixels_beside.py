@@ -24,8 +24,8 @@ from experiments.pixel_cells import (
 )
 from minimax_cal.fitting.pixels.camera import read_camera
 from minimax_cal.fitting.pixels.data import read_pixels
+from minimax_cal.fitting.pixels.images import as_instrument, detected
 from minimax_cal.fitting.pixels.options import PixelOptions
-from minimax_cal.fitting.several.cameras import as_instrument, detected
 from minimax_cal.fitting.several.pixel_calibration import fitted
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements

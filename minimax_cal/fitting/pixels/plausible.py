@@ -35,12 +35,12 @@ UNITS = (1e-3, 1e3, 0.1, 10.0, 25.4, 1.0 / 25.4)  # slips of a board's unit
 
 def check_start(robot: Robot, data: PixelData, started: Started) -> None:
     """Raise DataError for slips that show where the arm as drawn is fitted."""
-    miss, good = started.miss(robot, data), POOR_FIT * robot.reach()
+    miss, good = started.miss(robot), POOR_FIT * robot.reach()
     if miss <= good:
         return
 
     def tried(mended: PixelData) -> tuple[float, float]:
-        square = start_scene(robot, mended, started.on_flange).miss(robot, mended) ** 2
+        square = start_scene(robot, mended, started.images.on_flange).miss(robot) ** 2
         return square, square
 
     every = (*slips(data), *other_poses(robot, data, started.direction))
@@ -140,10 +140,10 @@ def contradiction(
     robot: Robot, data: PixelData, fit: PixelFit, scale: Scale | None, options: PixelOptions
 ) -> str:
     """Why a fit contradicts its own data; empty where it does not."""
-    depth = np.abs(fit.model.seen(fit.scene).point[2])
-    focal = fit.model.intrinsic[fit.model.camera, 0]
-    size = np.linalg.norm(fit.model.errors(fit.scene), axis=0) * depth / focal
-    miss, aside = float(np.median(size)), float((fit.model.weight == 0.0).mean())
+    (arm, own), images = fit.problem.at(fit.state), fit.images
+    focal = images.intrinsic[images.pixels.camera, 0]
+    size = np.linalg.norm(images.off(arm, own), axis=0) * np.abs(images.depth(arm, own)) / focal
+    miss, aside = float(np.median(size)), float((~images.counted).mean())
     said = ""
     if miss > MAX_MISS_OF_REACH * robot.reach():
         said = f"the calibrated arm misses by {1e3 * miss:.3g} mm at the target"
@@ -161,7 +161,7 @@ def contradiction(
         or (
             ""
             if options.allow_large_changes
-            else too_changed(robot, robot.with_mdh(fit.scene.mdh[0]), links)
+            else too_changed(robot, robot.with_mdh(fit.state.mdh), links)
         )
     )
 
@@ -198,7 +198,7 @@ def other_size(scale: Scale | None, limit: float, least: float = 0.0) -> str:
 
 def file_notices(data: PixelData, fit: PixelFit, scale: Scale | None) -> list[str]:
     """Notices of lenses that are far from their files, and of a board of another size."""
-    file = fit.model.intrinsic[:, : len(INTRINSICS)]
+    file = fit.images.intrinsic[:, : len(INTRINSICS)]
     off = np.abs(fit.lens - file) / fit.doubt
     out = []
     for i, camera in enumerate(data.cameras):

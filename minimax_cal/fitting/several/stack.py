@@ -200,6 +200,12 @@ class Stack:
         """(k,) of the laws."""
         return x.effects[..., self.lawless - self.names.geometric :]
 
+    def read_out(self, x: State) -> State:
+        """A state as people are told it."""
+        parts = (self.part(x, i) for i in range(len(self.blocks)))
+        own = [b.instrument.read_out(b.own(at)) for b, at in zip(self.blocks, parts, strict=True)]
+        return replace(x, effects=np.concatenate([*own, self.values(x)]))
+
     def scenes(self, robot: Robot, x: State) -> list[Scene]:
         """What laws look at, block by block, with the geometry of a state and the targets."""
         parts = [(block, self.part(x, i)) for i, block in enumerate(self.blocks)]
