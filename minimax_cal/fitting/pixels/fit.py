@@ -26,7 +26,7 @@ from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares
-from minimax_cal.solvers.least_squares import METHODS, LeastSquares, Limits, solve_normal
+from minimax_cal.solvers.least_squares import METHODS, LeastSquares, Limits
 from minimax_cal.solvers.status import Status
 
 TYPICAL = 1.1774  # median of the length of two normal errors over their sigma [Rayleigh]
@@ -103,15 +103,6 @@ class PixelSquares(Squares):
         error, slope = self.block.rows(x, active)
         count = 2 * len(self.images.weight)
         return error[:count], slope[:, :count]
-
-    def reduced(self, x: State, *, full: bool) -> tuple[State, Array, Array, Array, Array]:
-        """The states with their best lengths; Kaufman's variant, which needs no coupling."""
-        _, gradient, gram = self.normal(x)
-        r = self.linear
-        move = np.zeros(gradient.shape)
-        move[:, r] = solve_normal(gram[:, r][:, :, r], gradient[:, r, None])[..., 0]
-        x = self.step(x, move)
-        return x, *self.normal(x), np.zeros((len(move), int(r.sum()), int((~r).sum())))
 
     def solved(
         self, x: State, limits: Limits, method: least_squares.Method = METHOD

@@ -15,8 +15,9 @@ from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.drawing import Scale
 from minimax_cal.fitting.pixels.fit import FAR_LENS, PixelFit
 from minimax_cal.fitting.pixels.options import PixelOptions
-from minimax_cal.fitting.pixels.start import IMAGES, Started, is_flat, poses_of_images, start_scene
+from minimax_cal.fitting.pixels.start import IMAGES, Started, poses_of_images, start_scene
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.words import name_first
 from minimax_cal.robots.robot import Robot
 
 BETTER = 0.3  # of the error: a slip whose mending leaves no more is the cause
@@ -71,7 +72,7 @@ def other_poses(robot: Robot, data: PixelData, seen: Array) -> list[tuple[str, P
     wherever the camera and the board are.  seen: (2, N) directions.
     """
     first = int(np.bincount(data.camera).argmax())
-    image = poses_of_images(data, seen) if is_flat(data.board) else {}
+    image = poses_of_images(data, seen)
     rows = np.array([pose for camera, pose in image if camera == first], dtype=int)
     if not IMAGES < len(rows) <= MOST_PAIRED:
         return []
@@ -228,21 +229,16 @@ def outlier_notices(data: PixelData, rows: Array) -> list[str]:
     out = []
     if lost.any():
         first = [int(np.argmax(image == each)) for each in np.flatnonzero(lost)]
-        named = ", ".join(
+        named = [
             f"pose {data.labels[data.pose[row]]} of camera {data.cameras[data.camera[row]].name}"
-            for row in first[:LISTED]
-        )
-        more = f" and {len(first) - LISTED} more" if len(first) > LISTED else ""
+            for row in first
+        ]
         out.append(
-            f"{data.source}: {len(first)} whole images are outliers, set aside: {named}{more}; "
-            "are the joint values those of the image?"
+            f"{data.source}: {len(first)} whole images are outliers, set aside: "
+            f"{name_first(named, LISTED)}; are the joint values those of the image?"
         )
     if len(single):
-        named = ", ".join(data.says(int(row)) for row in single[:LISTED])
-        more = f" and {len(single) - LISTED} more" if len(single) > LISTED else ""
-        one = len(single) == 1
-        out.append(
-            f"{data.source}: {len(single)} pixel{'' if one else 's'} "
-            f"stand{'s' if one else ''} out and {'is' if one else 'are'} set aside: {named}{more}"
-        )
+        says = "pixel stands out and is" if len(single) == 1 else "pixels stand out and are"
+        named = [data.says(int(row)) for row in single]
+        out.append(f"{data.source}: {len(single)} {says} set aside: {name_first(named, LISTED)}")
     return out

@@ -69,20 +69,16 @@ class Started:
         """Typical error at the targets, infinite where most lie behind a camera [m]."""
         one, own = self.images, self.state.effects
         arm = Arm.of(robot, one.at.q).at(self.state.mdh)
-        depth = one.depth(arm, own)
-        focal = one.intrinsic[one.pixels.camera, :2].T
-        size = np.linalg.norm(one.off(arm, own) / focal, axis=0)
-        return float(np.median(np.where(depth > self.nearest, size * depth, np.inf)))
+        size = np.linalg.norm(one.at_targets(arm, own), axis=0)
+        return float(np.median(np.where(one.depth(arm, own) > self.nearest, size, np.inf)))
 
 
 def start_scene(robot: Robot, data: PixelData, on_flange: bool) -> Started:
     """Cameras and targets that fit the arm as drawn."""
-    seen = directions(data)
-    image = poses_of_images(data, seen) if is_flat(data.board) else {}
-    every = range(len(data.cameras))
-    told = [by_poses(robot, data, on_flange, image, camera) for camera in every]
-    found = [each for each in told if each is not None]
-    if len(found) < len(told):
+    seen, every = directions(data), range(len(data.cameras))
+    image = poses_of_images(data, seen)
+    found = by_poses(robot, data, on_flange, image)
+    if not found:
         found = [by_rotations(robot, data, on_flange, seen, camera) for camera in every]
     images, own = merged(data, on_flange, found)
     return Started(images, own_state(robot.mdh, own), seen, depths(data, image))
@@ -94,8 +90,7 @@ def from_far(robot: Robot, data: PixelData, started: Started) -> Started:
     A pose from each image is what a tracker of whole poses sees: `calibrate` finds the arm from
     any start.
     """
-    on_flange = started.images.on_flange
-    image = poses_of_images(data, started.direction) if is_flat(data.board) else {}
+    on_flange, image = started.images.on_flange, poses_of_images(data, started.direction)
     first = int(np.bincount(data.camera).argmax())
     rows = np.array([pose for camera, pose in image if camera == first], dtype=int)
     if len(rows) < IMAGES:
@@ -112,9 +107,8 @@ def from_far(robot: Robot, data: PixelData, started: Started) -> Started:
         except CalibrationError:  # too few poses for all parameters, say
             return started
     arm = robot.with_mdh(fit.cell.robot.mdh)
-    told = [by_poses(arm, data, on_flange, image, camera) for camera in range(len(data.cameras))]
-    found = [each for each in told if each is not None]
-    if len(found) < len(told):
+    found = by_poses(arm, data, on_flange, image)
+    if not found:
         return started
     images, own = merged(data, on_flange, found)
     own = images.counted_from(own, started.images.turn)
@@ -124,11 +118,9 @@ def from_far(robot: Robot, data: PixelData, started: Started) -> Started:
 def depths(data: PixelData, image: dict[tuple[int, int], Array]) -> Array:
     """(N,) of each target by the pose of its board in its image, 0 where there is none [m]."""
     out = np.zeros(data.count)
-    if image:
-        none = np.full((3, 4), 0.0)
-        keys = zip(data.camera.tolist(), data.pose.tolist(), strict=True)
-        row = np.stack([image[key][2] if key in image else none[2] for key in keys])
-        out = np.einsum("ni,ni->n", row[:, :3], data.board[data.target]) + row[:, 3]
+    for (camera, pose), found in image.items():
+        mine = (data.camera == camera) & (data.pose == pose)
+        out[mine] = data.board[data.target[mine]] @ found[2, :3] + found[2, 3]
     return out
 
 
@@ -158,7 +150,9 @@ def plane_of(board: Array) -> Array:
 
 
 def poses_of_images(data: PixelData, seen: Array) -> dict[tuple[int, int], Array]:
-    """Pose (4, 4) of the board in the camera by camera and pose, where it shows [m]."""
+    """Pose (4, 4) of a flat board in the camera by camera and pose, where it shows [m]."""
+    if not is_flat(data.board):
+        return {}
     plane = plane_of(data.board)
     local = (data.board - plane[:3, 3]) @ plane[:3, :3]
     out = {}
@@ -216,6 +210,15 @@ def centred(places: Array) -> tuple[Array, Array]:
 
 
 def by_poses(
+    robot: Robot, data: PixelData, on_flange: bool, image: dict[tuple[int, int], Array]
+) -> list[tuple[Array, Array, Array]]:
+    """`by_pose` of each camera; none where one of them has too few images."""
+    every = (by_pose(robot, data, on_flange, image, i) for i in range(len(data.cameras)))
+    found = [each for each in every if each is not None]
+    return found if len(found) == len(data.cameras) else []
+
+
+def by_pose(
     robot: Robot,
     data: PixelData,
     on_flange: bool,
@@ -327,7 +330,7 @@ def rays_of(robot: Robot, data: PixelData, on_flange: bool, seen: Array, camera:
 def by_rotations(
     robot: Robot, data: PixelData, on_flange: bool, seen: Array, camera: int
 ) -> tuple[Array, Array, Array]:
-    """As `by_poses`, for targets taken as of unknown place, NaN where one camera cannot tell it."""
+    """As `by_pose`, for targets taken as of unknown place, NaN where one camera cannot tell it."""
     rays = rays_of(robot, data, on_flange, seen, camera)
     few, fewest = (rays.some(thinned(rays.target, most)) for most in (ENOUGH, SCREENED))
     looks = Rotation.random(ROTATIONS, rng=np.random.default_rng(0)).as_matrix()
