@@ -16,14 +16,14 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from experiments.real import off_drawing
-from minimax_cal.fitting.pixels.camera import Camera
-from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.fit import PixelSquares
-from minimax_cal.fitting.pixels.images import Images
 from minimax_cal.fitting.pixels.judge import POSES as JUDGED
 from minimax_cal.fitting.pixels.judge import everywhere, free_motion, missed, tool_points
 from minimax_cal.fitting.several.stack import own_state
 from minimax_cal.ground.arrays import Array
+from minimax_cal.instruments.camera import Camera
+from minimax_cal.instruments.images import Images
+from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.gravity import masses_of, torques

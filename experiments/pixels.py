@@ -36,7 +36,6 @@ from experiments.pixel_cells import (
     taken,
 )
 from experiments.sweep import Study, study_options
-from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.fit import ANY, PixelSquares, by_depths, fit_drawn, reprojected
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import directions, from_far, poses_of_images, start_scene
@@ -45,6 +44,7 @@ from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.stages import silent
 from minimax_cal.ground.tables import Table
 from minimax_cal.instruments import flange_poses
+from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.measuring.grouping import held_out
 from minimax_cal.planning.camera_options import CameraOptions
 from minimax_cal.planning.cameras import planned_images

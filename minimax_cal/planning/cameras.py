@@ -19,10 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from minimax_cal.fitting.identify import RESOLUTION
-from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, Camera, read_camera
-from minimax_cal.fitting.pixels.data import PixelData, read_board
 from minimax_cal.fitting.pixels.fit import PixelSquares
-from minimax_cal.fitting.pixels.images import LENS, Images
 from minimax_cal.fitting.pixels.judge import everywhere, free_motion
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.several.pixel_result import PixelCalibration
@@ -33,6 +30,9 @@ from minimax_cal.ground.facts import Apart, Fact
 from minimax_cal.ground.files import plain, saved_content
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
+from minimax_cal.instruments.camera import FLANGE, GROUND, Camera, read_camera
+from minimax_cal.instruments.images import LENS, Images
+from minimax_cal.instruments.pixels import PixelData, read_board
 from minimax_cal.modelling.cell import Cell, pose_from_dict, still
 from minimax_cal.modelling.parameters import State, zero_positions
 from minimax_cal.planning.camera_options import FOR_CAMERAS, SIDES, CameraOptions, check_cameras

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from minimax_cal.fitting.checks import POOR_FIT
-from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS
-from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.drawing import Drawing, Scale, scale_of
 from minimax_cal.fitting.pixels.fit import ROUNDS, PixelFit, PixelSquares, fit_pixels, right, softly
-from minimax_cal.fitting.pixels.images import Images
 from minimax_cal.fitting.pixels.judge import Uncertainty, uncertainty_of
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.plausible import WHOLE_IMAGE, check_start
@@ -20,7 +17,9 @@ from minimax_cal.fitting.pixels.start import from_far, start_scene
 from minimax_cal.fitting.pixels.worst import WorstPixels, fit_worst
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress, silent
-from minimax_cal.instruments.options import InstrumentOptions
+from minimax_cal.instruments.camera import FLANGE, GROUND, INTRINSICS
+from minimax_cal.instruments.images import Images
+from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.measuring.grouping import groups, held_out
 from minimax_cal.modelling.cell import pose_to_dict
 from minimax_cal.modelling.parameters import State
@@ -84,16 +83,6 @@ def fitted_on(robot: Robot, data: PixelData, options: PixelOptions, progress: Pr
     return min(fits, key=lambda fit: fit.noise_px)
 
 
-def alone(robot: Robot, images: Images, options: InstrumentOptions) -> Images:
-    """Images for a fit beside other instruments, by a fit of their own.  Raises DataError."""
-    chosen = {name: getattr(options, name) for name in images.options}
-    fit = fitted_on(robot, images.images, PixelOptions(holdout=0.0, **chosen), silent)
-    return replace(
-        fit.images, robot=robot, fit=fit, metre=metre_of(fit), doubt=fit.lens_sigma,
-        noise=fit.noise_px, lens_held=fit.held,
-    )  # fmt: skip
-
-
 def counting(robot: Robot, data: PixelData, held: Array, fit: PixelFit) -> tuple[Array, Array]:
     """(N,) True for pixels that judge a fit, (N,) for those that are set aside.  held: (m,)."""
     known, wrong = fit.known_of(data), np.zeros(data.count, dtype=bool)
@@ -153,8 +142,7 @@ def placed(images: Images, own: Array, fit: PixelFit) -> dict[str, Any]:
             "distortion_coefficients": [*distortion, *camera.intrinsic[len(INTRINSICS) :]],
         }
     on, other = (FLANGE, "base") if images.on_flange else ("base", FLANGE)
-    out: dict[str, Any] = {"cameras_in": on, "targets_in": other, "cameras": cameras}
-    out["noise_px"] = fit.noise_px
+    out = {"cameras_in": on, "targets_in": other, "cameras": cameras, "noise_px": fit.noise_px}
     if images.has_length:
         return {**out, "board": poses[-1]}
     spots = (1e3 * images.spots(own)).tolist()

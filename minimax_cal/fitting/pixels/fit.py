@@ -11,8 +11,6 @@ from typing import Any, cast
 import numpy as np
 
 from minimax_cal.fitting.identify import Because, Identification, Reason
-from minimax_cal.fitting.pixels.data import PixelData
-from minimax_cal.fitting.pixels.images import AXES, Images, Sight
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import Started
 from minimax_cal.fitting.several.fit import InstrumentFit, allowed_of
@@ -21,6 +19,8 @@ from minimax_cal.fitting.several.stack import Block, Known, Squares, Stack
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.stages import Progress
+from minimax_cal.instruments.images import AXES, Images, Sight
+from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.instruments.protocol import FlangePoses
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.parameters import State, links_of

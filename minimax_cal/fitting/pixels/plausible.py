@@ -10,14 +10,14 @@ import scipy
 
 from minimax_cal.fitting.checks import POOR_FIT, check_mends, too_changed
 from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
-from minimax_cal.fitting.pixels.camera import INTRINSICS
-from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.drawing import Scale
 from minimax_cal.fitting.pixels.fit import FAR_LENS, PixelFit
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import IMAGES, Started, poses_of_images, start_scene
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import name_first
+from minimax_cal.instruments.camera import INTRINSICS
+from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.robots.robot import Robot
 
 BETTER = 0.3  # of the error: a slip whose mending leaves no more is the cause
@@ -238,7 +238,10 @@ def outlier_notices(data: PixelData, rows: Array) -> list[str]:
             f"{name_first(named, LISTED)}; are the joint values those of the image?"
         )
     if len(single):
-        says = "pixel stands out and is" if len(single) == 1 else "pixels stand out and are"
         named = [data.says(int(row)) for row in single]
-        out.append(f"{data.source}: {len(single)} {says} set aside: {name_first(named, LISTED)}")
+        ending, are = ("s", "is") if len(named) == 1 else ("", "are")
+        out.append(
+            f"{data.source}: {len(named)} pixel{'' if ending else 's'} stand{ending} out and {are} "
+            f"set aside: {name_first(named, LISTED)}"
+        )
     return out

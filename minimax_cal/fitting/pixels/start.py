@@ -16,12 +16,12 @@ import scipy
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting.calibrate import calibrate
-from minimax_cal.fitting.pixels.camera import undistorted
-from minimax_cal.fitting.pixels.data import PixelData
-from minimax_cal.fitting.pixels.images import Images
 from minimax_cal.fitting.several.stack import own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
+from minimax_cal.instruments.camera import undistorted
+from minimax_cal.instruments.images import Images
+from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.instruments.protocol import Arm
 from minimax_cal.instruments.reflectors import LEVER, posed, reflectors, spots_of
 from minimax_cal.measuring.measurements import Measurements

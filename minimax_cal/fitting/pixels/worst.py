@@ -14,7 +14,6 @@ from typing import Annotated
 import numpy as np
 
 from minimax_cal.fitting.options import solver_of
-from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.pixels.options import SUM, WORST_CAMERA, WORST_TARGET, PixelOptions
 from minimax_cal.fitting.several.stack import Squares
@@ -23,6 +22,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import APART, Fact, derived
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import list_counts
+from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.minimax import Kkt, Linear, Optimum

@@ -13,8 +13,6 @@ import numpy as np
 from minimax_cal.fitting.accuracy import HELD, accuracy
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.options import listed, qp_name
-from minimax_cal.fitting.pixels.camera import FLANGE, read_camera
-from minimax_cal.fitting.pixels.data import PixelData, read_pixels
 from minimax_cal.fitting.pixels.determined import Determined, counting, determined, metre_of, placed
 from minimax_cal.fitting.pixels.drawing import Scale
 from minimax_cal.fitting.pixels.fit import PixelFit, PixelSquares
@@ -36,6 +34,8 @@ from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.ground.threads import one_thread
+from minimax_cal.instruments.camera import FLANGE, read_camera
+from minimax_cal.instruments.pixels import PixelData, read_pixels
 from minimax_cal.measuring.checks import check_joints, limit_notices
 from minimax_cal.measuring.measurements import TOOL, SetAside
 from minimax_cal.robots.robot import Robot, load_robot
@@ -133,11 +133,8 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
         kind=PIXELS, parts=data.parts, errors=errors, numbers=numbers, turns={},
         instrument=placed(fit.images, fit.state.effects, fit) | of_scale(scale),
     )  # fmt: skip
-    at, noise = (
-        replace(data.at, source=data.source, digest=data.digest),
-        metre_of(fit) * fit.noise_px,
-    )
-    aside = np.flatnonzero(wrong)
+    at = replace(data.at, source=data.source, digest=data.digest)
+    noise, aside = metre_of(fit) * fit.noise_px, np.flatnonzero(wrong)
     return PixelCalibration(
         **vars(measured),
         robot=robot if status is Status.NO_BETTER else arm,

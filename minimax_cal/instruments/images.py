@@ -12,23 +12,19 @@ them are wrong and how noisy they are, they say by themselves, in a fit of their
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from minimax_cal.fitting.pixels.camera import INTRINSICS, distorted, read_camera, slopes
-from minimax_cal.fitting.pixels.data import PixelData, read_pixels
 from minimax_cal.ground.arrays import Array
-from minimax_cal.instruments.instrument import UNREADY, Instrument, Words, bare, checked
-from minimax_cal.instruments.options import InstrumentOptions
+from minimax_cal.instruments.camera import INTRINSICS, distorted, slopes
+from minimax_cal.instruments.instrument import UNREADY, Instrument, Words, anywhere
+from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.robots.kinematics import right_jacobian, rotation, rotation_vector
 from minimax_cal.robots.robot import Robot
-from minimax_cal.robots.sampling import random_joints
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 LENS = len(INTRINSICS)
@@ -67,9 +63,8 @@ class Images(Instrument):
     and lenses.  on_flange: whether the cameras ride.  turn: (c, 3, 3), or with a board (c + 1, 3,
     3), from where the turns of cameras and board are counted.  weight: (N,) of the pixels.  doubt:
     (c, 9) how well the files know the lenses, as rows beside pixels as noisy as `noise` [px].
-    held: whether lenses stay.  metre: what a pixel counts [m].  sight: None for pixels.  bearings:
-    whether rows are directions to targets, which need no camera that sees them.  robot: as drawn.
-    fit: of training images, by themselves.
+    lens_held: whether lenses stay.  metre: what a pixel counts [m].  sight: None for pixels.
+    bearings: whether rows are directions to targets, which need no camera that sees them.
     """
 
     pixels: PixelData
@@ -82,8 +77,6 @@ class Images(Instrument):
     metre: float = 1.0
     sight: Sight | None = None
     bearings: bool = False
-    robot: Robot = UNREADY
-    fit: Any = None
 
     kind = "pixels"
     words = Words(
@@ -91,7 +84,14 @@ class Images(Instrument):
         caution="A pixel is no position: what moves along the line of sight does not show in it. ",
         whole="cameras and targets moved together",
     )
-    chosen = ("on_flange", "turn", "doubt", "noise", "lens_held", "metre", "robot", "fit")
+    chosen: ClassVar[tuple[str, ...]] = (
+        "on_flange",
+        "turn",
+        "doubt",
+        "noise",
+        "lens_held",
+        "metre",
+    )
     options = ("camera_on", "fix_camera", "camera_prior")
     targets_at = slice(0, 0)
     refines = False
@@ -224,16 +224,6 @@ class Images(Instrument):
 
     # ---- in a fit ----------------------------------------------------------------------------
 
-    def ready(self, robot: Robot, options: InstrumentOptions) -> Images:
-        """Fitted by itself.  Raises DataError."""
-        from minimax_cal.fitting.pixels.determined import alone  # which fits such images
-
-        return alone(robot, self, options)
-
-    def starts(self, arm: FlangePoses, free: Array) -> Sequence[Array]:
-        """Of the fit of the pixels to the arm as drawn."""
-        return [self.fit.nominal.effects]
-
     def in_view(self, arm: FlangePoses, own: Array) -> Seen:
         """Where the targets are."""
         turn, place = self.frames(own)
@@ -362,7 +352,7 @@ class Images(Instrument):
         pixels = replace(
             self.pixels, pose=pose, camera=camera, target=target, pixel=np.zeros((len(pose), 2))
         )
-        at = bare(random_joints(robot, (PLENTY,), np.random.default_rng(0)), {})
+        at = anywhere(robot, PLENTY)
         doubt = np.ones((len(every[1]), LENS))  # lenses turn nothing, and are no rank's concern
         return replace(
             self, at=at, pixels=pixels, weight=np.ones(len(pose)), doubt=doubt, bearings=True
@@ -379,38 +369,9 @@ class Images(Instrument):
         """Of the errors at the targets [m^2]."""
         return float((self.at_targets(arm, own)[:, self.counted] ** 2).sum(axis=0).mean())
 
-    def errors(self, arm: FlangePoses, own: Array, held: Array) -> Array:
-        """At the targets, of all images; wrong pixels are left out."""
-        from minimax_cal.fitting.pixels.determined import counting
-
-        return self.table(arm, own, counting(self.robot, self.images, held, self.fit)[0])
-
-    def placed(self, arm: FlangePoses, own: Array, drawn: Array) -> dict[str, Any]:
-        """Cameras, lenses, and the board or the targets."""
-        from minimax_cal.fitting.pixels.determined import placed
-
-        return placed(self, own, self.fit)
-
     def table(self, arm: FlangePoses, own: Array, counts: Array) -> Array:
         """(parts, m, 3) errors at the targets, NaN where not measured [m].  counts: (N,) mask."""
         pixels, error = self.pixels, self.at_targets(arm, own)[:, counts].T
         out = np.full((len(pixels.parts), self.poses, 3), np.nan)
         out[pixels.part[counts], pixels.pose[counts]] = np.pad(error, ((0, 0), (0, 1)))
         return out
-
-
-def detected(
-    detections: Path | str,
-    joints: Path | str,
-    camera: Mapping[str, Path | str],
-    board: Path | str | None = None,
-) -> Images:
-    """What cameras saw, for `relative`.  Files as `calibrate_pixels` takes them."""
-    cameras = [read_camera(name, path) for name, path in camera.items()]
-    return as_instrument(read_pixels(detections, joints, cameras, board))
-
-
-def as_instrument(data: PixelData) -> Images:
-    """Pixels as one instrument of several."""
-    at = replace(data.at, source=data.source, digest=data.digest, notices=data.notices)
-    return checked(Images(at, data))

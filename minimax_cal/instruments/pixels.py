@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.fitting.pixels.camera import Camera
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import name_first
+from minimax_cal.instruments.camera import Camera
 from minimax_cal.measuring.measurements import Measurements, joint_rows
 from minimax_cal.reading.rows import Rows, read_rows
 
