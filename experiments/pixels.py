@@ -312,8 +312,8 @@ def reach(start: Start) -> tuple[float, float]:
     problem = replace(problem, active=told.active)
     errors = []
     for x in (by_depths(problem, begun.begin or scene, begun), scene):
-        found = reprojected(problem, x)[1].x
-        errors.append(arm_error(cell, drawn.with_mdh(found.mdh[0])))
+        found = reprojected(problem, x)[1]
+        errors.append(arm_error(cell, drawn.with_mdh(found.mdh)))
     return errors[0], errors[1]
 
 

@@ -34,7 +34,7 @@ from minimax_cal.instruments.camera import FLANGE, GROUND, Camera, read_camera
 from minimax_cal.instruments.images import LENS, Images
 from minimax_cal.instruments.pixels import PixelData, read_board
 from minimax_cal.modelling.cell import Cell, pose_from_dict, still
-from minimax_cal.modelling.parameters import State, zero_positions
+from minimax_cal.modelling.parameters import State
 from minimax_cal.planning.camera_options import FOR_CAMERAS, SIDES, CameraOptions, check_cameras
 from minimax_cal.planning.camera_sight import CameraSight
 from minimax_cal.planning.options import USUAL, PlanOptions, check_options
@@ -144,10 +144,8 @@ class CameraProspect:
     def information(self, q: Array, seen: Array, jitter: float) -> Array:
         """(m, f, f) of each pose, for pixels of noise one."""
         problem, x, inside = self.images(q, seen)
-        joints = np.zeros(len(self.active), dtype=bool)
-        joints[zero_positions(self.cell.robot.prismatic)] = True
         own = problem.rows(x, self.active)[1] / self.scale[:, None]
-        rows = np.concatenate([own, problem.rows(x, joints)[1]])
+        rows = np.concatenate([own, problem.by_joints(x)])
         rows = rows.reshape(len(rows), 2, -1)
         whole = np.zeros((*rows.shape[:2], inside.size))
         whole[..., np.flatnonzero(inside)] = rows

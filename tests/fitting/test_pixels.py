@@ -30,11 +30,12 @@ from minimax_cal.fitting.several.pixel_calibration import concluded, fitted
 from minimax_cal.fitting.several.stack import own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments.camera import INTRINSICS, distorted, slopes, undistorted
-from minimax_cal.instruments.images import Sight
+from minimax_cal.instruments.images import Images, Sight
 from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.measuring.grouping import held_out
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.robots.sampling import random_joints
 from minimax_cal.robots.transforms import transform
 from minimax_cal.robots.urdf import to_robot
 from minimax_cal.robots.urdf_file import parse_urdf
@@ -130,6 +131,26 @@ def test_rows_are_the_derivatives_of_the_pixels(cell, board, kind):
         there, back = (problem.stack.rows(end, problem.active)[0] for end in ends)
         slope = (back - there) / (2.0 * step)
         assert_allclose(rows[i], slope, rtol=0, atol=2e-6 * max(float(np.abs(rows[i]).max()), 1.0))
+
+
+def test_joints_move_pixels_in_their_order():
+    """Of an arm whose third of four joints slides, by differences of the joint values."""
+    robot, step, rng = mc.load_robot("scara_600"), 1e-6, np.random.default_rng(0)
+    q, above = random_joints(robot, (5,), rng), transform(np.diag([1.0, -1.0, -1.0]), np.eye(3)[2])
+    cell = Cell(robot, robot, False, (View(above),), board_points(SMALL, WIDE), np.eye(4), q,
+                np.zeros((1, 5, 30, 2)), tuple(map(str, range(30))))  # fmt: skip
+
+    def seen(q: Array) -> tuple[PixelSquares, State]:
+        images, own = Images.placed_at(
+            data_of(replace(cell, q=q)), above[None], np.eye(4), cell.points, on_flange=False
+        )
+        return PixelSquares.of(robot, images), own_state(robot.mdh, own)
+
+    problem, x = seen(q)
+    for joint, slope in enumerate(problem.by_joints(x)):
+        back, there = (one.errors(x) for one, x in (
+            seen(q + way * step * robot.turned(np.eye(4))[joint]) for way in (-1, 1)))  # fmt: skip
+        assert_allclose(slope, (back - there).reshape(-1) / (2.0 * step), rtol=1e-6, atol=1e-3)
 
 
 @pytest.mark.parametrize(

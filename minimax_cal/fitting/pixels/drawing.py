@@ -41,7 +41,7 @@ class Drawing:
     @staticmethod
     def of(robot: Robot, fit: PixelFit, sure: Uncertainty, among: Array) -> Drawing:
         """That of an arm.  among: (5n,) True for links that count."""
-        links = np.flatnonzero(among & fit.active[: len(among)])
+        links = np.flatnonzero(among & fit.problem.active[: len(among)])
         off = links_of(robot.mdh - fit.state.mdh)[links]
         some = np.ix_(links, links)
         noise = drawn_covariance(robot)[some] + (sure.drawn @ sure.drawn.T)[some]
@@ -65,7 +65,7 @@ class Drawing:
         noise = self.share * self.noise
         across = np.nan_to_num(sure.covariance[self.links])
         gain = np.linalg.solve(self.cover + noise, across).T
-        step = np.where(fit.active, gain @ self.off, 0.0)
+        step = np.where(fit.problem.active, gain @ self.off, 0.0)
         return replace(fit, state=fit.state.step(step)), sure.after(gain, self.links, noise)
 
 

@@ -19,11 +19,11 @@ from minimax_cal.fitting.several.stack import Block, Known, Squares, Stack
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.stages import Progress
-from minimax_cal.instruments.images import AXES, Images, Sight
+from minimax_cal.instruments.images import AXES, LENS, Images, Sight
 from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.instruments.protocol import FlangePoses
 from minimax_cal.measuring.grouping import groups
-from minimax_cal.modelling.parameters import State, links_of
+from minimax_cal.modelling.parameters import State, links_of, zero_positions
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import METHODS, LeastSquares, Limits
@@ -70,7 +70,7 @@ class PixelSquares(Squares):
     def lenses(self) -> Array:
         """(p,) True for what is of a lens."""
         count = self.names.count
-        return np.asarray(np.arange(count) >= count - self.images.intrinsic[:, :9].size)
+        return np.asarray(np.arange(count) >= count - self.images.intrinsic[:, :LENS].size)
 
     @property
     def linear(self) -> Array:
@@ -103,6 +103,12 @@ class PixelSquares(Squares):
         error, slope = self.block.rows(x, active)
         count = 2 * len(self.images.weight)
         return error[:count], slope[:, :count]
+
+    def by_joints(self, x: State) -> Array:
+        """(n, 2N) slopes of what is predicted by each joint, by roots of weights."""
+        at = zero_positions(self.block.arm.prismatic)
+        rows = self.rows(x, np.isin(np.arange(self.names.count), at))[1]
+        return rows[np.argsort(np.argsort(at))]
 
     def solved(
         self, x: State, limits: Limits, method: least_squares.Method = METHOD
@@ -152,11 +158,6 @@ class PixelFit(InstrumentFit):
         return self.problem.images
 
     @property
-    def active(self) -> Array:
-        """(p,) True where a parameter was fitted."""
-        return self.identification.active
-
-    @property
     def noise_px(self) -> float:
         """Sigma of u and v [px]."""
         return float(self.noise[0])
@@ -164,7 +165,7 @@ class PixelFit(InstrumentFit):
     @property
     def prior(self) -> Array:
         """(free,) weights of what is known of the parameters besides pixels."""
-        _, slope = self.problem.block.rows(self.squares, self.active)
+        _, slope = self.problem.block.rows(self.squares, self.problem.active)
         lens = slope[:, 2 * len(self.images.weight) :]
         return np.asarray((lens**2).sum(axis=1) + np.diag(self.problem.prior))
 
@@ -232,18 +233,17 @@ def fit_pixels(
     check_count(problem.images, int(told.active.sum()), int(known_links.sum()))
     x = replace(x, mdh=np.where(known_links.reshape(5, -1).T, x.mdh, robot.mdh))
     progress("reprojection")
-    problem, found, noise = reprojected(replace(problem, active=told.active), x)
-    x = found.x.take(np.array(0))
+    problem, x, found = reprojected(replace(problem, active=told.active), x)
     own = with_lenses(problem, x) if held else x
-    if np.abs(lens_off(problem, own, doubt)).max() > FAR_LENS and not held:
-        problem, found, noise = reprojected(problem.changed(doubt=LOOSE * doubt), x)
-        own = x = found.x.take(np.array(0))
-    off = np.abs(lens_off(problem, own, doubt)) * doubt
+    if (lens_off(problem, own) > FAR_LENS * doubt).any() and not held:
+        problem, x, found = reprojected(problem.changed(doubt=LOOSE * doubt), x)
+        own = x
+    off = lens_off(problem, own)
     if held:  # known, or as the user says; where pixels contradict a lens, as far as they say
         sigma = np.where(off > FAR_LENS * doubt, off, doubt * bool(options.camera_prior))
         reasons = dict.fromkeys(problem.images.names[-lens.sum() :], LENS_HELD)
         told = replace(told, reasons={**told.reasons, **reasons})
-    images = problem.images
+    images, noise = problem.images, spread_of(problem, x)
     lenses, turn = images.lens(own.effects), images.frames(x.effects)[0]
     x, nominal = (replace(one, effects=images.counted_from(one.effects, turn))
                   for one in (x, nominal))  # fmt: skip
@@ -288,15 +288,15 @@ def with_lenses(problem: PixelSquares, x: State) -> State:
     ]
 
 
-def reprojected(problem: PixelSquares, x: State) -> tuple[PixelSquares, LeastSquares[State], float]:
-    """The fit of the pixels, those that stand out set aside; the noise of the others [px]."""
+def reprojected(problem: PixelSquares, x: State) -> tuple[PixelSquares, State, LeastSquares[State]]:
+    """The fit of the pixels, those that stand out set aside: where it ends, and all of it."""
     for _ in range(2):
         error = problem.errors(x)
         problem = problem.changed(noise=sigma_of(error), weight=softly(error))
         x, found = problem.solved(x, COARSE)
     problem = problem.changed(weight=np.ones(len(problem.images.weight)))
     if sigma_of(problem.errors(x)) > HOPELESS * problem.images.intrinsic[:, 0].max():
-        return problem, replace(found, status=(Status.FAILED,)), spread_of(problem, x)
+        return problem, x, replace(found, status=(Status.FAILED,))
     for _ in range(ROUNDS):
         before, error = problem.images.weight, problem.errors(x)
         weight = right(error, before)
@@ -304,13 +304,13 @@ def reprojected(problem: PixelSquares, x: State) -> tuple[PixelSquares, LeastSqu
         x, found = problem.solved(x, FINE)
         if np.array_equal(weight, before):
             break
-    return problem, found, spread_of(problem, x)
+    return problem, x, found
 
 
-def lens_off(problem: PixelSquares, x: State, sigma: Array) -> Array:
-    """(c, 9) how far the lenses are from their files, in doubts sigma (c, 9)."""
+def lens_off(problem: PixelSquares, x: State) -> Array:
+    """(c, 9) how far the lenses are from their files."""
     images = problem.images
-    return np.asarray((images.lens(x.effects) - images.intrinsic[:, : sigma.shape[1]]) / sigma)
+    return np.asarray(abs(images.lens(x.effects) - images.intrinsic[:, :LENS]))
 
 
 def spread_of(problem: PixelSquares, x: State) -> float:

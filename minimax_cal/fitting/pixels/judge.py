@@ -84,13 +84,11 @@ def uncertainty_of(robot: Robot, fit: PixelFit, group: Array) -> Uncertainty:
 
     Noise and lack are what the least squares leave; they move the fit by the pixels' shares in it.
     """
-    problem, x, active, prior = fit.problem, fit.squares, fit.active, fit.prior
-    zero = np.zeros(len(active), dtype=bool)
-    zero[zero_positions(robot.prismatic)] = True
+    problem, x, active, prior = fit.problem, fit.squares, fit.problem.active, fit.prior
     error, jacobian = problem.rows(x, active)
     gram = jacobian @ jacobian.T
     cover = solve_normal(gram + np.diag(prior), np.eye(len(gram)))
-    joints = problem.rows(x, zero)[1].reshape(robot.joints, 2, -1)
+    joints = problem.by_joints(x).reshape(robot.joints, 2, -1)
     columns, kind, functions = lacking(robot.with_mdh(x.mdh), fit, joints, group)
     moved = cover @ (jacobian @ columns.T)
     left = columns - moved.T @ jacobian
@@ -133,7 +131,7 @@ def shift_by(fit: PixelFit, held: Array, sigma: Array) -> Array:
 
     held: (p,) mask of h that were not fitted.  sigma: (h,).
     """
-    active = fit.active
+    active = fit.problem.active
     rows = fit.problem.changed(weight=fit.share).rows(fit.squares, active | held)[1]
     free = active[active | held]
     out = np.zeros((len(active), len(sigma)))
@@ -147,7 +145,7 @@ def unfitted(robot: Robot, fit: PixelFit) -> Array:
 
     What pixels take for others moves these along; where it moves no position, it counts for none.
     """
-    held = fit.problem.names.links & ~fit.active
+    held = fit.problem.names.links & ~fit.problem.active
     sigma = np.where(lengths_of(fit.problem.names)[held], *robot.drawn_within)
     out = shift_by(fit, held, sigma)
     out[held] = np.diag(sigma)

@@ -155,7 +155,7 @@ def contradiction(
             f"{said}: check that joints, detections, board and camera files belong together, and "
             "what the cameras are fixed to (camera_on)"
         )
-    links = fit.active[: 5 * robot.joints]
+    links = fit.problem.active[: 5 * robot.joints]
     return (
         other_lens(data, fit)
         or other_size(scale, OTHER_SIZE, LEAST_SIZE)

@@ -125,7 +125,9 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
     if reason:
         status = Status.FAILED
     elif (
-        fit.active[: 5 * robot.joints].any() and not claim.is_better and status is not Status.FAILED
+        fit.problem.active[: 5 * robot.joints].any()
+        and not claim.is_better
+        and status is not Status.FAILED
     ):
         status, reason = Status.NO_BETTER, kept_because(claim)
     numbers = {key: 2 * sum(accuracy(error).counts) for key, error in errors.items()}
