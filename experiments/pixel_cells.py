@@ -292,11 +292,9 @@ def least_variances(
     poses = np.stack([view.pose for view in cell.views])
     data = replace(data, cameras=tuple(cameras))
     images, own = Images.placed_at(data, poses, cell.place, cell.points, on_flange=cell.on_flange)
-    every = np.ones(len(active), dtype=bool)
-    rows = PixelSquares.of(cell.true, images).rows(own_state(cell.true.mdh, own), every)[1]
-    told = rows @ rows.T / noise**2
-    told[-lens_sigma.size :, -lens_sigma.size :] += np.diag(lens_sigma.reshape(-1) ** -2.0)
-    cover = solve_normal(told[np.ix_(active, active)], np.eye(int(active.sum())))
+    rows = PixelSquares.of(cell.true, images).rows(own_state(cell.true.mdh, own), active)[1]
+    known = np.pad(lens_sigma.reshape(-1) ** -2.0, (len(active) - lens_sigma.size, 0))[active]
+    cover = solve_normal(rows @ rows.T / noise**2 + np.diag(known), np.eye(len(rows)))
     links = active[: 5 * cell.true.joints]
     moved = free_motion(cell.true, everywhere(cell.true))[0][:, links]
     root = np.linalg.cholesky(cover[: links.sum(), : links.sum()])
