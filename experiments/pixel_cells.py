@@ -16,13 +16,14 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from experiments.real import off_drawing
-from minimax_cal.fitting.pixels.camera import Camera
-from minimax_cal.fitting.pixels.data import PixelData
-from minimax_cal.fitting.pixels.fit import gram_of_pixels
+from minimax_cal.fitting.pixels.fit import PixelSquares
 from minimax_cal.fitting.pixels.judge import POSES as JUDGED
 from minimax_cal.fitting.pixels.judge import everywhere, free_motion, missed, tool_points
-from minimax_cal.fitting.pixels.model import PixelModel, Scene, lens_of
+from minimax_cal.fitting.several.stack import own_state
 from minimax_cal.ground.arrays import Array
+from minimax_cal.instruments.camera import Camera
+from minimax_cal.instruments.images import Images
+from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.gravity import masses_of, torques
@@ -288,15 +289,12 @@ def least_variances(
         replace(camera, intrinsic=np.array([*view.lens, *view.distortion, *np.zeros(7)]))
         for camera, view in zip(data.cameras, cell.views, strict=True)
     ]
-    model = PixelModel.of(cell.true, replace(data, cameras=tuple(cameras)), cell.on_flange)
     poses = np.stack([view.pose for view in cell.views])
-    x = Scene(
-        cell.true.mdh[None], poses[None, :, :3, :3], poses[None, :, :3, 3],
-        cell.place[None, :3, :3], cell.place[None, :3, 3], np.zeros((1, 0, 3)), lens_of(cameras),
-    )  # fmt: skip
-    told = gram_of_pixels(model, x, active) / noise**2
-    told[-lens_sigma.size :, -lens_sigma.size :] += np.diag(lens_sigma.reshape(-1) ** -2.0)
-    cover = solve_normal(told[np.ix_(active, active)], np.eye(int(active.sum())))
+    data = replace(data, cameras=tuple(cameras))
+    images, own = Images.placed_at(data, poses, cell.place, cell.points, on_flange=cell.on_flange)
+    rows = PixelSquares.of(cell.true, images).rows(own_state(cell.true.mdh, own), active)[1]
+    known = np.pad(lens_sigma.reshape(-1) ** -2.0, (len(active) - lens_sigma.size, 0))[active]
+    cover = solve_normal(rows @ rows.T / noise**2 + np.diag(known), np.eye(len(rows)))
     links = active[: 5 * cell.true.joints]
     moved = free_motion(cell.true, everywhere(cell.true))[0][:, links]
     root = np.linalg.cholesky(cover[: links.sum(), : links.sum()])

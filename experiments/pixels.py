@@ -36,16 +36,7 @@ from experiments.pixel_cells import (
     taken,
 )
 from experiments.sweep import Study, study_options
-from minimax_cal.fitting.pixels.data import PixelData
-from minimax_cal.fitting.pixels.fit import (
-    ANY,
-    by_depths,
-    fit_drawn,
-    identified,
-    known_of,
-    reprojected,
-)
-from minimax_cal.fitting.pixels.model import PixelModel
+from minimax_cal.fitting.pixels.fit import ANY, PixelSquares, by_depths, fit_drawn, reprojected
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import directions, from_far, poses_of_images, start_scene
 from minimax_cal.fitting.several.pixel_calibration import fitted
@@ -53,6 +44,7 @@ from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.stages import silent
 from minimax_cal.ground.tables import Table
 from minimax_cal.instruments import flange_poses
+from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.measuring.grouping import held_out
 from minimax_cal.planning.camera_options import CameraOptions
 from minimax_cal.planning.cameras import planned_images
@@ -140,8 +132,7 @@ def whole_poses(job: Job) -> Found:
     """A pose from each image, then a calibration from whole poses."""
     cell = cell_of(job)
     data = data_of(cell)
-    model = PixelModel.of(cell.drawn, data, on_flange=True)
-    image = poses_of_images(data, directions(model))
+    image = poses_of_images(data, directions(data))
     rows = [pose for _, pose in image]
     pose = np.stack([resected(cell, data, row, found) for (_, row), found in image.items()])
     fit = mc.relative(cell.drawn, flange_poses(data.at.q[rows], np.linalg.inv(pose)))
@@ -314,17 +305,15 @@ def reach(start: Start) -> tuple[float, float]:
     mdh[:, 2] += BAD_ANGLE * rng.normal(size=len(mdh))
     drawn, data = cell.drawn.with_mdh(mdh), data_of(cell)
     begun = from_far(drawn, data, start_scene(drawn, data, on_flange=True))
-    model = PixelModel.of(drawn, data, on_flange=True)
-    scene, lenses = fit_drawn(model, begun.scene), begun.scene.lens[0].size
-    allowed = np.ones(model.names.count, dtype=bool)
-    allowed[-lenses:] = False
-    told = identified(drawn, model, begun.begin or scene, allowed, ~allowed, ANY)
-    model = replace(model, active=told.identification.active)
-    beside = known_of(drawn, model, PixelOptions().lens_sigma(model.intrinsic), by_drawing=False)
+    doubt = PixelOptions().lens_sigma(begun.images.intrinsic)
+    problem = PixelSquares.of(drawn, replace(begun.images, doubt=doubt))
+    scene, allowed = fit_drawn(problem, begun.state), problem.stack.movable & ~problem.lenses
+    told = problem.identified(drawn, begun.begin or scene, allowed, ~allowed, ANY)
+    problem = replace(problem, active=told.active)
     errors = []
-    for x in (by_depths(model, begun.begin or scene, begun), scene):
-        found = reprojected(model, x, beside)[1].x
-        errors.append(arm_error(cell, drawn.with_mdh(found.mdh[0])))
+    for x in (by_depths(problem, begun.begin or scene, begun), scene):
+        found = reprojected(problem, x)[1]
+        errors.append(arm_error(cell, drawn.with_mdh(found.mdh)))
     return errors[0], errors[1]
 
 

@@ -510,7 +510,7 @@ def together(
     chosen: dict[str, Any],
 ) -> int:
     """What a verb says of data of any instruments, and of what cameras saw; the exit code."""
-    from minimax_cal.fitting.several.cameras import detected
+    from minimax_cal.fitting.pixels.beside import detected
 
     to.undrawn()
     if "objective" in on_command_line() and chosen.get("objective", "sum") != "sum":

@@ -111,6 +111,7 @@ class Instrument:
     alone: ClassVar[str] = ""
     unmoved: ClassVar[str] = FRAMELESS
     scale: ClassVar[tuple[str, ...]] = ()
+    drawn_scale: ClassVar[bool] = False
     lone_names: ClassVar[tuple[str, ...]] = ()
     first_column: ClassVar[str] = "smr1_x_"
 
@@ -315,6 +316,10 @@ class Instrument:
         own, drawn: (e,) found, and fitted to the arm as drawn.  covariance: (e, e).
         """
         return ()
+
+    def read_out(self, own: Array) -> Array:
+        """(e,) of its unknowns, as people are told them."""
+        return own
 
     def placed(self, arm: FlangePoses, own: Array, drawn: Array) -> dict[str, Any]:
         """For JSON: what was fitted besides the robot.  drawn: (e,) to the arm as drawn."""

@@ -13,7 +13,7 @@ INSTRUMENTS: dict[str, str | type[Instrument]] = {  # name: where its class is, 
     "poses": "minimax_cal.instruments.poses:WholePoses",
     "points": "minimax_cal.instruments.tracker:Points",
     "contacts": "minimax_cal.instruments.probe:Touches",
-    "pixels": "minimax_cal.fitting.several.cameras:Images",
+    "pixels": "minimax_cal.fitting.pixels.beside:FittedImages",
 }
 
 

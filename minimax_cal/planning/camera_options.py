@@ -8,10 +8,10 @@ from functools import partial
 
 import numpy as np
 
-from minimax_cal.fitting.pixels.camera import FLANGE, GROUND
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import SI, grouped, numbers
+from minimax_cal.instruments.camera import FLANGE, GROUND
 from minimax_cal.robots.transforms import from_rpy
 
 SIDES = {"-z": -1.0, "z": 1.0}  # of a board's frame: where its print looks

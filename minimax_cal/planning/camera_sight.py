@@ -14,9 +14,9 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minimax_cal.fitting.pixels.camera import distorted
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning
+from minimax_cal.instruments.camera import distorted
 from minimax_cal.planning.visibility import Condition, Room, Sight, View, unobstructed, within_range
 from minimax_cal.robots.transforms import inverse, transform
 

@@ -19,21 +19,22 @@ from typing import Annotated, Any
 import numpy as np
 
 from minimax_cal.fitting.identify import RESOLUTION
-from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, Camera, read_camera
-from minimax_cal.fitting.pixels.data import PixelData, read_board
-from minimax_cal.fitting.pixels.fit import identified
+from minimax_cal.fitting.pixels.fit import PixelSquares
 from minimax_cal.fitting.pixels.judge import everywhere, free_motion
-from minimax_cal.fitting.pixels.model import LENS, PixelModel, Scene, lens_of
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.several.pixel_result import PixelCalibration
+from minimax_cal.fitting.several.stack import own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.facts import Apart, Fact
 from minimax_cal.ground.files import plain, saved_content
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
+from minimax_cal.instruments.camera import FLANGE, GROUND, Camera, read_camera
+from minimax_cal.instruments.images import LENS, Images
+from minimax_cal.instruments.pixels import PixelData, read_board
 from minimax_cal.modelling.cell import Cell, pose_from_dict, still
-from minimax_cal.modelling.parameters import zero_positions
+from minimax_cal.modelling.parameters import State
 from minimax_cal.planning.camera_options import FOR_CAMERAS, SIDES, CameraOptions, check_cameras
 from minimax_cal.planning.camera_sight import CameraSight
 from minimax_cal.planning.options import USUAL, PlanOptions, check_options
@@ -82,18 +83,18 @@ class CameraProspect:
         """What poses (m, n) can tell; parameters are identified as in a calibration."""
         nothing = np.zeros(0)
         plain = CameraProspect(cell, room, sight, cameras, noise, nothing, (), nothing)
-        model, x, _ = plain.images(q[:SAMPLE], seen[:SAMPLE])
-        every = np.ones(model.names.count, dtype=bool)
-        found = identified(cell.robot, model, x, every, ~every, RESOLUTION).identification
-        active = found.active
-        names = tuple(n for n, free in zip(model.names.all, active, strict=True) if free)
-        pixel = np.median(model.seen(x).point[2] / model.intrinsic[model.camera, 0])
+        problem, x, _ = plain.images(q[:SAMPLE], seen[:SAMPLE])
+        images, every = problem.images, problem.stack.movable
+        found = problem.identified(cell.robot, x, every, every & ~every, RESOLUTION)
+        free = tuple(problem.names.all[i] for i in np.flatnonzero(found.active))
+        focal = images.intrinsic[images.pixels.camera, 0]
+        pixel = np.median(images.depth(*problem.at(x)) / focal)
         return CameraProspect(
-            cell, room, sight, cameras, noise, active, names, pixel * found.scale[active]
+            cell, room, sight, cameras, noise, found.active, free, pixel * found.scale[found.active]
         )
 
-    def images(self, q: Array, seen: Array) -> tuple[PixelModel, Scene, Array]:
-        """The pixels that would be seen, the scene, and (m, c * k) True where they are."""
+    def images(self, q: Array, seen: Array) -> tuple[PixelSquares, State, Array]:
+        """The pixels that would be seen, the state, and (m, c * k) True where they are."""
         sight, robot, count = self.sight, self.cell.robot, len(self.sight.corners)
         inside = np.moveaxis(sight.inside(sight.relative(View(self.room, sight, q))), 0, 1)
         inside = (inside & seen[..., None]).reshape(len(q), -1)
@@ -103,12 +104,10 @@ class CameraProspect:
             at, tuple(map(str, at.line)), self.cameras, tuple(map(str, range(count))),
             sight.corners, pose, place // count, place % count, np.zeros((len(pose), 2)), pose,
         )  # fmt: skip
-        x = Scene(
-            robot.mdh[None], sight.camera[None, :, :3, :3], sight.camera[None, :, :3, 3],
-            sight.board[None, :3, :3], sight.board[None, :3, 3], np.zeros((1, 0, 3)),
-            lens_of(self.cameras),
-        )  # fmt: skip
-        return PixelModel.of(robot, data, sight.on_flange), x, inside
+        images, own = Images.placed_at(
+            data, sight.camera, sight.board, sight.corners, on_flange=sight.on_flange
+        )
+        return PixelSquares.of(robot, images), own_state(robot.mdh, own), inside
 
     def ahead(self, q: Array, seen: Array) -> Array:
         """(m, r, f) rows whose squares are the information of each pose.  seen: (m, c)."""
@@ -144,11 +143,10 @@ class CameraProspect:
 
     def information(self, q: Array, seen: Array, jitter: float) -> Array:
         """(m, f, f) of each pose, for pixels of noise one."""
-        model, x, inside = self.images(q, seen)
-        joints = np.zeros(len(self.active), dtype=bool)
-        joints[zero_positions(model.prismatic)] = True
-        own = model.rows(x, self.active)[1] / self.scale[:, None, None]
-        rows = np.concatenate([own, model.rows(x, joints)[1]])
+        problem, x, inside = self.images(q, seen)
+        own = problem.rows(x, self.active)[1] / self.scale[:, None]
+        rows = np.concatenate([own, problem.by_joints(x)])
+        rows = rows.reshape(len(rows), 2, -1)
         whole = np.zeros((*rows.shape[:2], inside.size))
         whole[..., np.flatnonzero(inside)] = rows
         by_pose = whole.reshape(len(rows), 2, len(q), -1).transpose(2, 0, 1, 3)

@@ -21,18 +21,21 @@ from experiments.pixel_cells import (
     make_cell,
     seen_by,
 )
-from minimax_cal.fitting.pixels.camera import INTRINSICS, distorted, slopes, undistorted
-from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.determined import determined
-from minimax_cal.fitting.pixels.fit import gram_of_pixels
+from minimax_cal.fitting.pixels.fit import PixelSquares
 from minimax_cal.fitting.pixels.judge import Claim
-from minimax_cal.fitting.pixels.model import PixelModel, Scene, Sight
 from minimax_cal.fitting.pixels.options import PixelOptions, check_options, doubts_of
 from minimax_cal.fitting.pixels.start import by_rotations, directions, merged, start_scene
 from minimax_cal.fitting.several.pixel_calibration import concluded, fitted
+from minimax_cal.fitting.several.stack import own_state
 from minimax_cal.ground.arrays import Array
+from minimax_cal.instruments.camera import INTRINSICS, distorted, slopes, undistorted
+from minimax_cal.instruments.images import Images, Sight
+from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.measuring.grouping import held_out
+from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.robots.sampling import random_joints
 from minimax_cal.robots.transforms import transform
 from minimax_cal.robots.urdf import to_robot
 from minimax_cal.robots.urdf_file import parse_urdf
@@ -101,36 +104,53 @@ def test_undistorted_is_the_inverse():
 # ---- the model -------------------------------------------------------------------------------
 
 
-def scene_of(cell: Cell, data: PixelData) -> tuple[PixelModel, Scene]:
-    """Every twentieth pixel, and a scene near the truth; the base is no parameter."""
-    x = start_scene(cell.drawn, data_of(cell), cell.on_flange).scene
-    if not len(data.board):
-        spots = cell.points @ x.board_turn[0].T + x.board_place[0]
-        x = replace(x, points=spots[None])
-    model = PixelModel.of(cell.drawn, data, cell.on_flange)
-    active = np.ones(model.names.count, dtype=bool)
-    active[5 * cell.drawn.joints : model.names.geometric] = False
-    rows = ("pose", "camera", "target", "pixel", "weight")
-    return replace(model, active=active, **{row: getattr(model, row)[::20] for row in rows}), x
+def scene_of(cell: Cell, data: PixelData) -> tuple[PixelSquares, State]:
+    """Every twentieth pixel, and a state near the truth whose turns are none; lenses have files."""
+    started = start_scene(cell.drawn, data, cell.on_flange)
+    some = data.some(np.arange(data.count) % 20 == 0)
+    images = replace(started.images, pixels=some, weight=np.ones(some.count))
+    own = started.state.effects.copy()
+    own[3:6] += (0.2, -0.1, 0.3)
+    problem = PixelSquares.of(cell.drawn, replace(images, noise=0.1, doubt=np.full((1, 9), 0.5)))
+    return replace(problem, active=problem.stack.movable), replace(started.state, effects=own)
 
 
 @pytest.mark.parametrize("board", [True, False], ids=["board", "tags"])
-@pytest.mark.parametrize("affine", [False, True], ids=["pixels", "given depths"])
-def test_rows_are_the_derivatives_of_the_pixels(cell, board, affine):
-    data = data_of(cell, board=board)
-    model, x = scene_of(cell, data)
-    if affine:
-        depth = np.linspace(0.3, 0.6, len(model.pose))
-        model = replace(model, sight=Sight(depth, directions(model)))
-    _, rows = model.rows(x, model.active)
-    free, step = int(model.active.sum()), 1e-6
+@pytest.mark.parametrize("kind", ["pixels", "given depths"])
+def test_rows_are_the_derivatives_of_the_pixels(cell, board, kind):
+    problem, x = scene_of(cell, data_of(cell, board=board))
+    if kind == "given depths":
+        pixels = problem.images.pixels
+        depth = np.linspace(0.3, 0.6, pixels.count)
+        problem = problem.changed(sight=Sight(depth, directions(pixels)))
+    _, rows = problem.stack.rows(x, problem.active)
+    free, step = int(problem.active.sum()), 1e-6
     for i in range(free):
-        move = np.zeros((1, free))
-        move[0, i] = step
-        there, back = (model.rows(model.step(x, way * move), model.active)[0] for way in (1, -1))
+        move = step * (np.arange(free) == i)
+        ends = (problem.step(x, way * move) for way in (1, -1))
+        there, back = (problem.stack.rows(end, problem.active)[0] for end in ends)
         slope = (back - there) / (2.0 * step)
-        size = max(float(np.abs(rows[i]).max()), 1.0)
-        assert_allclose(rows[i] / size, slope / size, rtol=0, atol=2e-6)
+        assert_allclose(rows[i], slope, rtol=0, atol=2e-6 * max(float(np.abs(rows[i]).max()), 1.0))
+
+
+def test_joints_move_pixels_in_their_order():
+    """Of an arm whose third of four joints slides, by differences of the joint values."""
+    robot, step, rng = mc.load_robot("scara_600"), 1e-6, np.random.default_rng(0)
+    q, above = random_joints(robot, (5,), rng), transform(np.diag([1.0, -1.0, -1.0]), np.eye(3)[2])
+    cell = Cell(robot, robot, False, (View(above),), board_points(SMALL, WIDE), np.eye(4), q,
+                np.zeros((1, 5, 30, 2)), tuple(map(str, range(30))))  # fmt: skip
+
+    def seen(q: Array) -> tuple[PixelSquares, State]:
+        images, own = Images.placed_at(
+            data_of(replace(cell, q=q)), above[None], np.eye(4), cell.points, on_flange=False
+        )
+        return PixelSquares.of(robot, images), own_state(robot.mdh, own)
+
+    problem, x = seen(q)
+    for joint, slope in enumerate(problem.by_joints(x)):
+        back, there = (one.errors(x) for one, x in (
+            seen(q + way * step * robot.turned(np.eye(4))[joint]) for way in (-1, 1)))  # fmt: skip
+        assert_allclose(slope, (back - there).reshape(-1) / (2.0 * step), rtol=1e-6, atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -138,11 +158,12 @@ def test_rows_are_the_derivatives_of_the_pixels(cell, board, affine):
 )
 def test_a_search_over_rotations_needs_no_board(cell, board):
     data = data_of(cell, board=board)
-    model = PixelModel.of(cell.drawn, data, cell.on_flange)
-    found = merged(cell.drawn, data, [by_rotations(cell.drawn, data, model, directions(model), 0)])
-    away = np.linalg.norm(found.place[0, 0] - cell.views[0].pose[:3, 3])
+    told = by_rotations(cell.drawn, data, cell.on_flange, directions(data), 0)
+    images, own = merged(data, cell.on_flange, [told])
+    away = np.linalg.norm(images.frames(own)[1][0] - cell.views[0].pose[:3, 3])
     assert away < 0.01
-    assert np.median(np.linalg.norm(model.errors(found), axis=0)) < 30.0
+    error = PixelSquares.of(cell.drawn, images).errors(own_state(cell.drawn.mdh, own))
+    assert np.median(np.linalg.norm(error, axis=0)) < 30.0
 
 
 # ---- the fit ---------------------------------------------------------------------------------
@@ -318,15 +339,15 @@ def test_the_minimax_is_that_of_slsqp(objective, count):
     found = determined(cell.drawn, data, options)
     assert found.worst is not None
     assert len(found.worst.functions) == count
-    label = plain.train.part if objective == "minimax" else plain.train.camera
-    model, kept = plain.fit.model, plain.fit.model.weight > 0.0
-    gram = gram_of_pixels(model, plain.fit.scene, model.active)
-    scale = np.sqrt(len(model.pose) / np.diag(gram)[model.active])
+    problem, kept = plain.fit.problem, plain.fit.images.counted
+    label = (plain.train.part if objective == "minimax" else plain.train.camera)[kept]
+    slopes = problem.rows(plain.fit.state, problem.active)[1]
+    scale = np.sqrt(len(kept)) / np.linalg.norm(slopes, axis=1)
 
     def sizes(x: Array) -> Array:
-        error = model.errors(model.step(plain.fit.scene, (scale * x[:-1])[None]))
-        square = np.bincount(label[kept], (error[:, kept] ** 2).sum(axis=0))
-        return x[-1] - square / np.bincount(label[kept])
+        error = problem.errors(problem.step(plain.fit.state, scale * x[:-1]))
+        square = np.bincount(label, (error[:, kept] ** 2).sum(axis=0))
+        return x[-1] - square / np.bincount(label)
 
     begin = np.zeros(len(scale) + 1)
     begin[-1] = -sizes(begin).min()

@@ -22,12 +22,12 @@ from experiments.pixel_cells import (
     make_cell,
     write_cell,
 )
-from minimax_cal.fitting.pixels.camera import read_camera
-from minimax_cal.fitting.pixels.data import read_pixels
+from minimax_cal.fitting.pixels.beside import as_instrument, detected
 from minimax_cal.fitting.pixels.options import PixelOptions
-from minimax_cal.fitting.several.cameras import as_instrument, detected
 from minimax_cal.fitting.several.pixel_calibration import fitted
 from minimax_cal.ground.arrays import Array
+from minimax_cal.instruments.camera import read_camera
+from minimax_cal.instruments.pixels import read_pixels
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots.kinematics import rotation
 from minimax_cal.robots.sampling import random_joints

@@ -15,9 +15,9 @@ from conftest import run
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.fitting.pixels.data import read_board
 from minimax_cal.ground.files import json_of
 from minimax_cal.instruments import read_relative
+from minimax_cal.instruments.pixels import read_board
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.reporting.plots.figures import new_figure, save

@@ -123,7 +123,7 @@ def test_information_is_that_of_the_fit(cell, tmp_path):
     true = planned(replace(cell, drawn=cell.true), tmp_path)
     same = taken(cell, true.q, np.random.default_rng(0))
     known = determined(cell.true, data_of(same), PixelOptions(camera_on=on, holdout=0.0))
-    every = known.fit.model.names.all
+    every = known.fit.problem.names.all
     links = [name for name in true.names if name in every[: 5 * cell.true.joints]]
     own = true.sigma[[true.names.index(name) for name in links]]
     theirs = np.sqrt(np.diag(known.sure.noise)[[every.index(name) for name in links]])

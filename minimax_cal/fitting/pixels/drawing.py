@@ -41,8 +41,8 @@ class Drawing:
     @staticmethod
     def of(robot: Robot, fit: PixelFit, sure: Uncertainty, among: Array) -> Drawing:
         """That of an arm.  among: (5n,) True for links that count."""
-        links = np.flatnonzero(among & fit.active[: len(among)])
-        off = links_of(robot.mdh)[links] - fit.model.values(fit.scene)[links]
+        links = np.flatnonzero(among & fit.problem.active[: len(among)])
+        off = links_of(robot.mdh - fit.state.mdh)[links]
         some = np.ix_(links, links)
         noise = drawn_covariance(robot)[some] + (sure.drawn @ sure.drawn.T)[some]
         return Drawing(links, off, sure.covariance[some], noise)
@@ -65,8 +65,8 @@ class Drawing:
         noise = self.share * self.noise
         across = np.nan_to_num(sure.covariance[self.links])
         gain = np.linalg.solve(self.cover + noise, across).T
-        moved = fit.model.step(fit.scene, (gain @ self.off)[fit.active][None])
-        return replace(fit, scene=moved), sure.after(gain, self.links, noise)
+        step = np.where(fit.problem.active, gain @ self.off, 0.0)
+        return replace(fit, state=fit.state.step(step)), sure.after(gain, self.links, noise)
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def scale_of(robot: Robot, fit: PixelFit, sure: Uncertainty) -> Scale | None:
     drawing = Drawing.of(robot, fit, sure, ~(length & (number % n == n - 1)))
     drawn = np.where(length, links_of(robot.mdh), 0.0)[drawing.links]
     dof = len(drawn) - 1
-    if not len(fit.model.board) or robot.rough or not drawn.any() or dof < 1:
+    if not fit.images.has_length or robot.rough or not drawn.any() or dof < 1:
         return None
     root = np.linalg.cholesky(drawing.cover + drawing.noise)
     white = np.linalg.solve(root, np.stack([drawn, -drawing.off], axis=1))

@@ -1,140 +1,33 @@
-"""The fit of pixels: start, identifiable parameters, least squares, wrong pixels, covariance.
+"""The fit of pixels: least squares from far and near, wrong pixels, lenses that are not as told.
 
-Pixels know no base and no tool, and no length either where no board gives one.  Both show in the
-rank of the directions to the targets at plenty of poses that no one had to take.
+Pixels know no base and no tool, and no length either where no board gives one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 
-from minimax_cal.fitting.identify import (
-    RANK_TOLERANCE,
-    Because,
-    Identification,
-    Kept,
-    drop_order,
-    redundant,
-    scale_keeper,
-)
-from minimax_cal.fitting.options import freed
-from minimax_cal.fitting.pixels.data import PixelData
-from minimax_cal.fitting.pixels.model import PixelModel, Scene, Sight
+from minimax_cal.fitting.identify import Because, Identification, Reason
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import Started
+from minimax_cal.fitting.several.fit import InstrumentFit, allowed_of
+from minimax_cal.fitting.several.identify import identified, lengths_of, open_scale, order_of
+from minimax_cal.fitting.several.stack import Block, Known, Squares, Stack
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.stages import Progress
+from minimax_cal.instruments.images import AXES, LENS, Images, Sight
+from minimax_cal.instruments.pixels import PixelData
+from minimax_cal.instruments.protocol import FlangePoses
 from minimax_cal.measuring.grouping import groups
-from minimax_cal.modelling.model import Prior
-from minimax_cal.modelling.parameters import Names, links_of
+from minimax_cal.modelling.parameters import State, links_of, zero_positions
 from minimax_cal.robots.robot import Robot
-from minimax_cal.robots.sampling import random_joints
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import METHODS, LeastSquares, Limits
 from minimax_cal.solvers.status import Status
-
-PLENTY = 60  # poses that show what no poses could tell
-STILL = 1e-9  # relative motion of a column that moves nothing
-WHOLE = 4  # targets of a board that stand for all
-NO_BASE = "no pixel knows the base"
-
-
-@dataclass(frozen=True)
-class Told:
-    """What was identified; by_drawing: whether nothing but the drawing tells the scale."""
-
-    identification: Identification
-    by_drawing: bool
-
-
-def lengths_of(names: Names) -> Array:
-    """(p,) True for the lengths of the links."""
-    return np.asarray(np.arange(names.count) < 2 * names.joints)
-
-
-def reference_of(robot: Robot, model: PixelModel) -> PixelModel:
-    """Every target seen by every camera at plenty of random poses; of a board some targets."""
-    q = random_joints(robot, (PLENTY,), np.random.default_rng(0))
-    targets = np.unique(model.target)
-    if len(model.board):
-        chosen = np.linspace(0, len(targets) - 1, min(len(targets), WHOLE)).astype(int)
-        spread = np.argsort(np.linalg.norm(model.board[targets] - model.board.mean(axis=0), axis=1))
-        targets = targets[spread[chosen]]
-    cameras = np.arange(len(model.intrinsic))
-    grid = np.meshgrid(np.arange(PLENTY), cameras, targets, indexing="ij")
-    pose, camera, target = (part.reshape(-1) for part in grid)
-    none = np.zeros((len(pose), 2))
-    return replace(
-        model, q=robot.turned(q), pose=pose, camera=camera, target=target, pixel=none,
-        weight=np.ones(len(pose)),
-    )  # fmt: skip
-
-
-def gram_of_bearings(model: PixelModel, x: Scene, active: Array) -> Array:
-    """(p, p) Gram matrix of the directions to the targets, 0 but for the active parameters."""
-    rows = model.bearings(x, active)
-    flat = rows.reshape(len(rows), -1)
-    gram = np.zeros((len(active),) * 2)
-    gram[np.ix_(active, active)] = flat @ flat.T
-    return gram
-
-
-def gram_of_pixels(model: PixelModel, x: Scene, active: Array) -> Array:
-    """(p, p) Gram matrix of the pixels, 0 but for the active parameters."""
-    _, rows = model.rows(x, active)
-    flat = (rows * np.sqrt(model.weight)).reshape(len(rows), -1)
-    gram = np.zeros((len(active),) * 2)
-    gram[np.ix_(active, active)] = flat @ flat.T
-    return gram
-
-
-def identified(
-    robot: Robot,
-    model: PixelModel,
-    x: Scene,
-    allowed: Array,
-    wanted: Array,
-    resolution: float,
-) -> Told:
-    """The largest set of allowed parameters that the pixels determine; see `fitting.identify`.
-
-    x: the arm as drawn, with cameras and targets fitted to it.  allowed: (p,) False for what the
-    user fixed, lenses that are held among it.  wanted: (p,) those to give up last.
-    """
-    names = model.names
-    lens = np.arange(names.count) >= names.count - x.lens[0].size
-    base = ~names.links & (np.arange(names.count) < names.geometric)
-    plain = gram_of_bearings(reference_of(robot, model), x, ~lens & ~base)
-    gram = gram_of_pixels(model, x, ~base)
-    scale = np.sqrt(np.diag(gram) / max(len(model.pose), 1))
-    kept = Kept(names, allowed & ~base, {}).without(base, Because.OTHER, NO_BASE)
-    kept = kept.without(~allowed & names.links, Because.FIXED)
-    kept = kept.without(~allowed & lens, Because.OTHER, "held as the camera's file says")
-    size = np.sqrt(np.diag(plain))
-    for motion, reason in ((size, "turns no direction"), (scale, "moves nothing at these poses")):
-        part = kept.active & ~lens
-        still = part & (motion <= STILL * motion[~lens].max())
-        kept = kept.without(still, Because.OTHER, reason)
-    order = np.concatenate([drop_order(robot, names), np.arange(names.geometric, names.count)])
-    order = np.concatenate([order[~wanted[order]], order[wanted[order]]])
-    keeper = [] if len(model.board) else scale_keeper(robot, kept.active & names.links, wanted)
-    order = np.array(list(dict.fromkeys([*keeper, *(int(i) for i in order)])))
-    gone = redundant(plain, kept.active & ~lens, order, RANK_TOLERANCE)
-    by_drawing = set(keeper) & set(gone)  # nothing but the drawing tells the scale
-    kept = kept.without([i for i in gone if i not in by_drawing], Because.SAME_MOTION)
-    known = lens | (bool(by_drawing) & lengths_of(names))
-    told = gram + np.diag(np.where(known, np.diag(gram), 0.0))
-    kept = kept.without(redundant(told, kept.active, order, resolution), Because.NOT_TOLD)
-    stems = {"board"} | {name.rpartition("_")[0] for name in names.all if "_" in name}
-    found = kept.identification(told, scale, stems, "cameras and targets moved together")
-    return Told(found, bool(by_drawing))
-
-
-# ---- the fit -------------------------------------------------------------------------------------
-
 
 TYPICAL = 1.1774  # median of the length of two normal errors over their sigma [Rayleigh]
 SOFT = 3.0  # times sigma: from here on a pixel counts less, until the fit is near
@@ -149,50 +42,142 @@ COARSE = Limits(step=1e-2, iterations=40)  # of a fit that another follows [px]
 FINE = Limits(step=1e-7, iterations=100, damping=1e-9)
 ANY = 0.0  # resolution at which everything counts that any pixels could tell
 METHOD, AFFINE = METHODS["nllm"], METHODS["snllm-kaufman"]
+LENS_HELD = Reason("held as the camera's file says", Because.OTHER)
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """What is known of parameters besides pixels: mean, sigma (p,), inf where nothing is."""
+class PixelSquares(Squares):
+    """The sum of squared pixels of one arm; at given depths its errors are affine in lengths."""
 
-    mean: Array
-    sigma: Array
+    @staticmethod
+    def of(robot: Robot, images: Images) -> PixelSquares:
+        """Every parameter free and nothing known."""
+        stack, links = Stack.of(robot, [images], [""]), links_of(robot.mdh)
+        known = Known(links, np.full(len(links), np.inf))
+        return PixelSquares(stack, np.ones(stack.names.count, dtype=bool), known)
 
-    def prior(self, noise: float) -> Prior:
-        """As a prior beside pixels as noisy as `noise` [px]."""
-        return Prior(self.mean, (noise / self.sigma) ** 2)
+    @property
+    def block(self) -> Block:
+        """The only one."""
+        return self.stack.blocks[0]
+
+    @property
+    def images(self) -> Images:
+        """Its instrument."""
+        return cast(Images, self.block.instrument)
+
+    @property
+    def lenses(self) -> Array:
+        """(p,) True for what is of a lens."""
+        count = self.names.count
+        return np.asarray(np.arange(count) >= count - self.images.intrinsic[:, :LENS].size)
+
+    @property
+    def linear(self) -> Array:
+        """(free,) True for lengths."""
+        own = [name.rpartition("_")[2] in AXES[:3] for name in self.names.effects]
+        every = lengths_of(self.names) | np.pad(own, (self.names.geometric, 0))
+        return np.asarray(every[self.active])
+
+    def changed(self, **changes: Any) -> PixelSquares:
+        """The same of other images; noise: beside which files and drawing count [px]."""
+        block = replace(self.block, instrument=replace(self.images, **changes))
+        out = replace(self, stack=replace(self.stack, blocks=(block,)))
+        if "noise" not in changes or self.known is None:
+            return out
+        return replace(out, weight=self.known.weights(changes["noise"] ** 2, self.names.count))
+
+    def at(self, x: State) -> tuple[FlangePoses, Array]:
+        """The arm, and the images' own parameters."""
+        return self.block.flange(x), self.block.own(x)
+
+    def errors(self, x: State) -> Array:
+        """(2, N) measured minus predicted [px]."""
+        return self.images.off(*self.at(x))
+
+    def rows(self, x: State, active: Array) -> tuple[Array, Array]:
+        """Errors (2N,), u and then v, and slopes (k, 2N) of what is predicted, by roots of weights.
+
+        active: (p,) True for the k parameters.
+        """
+        error, slope = self.block.rows(x, active)
+        count = 2 * len(self.images.weight)
+        return error[:count], slope[:, :count]
+
+    def by_joints(self, x: State) -> Array:
+        """(n, 2N) slopes of what is predicted by each joint, by roots of weights."""
+        at = zero_positions(self.block.arm.prismatic)
+        rows = self.rows(x, np.isin(np.arange(self.names.count), at))[1]
+        return rows[np.argsort(np.argsort(at))]
+
+    def solved(
+        self, x: State, limits: Limits, method: least_squares.Method = METHOD
+    ) -> tuple[State, LeastSquares[State]]:
+        """Least squares over the active parameters from one state: where it ends, and all of it."""
+        points = float(max(len(self.images.weight), 1))
+        found = least_squares.solve(self, x.batch(), 1, points, method, limits)
+        return found.x.take(np.array(0)), found
+
+    def identified(
+        self, robot: Robot, x: State, allowed: Array, wanted: Array, resolution: float
+    ) -> Identification:
+        """What pixels determine; lenses as well as files know them.
+
+        x: the arm as drawn, with cameras and targets fitted to it.
+        """
+        stack = self.changed(noise=0.0).stack
+        return identified(
+            robot, stack, stack.reference(robot, x), x, allowed, wanted, known=self.lenses,
+            resolution=resolution,
+        )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class PixelFit:
-    """What the solver found.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PixelFit(InstrumentFit):
+    """What the solver found, in pixels.
 
-    model: of the training pixels, weight 0 where set aside.  nominal: the arm as drawn with cameras
-    and targets fitted to it.  scene: the calibrated one.  noise: sigma of u and v [px].
-    lens_sigma: (c, 9) how well the files know the lenses.  held: whether lenses are held so.
-    by_drawing: whether nothing but the drawing tells the scale.  lens: (c, 9) the lenses as the
-    pixels say they are, also where they are held; doubt: (c, 9) as it was given.
-    share: (N,) how much each pixel counts in the scene.  squares: the scene of the least squares.
+    problem: of the training pixels, of weight 0 where set aside.  lens_sigma: (c, 9) how well the
+    files know the lenses.  held: whether lenses are held so.  by_drawing: whether nothing but the
+    drawing tells the scale.  lens: (c, 9) the lenses as the pixels say they are, also where they
+    are held; doubt: (c, 9) as it was given.  share: (N,) how much each pixel counts in the state.
+    squares: the state of the least squares.
     """
 
-    model: PixelModel
-    nominal: Scene
-    scene: Scene
-    identification: Identification
-    found: LeastSquares[Scene]
-    noise: float
+    problem: PixelSquares
     lens_sigma: Array
     held: bool
     by_drawing: bool
     lens: Array
     doubt: Array
     share: Array
-    squares: Scene
+    squares: State
 
     @property
-    def active(self) -> Array:
-        """(p,) True where a parameter was fitted."""
-        return self.identification.active
+    def images(self) -> Images:
+        """Of training, as they weigh."""
+        return self.problem.images
+
+    @property
+    def noise_px(self) -> float:
+        """Sigma of u and v [px]."""
+        return float(self.noise[0])
+
+    @property
+    def prior(self) -> Array:
+        """(free,) weights of what is known of the parameters besides pixels."""
+        _, slope = self.problem.block.rows(self.squares, self.problem.active)
+        lens = slope[:, 2 * len(self.images.weight) :]
+        return np.asarray((lens**2).sum(axis=1) + np.diag(self.problem.prior))
+
+    def known_of(self, data: PixelData) -> Array:
+        """(N,) True for pixels of targets whose place is known."""
+        seen = np.isin(np.arange(len(data.targets)), self.images.pixels.target)
+        return (seen | self.images.has_length)[data.target]
+
+    def everywhere(self, robot: Robot, data: PixelData) -> PixelSquares:
+        """Pixels of all poses, alike, without what files know."""
+        plain = replace(self.images, at=data.at, pixels=data, doubt=self.doubt[:0])
+        return PixelSquares.of(robot, replace(plain, weight=np.ones(data.count)))
 
 
 def sigma_of(error: Array, weight: Array | None = None) -> float:
@@ -213,158 +198,140 @@ def right(error: Array, weight: Array) -> Array:
     return np.asarray(np.linalg.norm(error, axis=0) <= APART * sigma_of(error, weight), dtype=float)
 
 
-def solved(
-    model: PixelModel, x: Scene, limits: Limits, method: least_squares.Method = METHOD
-) -> LeastSquares[Scene]:
-    """Least squares over the model's active parameters from one scene."""
-    return least_squares.solve(model, x, 1, float(max(len(model.pose), 1)), method, limits)
-
-
-def placing(names: Names, lenses: int) -> Array:
-    """(p,) True for the poses of cameras and the places of targets."""
-    mask = np.arange(names.count) >= names.geometric
-    mask[-lenses:] = False
-    return mask
-
-
-def fit_drawn(model: PixelModel, x: Scene) -> Scene:
+def fit_drawn(problem: PixelSquares, x: State) -> State:
     """The arm as drawn with the cameras and targets that fit it best, wrong pixels weighed down."""
-    model = replace(model, active=placing(model.names, x.lens[0].size))
+    own = np.arange(problem.names.count) >= problem.names.geometric
+    problem = replace(problem, active=own & ~problem.lenses)
     for _ in range(3):
-        model = replace(model, weight=softly(model.errors(x)))
-        x = solved(model, x, COARSE).x
+        x, _ = problem.changed(weight=softly(problem.errors(x))).solved(x, COARSE)
     return x
 
 
-def known_of(robot: Robot, model: PixelModel, lens: Array, *, by_drawing: bool) -> Known:
-    """What the files know of the lenses, and, where nothing else tells the scale, the drawing.
-
-    lens: (c, 9) sigmas.
-    """
-    names = model.names
-    mean, sigma = np.zeros(names.count), np.full(names.count, np.inf)
-    mean[-lens.size :] = model.intrinsic[:, : lens.shape[1]].reshape(-1)
-    sigma[-lens.size :] = lens.reshape(-1)
-    mean[names.links] = links_of(robot.mdh)
-    sigma[lengths_of(names)] = robot.drawn_within[0] if by_drawing else np.inf
-    return Known(mean, sigma)
-
-
 def fit_pixels(
-    robot: Robot, train: PixelData, started: Started, options: PixelOptions, progress: Progress
+    robot: Robot, started: Started, options: PixelOptions, progress: Progress
 ) -> PixelFit:
     """Fit the identifiable parameters to the training pixels.  Raises DataError."""
-    model, x = PixelModel.of(robot, train, started.on_flange), started.scene
-    lenses = x.lens[0].size
-    sigma = options.lens_sigma(model.intrinsic)
-    allowed = ~model.names.match(options.fix, "fix")
-    wanted = freed(model.names, options.free, allowed)
-    if options.fix_camera:
-        allowed[-lenses:] = False
-    nominal = fit_drawn(model, x)
+    doubt = sigma = options.lens_sigma(started.images.intrinsic)
+    problem, held = PixelSquares.of(robot, replace(started.images, doubt=doubt)), options.fix_camera
+    allowed, wanted = allowed_of(problem.stack, options)
+    lens = problem.lenses
+    allowed[lens] &= not held
+    nominal = fit_drawn(problem, started.state)
     progress("lengths and angles at given depths")
-    lens = np.arange(model.names.count) >= model.names.count - lenses
-    first = nominal if started.begin is None else started.begin
-    told = identified(robot, model, first, allowed, wanted, ANY)
-    beside = known_of(robot, model, sigma, by_drawing=told.by_drawing)
-    near = replace(model, active=told.identification.active & ~lens)
-    near = replace(near, prior=beside.prior(sigma_of(model.errors(first))))
-    x = by_depths(near, first, started)
+    first = started.begin or nominal
+    told = problem.identified(robot, first, allowed, wanted, ANY)
+    by_drawing = scale_drawn(robot, problem, first, told.active)
+    if by_drawing:
+        drawn = np.where(lengths_of(problem.names), robot.drawn_within[0], np.inf)
+        known = Known(links_of(robot.mdh), drawn[problem.names.links])
+        problem = replace(problem, known=known)
+    near = replace(problem, active=told.active & ~lens)
+    x = by_depths(near.changed(noise=sigma_of(near.errors(first))), first, started)
     progress("identifiable parameters")  # where the arm is, not where a bad drawing has it
-    known = identified(robot, model, x, allowed, wanted, options.resolution).identification
-    check_count(train, int(known.active.sum()), int(known.active[model.names.links].sum()))
-    told_links = known.active[: 5 * robot.joints].reshape(5, -1).T
-    x = replace(x, mdh=np.where(told_links, x.mdh, robot.mdh))
+    told = problem.identified(robot, x, allowed, wanted, options.resolution)
+    known_links = told.active[: 5 * robot.joints]
+    check_count(problem.images, int(told.active.sum()), int(known_links.sum()))
+    x = replace(x, mdh=np.where(known_links.reshape(5, -1).T, x.mdh, robot.mdh))
     progress("reprojection")
-    model = replace(model, active=known.active)
-    model, found, noise = reprojected(model, x, beside)
-    held = options.fix_camera
-    own = found.x if not held else with_lenses(model, found.x, beside)
-    if np.abs(lens_off(model, own, sigma)).max() > FAR_LENS and not held:
-        loose = replace(beside, sigma=np.where(lens, LOOSE * beside.sigma, beside.sigma))
-        model, found, noise = reprojected(model, found.x, loose)
-        own = found.x
-    off = np.abs(lens_off(model, own, sigma)) * sigma
+    problem, x, found = reprojected(replace(problem, active=told.active), x)
+    own = with_lenses(problem, x) if held else x
+    if (lens_off(problem, own) > FAR_LENS * doubt).any() and not held:
+        problem, x, found = reprojected(problem.changed(doubt=LOOSE * doubt), x)
+        own = x
+    off = lens_off(problem, own)
     if held:  # known, or as the user says; where pixels contradict a lens, as far as they say
-        sigma = np.where(off > FAR_LENS * sigma, off, sigma * bool(options.camera_prior))
+        sigma = np.where(off > FAR_LENS * doubt, off, doubt * bool(options.camera_prior))
+        reasons = dict.fromkeys(problem.images.names[-lens.sum() :], LENS_HELD)
+        told = replace(told, reasons={**told.reasons, **reasons})
+    images, noise = problem.images, spread_of(problem, x)
+    lenses, turn = images.lens(own.effects), images.frames(x.effects)[0]
+    x, nominal = (replace(one, effects=images.counted_from(one.effects, turn))
+                  for one in (x, nominal))  # fmt: skip
     return PixelFit(
-        model, nominal, found.x, known, found, noise, sigma, held, told.by_drawing, own.lens[0],
-        options.lens_sigma(model.intrinsic), model.weight, found.x,
+        problem=problem.changed(turn=turn), nominal=nominal, state=x, identification=told,
+        found=found, covariance=np.zeros((0, 0)), noise=np.array([noise]), trains=(), alone=(),
+        lens_sigma=sigma, held=held, by_drawing=by_drawing, lens=lenses, doubt=doubt,
+        share=images.weight, squares=x,
     )  # fmt: skip
 
 
-def by_depths(model: PixelModel, x: Scene, started: Started) -> Scene:
+def scale_drawn(robot: Robot, problem: PixelSquares, x: State, active: Array) -> bool:
+    """Whether nothing but the drawing tells the scale of what is fitted.  active: (p,)."""
+    reference = problem.stack.reference(robot, x)
+    return open_scale(reference, x, reference.gram(x), active, order_of(robot, problem.stack))
+
+
+def by_depths(problem: PixelSquares, x: State, started: Started) -> State:
     """A fit of lengths and angles in errors that are affine in the lengths, from far away.
 
     Depths are those that the images tell by themselves, as far as they do; then those of the fit.
     """
     for at in range(DEPTH_ROUNDS):
-        depth = np.maximum(model.seen(x).point[2], started.nearest)
+        depth = np.maximum(problem.images.depth(*problem.at(x)), started.nearest)
         if at == 0 and len(started.depth):
             depth = np.where(started.depth > 0.0, started.depth, depth)
-        sight = replace(model, sight=Sight(depth, started.direction))
-        sight = replace(sight, weight=softly(sight.rows(x, np.zeros(0, dtype=bool))[0]))
-        x = solved(sight, x, COARSE, AFFINE).x
+        sight = problem.changed(sight=Sight(depth, started.direction))
+        error, _ = sight.rows(x, np.zeros(sight.names.count, dtype=bool))
+        x, _ = sight.changed(weight=softly(error.reshape(2, -1))).solved(x, COARSE, AFFINE)
     return x
 
 
-def with_lenses(model: PixelModel, x: Scene, beside: Known) -> Scene:
+def with_lenses(problem: PixelSquares, x: State) -> State:
     """What the pixels say of lenses that are held: a fit that frees them, from that which does not.
 
     Of what the files know of them hardly anything counts.
     """
-    lens = np.arange(model.names.count) >= model.names.count - x.lens[0].size
-    prior = replace(beside, sigma=np.where(lens, LOOSE * beside.sigma, beside.sigma))
-    free = replace(model, active=model.active | lens, weight=softly(model.errors(x)))
-    return solved(replace(free, prior=prior.prior(sigma_of(model.errors(x)))), x, COARSE).x
+    error, doubt = problem.errors(x), LOOSE * problem.images.doubt
+    free = replace(problem, active=problem.active | problem.lenses)
+    return free.changed(noise=sigma_of(error), doubt=doubt, weight=softly(error)).solved(x, COARSE)[
+        0
+    ]
 
 
-def reprojected(
-    model: PixelModel, x: Scene, beside: Known
-) -> tuple[PixelModel, LeastSquares[Scene], float]:
-    """The fit of the pixels, those that stand out set aside; the noise of the others [px]."""
+def reprojected(problem: PixelSquares, x: State) -> tuple[PixelSquares, State, LeastSquares[State]]:
+    """The fit of the pixels, those that stand out set aside: where it ends, and all of it."""
     for _ in range(2):
-        noise = sigma_of(model.errors(x))
-        model = replace(model, weight=softly(model.errors(x)), prior=beside.prior(noise))
-        found = solved(model, x, COARSE)
-        x = found.x
-    model = replace(model, weight=np.ones(len(model.pose)))
-    if sigma_of(model.errors(x)) > HOPELESS * model.intrinsic[:, 0].max():
-        return model, replace(found, status=(Status.FAILED,)), spread_of(model, x)
+        error = problem.errors(x)
+        problem = problem.changed(noise=sigma_of(error), weight=softly(error))
+        x, found = problem.solved(x, COARSE)
+    problem = problem.changed(weight=np.ones(len(problem.images.weight)))
+    if sigma_of(problem.errors(x)) > HOPELESS * problem.images.intrinsic[:, 0].max():
+        return problem, x, replace(found, status=(Status.FAILED,))
     for _ in range(ROUNDS):
-        before, error = model.weight, model.errors(x)
+        before, error = problem.images.weight, problem.errors(x)
         weight = right(error, before)
-        model = replace(model, weight=weight, prior=beside.prior(sigma_of(error, before)))
-        found = solved(model, x, FINE)
-        x = found.x
+        problem = problem.changed(noise=sigma_of(error, before), weight=weight)
+        x, found = problem.solved(x, FINE)
         if np.array_equal(weight, before):
             break
-    return model, found, spread_of(model, x)
+    return problem, x, found
 
 
-def lens_off(model: PixelModel, x: Scene, sigma: Array) -> Array:
-    """(c, 9) how far the lenses are from their files, in doubts sigma (c, 9)."""
-    return np.asarray((x.lens[0] - model.intrinsic[:, : sigma.shape[1]]) / sigma)
+def lens_off(problem: PixelSquares, x: State) -> Array:
+    """(c, 9) how far the lenses are from their files."""
+    images = problem.images
+    return np.asarray(abs(images.lens(x.effects) - images.intrinsic[:, :LENS]))
 
 
-def spread_of(model: PixelModel, x: Scene) -> float:
+def spread_of(problem: PixelSquares, x: State) -> float:
     """Sigma of u and v by the squares of the pixels that count [px]."""
-    counted = model.weight > 0.0
-    freedom = max(2 * int(counted.sum()) - int(model.active.sum()), 1)
-    return max(float(np.sqrt((model.errors(x)[:, counted] ** 2).sum() / freedom)), FINEST)
+    counted = problem.images.counted
+    freedom = max(2 * int(counted.sum()) - int(problem.active.sum()), 1)
+    return max(float(np.sqrt((problem.errors(x)[:, counted] ** 2).sum() / freedom)), FINEST)
 
 
-def check_count(train: PixelData, unknowns: int, links: int) -> None:
+def check_count(train: Images, unknowns: int, links: int) -> None:
     """Raise DataError if the training pixels cannot determine the unknowns, links among them.
 
     Many targets in one image are no more than one pose of a camera, which has six numbers.
     """
-    poses = len(np.unique(groups(train.at)[np.unique(train.pose)]))
-    seen = min(2.0 * train.count / max(poses, 1), 6.0 * len(train.cameras))
-    needed = int(np.ceil((links + 6 * len(train.cameras)) / max(seen, 1.0))) + 1
-    if poses < needed or 2 * train.count <= unknowns:
+    data, count = train.pixels, 2 * train.pixels.count
+    poses, cameras = len(np.unique(groups(train.at)[np.unique(data.pose)])), len(data.cameras)
+    seen = min(count / max(poses, 1), 6.0 * cameras)
+    needed = int(np.ceil((links + 6 * cameras) / max(seen, 1.0))) + 1
+    if poses < needed or count <= unknowns:
         raise DataError(
-            f"{train.source}: {poses} poses with {2 * train.count} numbers for the fit, but "
+            f"{data.source}: {poses} poses with {count} numbers for the fit, but "
             f"{unknowns} unknown parameters, {links} of links, need at least {needed} poses; take "
             "more images, hold out fewer or fix parameters (fix)"
         )

@@ -16,7 +16,8 @@ from typing import Annotated
 import numpy as np
 
 from minimax_cal.evidence.noise import fit_components
-from minimax_cal.fitting.pixels.fit import PixelFit, gram_of_pixels, lengths_of
+from minimax_cal.fitting.pixels.fit import PixelFit
+from minimax_cal.fitting.several.identify import lengths_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import Fact, Mm, derived
 from minimax_cal.measuring.measurements import measurements
@@ -83,20 +84,15 @@ def uncertainty_of(robot: Robot, fit: PixelFit, group: Array) -> Uncertainty:
 
     Noise and lack are what the least squares leave; they move the fit by the pixels' shares in it.
     """
-    model, x, active = fit.model, fit.squares, fit.active
-    root = np.sqrt(model.weight)
-    zero = np.zeros(len(active), dtype=bool)
-    zero[zero_positions(model.prismatic)] = True
-    error, jacobian = model.rows(x, active)
-    joints = root * model.rows(x, zero)[1]
-    error, jacobian = (root * error).reshape(-1), (root * jacobian).reshape(len(jacobian), -1)
-    prior = model.prior.weight[active]
+    problem, x, active, prior = fit.problem, fit.squares, fit.problem.active, fit.prior
+    error, jacobian = problem.rows(x, active)
     gram = jacobian @ jacobian.T
     cover = solve_normal(gram + np.diag(prior), np.eye(len(gram)))
-    columns, kind, functions = lacking(robot.with_mdh(x.mdh[0]), fit, joints, group)
+    joints = problem.by_joints(x).reshape(robot.joints, 2, -1)
+    columns, kind, functions = lacking(robot.with_mdh(x.mdh), fit, joints, group)
     moved = cover @ (jacobian @ columns.T)
     left = columns - moved.T @ jacobian
-    dof = max(2 * int((model.weight > 0.0).sum()) - len(gram), 1)
+    dof = max(2 * fit.images.points - len(gram), 1)
     found = fit_components(left @ columns.T, left @ error, float(error @ error), dof, kind)
     size = (UNIT * joint_units(robot)) ** 2
     own = kind[functions:].reshape(robot.joints, -1)[:, 0]
@@ -105,11 +101,10 @@ def uncertainty_of(robot: Robot, fit: PixelFit, group: Array) -> Uncertainty:
     pulled = jacobian * np.tile(fit.share, 2)
     cover = solve_normal(pulled @ jacobian.T + np.diag(prior), np.eye(len(gram)))
     moved = cover @ (pulled @ columns.T)
-    told = found.noise * pulled @ pulled.T + np.diag(fit.noise**2 * prior)
+    told = found.noise * pulled @ pulled.T + np.diag(fit.noise_px**2 * prior)
     noise[np.ix_(active, active)] = cover @ told @ cover
     if fit.held:
-        lens = np.arange(len(active)) >= len(active) - x.lens[0].size
-        shift = shift_by(fit, lens, fit.lens_sigma.reshape(-1))
+        shift = shift_by(fit, problem.lenses, fit.lens_sigma.reshape(-1))
         noise += shift @ shift.T
     every = np.zeros((len(active), len(columns)))
     every[active] = moved
@@ -121,8 +116,8 @@ def lacking(arm: Robot, fit: PixelFit, joints: Array, group: Array) -> tuple[Arr
 
     joints: (n, 2, N) motion by each joint.  group: (N,).
     """
-    model, n = fit.model, arm.joints
-    turned, kind = by_pose(arm, model.q[model.pose], joints.transpose(2, 1, 0))
+    n, q = arm.joints, fit.problem.block.arm.q[fit.images.pixels.pose]
+    turned, kind = by_pose(arm, q, joints.transpose(2, 1, 0))
     unit = UNIT * joint_units(arm)[:, None, None]
     alone = [joint * (group == each) for joint in unit * joints for each in range(group.max() + 1)]
     columns = np.concatenate([turned.transpose(2, 1, 0), np.stack(alone)])
@@ -136,12 +131,12 @@ def shift_by(fit: PixelFit, held: Array, sigma: Array) -> Array:
 
     held: (p,) mask of h that were not fitted.  sigma: (h,).
     """
-    model, active = replace(fit.model, weight=fit.share), fit.active
-    gram = gram_of_pixels(model, fit.squares, active | held)
-    normal = gram + np.diag(np.where(active, model.prior.weight, 0.0))
+    active = fit.problem.active
+    rows = fit.problem.changed(weight=fit.share).rows(fit.squares, active | held)[1]
+    free = active[active | held]
     out = np.zeros((len(active), len(sigma)))
-    mixed = gram[np.ix_(active, held)]
-    out[active] = -solve_normal(normal[np.ix_(active, active)], mixed) * sigma
+    normal = rows[free] @ rows[free].T + np.diag(fit.prior)
+    out[active] = -solve_normal(normal, rows[free] @ rows[~free].T) * sigma
     return out
 
 
@@ -150,9 +145,8 @@ def unfitted(robot: Robot, fit: PixelFit) -> Array:
 
     What pixels take for others moves these along; where it moves no position, it counts for none.
     """
-    links = fit.model.names.links
-    held = links & ~fit.active
-    sigma = np.where(lengths_of(fit.model.names)[held], *robot.drawn_within)
+    held = fit.problem.names.links & ~fit.problem.active
+    sigma = np.where(lengths_of(fit.problem.names)[held], *robot.drawn_within)
     out = shift_by(fit, held, sigma)
     out[held] = np.diag(sigma)
     return out

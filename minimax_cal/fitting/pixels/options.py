@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.fitting.options import Options, QpSolver, check_resolution, qp_name
-from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import grouped
+from minimax_cal.instruments.camera import FLANGE, GROUND, INTRINSICS
 from minimax_cal.reading.rows import Rows
 
 SUM, WORST_TARGET, WORST_CAMERA = OBJECTIVES = ("sum", "minimax", "camera")

@@ -10,13 +10,14 @@ import scipy
 
 from minimax_cal.fitting.checks import POOR_FIT, check_mends, too_changed
 from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
-from minimax_cal.fitting.pixels.camera import INTRINSICS
-from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.drawing import Scale
 from minimax_cal.fitting.pixels.fit import FAR_LENS, PixelFit
 from minimax_cal.fitting.pixels.options import PixelOptions
-from minimax_cal.fitting.pixels.start import IMAGES, Started, is_flat, poses_of_images, start_scene
+from minimax_cal.fitting.pixels.start import IMAGES, Started, poses_of_images, start_scene
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.words import name_first
+from minimax_cal.instruments.camera import INTRINSICS
+from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.robots.robot import Robot
 
 BETTER = 0.3  # of the error: a slip whose mending leaves no more is the cause
@@ -35,12 +36,12 @@ UNITS = (1e-3, 1e3, 0.1, 10.0, 25.4, 1.0 / 25.4)  # slips of a board's unit
 
 def check_start(robot: Robot, data: PixelData, started: Started) -> None:
     """Raise DataError for slips that show where the arm as drawn is fitted."""
-    miss, good = started.miss(robot, data), POOR_FIT * robot.reach()
+    miss, good = started.miss(robot), POOR_FIT * robot.reach()
     if miss <= good:
         return
 
     def tried(mended: PixelData) -> tuple[float, float]:
-        square = start_scene(robot, mended, started.on_flange).miss(robot, mended) ** 2
+        square = start_scene(robot, mended, started.images.on_flange).miss(robot) ** 2
         return square, square
 
     every = (*slips(data), *other_poses(robot, data, started.direction))
@@ -71,7 +72,7 @@ def other_poses(robot: Robot, data: PixelData, seen: Array) -> list[tuple[str, P
     wherever the camera and the board are.  seen: (2, N) directions.
     """
     first = int(np.bincount(data.camera).argmax())
-    image = poses_of_images(data, seen) if is_flat(data.board) else {}
+    image = poses_of_images(data, seen)
     rows = np.array([pose for camera, pose in image if camera == first], dtype=int)
     if not IMAGES < len(rows) <= MOST_PAIRED:
         return []
@@ -140,10 +141,10 @@ def contradiction(
     robot: Robot, data: PixelData, fit: PixelFit, scale: Scale | None, options: PixelOptions
 ) -> str:
     """Why a fit contradicts its own data; empty where it does not."""
-    depth = np.abs(fit.model.seen(fit.scene).point[2])
-    focal = fit.model.intrinsic[fit.model.camera, 0]
-    size = np.linalg.norm(fit.model.errors(fit.scene), axis=0) * depth / focal
-    miss, aside = float(np.median(size)), float((fit.model.weight == 0.0).mean())
+    (arm, own), images = fit.problem.at(fit.state), fit.images
+    focal = images.intrinsic[images.pixels.camera, 0]
+    size = np.linalg.norm(images.off(arm, own), axis=0) * np.abs(images.depth(arm, own)) / focal
+    miss, aside = float(np.median(size)), float((~images.counted).mean())
     said = ""
     if miss > MAX_MISS_OF_REACH * robot.reach():
         said = f"the calibrated arm misses by {1e3 * miss:.3g} mm at the target"
@@ -154,14 +155,14 @@ def contradiction(
             f"{said}: check that joints, detections, board and camera files belong together, and "
             "what the cameras are fixed to (camera_on)"
         )
-    links = fit.active[: 5 * robot.joints]
+    links = fit.problem.active[: 5 * robot.joints]
     return (
         other_lens(data, fit)
         or other_size(scale, OTHER_SIZE, LEAST_SIZE)
         or (
             ""
             if options.allow_large_changes
-            else too_changed(robot, robot.with_mdh(fit.scene.mdh[0]), links)
+            else too_changed(robot, robot.with_mdh(fit.state.mdh), links)
         )
     )
 
@@ -198,7 +199,7 @@ def other_size(scale: Scale | None, limit: float, least: float = 0.0) -> str:
 
 def file_notices(data: PixelData, fit: PixelFit, scale: Scale | None) -> list[str]:
     """Notices of lenses that are far from their files, and of a board of another size."""
-    file = fit.model.intrinsic[:, : len(INTRINSICS)]
+    file = fit.images.intrinsic[:, : len(INTRINSICS)]
     off = np.abs(fit.lens - file) / fit.doubt
     out = []
     for i, camera in enumerate(data.cameras):
@@ -228,21 +229,19 @@ def outlier_notices(data: PixelData, rows: Array) -> list[str]:
     out = []
     if lost.any():
         first = [int(np.argmax(image == each)) for each in np.flatnonzero(lost)]
-        named = ", ".join(
+        named = [
             f"pose {data.labels[data.pose[row]]} of camera {data.cameras[data.camera[row]].name}"
-            for row in first[:LISTED]
-        )
-        more = f" and {len(first) - LISTED} more" if len(first) > LISTED else ""
+            for row in first
+        ]
         out.append(
-            f"{data.source}: {len(first)} whole images are outliers, set aside: {named}{more}; "
-            "are the joint values those of the image?"
+            f"{data.source}: {len(first)} whole images are outliers, set aside: "
+            f"{name_first(named, LISTED)}; are the joint values those of the image?"
         )
     if len(single):
-        named = ", ".join(data.says(int(row)) for row in single[:LISTED])
-        more = f" and {len(single) - LISTED} more" if len(single) > LISTED else ""
-        one = len(single) == 1
+        named = [data.says(int(row)) for row in single]
+        ending, are = ("s", "is") if len(named) == 1 else ("", "are")
         out.append(
-            f"{data.source}: {len(single)} pixel{'' if one else 's'} "
-            f"stand{'s' if one else ''} out and {'is' if one else 'are'} set aside: {named}{more}"
+            f"{data.source}: {len(named)} pixel{'' if ending else 's'} stand{ending} out and {are} "
+            f"set aside: {name_first(named, LISTED)}"
         )
     return out

@@ -16,14 +16,17 @@ import scipy
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting.calibrate import calibrate
-from minimax_cal.fitting.pixels.camera import undistorted
-from minimax_cal.fitting.pixels.data import PixelData
-from minimax_cal.fitting.pixels.model import PixelModel, Scene, lens_of
+from minimax_cal.fitting.several.stack import own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
+from minimax_cal.instruments.camera import undistorted
+from minimax_cal.instruments.images import Images
+from minimax_cal.instruments.pixels import PixelData
+from minimax_cal.instruments.protocol import Arm
 from minimax_cal.instruments.reflectors import LEVER, posed, reflectors, spots_of
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.start import fit_base
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
@@ -50,37 +53,35 @@ SOFT = 0.01  # errors count less from here on
 class Started:
     """The arm as drawn, among cameras and targets that fit it.
 
-    on_flange: whether the cameras ride on it.  direction: (2, N) that was seen, in the plane at
-    depth one.  depth: (N,) of each target as its image tells it alone, 0 where it does not [m].
-    nearest: least depth of a target [m].  begin: where a fit begins, None for the drawn arm.
+    images: all pixels, alike.  direction: (2, N) that was seen, in the plane at depth one.  depth:
+    (N,) of each target as its image tells it alone, 0 where it does not [m].  nearest: least depth
+    of a target [m].  begin: where a fit begins, None for the drawn arm.
     """
 
-    scene: Scene
-    on_flange: bool
+    images: Images
+    state: State
     direction: Array
     depth: Array
     nearest: float = NEARBY
-    begin: Scene | None = None
+    begin: State | None = None
 
-    def miss(self, robot: Robot, data: PixelData) -> float:
+    def miss(self, robot: Robot) -> float:
         """Typical error at the targets, infinite where most lie behind a camera [m]."""
-        model = PixelModel.of(robot, data, self.on_flange)
-        depth = model.seen(self.scene).point[2]
-        size = np.linalg.norm(model.errors(self.scene) / model.intrinsic[data.camera, :2].T, axis=0)
-        return float(np.median(np.where(depth > self.nearest, size * depth, np.inf)))
+        one, own = self.images, self.state.effects
+        arm = Arm.of(robot, one.at.q).at(self.state.mdh)
+        size = np.linalg.norm(one.at_targets(arm, own), axis=0)
+        return float(np.median(np.where(one.depth(arm, own) > self.nearest, size, np.inf)))
 
 
 def start_scene(robot: Robot, data: PixelData, on_flange: bool) -> Started:
     """Cameras and targets that fit the arm as drawn."""
-    model = PixelModel.of(robot, data, on_flange)
-    seen = directions(model)
-    image = poses_of_images(data, seen) if is_flat(data.board) else {}
-    every = range(len(data.cameras))
-    told = [by_poses(robot, data, model, image, camera) for camera in every]
-    found = [each for each in told if each is not None]
-    if len(found) < len(told):
-        found = [by_rotations(robot, data, model, seen, camera) for camera in every]
-    return Started(merged(robot, data, found), on_flange, seen, depths(data, image))
+    seen, every = directions(data), range(len(data.cameras))
+    image = poses_of_images(data, seen)
+    found = by_poses(robot, data, on_flange, image)
+    if not found:
+        found = [by_rotations(robot, data, on_flange, seen, camera) for camera in every]
+    images, own = merged(data, on_flange, found)
+    return Started(images, own_state(robot.mdh, own), seen, depths(data, image))
 
 
 def from_far(robot: Robot, data: PixelData, started: Started) -> Started:
@@ -89,14 +90,13 @@ def from_far(robot: Robot, data: PixelData, started: Started) -> Started:
     A pose from each image is what a tracker of whole poses sees: `calibrate` finds the arm from
     any start.
     """
-    model = PixelModel.of(robot, data, started.on_flange)
-    image = poses_of_images(data, started.direction) if is_flat(data.board) else {}
+    on_flange, image = started.images.on_flange, poses_of_images(data, started.direction)
     first = int(np.bincount(data.camera).argmax())
     rows = np.array([pose for camera, pose in image if camera == first], dtype=int)
     if len(rows) < IMAGES:
         return started
     pose = np.stack([image[first, row] for row in rows])
-    targets = seen_reflectors(data, rows, np.linalg.inv(pose) if started.on_flange else pose)
+    targets = seen_reflectors(data, rows, np.linalg.inv(pose) if on_flange else pose)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CalibrationWarning)
         try:
@@ -107,27 +107,27 @@ def from_far(robot: Robot, data: PixelData, started: Started) -> Started:
         except CalibrationError:  # too few poses for all parameters, say
             return started
     arm = robot.with_mdh(fit.cell.robot.mdh)
-    told = [by_poses(arm, data, model, image, camera) for camera in range(len(data.cameras))]
-    found = [each for each in told if each is not None]
-    if len(found) < len(told):
+    found = by_poses(arm, data, on_flange, image)
+    if not found:
         return started
-    return replace(started, begin=merged(arm, data, found))
+    images, own = merged(data, on_flange, found)
+    own = images.counted_from(own, started.images.turn)
+    return replace(started, begin=own_state(arm.mdh, own))
 
 
 def depths(data: PixelData, image: dict[tuple[int, int], Array]) -> Array:
     """(N,) of each target by the pose of its board in its image, 0 where there is none [m]."""
     out = np.zeros(data.count)
-    if image:
-        none = np.full((3, 4), 0.0)
-        keys = zip(data.camera.tolist(), data.pose.tolist(), strict=True)
-        row = np.stack([image[key][2] if key in image else none[2] for key in keys])
-        out = np.einsum("ni,ni->n", row[:, :3], data.board[data.target]) + row[:, 3]
+    for (camera, pose), found in image.items():
+        mine = (data.camera == camera) & (data.pose == pose)
+        out[mine] = data.board[data.target[mine]] @ found[2, :3] + found[2, 3]
     return out
 
 
-def directions(model: PixelModel) -> Array:
+def directions(data: PixelData) -> Array:
     """(2, N) what was seen, in the plane at depth one, by the lenses as their files say."""
-    return undistorted(model.intrinsic[model.camera].T, model.pixel.T)
+    lens = np.stack([camera.intrinsic for camera in data.cameras])
+    return undistorted(lens[data.camera].T, data.pixel.T)
 
 
 def is_flat(board: Array) -> bool:
@@ -150,7 +150,9 @@ def plane_of(board: Array) -> Array:
 
 
 def poses_of_images(data: PixelData, seen: Array) -> dict[tuple[int, int], Array]:
-    """Pose (4, 4) of the board in the camera by camera and pose, where it shows [m]."""
+    """Pose (4, 4) of a flat board in the camera by camera and pose, where it shows [m]."""
+    if not is_flat(data.board):
+        return {}
     plane = plane_of(data.board)
     local = (data.board - plane[:3, 3]) @ plane[:3, :3]
     out = {}
@@ -208,9 +210,18 @@ def centred(places: Array) -> tuple[Array, Array]:
 
 
 def by_poses(
+    robot: Robot, data: PixelData, on_flange: bool, image: dict[tuple[int, int], Array]
+) -> list[tuple[Array, Array, Array]]:
+    """`by_pose` of each camera; none where one of them has too few images."""
+    every = (by_pose(robot, data, on_flange, image, i) for i in range(len(data.cameras)))
+    found = [each for each in every if each is not None]
+    return found if len(found) == len(data.cameras) else []
+
+
+def by_pose(
     robot: Robot,
     data: PixelData,
-    model: PixelModel,
+    on_flange: bool,
     image: dict[tuple[int, int], Array],
     camera: int,
 ) -> tuple[Array, Array, Array] | None:
@@ -223,7 +234,7 @@ def by_poses(
     if len(rows) < IMAGES:
         return None
     pose = np.stack([image[camera, row] for row in rows])
-    if model.on_flange:
+    if on_flange:
         pose = np.linalg.inv(pose)
     targets = seen_reflectors(data, np.array(rows), pose)
     for _ in range(REWEIGHED):  # images that the arm contradicts are left out
@@ -235,7 +246,7 @@ def by_poses(
         targets = targets.take(kept)
     tool = posed(found.target_positions, spots_of(LEVER))
     still = np.linalg.inv(found.base)
-    place, board = (tool, still) if model.on_flange else (still, tool)
+    place, board = (tool, still) if on_flange else (still, tool)
     return place, board, data.board @ board[:3, :3].T + board[:3, 3]
 
 
@@ -304,23 +315,23 @@ class Rays:
         return np.asarray(fixed @ view[2])
 
 
-def rays_of(robot: Robot, data: PixelData, model: PixelModel, seen: Array, camera: int) -> Rays:
+def rays_of(robot: Robot, data: PixelData, on_flange: bool, seen: Array, camera: int) -> Rays:
     """Those of one camera, for the arm as drawn.  The targets' numbers are those of the data."""
     rows = np.flatnonzero(data.camera == camera)
-    links = kinematics.chain(robot.mdh, model.q, model.prismatic)
-    axes = np.moveaxis(links.axes[..., data.pose[rows]], -1, 0)
-    origin = links.origin[:, data.pose[rows]].T
+    flange = robot.pose(data.at.q)[data.pose[rows]]
+    turn, origin = flange[:, :3, :3], flange[:, :3, 3]
     target, direction = data.target[rows], seen[:, rows].T
-    if model.on_flange:
+    if on_flange:
+        axes = turn.swapaxes(1, 2)
         return Rays(axes, (axes @ origin[..., None])[..., 0], direction, target)
-    return Rays(axes.swapaxes(1, 2), -origin, direction, target)
+    return Rays(turn, -origin, direction, target)
 
 
 def by_rotations(
-    robot: Robot, data: PixelData, model: PixelModel, seen: Array, camera: int
+    robot: Robot, data: PixelData, on_flange: bool, seen: Array, camera: int
 ) -> tuple[Array, Array, Array]:
-    """As `by_poses`, for targets taken as of unknown place, NaN where one camera cannot tell it."""
-    rays = rays_of(robot, data, model, seen, camera)
+    """As `by_pose`, for targets taken as of unknown place, NaN where one camera cannot tell it."""
+    rays = rays_of(robot, data, on_flange, seen, camera)
     few, fewest = (rays.some(thinned(rays.target, most)) for most in (ENOUGH, SCREENED))
     looks = Rotation.random(ROTATIONS, rng=np.random.default_rng(0)).as_matrix()
     cost = [clipped(fewest.solved(look)[2]) for look in looks]
@@ -386,23 +397,14 @@ def rigid(local: Array, place: Array) -> Array:
     return transform(turn, b - turn @ a)
 
 
-def merged(robot: Robot, data: PixelData, found: Sequence[tuple[Array, Array, Array]]) -> Scene:
-    """One scene of what each camera told by itself; the board as the one that saw most tells it."""
+def merged(
+    data: PixelData, on_flange: bool, found: Sequence[tuple[Array, Array, Array]]
+) -> tuple[Images, Array]:
+    """What each camera told by itself in one; the board as the one that saw most tells it."""
     poses = np.stack([place for place, _, _ in found])
-    first = int(np.bincount(data.camera).argmax())
-    board = found[first][1]
-    points = np.zeros((0, 3))
+    _, board, points = found[int(np.bincount(data.camera).argmax())]
+    for _, _, more in found:
+        points = np.where(np.isfinite(points), points, more)
     if not len(data.board):
-        points = found[first][2].copy()
-        for _, _, more in found:
-            points = np.where(np.isfinite(points), points, more)
         points = np.where(np.isfinite(points), points, np.nanmean(points, axis=0))
-    return Scene(
-        mdh=robot.mdh[None],
-        turn=poses[None, :, :3, :3],
-        place=poses[None, :, :3, 3],
-        board_turn=board[None, :3, :3],
-        board_place=board[None, :3, 3],
-        points=points[None],
-        lens=lens_of(data.cameras),
-    )
+    return Images.placed_at(data, poses, board, points, on_flange=on_flange)

@@ -14,15 +14,16 @@ from typing import Annotated
 import numpy as np
 
 from minimax_cal.fitting.options import solver_of
-from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.fit import PixelFit
-from minimax_cal.fitting.pixels.model import PixelModel, Scene
 from minimax_cal.fitting.pixels.options import SUM, WORST_CAMERA, WORST_TARGET, PixelOptions
+from minimax_cal.fitting.several.stack import Squares
 from minimax_cal.fitting.solve import MIN_TARGET_WEIGHT, QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import APART, Fact, derived
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import list_counts
+from minimax_cal.instruments.pixels import PixelData
+from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.minimax import Kkt, Linear, Optimum
 from minimax_cal.solvers.status import Status
@@ -38,15 +39,16 @@ OF: Mapping[str, Callable[[PixelData], Array]] = {  # (N,) whose mean square a p
 
 
 @dataclass(frozen=True, eq=False)
-class PixelMinimax:
-    """min over the scene of the largest f_i, as `solvers.minimax` wants it.
+class RowMinimax:
+    """min over the state of the largest f_i of groups of rows, as `solvers.minimax` wants it.
 
-    of: (N,) the number i of each pixel's function, -1 for none.  scale: (free,) divides a step's
-    entries.  size: divides the f_i [px^2].
+    member: (k, r) how much each row's square counts in each f_i; known: the same of what is known
+    of the arm.  scale: (free,) divides a step's entries.  size: divides the f_i.
     """
 
-    model: PixelModel
-    of: Array
+    problem: Squares
+    member: Array
+    known: float
     scale: Array
     size: float = 1.0
 
@@ -58,67 +60,55 @@ class PixelMinimax:
     upper = lower
 
     @staticmethod
-    def at(model: PixelModel, of: Array, start: Scene) -> PixelMinimax:
-        """Scaled at a start."""
-        plain = PixelMinimax(model, of, np.ones(int(model.active.sum())))
+    def at(problem: Squares, of: Array, numbers: int, start: State) -> RowMinimax:
+        """Mean squares, scaled at a start.
+
+        of: (r,) which function each row is of, -1 for none, -2 for rows that all have their share
+        of.  numbers: rows behind one square, as two of a pixel.
+        """
+        member = (of == np.arange(of.max() + 1)[:, None]).astype(float)
+        member *= numbers / member.sum(axis=1, keepdims=True)
+        known = numbers / np.count_nonzero(of >= 0)
+        member[:, of == -2] = known
+        plain = RowMinimax(problem, member, known, np.ones(int(problem.active.sum())))
         here = plain.linearise(start)
         size = max(float(here.f.max()), 1e-18)
         mean = here.curvature(np.full(len(here.f), 1.0 / len(here.f)))
         return replace(plain, scale=np.sqrt(np.maximum(np.diag(mean) / size, 1e-30)), size=size)
 
-    @property
-    def counts(self) -> Array:
-        """(k,) pixels behind each function."""
-        return np.bincount(self.of[self.of >= 0])
-
-    def evaluate(self, x: Scene) -> tuple[Array, Array]:
+    def evaluate(self, x: State) -> tuple[Array, Array]:
         """f, and no constraint."""
-        return self.values(x, self.model.errors(x)), NO_LIMITS
-
-    def sizes(self, x: Scene) -> Array:
-        """(k,) RMS of each function's pixels [px]."""
-        square = (self.model.errors(x) ** 2).sum(axis=0)
-        return np.asarray(np.sqrt(self.summed(square) / self.counts))
-
-    def values(self, x: Scene, error: Array) -> Array:
-        """f of the errors (2, N) at a scene."""
+        error, _ = self.problem.stack.rows(x, np.zeros(len(self.problem.active), dtype=bool))
         off, weight = self.beside(x)
-        known = float(weight @ off**2) / self.counts.sum()
-        return np.asarray((self.summed((error**2).sum(axis=0)) / self.counts + known) / self.size)
+        f = self.member @ error**2 + self.known * float(weight @ off**2)
+        return f / self.size, NO_LIMITS
 
-    def linearise(self, x: Scene) -> Linear:
+    def linearise(self, x: State) -> Linear:
         """f and its derivatives; the curvature is Gauss-Newton's 2 J'J."""
-        counts = self.counts
-        error, jacobian = self.model.rows(x, self.model.active)
+        error, jacobian = self.problem.stack.rows(x, self.problem.active)
         off, weight = self.beside(x)
-        pulled = self.summed((jacobian * error).sum(axis=1)) / counts
-        slope = -2.0 * (pulled.T + weight * off / counts.sum())
+        f = self.member @ error**2 + self.known * float(weight @ off**2)
+        slope = -2.0 * ((self.member * error) @ jacobian.T + self.known * weight * off)
         divisor = self.size * np.outer(self.scale, self.scale)
 
         def curvature(share: Array) -> Array:
-            each = np.where(self.of >= 0, (share / counts)[self.of], 0.0)
-            flat = (jacobian * np.sqrt(each)).reshape(len(jacobian), -1)
-            known = np.diag(weight) * share.sum() / counts.sum()
-            return np.asarray(2.0 * (flat @ flat.T + known) / divisor)
+            gram = (jacobian * (share @ self.member)) @ jacobian.T
+            return np.asarray(2.0 * (gram + self.known * share.sum() * np.diag(weight)) / divisor)
 
-        f, slope = self.values(x, error), slope / (self.size * self.scale)
-        return Linear(f, slope, NO_LIMITS, np.zeros((0, len(self.scale))), curvature)
+        none = np.zeros((0, len(self.scale)))
+        return Linear(f / self.size, slope / (self.size * self.scale), NO_LIMITS, none, curvature)
 
-    def step(self, x: Scene, d: Array) -> Scene:
-        """The scene moved by a scaled step in the free parameters."""
-        return self.model.step(x, (d / self.scale)[None])
+    def step(self, x: State, d: Array) -> State:
+        """The state moved by a scaled step in the free parameters."""
+        return self.problem.step(x, d / self.scale)
 
-    def beside(self, x: Scene) -> tuple[Array, Array]:
-        """(free,) how far the parameters are from what the files know, and the weight of that."""
-        model = self.model
-        off = model.prior.mean - model.values(x)
-        return off[model.active], model.prior.weight[model.active]
-
-    def summed(self, each: Array) -> Array:
-        """(..., k) sums over the pixels of each function.  each: (..., N)."""
-        flat, kept = each.reshape(-1, each.shape[-1]), self.of >= 0
-        sums = [np.bincount(self.of[kept], row[kept]) for row in flat]
-        return np.array(sums).reshape(*each.shape[:-1], -1)
+    def beside(self, x: State) -> tuple[Array, Array]:
+        """(free,) how far the parameters are from what is known of them, and the weight of that."""
+        problem, known = self.problem, self.problem.known
+        if known is None or not len(problem.weight):
+            return np.zeros(len(self.scale)), np.zeros(len(self.scale))
+        off = known.off(x, len(problem.active))
+        return off[problem.active], problem.weight[problem.active]
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,29 +148,33 @@ class WorstPixels:
 
 
 def fit_worst(
-    data: PixelData, fit: PixelFit, options: PixelOptions
+    fit: PixelFit, options: PixelOptions
 ) -> tuple[PixelFit, WorstPixels | None, tuple[str, ...]]:
-    """The minimax from a fit of the sum, where the objective asks for one, and notices.
-
-    data: the training pixels.
-    """
+    """The minimax from a fit of the sum, where the objective asks for one, and notices."""
     if options.objective == SUM or fit.found.status[0] is Status.FAILED:
         return fit, None, ()
-    label = OF[options.objective](data)
-    seen, number = np.unique(label[fit.model.weight > 0.0], return_inverse=True)
+    images, data, counted = fit.images, fit.images.pixels, fit.images.counted
+    seen, number = np.unique(OF[options.objective](data)[counted], return_inverse=True)
     of = np.full(data.count, -1)
-    of[fit.model.weight > 0.0] = number
-    problem = PixelMinimax.at(fit.model, of, fit.scene)
+    of[counted] = number.reshape(-1)
+    rows = np.concatenate([of, of, np.full(images.lens_rows, -2)])
+    problem = RowMinimax.at(fit.problem, rows, 2, fit.state)
     qp, notices = solver_of(options.qp, QP_TOLERANCE)
-    best: Optimum[Scene] = minimax.solve(problem, fit.scene, qp)
+    best: Optimum[State] = minimax.solve(problem, fit.state, qp)
     if best.status is Status.STALLED and best.value * problem.size < MAX_ROUNDING**2:
         best = replace(best, status=Status.CONVERGED)
-    before, after = (problem.sizes(x) for x in (fit.scene, best.x))
+    counts = np.bincount(number.reshape(-1))
+
+    def sizes(x: State) -> Array:
+        square = (fit.problem.errors(x)[:, counted] ** 2).sum(axis=0)
+        return np.asarray(np.sqrt(np.bincount(number.reshape(-1), square) / counts))
+
+    before, after = sizes(fit.state), sizes(best.x)
     names = data.parts if options.objective == WORST_TARGET else [c.name for c in data.cameras]
     functions = tuple(names[i] for i in seen)
     worst = WorstPixels(functions, after, best.mu, float(before.max()), best.kkt, best.answered)
-    heavy = np.maximum(best.mu, MIN_TARGET_WEIGHT) * problem.counts.sum() / problem.counts
+    heavy = np.maximum(best.mu, MIN_TARGET_WEIGHT) * counts.sum() / counts
     share = np.where(of >= 0, heavy[of], 0.0)
     found = replace(fit.found, status=(best.status,), iterations=np.array([best.iterations]))
     notes = tuple(f"QP: {note}" for note in best.notes)
-    return replace(fit, scene=best.x, found=found, share=share), worst, (*notices, *notes)
+    return replace(fit, state=best.x, found=found, share=share), worst, (*notices, *notes)

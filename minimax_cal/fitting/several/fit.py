@@ -11,6 +11,7 @@ import numpy as np
 from minimax_cal.fitting.found import Parameter, link_by_link
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.options import freed
+from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.several.identify import (
     Alone,
     determined_alone,
@@ -89,7 +90,7 @@ def stack_of(robot: Robot, trains: Sequence[Train], options: RelativeOptions) ->
     return replace(stack, given=np.square(of_rows))
 
 
-def allowed_of(stack: Stack, options: RelativeOptions) -> tuple[Array, Array]:
+def allowed_of(stack: Stack, options: RelativeOptions | PixelOptions) -> tuple[Array, Array]:
     """What may be fitted (p,), and what is to be given up last (p,); the base is no unknown."""
     names = stack.names
     allowed = ~names.match(options.fix, "fix")
@@ -345,7 +346,8 @@ def parameters_of(robot: Robot, fit: InstrumentFit) -> tuple[Parameter, ...]:
 def every_parameter(robot: Robot, fit: InstrumentFit) -> tuple[Parameter, ...]:
     """Links, those of all instruments as they are fitted, and last those of the laws."""
     names = fit.stack.names
-    before, after = (x.along(np.eye(3), robot) for x in (fit.nominal, fit.state))
+    states = map(fit.stack.read_out, (fit.nominal, fit.state))
+    before, after = (x.along(np.eye(3), robot) for x in states)
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     return link_by_link(names, names.units, before, after, sigma, fit.identification)
 

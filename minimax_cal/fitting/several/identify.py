@@ -27,7 +27,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments.instrument import FRAMELESS
 from minimax_cal.instruments.protocol import ResidualRows, by_arm
 from minimax_cal.modelling.model import TARGET
-from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots.robot import Robot
 
 STILL = 1e-7  # relative motion of a column that moves nothing
@@ -121,6 +121,8 @@ def identified(
     order = np.array(list(dict.fromkeys([*keeper, *(int(i) for i in order)])))
     gone = redundant(plain, kept.active[:stiff], order[order < stiff], RANK_TOLERANCE)
     gone = [i for i in gone if not known[i] or i in keeper]
+    if all(one.drawn_scale for one in stack.instruments) and keeper:
+        gone, known = [i for i in gone if i not in keeper], known | lengths_of(names)
     no_scale = LENGTHS + "; ".join(stack.instruments[0].scale)
     kept = kept.without(gone, Because.SAME_MOTION).without(
         [i for i in gone if i in keeper], Because.NO_SCALE, no_scale
@@ -131,6 +133,11 @@ def identified(
     own = names.effects[: stiff - names.geometric]
     stems = {name.rpartition("_")[0] for name in own if whole}
     return kept.identification(told, scale, stems - {TARGET, "base"}, whole)
+
+
+def lengths_of(names: Names) -> Array:
+    """(p,) True for the lengths of the links."""
+    return np.asarray(np.arange(names.count) < 2 * names.joints)
 
 
 def generic_count(robot: Robot, reference: Stack, x: State, allowed: Array) -> int:

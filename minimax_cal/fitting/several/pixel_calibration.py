@@ -6,23 +6,16 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.accuracy import accuracy
+from minimax_cal.fitting.accuracy import HELD, accuracy
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.fitting.found import Parameter, link_by_link
 from minimax_cal.fitting.options import listed, qp_name
-from minimax_cal.fitting.pixels.camera import FLANGE, read_camera
-from minimax_cal.fitting.pixels.data import PixelData, read_pixels
-from minimax_cal.fitting.pixels.determined import (
-    Determined,
-    determined,
-    judged_pixels,
-    metre_of,
-    placed,
-)
-from minimax_cal.fitting.pixels.fit import PixelFit
+from minimax_cal.fitting.pixels.determined import Determined, counting, determined, metre_of, placed
+from minimax_cal.fitting.pixels.drawing import Scale
+from minimax_cal.fitting.pixels.fit import PixelFit, PixelSquares
 from minimax_cal.fitting.pixels.judge import (
     Claim,
     Uncertainty,
@@ -30,16 +23,19 @@ from minimax_cal.fitting.pixels.judge import (
     drawn_sigma,
     position_sigma,
 )
-from minimax_cal.fitting.pixels.model import Scene, units_of
 from minimax_cal.fitting.pixels.options import PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import contradiction, file_notices, outlier_notices
+from minimax_cal.fitting.several.fit import parameters_of
 from minimax_cal.fitting.several.identify import Alone
+from minimax_cal.fitting.several.kinds import by_key
 from minimax_cal.fitting.several.pixel_result import PIXELS, PixelCalibration
 from minimax_cal.fitting.several.result import InstrumentResult, Measured
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.ground.threads import one_thread
+from minimax_cal.instruments.camera import FLANGE, read_camera
+from minimax_cal.instruments.pixels import PixelData, read_pixels
 from minimax_cal.measuring.checks import check_joints, limit_notices
 from minimax_cal.measuring.measurements import TOOL, SetAside
 from minimax_cal.robots.robot import Robot, load_robot
@@ -120,23 +116,27 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
     fit, sure, scale = one.fit, one.sure, one.scale
     if options.drawn_prior:
         fit, sure = one.drawing.beside(fit, sure)
-    seen = judged_pixels(robot, data, held, fit)
-    arm = robot.with_mdh(fit.scene.mdh[0])
+    counts, wrong = counting(robot, data, held, fit)
+    errors, pixels, whole = left_by(fit, fit.everywhere(robot, data), held, counts, wrong)
+    arm = robot.with_mdh(fit.state.mdh)
     claim = claimed(robot, arm, sure, one.drawing.share)
     reason, status = contradiction(robot, train, fit, scale, options), fit.found.status[0]
     told = () if reason else file_notices(train, fit, scale)
     if reason:
         status = Status.FAILED
     elif (
-        fit.active[: 5 * robot.joints].any() and not claim.is_better and status is not Status.FAILED
+        fit.problem.active[: 5 * robot.joints].any()
+        and not claim.is_better
+        and status is not Status.FAILED
     ):
         status, reason = Status.NO_BETTER, kept_because(claim)
-    numbers = {key: 2 * sum(accuracy(error).counts) for key, error in seen.errors.items()}
+    numbers = {key: 2 * sum(accuracy(error).counts) for key, error in errors.items()}
     measured = Measured(
-        kind=PIXELS, parts=data.parts, errors=seen.errors, numbers=numbers, turns={},
-        instrument=placed(data, fit, scale),
+        kind=PIXELS, parts=data.parts, errors=errors, numbers=numbers, turns={},
+        instrument=placed(fit.images, fit.state.effects, fit) | of_scale(scale),
     )  # fmt: skip
-    at, noise = replace(data.at, source=data.source, digest=data.digest), metre_of(fit) * fit.noise
+    at = replace(data.at, source=data.source, digest=data.digest)
+    noise, aside = metre_of(fit) * fit.noise_px, np.flatnonzero(wrong)
     return PixelCalibration(
         **vars(measured),
         robot=robot if status is Status.NO_BETTER else arm,
@@ -144,26 +144,50 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
         status=status,
         iterations=int(fit.found.iterations[0]),
         seconds=time.perf_counter() - began,
-        parameters=parameters_of(robot, fit, sure.covariance),
+        parameters=parameters_of(robot, replace(fit, covariance=sure.covariance)),
         instruments=(InstrumentResult.of(PIXELS, measured, at, held, noise, Alone(0, ())),),
         identification=fit.identification,
         position_sigma=claim.sigma,
         beyond=(),
         notices=(
             *data.notices, *limit_notices(robot, data.at), *one.notices, *notices_of(fit, held),
-            *told, *outlier_notices(data, seen.aside),
+            *told, *outlier_notices(data, aside),
         ),
         provenance=Provenance.of(robot, at, options.settings()),
         calibrated=arm,
-        pixels=seen.pixels,
+        pixels=pixels,
         claim=claim,
-        set_aside=set_aside(data, seen.aside),
-        with_them=accuracy(seen.whole) if len(seen.aside) else None,
+        set_aside=set_aside(data, aside),
+        with_them=accuracy(whole) if len(aside) else None,
         reason=reason,
         objective=options.objective,
         qp=qp_name(options.qp) if one.worst else "",
         worst=one.worst,
     )  # fmt: skip
+
+
+def left_by(
+    fit: PixelFit, every: PixelSquares, held: Array, counts: Array, wrong: Array
+) -> tuple[dict[str, Array], dict[str, tuple[float, float]], Array]:
+    """Errors (parts, m, 3) by key [m], RMS and largest pixel by key [px], held out with all pixels.
+
+    every: pixels of all poses.  counts, wrong: (N,) as `counting` has them.  held: (m,).
+    """
+    images, later = every.images, held[every.images.pixels.pose]
+    arms = every.at(fit.nominal), every.at(fit.state)
+    before, after = (images.table(*arm, counts) for arm in arms)
+    drawn, found = (np.linalg.norm(images.off(*arm), axis=0) for arm in arms)
+    pixels = {}
+    for key, is_held in HELD.items():
+        size = (drawn if key.startswith("nominal") else found)[counts & (later == is_held)]
+        pixels[key] = (rms(size), float(size.max())) if size.size else (np.nan, np.nan)
+    whole = images.table(*arms[1], counts | wrong)[:, held]
+    return by_key(before, after, held), pixels, whole
+
+
+def of_scale(scale: Scale | None) -> dict[str, Any]:
+    """For JSON."""
+    return {"lengths_over_drawn": {"share": scale.share, "sigma": scale.sigma}} if scale else {}
 
 
 def claimed(robot: Robot, arm: Robot, sure: Uncertainty, share: float) -> Claim:
@@ -191,25 +215,10 @@ def kept_because(claim: Claim) -> str:
     )
 
 
-def parameters_of(robot: Robot, fit: PixelFit, covariance: Array) -> tuple[Parameter, ...]:
-    """Every parameter, link by link; then cameras, targets and lenses."""
-    names, base = fit.model.names, np.zeros(6)
-
-    def told(x: Scene) -> Array:
-        mdh = robot.notation.told(x.mdh[0], robot.prismatic)
-        return np.concatenate([mdh.T.reshape(-1), base, x.values()])
-
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    every = link_by_link(
-        names, units_of(names), told(fit.nominal), told(fit.scene), sigma, fit.identification
-    )
-    return tuple(p for p in every if not p.name.startswith("base_"))
-
-
 def notices_of(fit: PixelFit, held: Array) -> list[str]:
     """What the reader should know: the scale, the lenses, nothing held out."""
     out = []
-    on = FLANGE if fit.model.on_flange else "ground"
+    on = FLANGE if fit.images.on_flange else "ground"
     out.append(f"the cameras are taken as fixed to the {on}")
     if fit.by_drawing:
         out.append(

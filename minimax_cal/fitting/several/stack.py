@@ -24,7 +24,7 @@ from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.parameters import BASE_NAMES, Names, State
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares
-from minimax_cal.solvers.least_squares import METHODS, Limits
+from minimax_cal.solvers.least_squares import METHODS, Limits, solve_normal
 
 SCREENED = Limits(step=1e-6)  # tells one start from another; the best is refined
 
@@ -200,6 +200,12 @@ class Stack:
         """(k,) of the laws."""
         return x.effects[..., self.lawless - self.names.geometric :]
 
+    def read_out(self, x: State) -> State:
+        """A state as people are told it."""
+        parts = (self.part(x, i) for i in range(len(self.blocks)))
+        own = [b.instrument.read_out(b.own(at)) for b, at in zip(self.blocks, parts, strict=True)]
+        return replace(x, effects=np.concatenate([*own, self.values(x)]))
+
     def scenes(self, robot: Robot, x: State) -> list[Scene]:
         """What laws look at, block by block, with the geometry of a state and the targets."""
         parts = [(block, self.part(x, i)) for i, block in enumerate(self.blocks)]
@@ -311,7 +317,7 @@ class Known:
 class Squares:
     """The sum of squared rows over the active parameters, for `solvers.least_squares`.
 
-    Nothing is left to eliminate linearly.  known: of the links and the laws, which counts with the
+    known: of the links and the laws, which counts with the
     weights (p,) where these are given.  room: (k, 2) between which the laws' parameters must lie.
     """
 
@@ -334,7 +340,7 @@ class Squares:
 
     @property
     def linear(self) -> Array:
-        """(free,) False: all parameters count as nonlinear."""
+        """(free,) True for parameters in which the rows are affine: none that would be worth it."""
         return np.zeros(int(self.active.sum()), dtype=bool)
 
     @property
@@ -358,9 +364,14 @@ class Squares:
         return np.asarray(cost), np.asarray(gradient), gram
 
     def reduced(self, x: State, *, full: bool) -> tuple[State, Array, Array, Array, Array]:
-        """The same: there is nothing to eliminate."""
-        cost, gradient, gram = self.normal(x)
-        return x, cost, gradient, gram, np.zeros((len(cost), 0, gradient.shape[-1]))
+        """The states with their best linear parameters; Kaufman's variant, without coupling."""
+        r, normal = self.linear, self.normal(x)
+        if r.any():
+            move = np.zeros(normal[1].shape)
+            move[:, r] = solve_normal(normal[2][:, r][:, :, r], normal[1][:, r, None])[..., 0]
+            x = self.step(x, move)
+            normal = self.normal(x)
+        return x, *normal, np.zeros((len(normal[0]), int(r.sum()), int((~r).sum())))
 
     def step(self, x: State, dx: Array) -> State:
         """The states moved by a step in the active parameters."""

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.fitting.pixels.camera import Camera
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.words import name_first
+from minimax_cal.instruments.camera import Camera
 from minimax_cal.measuring.measurements import Measurements, joint_rows
 from minimax_cal.reading.rows import Rows, read_rows
 
@@ -25,6 +26,7 @@ MOST_PIXELS = 1e5  # no sensor has more in a row
 LEAST_SEEN = 2  # pixels of a target of unknown place: fewer say nothing
 LEAST_IMAGES = 4  # with fewer a camera's place says nothing of the arm
 SAME_PLACE = 1e-7  # no two corners are nearer [m]
+MOST_NAMED = 5  # poses or targets that a notice names
 LARGEST_BOARD = 100.0  # half its side [m]
 
 
@@ -249,9 +251,8 @@ def checked(data: PixelData) -> PixelData:
             )
     blind = np.setdiff1d(np.arange(data.at.poses), data.pose)
     if len(blind):
-        named = ", ".join(data.labels[i] for i in blind[:5])
-        more = f" and {len(blind) - 5} more" if len(blind) > 5 else ""
-        notice = f"{data.source}: no detections at {len(blind)} poses: {named}{more}"
+        named = name_first([data.labels[i] for i in blind], MOST_NAMED)
+        notice = f"{data.source}: no detections at {len(blind)} poses: {named}"
         data = replace(data, notices=(*data.notices, notice))
     return data
 
@@ -272,7 +273,7 @@ def without_single(data: PixelData) -> PixelData:
     kept = often >= LEAST_SEEN
     place = np.cumsum(kept) - 1
     some = data.some(kept[data.target])
-    named = ", ".join(gone[:5]) + (f" and {len(gone) - 5} more" if len(gone) > 5 else "")
+    named = name_first(gone, MOST_NAMED)
     return replace(
         some,
         target=place[some.target],
