@@ -103,6 +103,9 @@ def calibrate_command(
     if files.given or not isinstance(given, Measurements):
         refuse(("replicates", "in_rows", "without"), "is for points of a tracker")
         refuse(CAMERAS - OPTIONS, "is for pixels alone")
+        if asked["objective"] != "sum":
+            what = "is for points of a tracker, or pixels alone; minimax-cal relative has one, too"
+            refuse(("objective",), what)
         every = given if isinstance(given, list) else [given]
         return together(calibrate, robot, every, files, to, asked)
     with work(brief=replicates is None and given.poses <= BRIEF), to.stages() as progress:

@@ -513,10 +513,6 @@ def together(
     from minimax_cal.fitting.pixels.beside import detected
 
     to.undrawn()
-    if "objective" in on_command_line() and chosen.get("objective", "sum") != "sum":
-        raise OptionError(
-            "objective= is for points of a tracker, or for pixels alone: leave it out"
-        )
     seen = [detected(*files.paths())] if files.given else []
     found = to.work(verb, robot, [*data, *seen], **chosen)
     return to.finish(found, status=found.status)

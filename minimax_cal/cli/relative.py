@@ -35,7 +35,7 @@ CAMERAS = ("camera_on", "fix_camera", "camera_prior")
 @options_from(RelativeOptions)
 @options_from(PixelFiles)
 @options_from(PixelOptions, *CAMERAS)
-@options_from(Options, "method")
+@options_from(Options, "qp", "method")
 @plain_option(
     "What is sought",
     "--diagnose",
@@ -66,6 +66,8 @@ def relative_command(
     if diagnose:
         from minimax_cal.diagnosing.instruments import diagnose_relative
 
+        if chosen["objective"] != "sum":
+            raise OptionError("a diagnosis is by objective=sum: leave --objective out")
         verb = partial(diagnose_relative, exclude=exclude)
     files = record_of(PixelFiles, chosen)
     if not files.given:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import SHARED, shared
 from numpy.testing import assert_allclose
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
@@ -31,7 +31,8 @@ from experiments.relative import (
 )
 from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.several import RelativeCalibration, relative
-from minimax_cal.fitting.several.options import RelativeOptions
+from minimax_cal.fitting.several.fit import Train, fit_instruments
+from minimax_cal.fitting.several.options import RelativeOptions, silent
 from minimax_cal.fitting.several.stack import Block, Stack, own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments import (
@@ -480,6 +481,9 @@ def test_fix_and_free():
         ("wires_3", {"holdout": 1.0}, "not a fraction"),
         ("wires_3", {"seed": -1}, "seed -1"),
         ("wires_3", {"method": "newton"}, "no method 'newton'"),
+        ("wires_3", {"objective": "point"}, "no objective 'point'; choose sum or minimax"),
+        ("wires_3", {"objective": "minimax", "effects": ["tool_flex"]}, "objective='sum'"),
+        ("wires_3", {"objective": "minimax", "qp": "none"}, "none"),
         ("wires_3", {"resolution": 1.0}, "resolution"),
         ("wires_3", {"fix": ["a9"]}, "no parameter called 'a9'"),
         ("wires_3", {"fix": ["a2"], "free": ["a2"]}, "a2 is both fixed and freed"),
@@ -809,3 +813,62 @@ def test_one_reflector_on_the_last_axis_does_not_speak_for_the_tool(name, on_axi
     left = least_squares(missed, np.append(np.zeros(6), other)).fun.reshape(-1, 3)
     off_mm = rms_mm(np.linalg.norm(left, axis=1))
     assert bool(said) == on_axis == (off_mm > 3.0 * fit.accuracy["holdout"].rms_mm)
+
+
+# ---- minimax -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kinds", [("wires_4",), ("ball_bar",), ("wires_3", "poses")])
+def test_the_worst_part_is_as_good_as_slsqp_makes_it(kinds: tuple[str, ...]) -> None:
+    """By another solver over the same parameters; of several files in units of their noises."""
+    every = [measured("irb2600", kind, 1, NOISE) for kind in kinds]
+    robot, given = every[0][0].robot, [seen.data for _, seen in every]
+    found = relative(robot, given, objective="minimax")
+    options = RelativeOptions()
+    trains = [Train(str(i), data.take(~data.held_back(options)[0])) for i, data in enumerate(given)]
+    fit = fit_instruments(robot, trains, options, silent)
+    problem, start = fit.problem, fit.state
+    rows = [
+        block.read(problem.stack.part(start, i)) for i, block in enumerate(problem.stack.blocks)
+    ]
+    label = np.concatenate([
+        10 * i + (each.part if len(each.part) and each.part.max() < 4 and kind != "poses" else
+                  np.zeros(len(each.residual), dtype=int))
+        for i, (kind, each) in enumerate(zip(kinds, rows, strict=True))
+    ])  # fmt: skip
+    label = np.unique(label, return_inverse=True)[1].reshape(-1)
+    slopes = problem.stack.rows(start, problem.active)[1]
+    size = np.linalg.norm(slopes, axis=1) / NOISE
+
+    def squares(x: Array) -> Array:
+        at = problem.step(start, x[:-1] / size)
+        error, _ = problem.stack.rows(at, np.zeros_like(problem.active))
+        return np.bincount(label, (error / NOISE) ** 2) / np.bincount(label)
+
+    first = np.append(np.zeros(len(size)), squares(np.zeros(len(size) + 1)).max())
+    slope = np.append(np.zeros(len(size)), 1.0)
+    theirs = minimize(
+        lambda x: x[-1], first, jac=lambda x: slope, method="SLSQP",
+        constraints={"type": "ineq", "fun": lambda x: x[-1] - squares(x)},
+        options={"maxiter": 200, "ftol": 1e-12},
+    )  # fmt: skip
+    reached = squares(theirs.x).max()
+    assert found.worst is not None
+    assert len(found.worst.functions) == label.max() + 1
+    ours = found.worst.size**2
+    if len(kinds) == 1:
+        assert ours.max() == pytest.approx(NOISE**2 * reached, rel=1e-3)
+    assert_allclose(found.worst.multiplier.sum(), 1.0)
+    assert found.worst.kkt.residual <= 1e-6
+    assert found.worst.size.max() <= found.worst.before * (1.0 + 1e-9) or len(kinds) > 1
+    assert sum(found.worst.answered.values()) >= 1
+    again = RelativeCalibration.from_dict(found.to_dict(), "file")
+    assert again.worst is not None
+    assert again.worst.functions == found.worst.functions
+    assert "what decides the minimax" in found.summary()
+    plain = {p.name: p for p in relative(robot, given).parameters if p.identifiable}
+    assert all(
+        abs(p.value - plain[p.name].value) < 5.0 * p.sigma
+        for p in found.parameters
+        if p.identifiable
+    )

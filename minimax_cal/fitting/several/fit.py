@@ -11,7 +11,7 @@ import numpy as np
 from minimax_cal.fitting.found import Parameter, link_by_link
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.options import freed
-from minimax_cal.fitting.pixels.options import PixelOptions
+from minimax_cal.fitting.pixels.options import SUM, PixelOptions
 from minimax_cal.fitting.several.identify import (
     Alone,
     determined_alone,
@@ -25,6 +25,7 @@ from minimax_cal.fitting.several.options import (
     sigmas_of,
 )
 from minimax_cal.fitting.several.stack import Known, Squares, Stack, started
+from minimax_cal.fitting.several.worst import Worst, least_worst
 from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS, without_resting
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
@@ -36,6 +37,7 @@ from minimax_cal.modelling.rows import MIN_COMPUTED_NOISE
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import LeastSquares, method_of, solve_normal
+from minimax_cal.solvers.status import Status
 
 SETTLED = 0.01  # relative change of the noises that ends their weighing
 
@@ -56,7 +58,8 @@ class InstrumentFit:
     with the instruments fitted to it.  state: the calibrated one.  covariance: (p, p) [SI], NaN
     where not identified.  noise: (b,) sigma of a row of each instrument [m].  trains: what was
     fitted.  alone: what each determines by itself, empty where there is one.  stiff: the fit of
-    geometry alone, where this one has laws besides.
+    geometry alone, where this one has laws besides.  worst: what a minimax rests on, None where
+    the sum was minimised; notices: of it.
     """
 
     problem: Squares
@@ -69,6 +72,8 @@ class InstrumentFit:
     trains: Sequence[Train]
     alone: tuple[Alone, ...]
     stiff: InstrumentFit | None = None
+    worst: Worst | None = None
+    notices: tuple[str, ...] = ()
 
     @property
     def stack(self) -> Stack:
@@ -146,7 +151,40 @@ def fit_instruments(
 
         laws = laws_of(robot, stiff, options.effects)
         fit = replace(beside(beside(stiff, laws), laws), stiff=stiff)  # then for finite turns too
-    return with_alone(robot, fit, options)
+    return with_alone(robot, of_worst(fit, options), options)
+
+
+def of_worst(fit: InstrumentFit, options: RelativeOptions) -> InstrumentFit:
+    """The minimax from a fit of the sum, where the objective asks for one.
+
+    Parts of several files compare by the noises of these, which the sum told.
+    """
+    if options.objective == SUM or fit.found.status[0] is Status.FAILED:
+        return fit
+    stack, problem, every = fit.stack, fit.problem, fit.stack.part_of_rows(fit.state)
+    seen, number = np.unique(every[every >= 0], return_inverse=True)
+    of = every.copy()
+    of[every >= 0] = number.reshape(-1)
+    best, share, notes = least_worst(problem, of, 1, fit.state, options.qp, LEAST_NOISE)
+
+    def sizes(x: State) -> Array:
+        none = np.zeros(stack.names.count, dtype=bool)
+        square = np.concatenate([error for error, _ in stack.rows_by_block(x, none)]) ** 2
+        return np.asarray(
+            np.sqrt(np.bincount(of[of >= 0], square[of >= 0]) / np.bincount(of[of >= 0]))
+        )
+
+    labels = zip(stack.labels, stack.instruments, strict=True)
+    several = len(stack.blocks) > 1
+    names = [f"{label} {part}" if several else part for label, one in labels for part in one.parts]
+    return replace(
+        fit,
+        state=best.x,
+        found=replace(fit.found, status=(best.status,), iterations=np.array([best.iterations])),
+        covariance=covariance_of(problem, best.x, np.square(fit.noise), share),
+        worst=Worst.of([names[i] for i in seen], sizes(fit.state), sizes(best.x), best),
+        notices=notes,
+    )
 
 
 def with_laws(
@@ -302,17 +340,20 @@ def remaining(problem: Squares, x: State) -> tuple[Array, Array]:
     return np.array([float(error @ error) for error in errors]), spare
 
 
-def covariance_of(problem: Squares, x: State, variance: Array) -> Array:
+def covariance_of(problem: Squares, x: State, variance: Array, share: Array | float = 1.0) -> Array:
     """Covariance (p, p) of all parameters at a solution [SI], NaN where not identified.
 
     s^2 H^-1 F H^-1 with H = sum w j j' + P and F = sum w^2 j j' + P over the rows j of weight w and
     the priors P: a known distance weighs much and is no surer than a coordinate.  s^2: of a number
     of the best instrument, to which the others are weighed.  variance: (b,) as `variances` has it.
+    share: (rows,) how much more each counts in the fit than its weight says.
     """
     active, stack = problem.active, problem.stack
     _, jacobians = stack.rows(x, active)
-    inverse = solve_normal(jacobians @ jacobians.T + problem.prior, np.eye(len(jacobians)))
-    middle = (jacobians * stack.weights(x)) @ jacobians.T + problem.prior
+    inverse = solve_normal(
+        (jacobians * share) @ jacobians.T + problem.prior, np.eye(len(jacobians))
+    )
+    middle = (jacobians * stack.weights(x) * np.square(share)) @ jacobians.T + problem.prior
     covariance = np.full((len(active),) * 2, np.nan)
     unit = float((variance * stack.precision).mean())
     covariance[np.ix_(active, active)] = unit * inverse @ middle @ inverse

@@ -15,7 +15,7 @@ from minimax_cal.fitting.accuracy import HELD
 from minimax_cal.fitting.claims import lacking, position_sigma, positions_by
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.opened import listed_effects
-from minimax_cal.fitting.options import listed, priors_of
+from minimax_cal.fitting.options import listed, priors_of, qp_name
 from minimax_cal.fitting.several import fit, plausible
 from minimax_cal.fitting.several.fit import InstrumentFit, Train
 from minimax_cal.fitting.several.identify import Alone
@@ -190,7 +190,7 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
         said
         for data, (_, notes) in zip(every, splits, strict=True)
         for said in (*data.at.notices, *limit_notices(robot, data.at), *notes)
-    ]
+    ] + [*found.notices]
     sources = ", ".join(data.at.source for data in every)
     source = replace(every[0].at, source=sources, digest=" ".join(d.at.digest for d in every))
     geometry = found.stiff or found
@@ -214,6 +214,9 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
         provenance=Provenance.of(robot, source, settings),
         instruments=instruments_of(found, every, splits, measured),
         cell=cell_of(robot, found) if found.stiff else None,
+        objective=options.objective,
+        qp=qp_name(options.qp) if found.worst else "",
+        worst=found.worst,
     )
     return judged(asked, found, measured, result, sigma)
 

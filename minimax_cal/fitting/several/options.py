@@ -9,8 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.options import Options, check_priors, check_resolution, known_within
-from minimax_cal.fitting.pixels.options import PixelOptions
+from minimax_cal.fitting.options import (
+    Options,
+    QpSolver,
+    check_priors,
+    check_resolution,
+    known_within,
+    qp_name,
+)
+from minimax_cal.fitting.pixels.options import SUM, WORST_TARGET, PixelOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.stages import Progress as Progress
@@ -48,9 +55,15 @@ class RelativeOptions(InstrumentOptions):
     5mm.  effects: of the arm beyond geometry, fitted with it, as joint_compliance:all; or a
     diagnosis, of which the confirmed effects are taken.
     camera_on, fix_camera, camera_prior: of pixels, as `calibrate_pixels` takes them.
+    objective: sum, or minimax: the worst part of any file, as a wire or a contact.  qp: backend of
+    its quadratic programs.
     method: of the least squares.  resolution: relative singular value that counts as not measured.
     """
 
+    objective: str = fitted(
+        SUM, "What is minimised: sum, or minimax (the worst wire, contact, target ... of any file)."
+    )
+    qp: QpSolver = Options.qp
     fix: Sequence[str] = ()
     free: Sequence[str] = ()
     noises: Mapping[str, float] = fitted(
@@ -74,7 +87,8 @@ class RelativeOptions(InstrumentOptions):
         told = [list(known) for known in self.known_distances]
         effects = [e.text if isinstance(e, Term) else e for e in self.effects]
         return {**vars(self), "known_distances": told, "priors": dict(self.priors),
-                "noises": dict(self.noises), "effects": effects}  # fmt: skip
+                "noises": dict(self.noises), "effects": effects,
+                "qp": qp_name(self.qp)}  # fmt: skip
 
 
 def read_noises(noises: Mapping[str, float | str]) -> dict[str, float]:
@@ -106,6 +120,10 @@ def check_options(every: Sequence[Instrument], options: RelativeOptions) -> None
     if options.method not in (AUTO, *METHODS):
         raise OptionError(f"no method {options.method!r}; choose {', '.join((AUTO, *METHODS))}")
     check_resolution(options.resolution)
+    if options.objective not in (SUM, WORST_TARGET):
+        raise OptionError(f"no objective {options.objective!r}; choose {SUM} or {WORST_TARGET}")
+    if options.objective == WORST_TARGET and options.effects:
+        raise OptionError("effects= of other instruments are fitted by objective='sum': give one")
     default = RelativeOptions()
     for found in map(instrument, INSTRUMENTS):
         mine = [data for data in every if data.kind == found.kind]
@@ -148,9 +166,9 @@ def with_others(
 ) -> RelativeOptions:
     """What is chosen of a verb for trackers, and of other instruments, which are given.
 
-    Raises OptionError for what they do not know.  All have the objective sum.
+    Raises OptionError for what they do not know.  All have the objective sum: `relative` has more.
     """
-    default, known = type(options)(), {one.name for one in fields(RelativeOptions)}
+    default, known = type(options)(), {one.name for one in fields(RelativeOptions)} - {"objective"}
     chosen = {one.name: getattr(options, one.name) for one in fields(options)}
     for name, value in chosen.items():
         is_sum = name == "objective" and value == "sum"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from minimax_cal.fitting.accuracy import NO_ENDS, Accuracy
@@ -14,7 +14,6 @@ from minimax_cal.fitting.pixels.judge import Claim
 from minimax_cal.fitting.pixels.worst import WorstPixels
 from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.ground.facts import APART, Fact
-from minimax_cal.ground.records import as_kind
 from minimax_cal.ground.results import merged
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import capitalise
@@ -116,11 +115,9 @@ class PixelCalibration(RelativeCalibration):
     ) -> dict[str, Any]:
         """As `RelativeCalibration`, and what pixels tell besides."""
         own = super().told_beside(content, told, source)
-        worst, stated = told.get("worst"), own["stated"]
-        answered = as_kind(Mapping[str, int], content.get("answered", {}), Fact(), "answered")
+        stated = own["stated"]
         calibrated = robot_from_dict(content["calibrated_robot"], f"{source}: calibrated_robot")
         return own | {
             "calibrated": calibrated,
             "pixels": {key: (each.rms_px, each.max_px) for key, each in stated.items()},
-            "worst": replace(worst, answered=answered) if worst else None,
         }

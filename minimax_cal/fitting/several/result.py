@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -24,6 +24,7 @@ from minimax_cal.fitting.found import Parameter, parameter_table, table_of_effec
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.fitting.several.identify import Alone
+from minimax_cal.fitting.several.worst import Worst
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.facts import APART, Fact, Mm, derived, in_file, scaled
 from minimax_cal.ground.files import plain
@@ -236,7 +237,7 @@ class RelativeCalibration(Measured, Result):
     measurements do not determine.
     beyond: parameters that whole poses tell and one reflector does not.  instruments: each file.
     cell: the arm with its effects, fitted together; None without any.  robot is then of a fit
-    without them.
+    without them.  worst: what a minimax rests on, None where there was none.
     """
 
     KIND = RELATIVE
@@ -259,6 +260,7 @@ class RelativeCalibration(Measured, Result):
     qp: str = ""
     set_aside: tuple[SetAside, ...] = ()
     reason: str = ""
+    worst: Annotated[Worst | None, Fact(key="minimax")] = None
     cell: Annotated[Cell | None, APART] = None
 
     @derived()
@@ -309,6 +311,7 @@ class RelativeCalibration(Measured, Result):
         if self.kind != SEVERAL:
             first = (self.accuracy_table(), *first[1:], self.parts_table(f"by {self.words.part}"))
         every = [*first, *tables_of(self.frames)]
+        every += [self.worst.table()] if self.worst else []
         for one in self.instruments if self.kind == SEVERAL else ():
             every += [one.scores(f"{one.name}: {one.words.quantity}"), *tables_of(one.frames),
                       one.parts_table(f"{one.name}, by {one.words.part}")]  # fmt: skip
@@ -339,6 +342,7 @@ class RelativeCalibration(Measured, Result):
             f"{self.identification.condition:.3g}); {self.status} after {self.iterations} "
             f"iterations, {self.seconds:.2f} s."
         )
+        text += f" {self.worst.sentence()}" if self.worst else ""
         return text + (f" {self.status.advice}." if self.status.advice else "")
 
     def summary(self, width: int = 110) -> str:
@@ -347,7 +351,9 @@ class RelativeCalibration(Measured, Result):
 
     def beside(self, *, poses: bool = True) -> dict[str, Any]:
         """The accuracies, and the arm with its effects."""
-        return self.measured_beside() | ({"cell": self.cell.whole()} if self.cell else {})
+        answered = {"answered": self.worst.answered} if self.worst else {}
+        cell = {"cell": self.cell.whole()} if self.cell else {}
+        return self.measured_beside() | cell | answered
 
     @classmethod
     def told_beside(
@@ -361,9 +367,11 @@ class RelativeCalibration(Measured, Result):
                 _ = each.frames
         known = np.array([p.identifiable for p in told["parameters"]])
         condition = as_kind(float, content.get("condition"), Fact(), "condition")
-        whole = content.get("cell")
+        whole, worst = content.get("cell"), told.get("worst")
+        answered = as_kind(Mapping[str, int], content.get("answered", {}), Fact(), "answered")
         return {
             **cls.fields_of(content, ""),
+            "worst": replace(worst, answered=answered) if worst else None,
             "identification": Stated(known, {}, np.zeros(0), np.zeros(0), condition),
             "cell": cell_from_dict(whole, f"{source}: cell") if whole else None,
         }

@@ -250,6 +250,18 @@ class Stack:
         )
         return errors, jacobians
 
+    def part_of_rows(self, x: State) -> Array:
+        """(rows,) which of all parts each is of, block by block; -2 of rows that are of several."""
+        out, first = [], 0
+        for i, block in enumerate(self.blocks):
+            rows = block.read(self.part(x, i))
+            own, count = np.zeros(len(rows.residual), dtype=int), len(block.instrument.parts)
+            if len(rows.part) and count > 1:  # corners of one pose are no parts of it
+                own = rows.part
+            out += [first + own, np.full(len(rows.short), -2)]
+            first += count
+        return np.concatenate(out)
+
     def weights(self, x: State) -> Array:
         """(rows,) how much more each weighs than its noise says."""
         every = (block.read(self.part(x, i)) for i, block in enumerate(self.blocks))
