@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from experiments.simulator_gap import robot_called
-from minimax_cal.dynamics.run import TORQUE, Run
+from minimax_cal.dynamics.logs.table import TORQUE, Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.gravity import tubes
 from minimax_cal.robots.mjcf import mujoco, numbers

@@ -19,11 +19,22 @@ from minimax_cal.dynamics.budget import (
     steps_of,
     without_harmful,
 )
-from minimax_cal.dynamics.given import MotionKnown, runs_of
+from minimax_cal.dynamics.given import LEAST_SCALE, MOST_SCALE, MotionKnown, runs_of
 from minimax_cal.dynamics.laws import ANGLE, CURVE, LAWS, USUAL, Term, terms_of
 from minimax_cal.dynamics.links import LinkChange, body_as_given, carried, weighing
-from minimax_cal.dynamics.logs.with_robot import LEAST_SCALE, MOST_SCALE
-from minimax_cal.dynamics.model import Body, Normal, TorqueModel, first_body
+from minimax_cal.dynamics.logs.table import CURRENT, Run
+from minimax_cal.dynamics.model import (
+    FRICTION,
+    RIGID,
+    Body,
+    Columns,
+    Normal,
+    TorqueModel,
+    dictionary_of,
+    first_body,
+    generous,
+    softened,
+)
 from minimax_cal.dynamics.probes import Unexplained, unexplained
 from minimax_cal.dynamics.result import (
     Alternative,
@@ -37,11 +48,7 @@ from minimax_cal.dynamics.result import (
     best_worth,
     worth_by_joint,
 )
-from minimax_cal.dynamics.rows import ROW_HZ, Logs, prepare, whitening
-from minimax_cal.dynamics.run import CURRENT, Run
-from minimax_cal.dynamics.scene import Arm, Scene, sense_of
-from minimax_cal.dynamics.search import FRICTION, RIGID, Columns, dictionary_of, generous
-from minimax_cal.dynamics.softness import softened
+from minimax_cal.dynamics.rows import ROW_HZ, Arm, Logs, Scene, prepare, sense_of, whitening
 from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import LEVEL, MINOR
 from minimax_cal.evidence.selection import Choice, select

@@ -17,10 +17,9 @@ from typing import Any, cast
 import numpy as np
 import scipy
 
+from minimax_cal.dynamics.logs.table import NOTHING, Run
 from minimax_cal.dynamics.regressor import Motion
-from minimax_cal.dynamics.rows import SLOWEST, UNFITTED_S, Logs, prepare
-from minimax_cal.dynamics.run import NOTHING, Run
-from minimax_cal.dynamics.scene import Arm, sense_of
+from minimax_cal.dynamics.rows import SLOWEST, UNFITTED_S, Arm, Logs, prepare, sense_of
 from minimax_cal.ground.arrays import Array
 
 LATEST, LOOK = 0.1, 0.004  # the latest command that is looked for, and how closely [s]

@@ -16,8 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from minimax_cal.dynamics.regressor import PER_LINK
-from minimax_cal.dynamics.rows import CUTOFF_HZ
-from minimax_cal.dynamics.scene import Scene, sense_of
+from minimax_cal.dynamics.rows import CUTOFF_HZ, Scene, sense_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Table

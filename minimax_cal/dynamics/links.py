@@ -12,10 +12,9 @@ from scipy.special import fdtrc
 
 from minimax_cal.dynamics.budget import parts_of
 from minimax_cal.dynamics.laws import Term
-from minimax_cal.dynamics.model import Normal
+from minimax_cal.dynamics.model import FRICTION, Columns, Normal, generous, one_of_each
 from minimax_cal.dynamics.regressor import PER_LINK
 from minimax_cal.dynamics.rows import whitening
-from minimax_cal.dynamics.search import FRICTION, Columns, generous, one_of_each
 from minimax_cal.evidence.noise import inflation, orthonormal
 from minimax_cal.ground.arrays import Array
 

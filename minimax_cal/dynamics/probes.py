@@ -15,8 +15,7 @@ import numpy as np
 from scipy.special import stdtr
 
 from minimax_cal.dynamics.model import Normal
-from minimax_cal.dynamics.rows import CUTOFF_HZ, FILTER_ORDER, SAMPLE_HZ
-from minimax_cal.dynamics.scene import Scene
+from minimax_cal.dynamics.rows import CUTOFF_HZ, FILTER_ORDER, SAMPLE_HZ, Scene
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
 

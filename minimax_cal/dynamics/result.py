@@ -14,7 +14,7 @@ from minimax_cal.dynamics.laws import USUAL, WORDS
 from minimax_cal.dynamics.model import TorqueModel
 from minimax_cal.dynamics.probes import Unexplained
 from minimax_cal.dynamics.regressor import PER_LINK
-from minimax_cal.dynamics.scene import YIELD, Arm
+from minimax_cal.dynamics.rows import YIELD, Arm
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import APART, Fact
 from minimax_cal.ground.records import stored

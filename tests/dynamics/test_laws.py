@@ -10,10 +10,9 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.dynamics.laws import LAWS, MODULE, QUANTITIES, WORDS, Law, Tuned, laws_table
-from minimax_cal.dynamics.rows import prepare
-from minimax_cal.dynamics.scene import Arm, Scene, sense_of
+from minimax_cal.dynamics.rows import Arm, Scene, prepare, sense_of
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.simulators.motion.module import laws_text
+from minimax_cal.simulators.motion.judge import laws_text
 
 DOCS = Path(__file__).parents[2] / "docs" / "torques.md"
 WAVE = Law(

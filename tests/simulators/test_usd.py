@@ -10,10 +10,8 @@ usd = pytest.importorskip("mujoco_usd_converter", reason="needs mujoco-usd-conve
 
 from pxr import Gf, Usd, UsdPhysics  # noqa: E402
 
-from minimax_cal.simulators.motion.bodies import Bodies  # noqa: E402
-from minimax_cal.simulators.motion.numbers import given_numbers, has_powers  # noqa: E402
-from minimax_cal.simulators.motion.opened import open_model  # noqa: E402
-from minimax_cal.simulators.motion.written import write_numbers  # noqa: E402
+from minimax_cal.simulators.motion.numbers import Bodies, given_numbers, has_powers  # noqa: E402
+from minimax_cal.simulators.motion.written import open_model, write_numbers  # noqa: E402
 
 
 def test_what_usd_holds_of_a_written_model(tmp_path):

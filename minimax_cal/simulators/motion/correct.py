@@ -35,14 +35,17 @@ from minimax_cal.dynamics.result import (
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress
 from minimax_cal.robots.mjcf import is_driven
-from minimax_cal.simulators.motion.bristles import fit_bristles
-from minimax_cal.simulators.motion.fit import Asked, Study, fit_numbers
-from minimax_cal.simulators.motion.judge import Judge, Missed
-from minimax_cal.simulators.motion.module import installed, module_text
+from minimax_cal.simulators.motion.fit import Asked, Study, fit_bristles, fit_numbers
+from minimax_cal.simulators.motion.judge import Judge, Missed, installed, module_text
 from minimax_cal.simulators.motion.numbers import POWERS, Numbers, has_powers
-from minimax_cal.simulators.motion.opened import Opened
-from minimax_cal.simulators.motion.result import MotionRung, WrittenElement
-from minimax_cal.simulators.motion.written import SHORTEST, stiffen, unwritten, write_numbers
+from minimax_cal.simulators.motion.written import (
+    SHORTEST,
+    Opened,
+    stiffen,
+    unwritten,
+    write_numbers,
+)
+from minimax_cal.simulators.result import MotionRung, WrittenElement
 
 ATTRIBUTES = {  # of the elements, in the order in which they are shown
     FRICTION: "frictionloss, damping",

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -23,15 +24,20 @@ from minimax_cal.dynamics.laws import (
     SPRINGS,
     Term,
 )
+from minimax_cal.dynamics.model import Columns, generous, held_friction, solve_scaled
 from minimax_cal.dynamics.regressor import PER_LINK
-from minimax_cal.dynamics.rows import Logs, Whitening, whitening
-from minimax_cal.dynamics.scene import Arm, Scene
-from minimax_cal.dynamics.search import Columns, generous, solve_scaled
+from minimax_cal.dynamics.rows import YIELD, Arm, Logs, Scene, Whitening, whitening
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.simulators.chain import Chain
-from minimax_cal.simulators.motion.bodies import Bodies, inertial, physical
-from minimax_cal.simulators.motion.numbers import POWERS, Numbers, given_numbers
+from minimax_cal.simulators.motion.numbers import (
+    POWERS,
+    Bodies,
+    Numbers,
+    given_numbers,
+    inertial,
+    physical,
+)
 
 PRIOR = 0.5  # standard deviation of a body's log-Cholesky coordinates about the model's
 PRIOR_ASSUMED = 1.5  # the same where the masses of the model are assumed
@@ -76,14 +82,17 @@ class Asked:
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """A number of one joint.  rows: (M,) torque of the log per unit.  low: its least value.
+    """A number of one joint.  rows: (M,) torque of the log per unit.
 
-    mean, sd: of its prior, sd infinite for none.
+    field, at, by: what it adds to of `Numbers`, there, per unit.  low: its least value.  mean, sd:
+    of its prior, sd infinite for none.
     """
 
-    kind: str
+    field: str
     joint: int
     rows: Array
+    at: Any
+    by: Array | float = 1.0
     low: float = 0.0
     mean: float = 0.0
     sd: float = np.inf
@@ -180,26 +189,26 @@ def columns_of(study: Study, scene: Scene, asked: Asked) -> Iterator[Column]:
     for j in range(given.joints):
         qd, qdd = motion.qd[:, j], motion.qdd[:, j]
         if FRICTION in asked.elements:
-            yield Column("friction", j, scene.sense[:, j] / unit[j])
-            yield Column("damping", j, qd / unit[j])
+            yield Column("friction", j, scene.sense[:, j] / unit[j], j)
+            yield Column("damping", j, qd / unit[j], (j, 0))
         if LEVELLED in asked.elements and j in asked.curved:
             for share in LEVELS_OFF:
                 powers = levelling(share * scene.arm.fastest[j])
-                yield Column(f"curve {share}", j, speeds(qd) @ powers / unit[j])
+                yield Column("damping", j, speeds(qd) @ powers / unit[j], j, powers)
         if ARMATURE in asked.elements:
             whole = unit[j] * np.abs(scene.logs.torque[:, j]).max() / np.abs(qdd).max()
             doubt = max(given.armature[j], ROTOR * study.inertia[j], ROTOR * whole)
-            yield Column("armature", j, qdd / unit[j], mean=given.armature[j], sd=doubt)
+            yield Column("armature", j, qdd / unit[j], j, mean=given.armature[j], sd=doubt)
         if SPRINGS in asked.elements and j in asked.sprung:
             for power in range(asked.bent + 1):
-                yield Column(f"spring {power}", j, motion.q[:, j] ** power / unit[j], -np.inf)
+                rows = motion.q[:, j] ** power / unit[j]
+                yield Column("spring", j, rows, (j, power), low=-np.inf)
         if GAIN in asked.elements and j in asked.geared:
-            yield Column("gain", j, scene.load[:, j], -np.inf)
+            yield Column("gain", j, scene.load[:, j], j, low=-np.inf)
     for number, term in enumerate(asked.laws):
-        rows = term.columns(scene)
         low = 0.0 if term.law.nonnegative else -np.inf
-        for k in range(rows.shape[1]):
-            yield Column(f"law {number} {k}", term.joint, rows[:, k], low)
+        for rows in term.columns(scene).T:
+            yield Column("law", term.joint, rows, number, low=low)
 
 
 def speeds(qd: Array) -> Array:
@@ -212,21 +221,28 @@ def levelling(speed: float) -> Array:
     return np.array([1.0, -1.0 / speed, 1.0 / (3.0 * speed**2)])
 
 
+def kept_numbers(study: Study, asked: Asked) -> Numbers:
+    """The model's own numbers, 0 where they are fitted."""
+    given, fitted = study.given, asked.elements
+    own, free = FRICTION not in fitted, list(asked.sprung if SPRINGS in fitted else ())
+    stiffness = given.stiffness.copy()
+    stiffness[free] = 0.0
+    return given.put(
+        friction=given.friction * own,
+        damping=given.damping * own,
+        bristles=given.bristles * own,
+        armature=given.armature * (ARMATURE not in fitted),
+        stiffness=stiffness,
+    )
+
+
 def standing(study: Study, asked: Asked) -> Array:
     """(M, n) torque of what the model has and is not fitted [N m]."""
-    given, motion = study.given, study.scene.logs.motion
-    out = np.zeros_like(motion.q)
-    if FRICTION not in asked.elements:
-        out += given.friction * study.scene.sense
-        out += np.einsum("mjp,jp->mj", speeds(motion.qd), given.damping)
-    if ARMATURE not in asked.elements:
-        out += given.armature * motion.qdd
-    x = motion.q - given.rest
-    springs = sum(given.stiffness[:, p] * x ** (p + 1) for p in range(POWERS))
-    free = [j for j in range(given.joints) if SPRINGS in asked.elements and j in asked.sprung]
-    springs = np.array(springs)
-    springs[:, free] = 0.0
-    return np.asarray(out + springs)
+    own, motion = kept_numbers(study, asked), study.scene.logs.motion
+    out = own.friction * study.scene.sense + own.armature * motion.qdd
+    out += np.einsum("mjp,jp->mj", speeds(motion.qd), own.damping)
+    x = motion.q - own.rest
+    return np.asarray(sum((own.stiffness[:, p] * x ** (p + 1) for p in range(POWERS)), out))
 
 
 def solved(
@@ -344,45 +360,26 @@ def numbers_of(
     before: Numbers,
 ) -> Numbers:
     """What was fitted, and the model's own for the rest; all at the joints."""
-    given, n = study.given, study.given.joints
-    friction, damping = given.friction.copy(), given.damping.copy()
-    armature, gain = given.armature.copy(), np.ones(n)
-    spring = np.zeros((n, POWERS))
-    if FRICTION in asked.elements:
-        friction[:], damping[:] = 0.0, 0.0
-    laws: list[list[float]] = [[] for _ in asked.laws]
+    own, n = kept_numbers(study, asked), study.given.joints
+    found = {name: getattr(own, name).copy() for name in ("friction", "damping", "armature")}
+    found |= {"gain": np.ones(n), "spring": np.zeros((n, POWERS))}
     for column, one in zip(columns, value, strict=True):
-        kind, j = column.kind, column.joint
-        match kind.split():
-            case ["friction"]:
-                friction[j] = one
-            case ["damping"]:
-                damping[j, 0] += one
-            case ["curve", share]:
-                damping[j] += one * levelling(float(share) * before.fastest[j])
-            case ["armature"]:
-                armature[j] = one
-            case ["spring", power]:
-                spring[j, int(power)] = one
-            case ["gain"]:
-                gain[j] += one
-            case ["law", number, _]:
-                laws[int(number)].append(float(one))
-    stiffness, rest = given.stiffness.copy(), given.rest.copy()
+        if column.field in found:
+            found[column.field][column.at] += one * column.by
+    gain, spring = found.pop("gain"), found.pop("spring")
+    stiffness, rest = own.stiffness, own.rest.copy()
     for j in asked.sprung if SPRINGS in asked.elements else ():
         stiffness[j], rest[j] = spring_of(spring[j] / gain[j])
-    per = gain[:, None]
+    law = np.array([column.at if column.field == "law" else -1 for column in columns])
     return before.put(
+        **{name: (one.T / gain).T for name, one in found.items()},
         bodies=bodies,
-        friction=friction / gain,
-        bristles=before.bristles * (FRICTION not in asked.elements),
-        damping=damping / per,
-        armature=armature / gain,
+        bristles=own.bristles,
         stiffness=stiffness,
         rest=rest,
         gain=gain,
         laws=asked.laws,
-        value=tuple(np.array(one) for one in laws),
+        value=tuple(value[law == number] for number in range(len(asked.laws))),
     )
 
 
@@ -450,3 +447,38 @@ def weights(chain: Chain, numbers: Numbers) -> Array:
     model.dof_armature[dofs] = numbers.armature
     mj.mj_setConst(model, mj.MjData(model))
     return np.asarray(np.maximum(model.dof_invweight0[dofs], 1e-15))
+
+
+# ---- friction at rest ----------------------------------------------------------------------------
+
+
+STABLE = 0.3  # timestep times frequency of a joint on its bristles, at most
+DAMPED = 0.02  # of critical damping; 0.5 and more do worse than no bristle
+BRISTLE_ROUNDS = 2  # of fits, each with the ways of the one before
+
+
+def has_bristles() -> bool:
+    """Whether this MuJoCo has motors without input."""
+    return hasattr(mujoco(), "mjtCtrlInput")
+
+
+def fit_bristles(study: Study, numbers: Numbers, missed: Array) -> Numbers:
+    """Numbers with bristles, by what the model misses on the runs to learn from (R, n).
+
+    A bristle of friction F that yields after a way L [Dahl 1968] is MuJoCo's `dcmotor` without
+    input, whose friction is of LuGre, of stiffness F / L and the same at every speed.  MuJoCo takes
+    its force at the beginning of a step: L is longer where the inertia of the joint and the
+    timestep ask for it.  A damper keeps a joint from creeping, and brakes where it turns round:
+    DAMPED is a small share of the critical one.
+    """
+    scene = with_numbers(study, study.scene, numbers)
+    inertia = 1.0 / weights(study.chain, numbers)
+    yields = np.broadcast_to(YIELD, numbers.bristles.shape)
+    for _ in range(BRISTLE_ROUNDS):
+        held = held_friction(scene.stuck(yields), missed) * (scene.divisor / numbers.gain)[:, None]
+        whole = np.maximum(held.sum(axis=1), 1e-300)
+        held *= np.minimum(1.0, numbers.friction / whole)[:, None]
+        slow = (float(study.chain.model.opt.timestep) / STABLE) ** 2 / inertia
+        yields = np.maximum(YIELD, held.shape[1] * held * slow[:, None])
+    damping = 2.0 * DAMPED * np.sqrt(inertia / np.maximum((held / yields).sum(axis=1), 1e-300))
+    return numbers.put(bristles=held, yields=yields, damped=damping)

@@ -2,34 +2,269 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import pprint
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib import resources
+from types import ModuleType
+from typing import Any
 
 import numpy as np
+import scipy
 
 from minimax_cal.dynamics.diagnose import named_runs
 from minimax_cal.dynamics.drives import command_of
 from minimax_cal.dynamics.given import MotionKnown
-from minimax_cal.dynamics.rows import Logs, prepare, rms_by_joint
-from minimax_cal.dynamics.run import NOTHING, Run
-from minimax_cal.dynamics.scene import Arm, Scene
+from minimax_cal.dynamics.laws import Law
+from minimax_cal.dynamics.logs.table import NOTHING, Run
+from minimax_cal.dynamics.rows import EDGE_S, Arm, Logs, Scene, bent_bristles, prepare, rms_by_joint
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.simulators.chain import Chain
-from minimax_cal.simulators.given import largest_inertia
-from minimax_cal.simulators.motion.driven import (
-    Gains,
-    follow_commands,
-    follow_gains,
-    follow_torques,
-    inverse_torque,
-    tracking,
-)
-from minimax_cal.simulators.motion.module import installed
-from minimax_cal.simulators.motion.numbers import Numbers
-from minimax_cal.simulators.motion.opened import Opened, in_its_gravity
-from minimax_cal.simulators.motion.result import COMMANDS, MotionRung
+from minimax_cal.robots.mjcf import mujoco
+from minimax_cal.simulators.chain import Chain, fill_history
+from minimax_cal.simulators.drive import check_stable
+from minimax_cal.simulators.mjcf import largest_inertia
+from minimax_cal.simulators.motion.numbers import FRICTION, Numbers, bristles_in, given_bristles
+from minimax_cal.simulators.motion.written import Opened, in_its_gravity
+from minimax_cal.simulators.result import COMMANDS, MotionRung
+
+NUMBERS = "NUMBERS: dict[str, dict[str, Any]] = {}"  # in callback.py, to be filled
+LAWS = "LAWS: dict[str, tuple[bool, Any]] = {}"
+ENDING = "_friction.py"
+
+
+def module_text(chain: Chain, numbers: Numbers, unit: Array, ratio: Array) -> str:
+    """The module.  unit: (n,) torque per unit of the log.  ratio: (n,) of the gears."""
+    told: dict[str, Any] = {}
+    laws = {term.effect: term.law for term in numbers.laws}
+    for j, name in enumerate(chain.names):
+        pairs = zip(numbers.laws, numbers.value, strict=True)
+        mine = [(t.effect, amounts_of(t.law, value, float(unit[j]), float(numbers.gain[j])),
+                 dict(t.tuned)) for t, value in pairs if t.joint == j]  # fmt: skip
+        told[name] = {
+            "frictionloss": float(numbers.loss[j]),
+            "damping": [float(v) for v in numbers.damping[j]],
+            "fastest": float(numbers.fastest[j]),
+            "laws": mine,
+        }
+        if any("gear" in laws[law].reads for law, *_ in mine):
+            told[name]["gear"] = abs(float(ratio[j]))
+    source = (resources.files("minimax_cal.simulators.motion") / "callback.py").read_text("utf-8")
+    filled = pprint.pformat(told, width=96, sort_dicts=False)
+    source = source.replace(NUMBERS, f"{NUMBERS[:-2]}{filled}")
+    return source.replace(LAWS, f"{LAWS[:-1]}\n{laws_text(laws)}}}" if laws else LAWS)
+
+
+def amounts_of(law: Law, value: Array, unit: float, gain: float) -> list[float]:
+    """A law's parameters at the joint [N m, or its share of torque]."""
+    pairs = zip(value, law.units, strict=False)
+    return [float(v * (unit if of.startswith("t") else 1.0) / gain) for v, of in pairs]
+
+
+def laws_text(laws: Mapping[str, Law]) -> str:
+    """Laws as entries of the module: whether friction, and torque per unit of each parameter."""
+    out = ""
+    for name, law in laws.items():
+        known = ", ".join([*sorted(law.reads), *law.tuned, "**_"])
+        out += f"    # {law.words}\n"
+        out += f'    "{name}": ({law.dry}, lambda {known}: ({", ".join(law.torque)},)),\n'
+    return out
+
+
+def loaded(text: str) -> ModuleType:
+    """A module of a text."""
+    made = ModuleType("friction")
+    exec(compile(text, "friction", "exec"), vars(made))
+    return made
+
+
+@contextmanager
+def installed(text: str, chain: Chain) -> Iterator[None]:
+    """A model with its module, if the text is not empty; another callback comes back after it."""
+    before = mujoco().get_mjcb_passive()
+    try:
+        if text:
+            loaded(text).install(chain.model)
+        yield
+    finally:
+        mujoco().set_mjcb_passive(before)
+
+
+# ---- a simulated arm along a log -----------------------------------------------------------------
+
+
+BANDWIDTH = 2.0 * np.pi * 5.0  # of drives that hold an arm to a log, where none are given [1/s]
+
+
+@dataclass(frozen=True, eq=False)
+class Gains:
+    """Of proportional and derivative drives: (n,) stiffness [N m/rad] and damper [N m s/rad]."""
+
+    stiffness: Array
+    damper: Array
+
+
+def inverse_torque(chain: Chain, logs: Logs) -> Array:
+    """(M, n) torque that a model takes for the motion of logs, as its drives feel it [N m]."""
+    mj, model = mujoco(), chain.model
+    data, (at, dofs) = mj.MjData(model), (chain.places, chain.dofs)
+    out = np.empty(logs.motion.q.shape)
+    joint, number, bristle = np.array(bristles_in(chain), dtype=int).reshape(-1, 3).T
+    yields = given_bristles(chain)[1]
+    bent = (bent_bristles(logs, yields) * yields)[:, joint, number]
+    floating = ~model.jnt_actgravcomp[list(chain.joints)].astype(bool)
+    motion = logs.motion
+    for k in range(len(out)):
+        data.qpos[at], data.qvel[dofs], data.qacc[dofs] = motion.q[k], motion.qd[k], motion.qdd[k]
+        data.time = float(logs.since[k])
+        mj.mj_inverse(model, data)
+        out[k] = data.qfrc_inverse[dofs] + floating * data.qfrc_gravcomp[dofs]
+        if len(bristle):
+            data.act[model.actuator_actadr[bristle]] = bent[k]
+            mj.mj_fwdActuation(model, data)
+            np.subtract.at(out[k], joint, data.actuator_force[bristle])
+    return out
+
+
+def follow_commands(chain: Chain, run: Run, commands: Array, source: str) -> Array:
+    """(m, n) joint values where a model's own position servos bring an arm.
+
+    commands: (m, n) at the times of the run [rad, m].  Raises RobotError for an unstable model.
+    """
+    servos = np.array([chain.servo(joint) for joint in chain.joints])
+    speeds = ahead_of(chain.model, chain.names)
+
+    def drive(data: Any, now: int) -> None:
+        data.ctrl[servos] = path[now]
+        data.ctrl[list(speeds)] = rates[now, list(speeds.values())]
+        if not now:
+            fill_history(chain.model, data)
+
+    path = on_steps(run.time, commands, chain)
+    rates = np.gradient(path, float(chain.model.opt.timestep), axis=0)
+    return stepped(chain, run, drive, source)
+
+
+def ahead_of(model: Any, names: Sequence[str]) -> dict[int, int]:
+    """Ids of actuators that take the commanded speed of some joints, and of which (from 0)."""
+    mj = mujoco()
+    ids = (mj.mj_name2id(model, mj.mjtObj.mjOBJ_ACTUATOR, f"{name}_ahead") for name in names)
+    return {number: j for j, number in enumerate(ids) if number >= 0}
+
+
+def follow_torques(
+    chain: Chain, run: Run, torque: Array, hold: Gains | Chain, source: str
+) -> Array:
+    """(m, n) joint values under measured torques and drives that hold the arm to the log.
+
+    torque: (m, n) at the times of the run [N m].  hold: gains of the drives, or the arm for whose
+    inertia they are critically damped.  They make up for what the model gets wrong: where it is
+    right, the arm follows the log by the measured torques alone.
+    """
+    model, at, dofs = chain.model, chain.places, chain.dofs
+    wanted = scipy.interpolate.CubicSpline(run.time, run.q)
+    time = steps_of(run.time, chain)
+    q, qd, ahead = wanted(time), wanted(time, 1), on_steps(run.time, torque, chain)
+    pull = by_gains(hold) if isinstance(hold, Gains) else by_inertia(hold)
+
+    def drive(data: Any, now: int) -> None:
+        off, slow = q[now] - data.qpos[at], qd[now] - data.qvel[dofs]
+        data.qfrc_applied[dofs] = ahead[now] + pull(data.qpos[at], off, slow)
+
+    with own_drives_off(model):
+        return stepped(chain, run, drive, source)
+
+
+Pull = Callable[[Array, Array, Array], Array]  # torque of joint values, and how far they are off
+
+
+def by_gains(gains: Gains) -> Pull:
+    """Drives of constant gains."""
+    return lambda q, off, slow: gains.stiffness * off + gains.damper * slow
+
+
+def by_inertia(chain: Chain) -> Pull:
+    """Drives whose gains follow the inertia of an arm."""
+    mj, model = mujoco(), chain.model
+    data, (at, dofs) = mj.MjData(model), (chain.places, chain.dofs)
+    wanted, torque = np.zeros(model.nv), np.zeros(model.nv)
+
+    def pull(q: Array, off: Array, slow: Array) -> Array:
+        data.qpos[at] = q
+        mj.mj_fwdPosition(model, data)
+        wanted[dofs] = BANDWIDTH**2 * off + 2.0 * BANDWIDTH * slow
+        mj.mj_mulM(model, data, torque, wanted)
+        return np.asarray(torque[dofs])
+
+    return pull
+
+
+def follow_gains(chain: Chain, run: Run, commands: Array, gains: Gains, source: str) -> Array:
+    """(m, n) joint values where proportional and derivative drives bring an arm by commands."""
+    model, at, dofs = chain.model, chain.places, chain.dofs
+    wanted = on_steps(run.time, commands, chain)
+
+    def drive(data: Any, now: int) -> None:
+        off = wanted[now] - data.qpos[at]
+        data.qfrc_applied[dofs] = gains.stiffness * off - gains.damper * data.qvel[dofs]
+
+    with own_drives_off(model):
+        return stepped(chain, run, drive, source)
+
+
+@contextmanager
+def own_drives_off(model: Any) -> Iterator[None]:
+    """A model without its actuators' forces but for bristles, and with all its weight."""
+    fields = ("actuator_gainprm", "actuator_biasprm", "body_gravcomp")
+    kept = {name: getattr(model, name).copy() for name in fields}
+    drives = kept["actuator_biasprm"][:, FRICTION] == 0.0
+    try:
+        for name in fields:
+            getattr(model, name)[drives if name.startswith("actuator") else ...] = 0.0
+        yield
+    finally:
+        for name in fields:
+            getattr(model, name)[:] = kept[name]
+
+
+def steps_of(time: Array, chain: Chain) -> Array:
+    """Times of a model's steps along a log [s]."""
+    step = float(chain.model.opt.timestep)
+    return np.asarray(time[0] + step * np.arange(int((time[-1] - time[0]) / step) + 1))
+
+
+def on_steps(time: Array, values: Array, chain: Chain) -> Array:
+    """Values (m, n) of a log at a model's steps, straight between rows."""
+    steps = steps_of(time, chain)
+    return np.stack([np.interp(steps, time, column) for column in values.T], axis=1)
+
+
+def stepped(chain: Chain, run: Run, drive: Callable[[Any, int], None], source: str) -> Array:
+    """(m, n) joint values at the times of a run.  drive: sets what acts at a step."""
+    mj, model = mujoco(), chain.model
+    data, (at, dofs) = mj.MjData(model), (chain.places, chain.dofs)
+    start = scipy.interpolate.CubicSpline(run.time, run.q)
+    data.qpos[at], data.qvel[dofs] = start(run.time[0]), start(run.time[0], 1)
+    time = steps_of(run.time, chain)
+    out = np.empty((len(time), run.joints))
+    for now in range(len(time)):
+        out[now] = data.qpos[at]
+        drive(data, now)
+        mj.mj_step(model, data)
+    check_stable(mj, data, source)
+    return np.stack([np.interp(run.time, time, column) for column in out.T], axis=1)
+
+
+def tracking(q: Array, run: Run) -> Array:
+    """(n,) RMS distance of joint values (m, n) from those of a run, its ends left out [rad, m]."""
+    inside = (run.time > run.time[0] + EDGE_S) & (run.time < run.time[-1] - EDGE_S)
+    return np.asarray(np.sqrt(((q - run.q)[inside] ** 2).mean(axis=0)))
+
+
+# ---- the judge -----------------------------------------------------------------------------------
+
 
 Pair = tuple[Sequence[float], Sequence[float]]  # stiffness and damper
 LEAST_HELD = 4.0  # of a single run: length of the end that is held out [s]

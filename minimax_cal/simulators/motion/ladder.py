@@ -11,8 +11,8 @@ import numpy as np
 
 from minimax_cal.dynamics.diagnose import diagnose_motion
 from minimax_cal.dynamics.given import MotionKnown, Payload, read_logs, runs_of
+from minimax_cal.dynamics.logs.table import CURRENT, NOTHING, Run
 from minimax_cal.dynamics.result import MotionDiagnosis, MotionEffect, load_motion
-from minimax_cal.dynamics.run import CURRENT, NOTHING, Run
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
@@ -22,10 +22,8 @@ from minimax_cal.ground.threads import one_thread
 from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.robots.urdf import MODELS
-from minimax_cal.simulators.given import largest_inertia
+from minimax_cal.simulators.mjcf import largest_inertia
 from minimax_cal.simulators.motion import drives
-from minimax_cal.simulators.motion.actuators import check_files, write_actuators, write_ranges
-from minimax_cal.simulators.motion.bristles import has_bristles
 from minimax_cal.simulators.motion.correct import (
     STAYS,
     Bench,
@@ -34,12 +32,17 @@ from minimax_cal.simulators.motion.correct import (
     lost,
     mean_log,
 )
-from minimax_cal.simulators.motion.fit import Study
-from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge
-from minimax_cal.simulators.motion.module import ENDING
-from minimax_cal.simulators.motion.opened import Opened, calibrated, open_model
-from minimax_cal.simulators.motion.positions import Answer, by_positions
-from minimax_cal.simulators.motion.result import MotionGap, MotionRung
+from minimax_cal.simulators.motion.drives import (
+    Answer,
+    by_positions,
+    check_files,
+    write_actuators,
+    write_ranges,
+)
+from minimax_cal.simulators.motion.fit import Study, has_bristles
+from minimax_cal.simulators.motion.judge import ENDING, OWN_SERVOS, Judge
+from minimax_cal.simulators.motion.written import Opened, calibrated, open_model
+from minimax_cal.simulators.result import MotionGap, MotionRung
 
 MOTOR = "dcmotor"  # what holds friction beside a constraint
 
