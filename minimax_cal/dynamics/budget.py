@@ -15,11 +15,11 @@ from minimax_cal.dynamics.laws import Term
 from minimax_cal.dynamics.logs.table import Run
 from minimax_cal.dynamics.model import (
     FRICTION,
-    RIGID,
     Columns,
     Normal,
     TorqueModel,
     held_friction,
+    parts_of,
     solve_scaled,
 )
 from minimax_cal.dynamics.result import (
@@ -43,26 +43,23 @@ NEVER_OUT = -1  # number of the fold of rows that are always fitted
 class LeftOut:
     """Fits without each fold of trajectories in turn, and what they miss there.
 
-    raw: (n, R, p) columns as in `Normal`, not whitened.  error: (n, R) torques; early: the same
-    before a delay was taken out.  fold: (R,).  gram: (f, p, p) and pull: (f, p) of the rows fitted
-    without each fold.
+    early: (n, R) torques before a delay was taken out.  fold: (R,).  gram: (f, p, p) and pull:
+    (f, p) of the rows fitted without each fold.
     """
 
     normal: Normal
-    raw: Array
-    error: Array
     early: Array
     fold: Array
     gram: Array
     pull: Array
 
     @staticmethod
-    def of(normal: Normal, error: Array, early: Array, fold: Array) -> LeftOut:
+    def of(normal: Normal, early: Array, fold: Array) -> LeftOut:
         """The fits of whitened rows.  fold: (R,) of every row."""
         own = np.broadcast_to(fold, normal.white.kept.shape)[normal.white.kept]
         products = [products_of(normal, own == f) for f in range(-1, int(fold.max()) + 1)]
         gram, pull = (np.array([each[k] for each in products]) for k in (0, 1))
-        return LeftOut(normal, normal.raw, error, early, fold,
+        return LeftOut(normal, early, fold,
                        gram.sum(axis=0) - gram[1:], pull.sum(axis=0) - pull[1:])  # fmt: skip
 
     @property
@@ -111,8 +108,9 @@ class LeftOut:
     @cached_property
     def compact(self) -> list[tuple[Array, Array]]:
         """Of each joint the columns (q,) that add to its rows, and these rows (R, q)."""
-        each = [np.flatnonzero(rows.any(axis=0)) for rows in self.raw]
-        return [(used, rows[:, used]) for used, rows in zip(each, self.raw, strict=True)]
+        raw = self.normal.raw
+        each = [np.flatnonzero(rows.any(axis=0)) for rows in raw]
+        return [(used, rows[:, used]) for used, rows in zip(each, raw, strict=True)]
 
     def values(self, index: Array) -> Array:
         """(f, p) values of some columns, of the fit without each fold."""
@@ -130,7 +128,7 @@ class LeftOut:
         delayed: whether a delay was taken out.  without: columns that are left out besides.
         """
         index = np.setdiff1d(self.normal.index(parts), np.array(without, dtype=int))
-        seen = self.error if delayed else self.early
+        seen = self.normal.columns.error if delayed else self.early
         value = self.values(index).T.copy()
         fitted = np.stack([rows @ value[used] for used, rows in self.compact])
         own = np.where(self.fold == NEVER_OUT, 0, self.fold)
@@ -230,11 +228,6 @@ def steps_of(terms: Sequence[Term]) -> list[tuple[str, tuple[Term, ...]]]:
         done += [term for term in terms if term.effect == effect]
         out.append((effect, tuple(done)))
     return out
-
-
-def parts_of(terms: Sequence[Term]) -> list[str]:
-    """The parts of a fit with usual friction and some laws."""
-    return [RIGID, FRICTION, *(term.text for term in terms)]
 
 
 def drawn_missed(columns: Columns, error: Array) -> Array:

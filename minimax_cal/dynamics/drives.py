@@ -151,12 +151,10 @@ class Followed:
         logs = self.logs
         used = ~logs.gap & (self.measured | self.slides[:, j])
         at = logs.picked[used[logs.picked]]
-        run = np.searchsorted(logs.start, at, side="right") - 1
+        run = logs.run_of(at)
         stretch = stretch_of(run, logs.since[at])
-        curves = [
-            scipy.interpolate.CubicSpline(logs.since[a:b], self.told.torque[a:b, j])
-            for a, b in zip(logs.start[:-1], logs.start[1:], strict=True)
-        ]
+        curves = [scipy.interpolate.CubicSpline(logs.since[own], self.told.torque[own, j])
+                  for own in logs.spans]  # fmt: skip
         torque = logs.torque[:, j] * self.gain[j] - self.carried[:, j]
         q, qd, qdd = (one[at, j] for one in (logs.motion.q, logs.motion.qd, logs.motion.qdd))
         return Rows(torque[at], q, qd, qdd, self.sense[at, j], logs.since[at], run, stretch,
@@ -171,8 +169,7 @@ class Followed:
     def samples(self, j: int, drive: Drive) -> Samples:
         """Every row of the logs as logged, at a joint: torque, and what a drive would ask for."""
         out: list[Array] = []
-        for number, run in enumerate(self.runs):
-            rows = slice(self.logs.start[number], self.logs.start[number + 1])
+        for number, (run, rows) in enumerate(zip(self.runs, self.logs.spans, strict=True)):
             time, grid = run.time - run.time[0], self.logs.since[rows]
             smooth = (self.logs.motion.qd, self.carried, self.logs.torque)
             qd, carried, torque = (np.interp(time, grid, one[rows, j]) for one in smooth)

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import fdtrc
 
-from minimax_cal.dynamics.budget import parts_of
 from minimax_cal.dynamics.laws import Term
-from minimax_cal.dynamics.model import FRICTION, Columns, Normal, generous, one_of_each
+from minimax_cal.dynamics.model import FRICTION, Columns, Normal, parts_of
 from minimax_cal.dynamics.regressor import PER_LINK
-from minimax_cal.dynamics.rows import whitening
 from minimax_cal.evidence.noise import inflation, orthonormal
 from minimax_cal.ground.arrays import Array
 
@@ -90,28 +88,25 @@ def body_as_given(normal: Normal) -> tuple[bool, LinkChange | None]:
         return False, None
     limit = squares[best] * np.exp(ALIKE / len(error))
     alike = tuple(k for k, square in squares.items() if k != best and square < limit)
-    change = changed(normal, rows, error, best, alike)
+    alone = replace(normal, matrix=matrix[:, spans[best]], error=error,
+                    place={FRICTION: slice(0, count), LINK: slice(count, None)})  # fmt: skip
+    change = changed(alone, normal.raw[..., others], rows, best, alike)
     return False, change if np.any(np.abs(change.value) > SURE * change.sigma) else None
 
 
 def changed(
-    normal: Normal, rows: Array, error: Array, link: int, others: tuple[int, ...]
+    alone: Normal, beside: Array, rows: Array, link: int, others: tuple[int, ...]
 ) -> LinkChange:
     """The change of one link, with its uncertainty.
 
-    rows: (n, R, 10 n) of all links.  error: (N,) whitened, less the torques of the body as given.
+    alone: of friction and the link, less the torques of the body as given.  beside: (n, R, p) rows
+    of friction, not whitened.  rows: (n, R, 10 n) of all links.
     """
-    white, arm = normal.white, normal.columns.scene.arm
-    part = rows[..., PER_LINK * link : PER_LINK * (link + 1)]
-    index = normal.index(parts_of(normal.terms)[1:])
-    raw = np.concatenate([normal.raw[..., index], part], axis=2)
-    count = len(index)
-    matrix = white.white(raw[white.kept])
-    places = {FRICTION: slice(0, count), LINK: slice(count, raw.shape[2])}
-    alone = Normal(normal.columns, white, (), raw, matrix, error, places, normal.group)
+    white, arm, count = alone.white, alone.columns.scene.arm, beside.shape[2]
+    raw = np.concatenate([beside, rows[..., PER_LINK * link : PER_LINK * (link + 1)]], axis=2)
     value = alone.solve([FRICTION, LINK])
     sigma = alone.spread([FRICTION, LINK], value)
-    plain = normal.columns.error[white.kept] - rows[white.kept] @ arm.drawn
+    plain = alone.columns.error[white.kept] - rows[white.kept] @ arm.drawn
 
     def rms(values: Array) -> Array:
         rest = plain - raw[white.kept] @ values
@@ -131,10 +126,10 @@ def carried(columns: Columns, terms: Sequence[Term]) -> list[Term]:
     joined, the most alike first, until their rows contradict it.
     """
     logs = columns.scene.logs
-    white = whitening(logs, generous(columns, terms))
+    white = columns.whitening(terms)
     kept, count = white.kept, len(logs.names)
-    run, group = (np.broadcast_to(each, kept.shape)[kept] for each in (logs.run, logs.quarter))
-    basis = orthonormal(white.white(one_of_each(columns, terms)[kept]))
+    run, group = white.rows(logs.run), white.rows(logs.quarter)
+    basis = orthonormal(white.white(columns.of_each(terms)[kept]))
     link = np.moveaxis(logs.filtered(columns.scene.regressor[:, :, -PER_LINK:]), 1, 0)
     link = white.white(link[kept])
     link /= np.maximum(np.linalg.norm(link, axis=0), 1e-300)
@@ -180,8 +175,7 @@ def carried(columns: Columns, terms: Sequence[Term]) -> list[Term]:
 def weighing(columns: Columns, terms: Sequence[Term], loads: Sequence[Term]) -> list[Term]:
     """The payloads that gravity shows, beside one variant of every other law: others are none."""
     every = [*{term.key: term for term in reversed(terms)}.values(), *loads]
-    white = whitening(columns.scene.logs, generous(columns, every))
-    normal, parts = Normal.of(columns, white, every), parts_of(every)
+    normal, parts = Normal.of(columns, columns.whitening(every), every), parts_of(every)
     value = normal.solve(parts)
     sure = np.abs(value) > SURE * normal.spread(parts, value)
     return [term for term in loads if sure[normal.place[term.text]][:WEIGHT].any()]

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from minimax_cal.dynamics.laws import Term
-from minimax_cal.dynamics.rows import YIELD, Arm, Scene, Whitening, sense_of
+from minimax_cal.dynamics.rows import YIELD, Arm, Scene, Whitening, sense_of, whitening
 from minimax_cal.evidence.library import Spec
 from minimax_cal.evidence.noise import Noise, Problem, orthonormal
 from minimax_cal.ground.arrays import Array
@@ -83,6 +83,17 @@ class Columns:
         """(n, R) torques less those of what the flange is known to carry."""
         known = self.scene.logs.filtered(self.scene.known_torque)
         return np.asarray((self.scene.logs.y - known).T)
+
+    def of_each(self, terms: Sequence[Term]) -> Array:
+        """(n, R, p) rigid body, usual friction, a variant of every law, and all that runs carry."""
+        first = {t.text if t.effect == "payload" else t.key: t for t in reversed(terms)}
+        return self.design(list(first.values()))
+
+    def whitening(self, terms: Sequence[Term]) -> Whitening:
+        """By what a fit of one variant of every law leaves: noise, were one of them true."""
+        kept = self.scene.logs.fitted.T
+        matrix, error = self.of_each(terms)[kept], self.error[kept]
+        return whitening(self.scene.logs, error - matrix @ least_squares(matrix, error))
 
 
 def block_rows(each: Array) -> Array:
@@ -166,31 +177,16 @@ def dictionary_of(columns: Columns, white: Whitening) -> TorqueLaws:
     nuisance = white.white(columns.design()[white.kept])
     error = white.white(columns.error[white.kept])
     logs = columns.scene.logs
-    group = np.broadcast_to(logs.quarter, white.kept.shape)[white.kept]
     problem = Problem(
         error=error,
         basis=orthonormal(nuisance),
         variance_ratio=np.zeros(len(error)),
         size=1.0,
-        group=np.unique(group, return_inverse=True)[1],
+        group=np.unique(white.rows(logs.quarter), return_inverse=True)[1],
         measured=np.ones(len(error), dtype=bool),
         exact=0.0,
     )
     return TorqueLaws(problem, columns, white, np.sqrt((logs.y**2).mean(axis=0)))
-
-
-def one_of_each(columns: Columns, terms: Sequence[Term]) -> Array:
-    """(n, R, p) rigid body, usual friction, one variant of every law, and all that runs carry."""
-    first = {t.text if t.effect == "payload" else t.key: t for t in reversed(terms)}
-    return columns.design(list(first.values()))
-
-
-def generous(columns: Columns, terms: Sequence[Term]) -> Array:
-    """(N,) what a fit of one variant of every law leaves: noise, were one of them true."""
-    kept = columns.scene.logs.fitted.T
-    matrix = one_of_each(columns, terms)[kept]
-    error = columns.error[kept]
-    return np.asarray(error - matrix @ least_squares(matrix, error))
 
 
 # ---- fits ----------------------------------------------------------------------------------------
@@ -278,7 +274,7 @@ class Normal:
     def of(columns: Columns, white: Whitening, terms: Sequence[Term]) -> Normal:
         """Of all rows that are fitted."""
         raw, kept = columns.design(terms), white.kept
-        group = np.broadcast_to(columns.scene.logs.quarter, kept.shape)[kept]
+        group = white.rows(columns.scene.logs.quarter)
         return Normal(columns, white, tuple(terms), raw, white.white(raw[kept]),
                       white.white(columns.error[kept]), columns.places(terms), group)  # fmt: skip
 
@@ -336,7 +332,7 @@ class Normal:
 
     def model(self, name: str, terms: Sequence[Term], context: Body, delay: float) -> TorqueModel:
         """The fit of rigid body, usual friction and some laws."""
-        value = self.solve([RIGID, FRICTION, *(t.text for t in terms)])
+        value = self.solve(parts_of(terms))
         found = tuple(FittedTerm(**vars(t), value=value[self.place[t.text]]) for t in terms)
         bristles = self.columns.scene.bristles
         held = held_friction(bristles, (self.columns.error - self.raw @ value).T)
@@ -346,6 +342,11 @@ class Normal:
         """The fit of the rigid body alone."""
         body = self.body(self.solve([RIGID]))
         return TorqueModel(name, body, (), context, np.zeros((len(body.usual), len(YIELD))), 0.0)
+
+
+def parts_of(terms: Sequence[Term]) -> list[str]:
+    """The parts of a fit with usual friction and some laws."""
+    return [RIGID, FRICTION, *(term.text for term in terms)]
 
 
 def held_friction(bent: Array, off: Array) -> Array:

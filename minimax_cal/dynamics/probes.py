@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.special import stdtr
@@ -61,38 +60,27 @@ class Moments:
     """What a scene knows of some rows, for one joint.
 
     scene: of all samples.  joint: from 0.  at: (k,) samples.  past: what all joints did before.
+    q, qd, qdd, sense: (k, n) of the joints.  load: (k, n) torques that the body puts on them, over
+    the largest.
     """
 
     scene: Scene
     joint: int
     at: Array
     past: Past
+    q: Array
+    qd: Array
+    qdd: Array
+    sense: Array
+    load: Array
 
-    @cached_property
-    def q(self) -> Array:
-        """(k, n) joint values."""
-        return np.asarray(self.scene.logs.motion.q[self.at])
-
-    @cached_property
-    def qd(self) -> Array:
-        """(k, n) speeds."""
-        return np.asarray(self.scene.logs.motion.qd[self.at])
-
-    @cached_property
-    def qdd(self) -> Array:
-        """(k, n) accelerations."""
-        return np.asarray(self.scene.logs.motion.qdd[self.at])
-
-    @cached_property
-    def sense(self) -> Array:
-        """(k, n) directions."""
-        return np.asarray(self.scene.sense[self.at])
-
-    @cached_property
-    def load(self) -> Array:
-        """(k, n) torques that the body puts on the joints, over the largest."""
-        size = np.maximum(np.abs(self.scene.load).max(axis=0), 1e-12)
-        return np.asarray(self.scene.load[self.at] / size)
+    @staticmethod
+    def of(scene: Scene, joint: int, at: Array, past: Past) -> Moments:
+        """With what joints do there."""
+        motion, load = scene.logs.motion.at(at), scene.load
+        size = np.maximum(np.abs(load).max(axis=0), 1e-12)
+        return Moments(scene, joint, at, past, motion.q, motion.qd, motion.qdd, scene.sense[at],
+                       load[at] / size)  # fmt: skip
 
     def both_ways(self, columns: list[Array]) -> list[Array]:
         """Columns alone and with the direction."""
@@ -122,14 +110,14 @@ class Past:
         lagged = np.empty((*q.shape, len(PLAYS)))
         way = np.maximum(np.ptp(q, axis=0), 1e-12)[:, None] * np.array(PLAYS)
         stays = np.exp(-1.0 / SAMPLE_HZ / np.array(RECENT_S))
-        for a, b in zip(scene.logs.start[:-1], scene.logs.start[1:], strict=True):
+        for run in scene.logs.spans:
             now, average = np.zeros_like(way), np.zeros((q.shape[1], len(RECENT_S)))
-            step = np.diff(q[a:b], axis=0, prepend=q[a : a + 1])[:, :, None]
-            new = np.abs(qd[a:b, :, None]) * (1.0 - stays)
-            for i in range(b - a):
+            step = np.diff(q[run], axis=0, prepend=q[run][:1])[:, :, None]
+            new = np.abs(qd[run, :, None]) * (1.0 - stays)
+            for i in range(len(new)):
                 now = np.clip(now + step[i], -way, way)
                 average = stays * average + new[i]
-                lagged[a + i], recent[a + i] = now, average
+                lagged[run.start + i], recent[run.start + i] = now, average
         return Past(recent, lagged / way)
 
 
@@ -191,7 +179,7 @@ def by_acceleration(m: Moments) -> list[Array]:
     """The joint's acceleration, its derivative, and accelerations that went before."""
     logs, j = m.scene.logs, m.joint
     qdd = m.qdd[:, j]
-    first = logs.start[np.searchsorted(logs.start, m.at, side="right") - 1]
+    first = logs.start[logs.run_of(m.at)]
     earlier = [logs.motion.qdd[np.maximum(m.at - int(s * SAMPLE_HZ), first), j] for s in BEFORE_S]
     return [qdd, np.abs(qdd), np.abs(qdd) * m.sense[:, j],
             logs.slope(logs.motion.qdd[:, j])[m.at], *earlier]  # fmt: skip
@@ -226,7 +214,7 @@ def by_friction_of_others(m: Moments) -> list[Array]:
 def by_time(m: Moments) -> list[Array]:
     """The time since the run began, of every run for itself."""
     logs = m.scene.logs
-    run = np.searchsorted(logs.start, m.at, side="right") - 1
+    run = logs.run_of(m.at)
     out = []
     for r in range(len(logs.names)):
         mine = run == r
@@ -277,7 +265,7 @@ def unexplained(normal: Normal, value: Array) -> list[Unexplained]:
         basis = orthonormal(normal.raw[j, kept][:, value != 0.0])
         left = less(basis, plain[mine])
         noise = float(np.sqrt(np.mean(plain[mine] ** 2)))
-        moments = Moments(scene, j, scene.logs.picked[kept], past)
+        moments = Moments.of(scene, j, scene.logs.picked[kept], past)
         group = np.unique(normal.group[mine], return_inverse=True)[1]
         for name, columns in DRIVERS.items():
             fold = blocks(moments) if name == TIME else group

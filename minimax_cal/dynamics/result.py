@@ -64,6 +64,11 @@ class MotionEffect:
     family: str = ""
 
     @property
+    def best(self) -> tuple[str, tuple[float, float]]:
+        """The joint at which it closes most, and the RMS without and with it."""
+        return max(self.worth.items(), key=lambda item: item[1][0] ** 2 - item[1][1] ** 2)
+
+    @property
     def words(self) -> str:
         """For people, as `joint flexibility at J2`; of a payload with the runs that carry it."""
         runs = ", ".join(p.name for p in self.parameters[PER_LINK:] if self.effect == "payload")
@@ -72,7 +77,7 @@ class MotionEffect:
     def row(self) -> tuple[str, ...]:
         """Of a table: words, the surest number, the worth where it is most, and whether it is."""
         p = max(self.parameters, key=lambda each: abs(each.value) / (each.sigma or 1.0))
-        joint, (before, after) = best_worth(self)
+        joint, (before, after) = self.best
         return (self.words, f"{p.value:.3g} ± {p.sigma:.1g} {p.unit}",
                 f"{joint}: {before:.3g} to {after:.3g}",
                 "yes" if self.established else "possible")  # fmt: skip
@@ -235,11 +240,6 @@ def changed_joints(without: Array, with_it: Array) -> dict[str, tuple[float, flo
     """`worth_by_joint` of the joints that something changes by a thousandth or more."""
     worth = worth_by_joint(without, with_it).items()
     return {joint: (a, b) for joint, (a, b) in worth if abs(a - b) > SHOWN * a}
-
-
-def best_worth(one: MotionEffect) -> tuple[str, tuple[float, float]]:
-    """The joint at which an effect closes most, and the RMS without and with it."""
-    return max(one.worth.items(), key=lambda item: item[1][0] ** 2 - item[1][1] ** 2)
 
 
 def check_parts(found: MotionDiagnosis) -> None:

@@ -96,6 +96,11 @@ def slope(values: Array, rate: float) -> Array:
     return np.asarray(out * rate)
 
 
+def at_times(to: Array, time: Array, values: Array) -> Array:
+    """Values (m, n) at some times, straight between those that they have (m,)."""
+    return np.stack([np.interp(to, time, column) for column in values.T], axis=1)
+
+
 @lru_cache(maxsize=4)
 def taps(rate: float) -> Array:
     """(2 k + 1,) what the filter takes of the samples about one, as far as that can be seen."""
@@ -157,16 +162,24 @@ class Logs:
         return float(len(self.since) / SAMPLE_HZ)
 
     @cached_property
+    def spans(self) -> list[slice]:
+        """The samples of each run."""
+        return list(map(slice, self.start[:-1].tolist(), self.start[1:].tolist()))
+
+    @cached_property
     def picked(self) -> Array:
         """(R,) samples that are rows."""
-        step = int(SAMPLE_HZ / ROW_HZ)
-        ends = zip(self.start[:-1], self.start[1:], strict=True)
-        return np.concatenate([np.arange(a, b, step) for a, b in ends])
+        every, step = np.arange(len(self.since)), int(SAMPLE_HZ / ROW_HZ)
+        return np.concatenate([every[run][::step] for run in self.spans])
 
     @cached_property
     def run(self) -> Array:
         """(R,) which run a row is of."""
-        return np.asarray(np.searchsorted(self.start, self.picked, side="right") - 1)
+        return self.run_of(self.picked)
+
+    def run_of(self, samples: Array) -> Array:
+        """Which run samples are of."""
+        return np.asarray(np.searchsorted(self.start, samples, side="right") - 1)
 
     @cached_property
     def quarter(self) -> Array:
@@ -182,9 +195,9 @@ class Logs:
         still[1:] |= qd[1:] * qd[:-1] < 0.0
         out = np.empty(qd.shape, dtype=bool)
         reach = round(seconds * SAMPLE_HZ)
-        for a, b in zip(self.start[:-1], self.start[1:], strict=True):
-            count = np.cumsum(np.pad(still[a:b], ((reach + 1, reach), (0, 0))), axis=0)
-            out[a:b] = count[2 * reach + 1 :] == count[: -2 * reach - 1]
+        for run in self.spans:
+            count = np.cumsum(np.pad(still[run], ((reach + 1, reach), (0, 0))), axis=0)
+            out[run] = count[2 * reach + 1 :] == count[: -2 * reach - 1]
         return out
 
     @cached_property
@@ -223,23 +236,19 @@ class Logs:
 
     def slope(self, values: Array) -> Array:
         """Derivative in time (M, ...) of values (M, ...), each run for itself."""
-        ends = zip(self.start[:-1], self.start[1:], strict=True)
-        return np.concatenate([slope(values[a:b], SAMPLE_HZ) for a, b in ends])
+        return np.concatenate([slope(values[run], SAMPLE_HZ) for run in self.spans])
 
     def earlier(self, late: float) -> Logs:
         """The logs with torques that were logged so much after the motion [s] put back in time."""
-        ends = zip(self.start[:-1], self.start[1:], strict=True)
         moved = [
-            scipy.interpolate.CubicSpline(self.since[a:b], self.torque[a:b])(
-                np.clip(self.since[a:b] + late, self.since[a], self.since[b - 1])
-            )
-            for a, b in ends
+            scipy.interpolate.CubicSpline(since, torque)(np.clip(since + late, since[0], since[-1]))
+            for since, torque in ((self.since[run], self.torque[run]) for run in self.spans)
         ]
-        return replace(self, torque=np.concatenate(moved))  # fmt: skip
+        return replace(self, torque=np.concatenate(moved))
 
     def only(self, runs: Sequence[int]) -> Logs:
         """The logs of some runs."""
-        keep = np.concatenate([np.arange(self.start[r], self.start[r + 1]) for r in runs])
+        keep = np.concatenate([np.arange(len(self.since))[self.spans[r]] for r in runs])
         long = np.diff(self.start)[list(runs)]
         return replace(
             self,
@@ -274,14 +283,11 @@ def prepare_run(run: Run) -> Logs:
     temperature = np.full((m, n), np.nan)
     if run.temperature is not None:
         given = run.temperature.reshape(len(run.time), -1)
-        each = [np.interp(time[::every], run.time, column) for column in given.T]
-        temperature = np.broadcast_to(np.array(each).T, (m, n))
-    wide = np.flatnonzero(np.diff(run.time) > GAP_S)
-    holes = [(run.time[0], run.time[0]), (run.time[-1], run.time[-1]),
-             *((run.time[i], run.time[i + 1]) for i in wide)]  # fmt: skip
-    gap = np.zeros(m, dtype=bool)
-    for begin, end in holes:
-        gap |= (time[::every] > begin - EDGE_S) & (time[::every] < end + EDGE_S)
+        temperature = np.broadcast_to(at_times(time[::every], run.time, given), (m, n))
+    wide, (first, last) = np.flatnonzero(np.diff(run.time) > GAP_S), run.time[[0, -1]]
+    begin, end = ([first, *run.time[wide + side], last] for side in (0, 1))
+    since = time[::every, None]
+    near = (since > np.array(begin) - EDGE_S) & (since < np.array(end) + EDGE_S)
     return Logs(
         (run.name,),
         motion,
@@ -290,7 +296,7 @@ def prepare_run(run: Run) -> Logs:
         np.full(m, np.nan if run.payload is None else run.payload),
         temperature,
         np.array([0, m]),
-        gap,
+        np.asarray(near.any(axis=1)),
         run.unit,
     )
 
@@ -328,6 +334,10 @@ class Whitening:
     def joint(self) -> Array:
         """(N,) which joint a row is of."""
         return np.asarray(np.nonzero(self.kept)[0])
+
+    def rows(self, values: Array) -> Array:
+        """(N,) values of all rows (R,), at those of every joint."""
+        return np.broadcast_to(values, self.kept.shape)[self.kept]
 
     def white(self, rows: Array) -> Array:
         """Rows (N, ...) of all joints with a noise of unit variance and no memory."""
@@ -418,16 +428,16 @@ def bent_bristles(logs: Logs, yields: Array) -> Array:
     Maxwell-slip elements, each after the law of Dahl [Al-Bender, Lampaert, Swevers 2005].
     """
     out = np.zeros((*logs.torque.shape, yields.shape[-1]))
-    for a, b in zip(logs.start[:-1], logs.start[1:], strict=True):
-        q = logs.motion.q[a:b]
+    for run in logs.spans:
+        q = logs.motion.q[run]
         way = np.diff(q, axis=0, prepend=q[:1])[..., None] / yields
         stays = np.exp(-np.abs(way))
         bent, step = np.sign(way) * (1.0 - stays), 1
-        while step < b - a:  # bent[i] += stays[i] * bent[i - 1], all i at once by doubling
+        while step < len(q):  # bent[i] += stays[i] * bent[i - 1], all i at once by doubling
             bent[step:] += stays[step:] * bent[:-step]
             stays[step:] *= stays[:-step].copy()
             step *= 2
-        out[a:b] = bent
+        out[run] = bent
     return out
 
 
@@ -543,12 +553,12 @@ class Scene:
     def since_reversal(self) -> Array:
         """(M, n) how far a joint is from where it last turned round, or began [rad, m]."""
         out = np.zeros_like(self.logs.torque)
-        for a, b in zip(self.logs.start[:-1], self.logs.start[1:], strict=True):
-            q, back = self.logs.motion.q[a:b], self.logs.motion.qd[a:b] > 0.0
+        for run in self.logs.spans:
+            q, back = self.logs.motion.q[run], self.logs.motion.qd[run] > 0.0
             flips = np.zeros(back.shape, dtype=bool)
             flips[1:] = back[1:] != back[:-1]
-            last = np.maximum.accumulate(np.where(flips, np.arange(b - a)[:, None], 0), axis=0)
-            out[a:b] = np.abs(q - np.take_along_axis(q, last, axis=0))
+            last = np.maximum.accumulate(np.where(flips, np.arange(len(q))[:, None], 0), axis=0)
+            out[run] = np.abs(q - np.take_along_axis(q, last, axis=0))
         return out
 
     def along(self, motion: Motion) -> Array:

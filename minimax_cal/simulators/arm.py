@@ -158,18 +158,8 @@ def with_springs(arm: Arm, found: Springs, state: State) -> Arm:
     after = state.step(found.change)
     mount = inverse(state.base) @ after.base
     arm = with_tool(arm, found.sag, found.drawn)
-    return replace(
-        arm,
-        robot=arm.robot.with_mdh(after.mdh),
-        spots=after.target_positions,
-        mount=mount @ arm.mount,
-        mass=found.mass,
-        com=found.com,
-        turn=found.turn,
-        bend=found.bend,
-        base=found.base,
-        remainder=found.remainder,
-    )
+    robot, spots = arm.robot.with_mdh(after.mdh), after.target_positions
+    return replace(arm, robot=robot, spots=spots, mount=mount @ arm.mount, **found.held)
 
 
 def with_tool(arm: Arm, sag: Array, drawn: float) -> Arm:
@@ -229,22 +219,21 @@ def parts_of(cell: Cell, scene: Scene, arm: Arm) -> Parts:
 
 def held_terms(cell: Cell) -> tuple[Term, ...]:
     """The effects of a cell that elements hold, or a command map; those of 0 need nothing."""
-    scene = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
-    bare = stiff(cell.robot, masses_of(cell.robot, LEAST_MASS))
-
-    def is_held(term: Term, values: Array) -> bool:
-        parts = Parts(bare)
-        if values.any():
-            ELEMENTS.get(term.effect, without_element)(parts, scene, term, values)
-        return not parts.left_out
-
-    return tuple(term for term, values in cell.effects.pairs if is_held(term, values))
+    data = still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot)
+    alone = ((term, replace(cell, effects=Fitted.of([(term, values)])))
+             for term, values in cell.effects.pairs)  # fmt: skip
+    return tuple(term for term, one in alone if not bare_parts(one, data).left_out)
 
 
 def unheld(cell: Cell, data: Measurements) -> tuple[Term, ...]:
     """Those effects of a cell that, with its values, only a command map can hold."""
-    parts = parts_of(cell, cell.scene(data), stiff(cell.robot, masses_of(cell.robot, LEAST_MASS)))
-    return tuple(term for term, _ in parts.mapped if term in cell.effects.terms)
+    mapped = bare_parts(cell, data).mapped
+    return tuple(term for term, _ in mapped if term in cell.effects.terms)
+
+
+def bare_parts(cell: Cell, data: Measurements) -> Parts:
+    """What is to hold each effect of a cell at some poses, whatever the arm weighs."""
+    return parts_of(cell, cell.scene(data), stiff(cell.robot, masses_of(cell.robot, LEAST_MASS)))
 
 
 Element = Callable[[Parts, Scene, Term, Array], None]
@@ -307,18 +296,15 @@ def softness(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
     parts.soft.append((term, values))
 
 
-def encoder(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
-    """The gear of the actuator."""
-    gain = parts.arm.gain.copy()
-    gain[joints_at(term.place, term.choice)] += values
-    parts.put(gain=gain)
+def on_joints(name: str) -> Element:
+    """A field of the arm by joints: the gear of an actuator, or the play of a hinge with stops."""
 
+    def element(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
+        held = getattr(parts.arm, name).copy()
+        held[joints_at(term.place, term.choice)] += values
+        parts.put(**{name: held})
 
-def backlash(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
-    """A hinge with stops on the joint's axis."""
-    play = parts.arm.play.copy()
-    play[joints_at(term.place, term.choice)] += values
-    parts.put(play=play)
+    return element
 
 
 def coupling(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
@@ -353,8 +339,8 @@ def balancer(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
 
 
 FIRM: dict[str, Element] = {
-    ENCODER_GAIN.name: encoder,
-    BACKLASH.name: backlash,
+    ENCODER_GAIN.name: on_joints("gain"),
+    BACKLASH.name: on_joints("play"),
     JOINT_COUPLING.name: coupling,
 }
 ELEMENTS: dict[str, Element] = {

@@ -21,6 +21,8 @@ from minimax_cal.robots.urdf import UrdfRobot, to_robot
 
 ROBOT = "minimax_cal_robot"  # the text under which a file of ours holds its robot whole
 SAME_ROBOT = 1e-6  # a file's own robot may differ from its bodies by no more [m, rad]
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # the quaternion of no turn, as MuJoCo has it
+TURNS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")  # forms of an orientation
 Bodies = Sequence[int]
 SHORTEST = 1e-5  # timestep with which an arm comes to rest in seconds [s]
 
@@ -72,6 +74,11 @@ class Chain:
     def ids_in(self, model: Any) -> tuple[int, ...]:
         """Of the joints of the same names in another model."""
         return tuple(int(model.joint(name).id) for name in self.names)
+
+    @property
+    def servos(self) -> Array:
+        """(n,) ids of the position actuators of its joints, -1 where there is none."""
+        return np.array([self.servo(joint) for joint in self.joints])
 
     def servo(self, joint: int) -> int:
         """Id of the position actuator of a joint; -1 where there is none."""
@@ -220,13 +227,17 @@ def holders(model: Any, bodies: Bodies) -> Array:
     return holder
 
 
+def pose_at(position: Array, quaternion: Array = UPRIGHT) -> Array:
+    """(4, 4) of a position and MuJoCo's quaternion, w first."""
+    turn = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    return transform(turn, np.array(position))
+
+
 def own_pose(attributes: dict[str, str], compiler: dict[str, str]) -> Array:
     """(4, 4) that position and orientation of an element mean, in whatever form they stand."""
-    keys = ("pos", "quat", "axisangle", "euler", "xyaxes", "zaxis")
-    kept = " ".join(f'{k}="{attributes[k]}"' for k in keys if k in attributes)
+    kept = " ".join(f'{k}="{attributes[k]}"' for k in ("pos", *TURNS) if k in attributes)
     told = " ".join(f'{k}="{compiler[k]}"' for k in ("angle", "eulerseq") if k in compiler)
     model = mujoco().MjModel.from_xml_string(
         f"<mujoco><compiler {told}/><worldbody><body {kept}/></worldbody></mujoco>"
     )
-    turn = Rotation.from_quat(model.body_quat[1], scalar_first=True).as_matrix()
-    return transform(turn, np.array(model.body_pos[1]))
+    return pose_at(model.body_pos[1], model.body_quat[1])

@@ -133,7 +133,7 @@ def drive(
     neighbours; each run begins at rest at the pose before its first one.
     Raises RobotError where MuJoCo finds that the model is unstable.
     """
-    servos = np.array([chain.servo(joint) for joint in chain.joints])
+    servos = chain.servos
     if (servos < 0).any():
         return set_joints(chain, commands, play)
     count = len(commands)
@@ -150,24 +150,12 @@ def drive(
         return visits(chain, servos, commands, sides, rows, source, heard)
 
     with ThreadPoolExecutor(min(len(runs), os.cpu_count() or 1)) as pool:
-        found = [visit for part in pool.map(one, runs) for visit in part]
-    return Driven(
-        poses=np.array([visit.pose for visit in found]),
-        q=np.array([visit.q for visit in found]),
-        speed=np.array([visit.speed for visit in found]),
-        limited=np.mean([visit.limited for visit in found], axis=0),
-        driven=True,
-    )
+        found = zip(*(visit for part in pool.map(one, runs) for visit in part), strict=True)
+        poses, q, speed, limited = map(np.array, found)
+    return Driven(poses, q, speed, limited.mean(axis=0), True)
 
 
-@dataclass(frozen=True, eq=False)
-class Visit:
-    """One row of `Driven`."""
-
-    pose: Array
-    q: Array
-    speed: float
-    limited: Array
+Visit = tuple[Array, Array, float, Array]  # a row of `Driven`
 
 
 def visits(
@@ -179,7 +167,7 @@ def visits(
     source: str,
     heard: Callable[[], object],
 ) -> list[Visit]:
-    """A run of moves, one after the other, with a model of its own."""
+    """A run of moves, one after the other, with a model of its own: a row each of `Driven`."""
     mj, model = mujoco(), copy(chain.model)
     chain_here = replace(chain, model=model)
     data, sides = mj.MjData(model), plays(chain_here)
@@ -192,23 +180,19 @@ def visits(
     start = commands[rows[0] - 1]
     data.qpos[at], data.ctrl[servos] = start, start
     fill_history(model, data)
-    settle(mj, model, data, limits, round(REST / step))
-    out = []
+    count, out = round(REST / step), list[Visit]()
+    follow(mj, model, data, limits, np.tile(start, (count, 1)), LOOKS)
     for row in rows:
         for joint, place in sides.items():
             model.qpos_spring[place] = play[row, joint]
         path = moves(start, commands[row], chain.robot.prismatic, step)
-        looks = (
-            move(mj, model, data, servos, path, limits),
-            settle(mj, model, data, limits, round(REST / step)),
-        )
+        at_limit = follow(mj, model, data, limits, path)
+        rest_path = np.tile(commands[row], (count, 1))
+        at_limit = at_limit + follow(mj, model, data, limits, rest_path, LOOKS)
         check_stable(mj, data, source)
-        (moved_at, moved_for), (rested_at, rested_for) = looks
-        share = (moved_at + rested_at) / (moved_for + rested_for)
-        out.append(Visit(
-            body_pose(data, carrier(chain_here)), np.array(data.qpos[at]),
-            float((np.abs(data.qvel[dofs]) / rest).max()), share,
-        ))  # fmt: skip
+        share = at_limit / (len(path) + count)
+        speed = float((np.abs(data.qvel[dofs]) / rest).max())
+        out.append((body_pose(data, carrier(chain_here)), np.array(data.qpos[at]), speed, share))
         start = commands[row]
         heard()
     return out
@@ -254,28 +238,19 @@ class Limits:
         )  # fmt: skip
 
 
-def move(
-    mj: Any, model: Any, data: Any, servos: Array, path: Array, limits: Limits
-) -> tuple[Array, int]:
-    """Follow commands, one a timestep; how many of them at each limit, and how many there are."""
-    force, torque = np.empty(path.shape), np.empty(path.shape)
-    for k, command in enumerate(path):
-        data.ctrl[servos] = command
-        mj.mj_step(model, data)
-        force[k], torque[k] = data.actuator_force[servos], data.qfrc_actuator[limits.dofs]
-    return limits.reached(force, torque).sum(axis=0), len(path)
+def follow(mj: Any, model: Any, data: Any, limits: Limits, path: Array, every: int = 1) -> Array:
+    """(n,) at how many timesteps each joint is at a limit along commands (steps, n).
 
-
-def settle(mj: Any, model: Any, data: Any, limits: Limits, count: int) -> tuple[Array, int]:
-    """Stay at a command; the same, from a look every few timesteps."""
-    at_limit, done = np.zeros(len(limits.servos), dtype=int), 0
-    while done < count:
-        steps = min(LOOKS, count - done)
-        mj.mj_step(model, data, steps)
-        found = limits.reached(data.actuator_force[limits.servos], data.qfrc_actuator[limits.dofs])
-        at_limit += steps * found
-        done += steps
-    return at_limit, count
+    every: timesteps between two looks, and two commands.
+    """
+    force, torque, starts = list[Array](), list[Array](), range(0, len(path), every)
+    for k in starts:
+        data.ctrl[limits.servos] = path[k]
+        mj.mj_step(model, data, min(every, len(path) - k))
+        force.append(data.actuator_force[limits.servos])
+        torque.append(data.qfrc_actuator[limits.dofs])
+    at_limit = limits.reached(np.array(force), np.array(torque))
+    return np.asarray(np.diff([*starts, len(path)]) @ at_limit)
 
 
 def check_stable(mj: Any, data: Any, source: str) -> None:
@@ -372,8 +347,7 @@ def stand(chain: Chain, names: tuple[str, ...], commands: Array, play: Array | N
     commands: (m, n) [rad, m].  play: (m, n) where each joint rests in its play [rad].
     """
     mj, model = mujoco(), copy(chain.model)
-    data, sides = mj.MjData(model), plays(chain)
-    servos = np.array([chain.servo(joint) for joint in chain.joints])
+    data, sides, servos = mj.MjData(model), plays(chain), chain.servos
     joints = list(way_to(model, int(model.site(names[0]).bodyid[0])))
     at, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
     states = model.actuator_actadr[servos]

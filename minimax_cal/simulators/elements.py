@@ -8,7 +8,7 @@ actuator's force, and joints that are springs let none pass (`actuatorfrcrange`)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
@@ -87,7 +87,7 @@ def choose_servos(arm: Arm, drives: Drives, *, springs: bool = False) -> Servos:
     inertia = np.maximum(inertia, drives.inertia)
     needed = SETTLES**2 * inertia
     ordinary = np.maximum(drives.gain, np.maximum(needed, SMALLEST * needed.max()))
-    _, reach, _ = carried(arm)
+    reach, _ = carried(arm)
     lever = np.where(arm.robot.prismatic, 1.0, reach)
     soft = arm.turn > NOTHING
     compliance = np.where(soft, arm.turn, np.inf)
@@ -104,14 +104,13 @@ def choose_servos(arm: Arm, drives: Drives, *, springs: bool = False) -> Servos:
     return Servos(share, gain, np.where(kept, drives.damper, new), sprung, kept)
 
 
-def loads(arm: Arm, q: Array | None = None) -> tuple[Array, Array]:
+def loads(arm: Arm) -> tuple[Array, Array]:
     """(n,) largest inertia [kg m^2] and gravity torque [N m] of each joint, of slides kg and N.
 
-    q: (m, n) poses, all over the workspace unless given [rad, m].
+    Over poses all over the workspace.
     """
     robot = arm.robot
-    if q is None:
-        q = random_poses(robot, SAMPLES, np.random.default_rng(0))
+    q = random_poses(robot, SAMPLES, np.random.default_rng(0))
     links = chain(robot.mdh, robot.turned(q), robot.prismatic)
     at = centres(links, arm.com)
     beyond = np.cumsum(arm.mass[::-1])[::-1]
@@ -130,14 +129,13 @@ def loads(arm: Arm, q: Array | None = None) -> tuple[Array, Array]:
     )
 
 
-def carried(arm: Arm) -> tuple[Array, Array, Array]:
-    """For each joint: weight beyond it [N], largest lever of that [m], largest inertia [kg m^2]."""
+def carried(arm: Arm) -> tuple[Array, Array]:
+    """(n,) each: largest lever of what is beyond a joint [m], largest inertia of that [kg m^2]."""
     robot = arm.robot
     length = np.abs(robot.mdh[:, :2]).sum(axis=1) + np.linalg.norm(arm.com, axis=1)
     slide = np.where(robot.prismatic, np.clip(np.abs(robot.upper), 0.0, 2.0), 0.0)
     reach = np.cumsum((length + slide)[::-1])[::-1] + LEVER
-    mass = np.cumsum(arm.mass[::-1])[::-1]
-    return mass * G, reach, mass * reach**2
+    return reach, np.cumsum(arm.mass[::-1])[::-1] * reach**2
 
 
 # ---- elements ------------------------------------------------------------------------------------
@@ -174,23 +172,33 @@ class Layout:
     degrees: bool = False
 
 
-def part(parent: ET.Element, tag: str, **attributes: object) -> ET.Element:
-    """A new element; arrays become numbers."""
-    text = {
+def as_text(attributes: Mapping[str, object]) -> dict[str, str]:
+    """Attributes as they stand in a file; arrays become numbers."""
+    return {
         key: value if isinstance(value, str) else numbers(np.asarray(value, dtype=float))
         for key, value in attributes.items()
     }
-    return ET.SubElement(parent, tag, text)
+
+
+def part(parent: ET.Element, tag: str, **attributes: object) -> ET.Element:
+    """A new element."""
+    return ET.SubElement(parent, tag, as_text(attributes))
 
 
 def known(parent: ET.Element, tag: str, name: str = "", **attributes: object) -> ET.Element:
     """The element of a name in its parent with other attributes, a new one where there is none."""
     for element in parent.findall(tag):
         if element.get("name", "") == name:
-            for key, value in attributes.items():
-                element.set(key, value if isinstance(value, str) else numbers(np.asarray(value)))
+            element.attrib |= as_text(attributes)
             return element
     return part(parent, tag, **({"name": name} if name else {}), **attributes)
+
+
+def forget(root: ET.Element, holder: str, tag: str, name: str) -> None:
+    """Take the elements of a name out of the sections that hold them."""
+    for one in root.iter(holder):
+        for old in [e for e in one.findall(tag) if e.get("name") == name]:
+            one.remove(old)
 
 
 def parents_of(root: ET.Element) -> dict[ET.Element, ET.Element]:
@@ -264,9 +272,7 @@ def write_servos(layout: Layout, arm: Arm, servos: Servos) -> None:
                 layout.joints[i].set("damping", numbers([damper]))
                 damper = 0.0
             tune(servo, gain, max(damper - layout.drives.own[i], 0.0) / gear**2)
-        for custom in layout.root.findall("custom"):  # of a calibration before this one
-            for old in [e for e in custom if e.get("name") == f"{name}_deflection"]:
-                custom.remove(old)
+        forget(layout.root, "custom", "text", f"{name}_deflection")  # of a calibration before
         if arm.turn[i] > NOTHING and not servos.sprung[i]:
             said = (f"the gain of {servo.get('name')} is a spring: under gravity {name} turns by "
                     f"{arm.turn[i]:.6g} rad/(N m); another gain is another deflection")  # fmt: skip
@@ -324,19 +330,15 @@ def spring(
 
     loaded: whether it feels all of gravity, or as much as the actuators do.
     """
-    new = ET.Element(
-        "joint",
-        {
-            "name": name, "type": kind, "pos": numbers(at), "axis": numbers(axis),
-            "stiffness": numbers([stiffness]), "springref": "0", "ref": "0", "limited": "false",
-            "damping": numbers([damping(np.array(stiffness), np.array(inertia))]),
-            "frictionloss": "0", "armature": numbers([ROTOR * inertia]),
-        },
-    )  # fmt: skip
+    own = damping(np.array(stiffness), np.array(inertia))
+    new = ET.Element("joint", as_text({
+        "name": name, "type": kind, "pos": at, "axis": axis, "stiffness": [stiffness],
+        "springref": "0", "ref": "0", "limited": "false", "damping": [own], "frictionloss": "0",
+        "armature": [ROTOR * inertia],
+    }))  # fmt: skip
     if loaded:
-        new.set("actuatorgravcomp", "true")
-        new.set("actuatorfrclimited", "true")
-        new.set("actuatorfrcrange", numbers([-PASSES, PASSES]))
+        passes = {"actuatorfrclimited": "true", "actuatorfrcrange": [-PASSES, PASSES]}
+        new.attrib |= as_text({"actuatorgravcomp": "true", **passes})
     places = [i for i, child in enumerate(body) if child.tag == "joint"]
     body.insert(places[-1] + 1 if places else 0, new)
     return new
@@ -344,7 +346,7 @@ def spring(
 
 def flexes(layout: Layout, arm: Arm, servos: Servos) -> None:
     """A spring on the axis of each joint whose servo does not hold its compliance."""
-    _, _, inertia = carried(arm)
+    _, inertia = carried(arm)
     for i in np.flatnonzero(servos.sprung):
         spring(
             layout.bodies[i], f"flex{i + 1}", "slide" if arm.robot.prismatic[i] else "hinge",
@@ -354,7 +356,7 @@ def flexes(layout: Layout, arm: Arm, servos: Servos) -> None:
 
 def plays(layout: Layout, arm: Arm, share: float) -> None:
     """A hinge with stops half the play away on either side, and a spring that holds it."""
-    _, reach, inertia = carried(arm)
+    reach, inertia = carried(arm)
     _, torque = loads(arm)
     for i in np.flatnonzero(arm.play):
         half = 0.5 * abs(arm.play[i])
@@ -370,7 +372,7 @@ def plays(layout: Layout, arm: Arm, share: float) -> None:
 
 def bends(layout: Layout, arm: Arm) -> None:
     """Hinges at the Gauss points of a link: together the compliance of a cantilever, exactly."""
-    _, _, inertia = carried(arm)
+    _, inertia = carried(arm)
     for i, flexibility in arm.bend.items():
         row = arm.robot.mdh[i]
         start, end = np.array([0.0, 0.0, -row[1]]), np.array([row[0], 0.0, 0.0])
@@ -406,7 +408,7 @@ def base(layout: Layout, arm: Arm) -> None:
     body, robot = layout.bodies[0], arm.robot
     foot = layout.seats[0] @ inverse(head(robot.mdh[0]))
     if arm.base > 0.0:
-        _, _, inertia = carried(arm)
+        _, inertia = carried(arm)
         level = level_to(robot.up)
         first = next(i for i, child in enumerate(body) if child.tag in ("joint", "freejoint"))
         for letter, axis in zip("xy", level, strict=True):

@@ -42,8 +42,8 @@ from minimax_cal.simulators.mjcf import (
     check_limits,
     content_for,
     corrected,
+    own_masses,
     told,
-    told_masses,
 )
 from minimax_cal.simulators.result import Rung, SimulatorGap
 from minimax_cal.solvers.status import Status
@@ -123,7 +123,7 @@ def causes_of(
 def weighed(fit: Fit, chain: Chain, effects: Sequence[Term | str]) -> Fit:
     """The same fit, effects given, of a robot that has the masses of a simulator's model."""
     nominal = fit.nominal.robot
-    mass, com = told_masses(chain, nominal)
+    mass, com = own_masses(chain, nominal) or (nominal.mass, nominal.com)
     settings = {**vars(fit.options), "effects": tuple(effects)}
     rows = marked(fit.data, fit.held)
     return calibrate(replace(nominal, mass=mass, com=com), rows, **settings)
@@ -291,7 +291,7 @@ def check_model(chain: Chain, q: Array, source: str) -> None:
 
     Before anything that takes long: some moves show it.
     """
-    if any(chain.servo(joint) < 0 for joint in chain.joints):
+    if (chain.servos < 0).any():
         return
     check_limits(chain, q, source)
     drive(chain, q[:FIRST_MOVES], source)
@@ -423,9 +423,7 @@ class Run:
 
     def arm(self, fit: Fit) -> Arm:
         """The elements of a fit, with the model's own masses unless those are assumed."""
-        own = None
-        if not assumed(self.chain.robot):
-            own = told_masses(self.chain, self.nominal.robot)
+        own = own_masses(self.chain, self.nominal.robot)
         some = fit.train.take(np.arange(0, fit.train.poses, max(1, fit.train.poses // TRAINING)))
         return arm_of(fit.cell, masses=own, measured=some)
 

@@ -43,7 +43,16 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_joints
 from minimax_cal.robots.transforms import SAME, difference, head, inverse, tail
 from minimax_cal.simulators.arm import Arm, arm_of, assumed, held_terms, sample, stiff
-from minimax_cal.simulators.chain import ROBOT, Chain, at_zero, braked, chain_of, own_pose
+from minimax_cal.simulators.chain import (
+    ROBOT,
+    TURNS,
+    Chain,
+    at_zero,
+    braked,
+    chain_of,
+    own_pose,
+    pose_at,
+)
 from minimax_cal.simulators.drive import Written
 from minimax_cal.simulators.elements import (
     SAMPLES,
@@ -168,7 +177,6 @@ def drawn(body: ET.Element, robot: Robot, i: int) -> None:
 # ---- a given file --------------------------------------------------------------------------------
 
 
-ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 IMPLICIT = (2, 3)  # mjINT_IMPLICIT, mjINT_IMPLICITFAST
 
 
@@ -187,8 +195,10 @@ def content_for(document: Document, source: Path, path: Path | None) -> bytes:
     return document.raw(whole=away)
 
 
-def told_masses(chain: Chain, nominal: Robot) -> tuple[Array, Array]:
-    """Masses of the model, their centres in the link frames of the fit's robot."""
+def own_masses(chain: Chain, nominal: Robot) -> tuple[Array, Array] | None:
+    """Masses of the model, their centres in the link frames of the fit's robot; None if assumed."""
+    if assumed(chain.robot):
+        return None
     base, _ = match(nominal, chain.seen)
     links, seen = laid(nominal, base)[1:], laid(chain.robot, chain.base)[1:]
     com = [
@@ -342,24 +352,27 @@ def elements_of(root: ET.Element, chain: Chain) -> list[ET.Element]:
     return [named[name] for name in chain.names]
 
 
-def drives_of(chain: Chain) -> Drives:
-    """The servos of a model as MuJoCo sees them."""
+def servos_of(chain: Chain) -> tuple[Array, Array, Array]:
+    """Gains and dampers (n,) of a model's servos at the joints, limits (n, 2) of their torques."""
     model, n = chain.model, len(chain.joints)
-    gain, damper, own = np.zeros(n), np.zeros(n), np.zeros(n)
-    limits = np.array([[-np.inf, np.inf]] * n)
-    for i, joint in enumerate(chain.joints):
-        own[i] = model.dof_damping[model.jnt_dofadr[joint]]
+    gain, damper, limits = np.zeros(n), np.zeros(n), np.array([[-np.inf, np.inf]] * n)
+    for i, (joint, servo) in enumerate(zip(chain.joints, chain.servos, strict=True)):
         if model.jnt_actfrclimited[joint]:
             limits[i] = model.jnt_actfrcrange[joint]
-        servo = chain.servo(joint)
         if servo < 0:
             continue
         gear = float(model.actuator_gear[servo, 0])
-        gain[i] = -model.actuator_biasprm[servo, 1] * gear**2
-        damper[i] = -model.actuator_biasprm[servo, 2] * gear**2
+        gain[i], damper[i] = -model.actuator_biasprm[servo, 1:3] * gear**2
         if model.actuator_forcelimited[servo]:
             ends = np.sort(model.actuator_forcerange[servo] * gear)
             limits[i] = max(limits[i, 0], ends[0]), min(limits[i, 1], ends[1])
+    return gain, damper, limits
+
+
+def drives_of(chain: Chain) -> Drives:
+    """The servos of a model as MuJoCo sees them."""
+    model, own = chain.model, np.array(chain.model.dof_damping[chain.dofs])
+    gain, damper, limits = servos_of(chain)
     floating = model.body_gravcomp[list(chain.bodies)] > 0.0
     free = bool(floating.any() and not model.jnt_actgravcomp[list(chain.joints)].any())
     return Drives(
@@ -434,15 +447,13 @@ def place(
 ) -> None:
     """Give a body another pose in its parent body; frames around it stay."""
     model, number = chain.model, chain.bodies[i]
-    compiled = own_pose(
-        {"pos": numbers(model.body_pos[number]), "quat": numbers(model.body_quat[number])}, {}
-    )
+    compiled = pose_at(model.body_pos[number], model.body_quat[number])
     if difference(compiled, pose) <= SAME * 10.0:
         return
     if parents[body].tag not in ("body", "worldbody"):
         own = own_pose(body.attrib, compiler_of(given.document.root))
         pose = own @ inverse(compiled) @ pose
-    for name in ORIENTATIONS:
+    for name in TURNS:
         body.attrib.pop(name, None)
     body.set("pos", numbers(pose[:3, 3]))
     body.set("quat", numbers(quaternion(pose)))
@@ -481,8 +492,7 @@ def correct(job: Job) -> Export:
     chain = chain_of(
         given.compiled(), job.robot.joints, given.source, job.tip, unknown=given.assumed
     )
-    own = None if assumed(chain.robot) else told_masses(chain, job.nominal)
-    arm = arm_of(job.cell, job.q, own)
+    arm = arm_of(job.cell, job.q, own_masses(chain, job.nominal))
     check_limits(chain, sample(job.robot) if job.q is None else job.q, given.source)
     document, notices = corrected(given, chain, job.nominal, arm, job.cell.target_names)
     made = chain.in_model(given.compiled(document.root))  # before its files are named from there

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from minimax_cal.dynamics.result import MotionEffect, best_worth, table_by_joint
+from minimax_cal.dynamics.result import MotionEffect, table_by_joint
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.ground.facts import Fact, derived
 from minimax_cal.ground.files import plain
@@ -187,7 +187,7 @@ def of_drive(one: MotionEffect) -> str:
     )  # fmt: skip
     if not one.worth:
         return f"not in the file: {one.words} ({amounts}), for which MuJoCo has no element"
-    joint, (before, after) = best_worth(one)
+    joint, (before, after) = one.best
     size = f"joint error at {joint} {before:.3g} to {after:.3g} mrad"
     return f"corrected {one.words} ({amounts}): {size} held out"
 

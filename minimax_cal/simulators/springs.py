@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import scipy
@@ -35,24 +36,19 @@ TRACELESS = np.linalg.svd(np.eye(3).reshape(1, 9))[2][1:].T  # (9, 8) matrices w
 
 @dataclass(frozen=True, eq=False)
 class Springs:
-    """turn: (n,) [rad/(N m)].  bend: 1/EI by link.  base: [rad/(N m)].  mass, com: of the links.
+    """held: of an arm: `turn`, `bend`, `base`, `mass`, `com`, and `remainder`: RMS distance from
+    the laws, or from the measurements [m].
 
     sag, drawn: of the tool: (3, 3) turn per direction of gravity [rad], and along its z [m].
     change: of geometry, base and targets, in the order of `Names` [m, rad].  firm: of the
     parameters of effects that elements hold exactly.
-    remainder: RMS distance from the laws, or from the measurements [m].
     """
 
-    turn: Array
-    bend: dict[int, float]
-    base: float
-    mass: Array
-    com: Array
+    held: dict[str, Any]
     sag: Array
     drawn: float
     change: Array
     firm: Array
-    remainder: float
 
 
 def springs_of(
@@ -107,18 +103,15 @@ def springs_of(
     rest = goal - np.einsum("el,elr->r", sizes, clear)
     change = inverse @ (right - np.einsum("el,elr->r", sizes, fields))
     values = dict(zip(kinds, (float(c) if c > LEAST else 0.0 for c in soft), strict=True))
-    return Springs(
-        turn=np.array([values.get(("joint", j), 0.0) for j in range(scene.joints)]),
-        bend={i: c for (kind, i), c in values.items() if kind == "link" and c > 0.0},
-        base=values.get(("base", 0), 0.0),
-        mass=mass,
-        com=com,
-        sag=(TRACELESS @ change[tool : tool + 8]).reshape(3, 3) if len(change) > tool else none,
-        drawn=float(change[tool + 8]) if len(change) > tool else 0.0,
-        change=change[:count],
-        firm=change[count:tool],
-        remainder=1e-3 * float(np.sqrt((rest**2).sum() / points)),
-    )
+    held = {
+        "turn": np.array([values.get(("joint", j), 0.0) for j in range(scene.joints)]),
+        "bend": {i: c for (kind, i), c in values.items() if kind == "link" and c > 0.0},
+        "base": values.get(("base", 0), 0.0), "mass": mass, "com": com,
+        "remainder": 1e-3 * float(np.sqrt((rest**2).sum() / points)),
+    }  # fmt: skip
+    sag = (TRACELESS @ change[tool : tool + 8]).reshape(3, 3) if len(change) > tool else none
+    drawn = float(change[tool + 8]) if len(change) > tool else 0.0
+    return Springs(held, sag, drawn, change[:count], change[count:tool])
 
 
 def beside(scene: Scene, laws: Fitted, geometry: Array, firm: Sequence[Term]) -> Iterator[Array]:

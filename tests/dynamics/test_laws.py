@@ -9,7 +9,7 @@ from dynamics.motions import simulated, three_joints
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.dynamics.laws import LAWS, MODULE, QUANTITIES, WORDS, Law, Tuned, laws_table
+from minimax_cal.dynamics.laws import LAWS, QUANTITIES, WORDS, Element, Law, Tuned, laws_table
 from minimax_cal.dynamics.rows import Arm, Scene, prepare, sense_of
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.simulators.motion.judge import laws_text
@@ -34,7 +34,7 @@ def registered() -> Iterator[Law]:
     del LAWS[WAVE.name], WORDS[WAVE.name]
 
 
-@pytest.mark.parametrize("name", [name for name, law in LAWS.items() if MODULE in law.held])
+@pytest.mark.parametrize("name", [name for name, law in LAWS.items() if Element.MODULE in law.held])
 def test_the_module_says_what_the_rows_say(name: str, scene: Scene) -> None:
     law, j = LAWS[name], 1
     written = eval(f"{{{laws_text({name: law})}}}", {"np": np})

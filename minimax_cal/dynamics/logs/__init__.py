@@ -229,32 +229,27 @@ def runs_text(runs: Sequence[Run], sliding: Array) -> str:
         raise DataError(
             f"{runs[0].source}: the runs differ in joints or units; write one at a time"
         )
-    n = runs[0].joints
+    n, many = runs[0].joints, len(runs) > 1
     length = ["mm" if slides else "rad" for slides in sliding]
     scale = np.where(sliding, 1e3, 1.0)
     drive = ["A" if TORQUE not in units else "N" if slides else "Nm" for slides in sliding]
     letter = "tau" if TORQUE in units else "i"
-    blocks: list[tuple[list[str], list[Array | None]]] = [
-        ([f"q{j + 1}_{u}" for j, u in enumerate(length)], [r.q * scale for r in runs]),
-    ]
-    for kind, suffix in (("qd", "_s"), ("qdd", "_s2")):
+    blocks: list[tuple[list[str], list[Array | None]]] = []
+    for kind, suffix in (("q", ""), ("qd", "_s"), ("qdd", "_s2")):
         given = [getattr(run, kind) for run in runs]
         if any(value is not None for value in given):
             names = [f"{kind}{j + 1}_{u}{suffix}" for j, u in enumerate(length)]
             blocks.append((names, [None if v is None else v * scale for v in given]))
     blocks.append(([f"{letter}{j + 1}_{u}" for j, u in enumerate(drive)], [r.torque for r in runs]))
     blocks += [block for block in (warmth(runs, n), payload(runs)) if block]
-    many = len(runs) > 1
-    header = [name for names, _ in blocks for name in names]
-    lines = [[*(["run"] if many else []), "t_s", *header]]
+    lines = [["run"] * many + ["t_s"] + [name for names, _ in blocks for name in names]]
     for at, run in enumerate(runs):
-        parts = [values[at] for _, values in blocks]
-        widths = [len(names) for names, _ in blocks]
-        for row in range(len(run.time)):
-            cells = [f"{run.time[row]:.6f}"]
-            for part, width in zip(parts, widths, strict=True):
-                cells += [""] * width if part is None else [f"{v:.9g}" for v in part[row]]
-            lines.append([*([run.name] if many else []), *cells])
+        empty = np.full((len(run.time), n), np.nan)
+        parts = [empty[:, : len(names)] if (own := values[at]) is None else own
+                 for names, values in blocks]  # fmt: skip
+        for time, row in zip(run.time, np.hstack(parts), strict=True):
+            cells = ["" if np.isnan(value) else f"{value:.9g}" for value in row]
+            lines.append([run.name] * many + [f"{time:.6f}"] + cells)
     return csv_text(lines)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -417,27 +417,20 @@ def is_step(seconds: float) -> bool:
 
 TURN = 2.0 * np.pi
 COMMANDS = "q_cmd"
-SAMPLED = ("row", "time", "q", "qd", "qdd", "torque")  # what has a value a row
+UNITS = {"tau": TORQUE, "i": CURRENT, COMMANDS: NOTHING}
 
 
-@dataclass(frozen=True, eq=False)
-class Draft:
-    """Rows of one trajectory in SI; fields as those of a Run.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Draft(Run):
+    """A run whose rows are still those of a log.
 
     log: the file's columns.  kind: of its torque columns, tau or i, else q_cmd.  row: (m,) rows of
     the log.
     """
 
     log: Log
-    name: str
     kind: str
     row: Array
-    time: Array
-    q: Array
-    qd: Array | None
-    qdd: Array | None
-    torque: Array
-    notices: tuple[str, ...] = ()
 
     @property
     def measured(self) -> bool:
@@ -465,7 +458,7 @@ class Draft:
 
     def keeping(self, rows: Array) -> Draft:
         """The same at some rows only.  rows: (m,) mask."""
-        return replace(self, **rows_of(self, SAMPLED, rows))
+        return replace(self, **rows_of(self, (*ROWS, "row"), rows))
 
     def lines(self, rows: Array) -> str:
         """Some lines of the file, to people."""
@@ -483,20 +476,13 @@ class Draft:
                 "each payload a run of its own"
             )
         warmth = values.get("temperature")
-        return Run(
-            name=self.name,
-            source=self.log.source,
-            time=self.time,
-            q=self.q,
-            qd=self.qd,
-            qdd=self.qdd,
-            torque=self.torque if self.measured else 0.0 * self.torque,
-            unit={"tau": TORQUE, "i": CURRENT, COMMANDS: NOTHING}[self.kind],
-            payload=float(payload[0]) if len(payload) else None,
-            temperature=warmth if warmth is not None and np.isfinite(warmth).all() else None,
-            notices=self.notices,
-            command=commanded(values.get(COMMANDS), self.q),
-        )
+        more = {
+            "torque": self.torque if self.measured else 0.0 * self.torque,
+            "payload": float(payload[0]) if len(payload) else None,
+            "temperature": warmth if warmth is not None and np.isfinite(warmth).all() else None,
+            "command": commanded(values.get(COMMANDS), self.q),
+        }
+        return Run(**{each.name: getattr(self, each.name) for each in fields(Run)} | more)
 
 
 def commanded(values: Array | None, q: Array) -> Array | None:
@@ -526,7 +512,9 @@ def drafts_of(log: Log, name: str) -> list[Draft]:
         draft = Draft(
             log=log,
             name=title,
+            source=log.source,
             kind=kind,
+            unit=UNITS[kind],
             row=row,
             time=values["t"][row] - values["t"][row[0]],
             q=values["q"][row],

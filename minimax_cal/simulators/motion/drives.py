@@ -17,6 +17,7 @@ from minimax_cal.dynamics.drives import (
     DELAY,
     FIELDS,
     FITTED,
+    FRICTION,
     GAINS,
     IN_A_RUN,
     INERTIA,
@@ -30,8 +31,7 @@ from minimax_cal.dynamics.drives import (
     fit_drive,
     is_another,
 )
-from minimax_cal.dynamics.laws import ARMATURE, FRICTION, WORDS
-from minimax_cal.dynamics.laws import DELAY as LATE_IN_FILE
+from minimax_cal.dynamics.laws import WORDS, Element
 from minimax_cal.dynamics.logs.table import NOTHING
 from minimax_cal.dynamics.regressor import Motion
 from minimax_cal.dynamics.result import MotionEffect, changed_joints
@@ -42,9 +42,14 @@ from minimax_cal.measuring.faults.fault import Amount
 from minimax_cal.robots.document import Document
 from minimax_cal.robots.mjcf import mujoco, numbers
 from minimax_cal.simulators.chain import Chain, braked
-from minimax_cal.simulators.elements import known, parents_of, section, tune
-from minimax_cal.simulators.mjcf import IMPLICIT, elements_of
-from minimax_cal.simulators.motion.correct import HISTORY_FIRST, Candidate, left_out_by, mean_log
+from minimax_cal.simulators.elements import forget, known, parents_of, section, tune
+from minimax_cal.simulators.mjcf import IMPLICIT, elements_of, servos_of
+from minimax_cal.simulators.motion.correct import (
+    HISTORY_FIRST,
+    Candidate,
+    Corrected,
+    mean_log,
+)
 from minimax_cal.simulators.motion.fit import Study, fit_numbers
 from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge, ahead_of
 from minimax_cal.simulators.motion.numbers import Bodies, Numbers, given_numbers
@@ -55,7 +60,7 @@ from minimax_cal.simulators.motion.written import (
     delayed,
     write_numbers,
 )
-from minimax_cal.simulators.result import MotionRung, WrittenElement
+from minimax_cal.simulators.result import WrittenElement
 
 WORTH = 0.01  # fall of the mean log joint error by which an effect of a drive is kept
 OTHER_SHARE = 0.4  # fall of what is left, as a mean log, by which drives carry gravity otherwise
@@ -106,19 +111,13 @@ class Served:
 def own_drives(chain: Chain) -> tuple[Drive, ...]:
     """(n) the position servos of a model."""
     model, out = chain.model, []
-    for joint, name in zip(chain.joints, chain.names, strict=True):
-        servo = chain.servo(joint)
-        gear = float(model.actuator_gear[servo, 0])
-        kp, kv = (-float(model.actuator_biasprm[servo, k]) * gear**2 for k in (1, 2))
+    late = getattr(model, "actuator_delay", np.zeros(model.nu))[chain.servos].tolist()
+    gain, damper, limits = servos_of(chain)
+    for j, name in enumerate(chain.names):
         ahead = sum(float(model.actuator_gainprm[k, 0]) for k in ahead_of(model, (name,)))
-        limits = [math.inf]
-        if model.actuator_forcelimited[servo]:
-            limits.append(float(np.abs(model.actuator_forcerange[servo]).min() * abs(gear)))
-        if model.jnt_actfrclimited[joint]:
-            limits.append(float(np.abs(model.jnt_actfrcrange[joint]).min()))
-        late = float(getattr(model, "actuator_delay", np.zeros(model.nu))[servo])
-        whole = kv + ahead
-        out.append(Drive(kp, whole, ahead / whole if ahead else 0.0, late, min(limits)))
+        whole = float(damper[j]) + ahead
+        out.append(Drive(float(gain[j]), whole, ahead / whole if ahead else 0.0, late[j],
+                         float(np.abs(limits[j]).min())))  # fmt: skip
     return tuple(out)
 
 
@@ -264,7 +263,7 @@ def effects_of(served: Served, judge: Judge, opened: Opened) -> Iterator[MotionE
 def lost_late(effects: Sequence[MotionEffect]) -> Iterator[str]:
     """What is to be said where a file has late commands, for people."""
     if any(one.effect == DELAY for one in effects):
-        yield left_out_by(LATE_IN_FILE)
+        yield Element.DELAY.left_out
         yield HISTORY_FIRST
 
 
@@ -321,10 +320,7 @@ def write_ahead(root: ET.Element, joint: str, gain: float) -> None:
     if gain:
         known(section(root, "actuator"), "velocity", f"{joint}_ahead", joint=joint, kv=gain)
         return
-    for part in root.iter("actuator"):
-        for old in part.findall("velocity"):
-            if old.get("name") == f"{joint}_ahead":
-                part.remove(old)
+    forget(root, "actuator", "velocity", f"{joint}_ahead")
 
 
 def write_late(actuator: ET.Element, late: float, step: float) -> None:
@@ -346,10 +342,9 @@ def write_share(root: ET.Element, chain: Chain, share: float) -> None:
 def can_write(opened: Opened) -> bool:
     """Whether every joint has a servo of its own that can be given other numbers."""
     chain, root = opened.chain, opened.given.document.root
-    servos = [chain.servo(joint) for joint in chain.joints]
     tags = [{e.tag for e in actuators_of(root, name)} for name in chain.names]
     named = all({"position", "general"} & some for some in tags)
-    return named and not chain.model.actuator_dyntype[servos].any()
+    return named and not chain.model.actuator_dyntype[chain.servos].any()
 
 
 # ---- actuators and ranges ------------------------------------------------------------------------
@@ -357,8 +352,8 @@ def can_write(opened: Opened) -> bool:
 
 UNITS = {name: unit for fields in FIELDS.values() for name, unit in fields.items()}
 ELEMENTS = {  # of the body, their names and units, and how they stand in `Numbers`
-    FRICTION: (("friction", "N m"), ("damping", "N m s/rad")),
-    ARMATURE: (("armature", "kg m^2"),),
+    Element.FRICTION: (("friction", "N m"), ("damping", "N m s/rad")),
+    Element.ARMATURE: (("armature", "kg m^2"),),
 }
 ISAAC = '''"""Actuators of {name} for Isaac Lab, whose physics steps are of {step} s.
 
@@ -472,9 +467,8 @@ def of_body(made: Candidate, study: Study, joints: tuple[str, ...]) -> Ranged:
                   for joint in joints)  # fmt: skip
 
     def values(numbers: Numbers) -> Array:
-        held = {"friction": numbers.friction, "damping": numbers.damping[:, 0],
-                "armature": numbers.armature}  # fmt: skip
-        return np.array([held[name][joints.index(joint)] for name, joint, _ in names])
+        each = (getattr(numbers, name) for kind in kinds for name, _ in ELEMENTS[kind])
+        return np.concatenate([[], *(one.reshape(len(joints), -1)[:, 0] for one in each)])
 
     mean, runs = values(made.numbers), range(len(study.scene.logs.names))
     if len(runs) < 2 or not names:
@@ -517,8 +511,8 @@ def write_ranges(
 
 
 HELD = {  # of the body, by their fields of `Numbers`: what was fitted beside drives, attributes
-    FRICTION: (FRICTION, "frictionloss"),
-    ARMATURE: (INERTIA, "armature"),
+    Element.FRICTION: (FRICTION, "frictionloss"),
+    Element.ARMATURE: (INERTIA, "armature"),
 }
 SCALE = (
     "commands and positions without torques: gains, friction and rotors are those for the masses "
@@ -527,24 +521,12 @@ SCALE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """A corrected model, and what is said of it.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Answer(Corrected):
+    """A corrected model with its drives, and what each effect of these is worth."""
 
-    rungs: after the first.  fitted: numbers of its body and the logs that told them, None without
-    torques.  module: text beside it.  lost: what other simulators leave out.
-    """
-
-    opened: Opened
-    served: Served | None
-    rungs: tuple[MotionRung, ...]
-    effects: tuple[MotionEffect, ...]
-    elements: tuple[WrittenElement, ...]
-    fitted: tuple[Candidate, Study] | None
-    module: str
-    left_out: tuple[str, ...]
-    notices: tuple[str, ...]
-    lost: tuple[str, ...]
+    served: Served | None = None
+    effects: tuple[MotionEffect, ...] = ()
 
 
 def by_positions(judge: Judge, opened: Opened, *, plain: bool) -> Answer:
@@ -571,11 +553,11 @@ def by_positions(judge: Judge, opened: Opened, *, plain: bool) -> Answer:
               for number, name in enumerate(names)]  # fmt: skip
     rungs = tuple(judge.rung(name, one.chain) for name, one in steps)
     elements = tuple(WrittenElement(name, "file", HELD[name][1], {}) for name in names)
-    return Answer(with_body(driven, served, names), served, rungs, effects, elements, None, "", (),
-                  (SCALE,), tuple(lost_late(effects)))  # fmt: skip
+    return Answer(with_body(driven, served, names), rungs, elements, None, "", (), (SCALE,),
+                  tuple(lost_late(effects)), served=served, effects=effects)  # fmt: skip
 
 
-def with_body(opened: Opened, served: Served, names: Sequence[str]) -> Opened:
+def with_body(opened: Opened, served: Served, names: Sequence[Element]) -> Opened:
     """The model with friction and rotors that were fitted beside the drives."""
     document = opened.given.document.copy()
     new = given = given_numbers(opened.chain, Bodies.of(opened.chain))

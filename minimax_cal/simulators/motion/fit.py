@@ -14,19 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.dynamics.laws import (
-    ARMATURE,
-    DELAY,
-    FRICTION,
-    GAIN,
-    LEVELLED,
-    MASSES,
-    SPRINGS,
-    Term,
-)
-from minimax_cal.dynamics.model import Columns, generous, held_friction, solve_scaled
+from minimax_cal.dynamics.laws import Element, Term
+from minimax_cal.dynamics.model import Columns, held_friction, solve_scaled
 from minimax_cal.dynamics.regressor import PER_LINK
-from minimax_cal.dynamics.rows import YIELD, Arm, Logs, Scene, Whitening, whitening
+from minimax_cal.dynamics.rows import YIELD, Arm, Logs, Scene, Whitening
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.simulators.chain import Chain
@@ -61,7 +52,7 @@ class Asked:
     gain is off.  laws: that no element holds.  bent: powers of the angle in a spring's torque.
     """
 
-    elements: frozenset[str]
+    elements: frozenset[Element]
     link: int = -1
     curved: tuple[int, ...] = ()
     sprung: tuple[int, ...] = ()
@@ -71,11 +62,11 @@ class Asked:
     late: float = 0.0
     bent: int = POWERS - 1
 
-    def adding(self, element: str) -> Asked:
+    def adding(self, element: Element) -> Asked:
         """With one element more."""
         return replace(self, elements=self.elements | {element})
 
-    def without(self, element: str) -> Asked:
+    def without(self, element: Element) -> Asked:
         """All but one element."""
         return replace(self, elements=self.elements - {element})
 
@@ -118,26 +109,24 @@ class Study:
 
     @staticmethod
     def of(chain: Chain, arm: Arm, logs: Logs, terms: tuple[Term, ...], inertia: Array,
-           *, assumed: bool) -> Study:  # fmt: skip
-        """Of the logs to learn from.  terms: the laws of a diagnosis."""
-        bodies, given, columns = begun(chain, arm, logs)
-        white = whitening(logs, generous(columns, terms))
+           prior: float, white: Whitening | None = None) -> Study:  # fmt: skip
+        """Of the logs to learn from.  white: by the laws, unless given."""
+        bodies, scene = Bodies.of(chain), Scene.of(arm, logs)
+        given = given_numbers(chain, bodies)
+        columns = Columns(scene.with_body(of_all(bodies.links(given.bodies)), scene.friction))
+        white = white or columns.whitening(terms)
         links = white.white(columns.links[white.kept])
-        prior = PRIOR_ASSUMED if assumed else PRIOR
         return Study(chain, bodies, given, columns.scene, white, links, inertia, prior, terms)
 
     def only(self, runs: Sequence[int]) -> Study:
         """Of some of the runs."""
-        logs, assumed = self.scene.logs.only(runs), self.prior == PRIOR_ASSUMED
-        return Study.of(self.chain, self.scene.arm, logs, self.terms, self.inertia, assumed=assumed)
+        arm, logs = self.scene.arm, self.scene.logs.only(runs)
+        return Study.of(self.chain, arm, logs, self.terms, self.inertia, self.prior)
 
     def of_file(self, chain: Chain, gain: Array) -> Study:
         """The same logs, for a written model.  gain: (n,) of its drives over those of the logs."""
-        arm = replace(self.scene.arm, gain=self.scene.arm.gain / gain)
-        bodies, given, columns = begun(chain, arm, self.scene.logs)
-        links = self.white.white(columns.links[self.white.kept])
-        return replace(self, chain=chain, bodies=bodies, given=given, scene=columns.scene,
-                       links=links)  # fmt: skip
+        arm, logs = replace(self.scene.arm, gain=self.scene.arm.gain / gain), self.scene.logs
+        return Study.of(chain, arm, logs, self.terms, self.inertia, self.prior, self.white)
 
     def error(self, late: float) -> Array:
         """(N,) whitened torques less those of a known payload; so much earlier [s]."""
@@ -154,14 +143,6 @@ class Study:
         return replace(self, bodies=bodies, given=given, scene=scene)
 
 
-def begun(chain: Chain, arm: Arm, logs: Logs) -> tuple[Bodies, Numbers, Columns]:
-    """What a model has, and columns of logs of its arm with its masses."""
-    bodies = Bodies.of(chain)
-    given, scene = given_numbers(chain, bodies), Scene.of(arm, logs)
-    rigid = of_all(bodies.links(given.bodies))
-    return bodies, given, Columns(scene.with_body(rigid, scene.friction))
-
-
 def of_all(links: Array) -> Array:
     """(n, 10 n) parameters that all joints share, of links (n, 10)."""
     return np.broadcast_to(links.ravel(), (len(links), links.size))
@@ -172,9 +153,9 @@ def fit_numbers(study: Study, asked: Asked) -> Numbers:
     if asked.behind:
         whole = replace(asked, laws=asked.behind, behind=())
         study = study.with_masses(fit_numbers(study, whole))
-        asked = replace(asked, behind=(), elements=asked.elements - {MASSES, ARMATURE})
+        asked = replace(asked, behind=()).without(Element.MASSES).without(Element.ARMATURE)
     scene, numbers = study.scene, study.given.put(fastest=study.scene.arm.fastest)
-    late = asked.late if DELAY in asked.elements else 0.0
+    late = asked.late if Element.DELAY in asked.elements else 0.0
     error = study.error(late)
     for _ in range(ROUNDS):
         columns = list(columns_of(study, scene, asked))
@@ -188,22 +169,22 @@ def columns_of(study: Study, scene: Scene, asked: Asked) -> Iterator[Column]:
     motion, unit, given = scene.logs.motion, scene.divisor, study.given
     for j in range(given.joints):
         qd, qdd = motion.qd[:, j], motion.qdd[:, j]
-        if FRICTION in asked.elements:
+        if Element.FRICTION in asked.elements:
             yield Column("friction", j, scene.sense[:, j] / unit[j], j)
             yield Column("damping", j, qd / unit[j], (j, 0))
-        if LEVELLED in asked.elements and j in asked.curved:
+        if Element.LEVELLED in asked.elements and j in asked.curved:
             for share in LEVELS_OFF:
                 powers = levelling(share * scene.arm.fastest[j])
                 yield Column("damping", j, speeds(qd) @ powers / unit[j], j, powers)
-        if ARMATURE in asked.elements:
+        if Element.ARMATURE in asked.elements:
             whole = unit[j] * np.abs(scene.logs.torque[:, j]).max() / np.abs(qdd).max()
             doubt = max(given.armature[j], ROTOR * study.inertia[j], ROTOR * whole)
             yield Column("armature", j, qdd / unit[j], j, mean=given.armature[j], sd=doubt)
-        if SPRINGS in asked.elements and j in asked.sprung:
+        if Element.SPRINGS in asked.elements and j in asked.sprung:
             for power in range(asked.bent + 1):
                 rows = motion.q[:, j] ** power / unit[j]
                 yield Column("spring", j, rows, (j, power), low=-np.inf)
-        if GAIN in asked.elements and j in asked.geared:
+        if Element.GAIN in asked.elements and j in asked.geared:
             yield Column("gain", j, scene.load[:, j], j, low=-np.inf)
     for number, term in enumerate(asked.laws):
         low = 0.0 if term.law.nonnegative else -np.inf
@@ -224,14 +205,14 @@ def levelling(speed: float) -> Array:
 def kept_numbers(study: Study, asked: Asked) -> Numbers:
     """The model's own numbers, 0 where they are fitted."""
     given, fitted = study.given, asked.elements
-    own, free = FRICTION not in fitted, list(asked.sprung if SPRINGS in fitted else ())
+    own, free = Element.FRICTION not in fitted, asked.sprung if Element.SPRINGS in fitted else ()
     stiffness = given.stiffness.copy()
-    stiffness[free] = 0.0
+    stiffness[list(free)] = 0.0
     return given.put(
         friction=given.friction * own,
         damping=given.damping * own,
         bristles=given.bristles * own,
-        armature=given.armature * (ARMATURE not in fitted),
+        armature=given.armature * (Element.ARMATURE not in fitted),
         stiffness=stiffness,
     )
 
@@ -278,7 +259,7 @@ def joint_fit(
     links, linear, right = rows
     n, k = study.bodies.count, len(columns)
     free = np.zeros((n, PER_LINK), dtype=bool)
-    if MASSES in asked.elements:
+    if Element.MASSES in asked.elements:
         free[:] = np.arange(n)[:, None] == asked.link if asked.link >= 0 else True
     mean, sd, low = (np.array([getattr(c, name) for c in columns]).reshape(k)
                      for name in ("mean", "sd", "low"))  # fmt: skip
@@ -368,7 +349,7 @@ def numbers_of(
             found[column.field][column.at] += one * column.by
     gain, spring = found.pop("gain"), found.pop("spring")
     stiffness, rest = own.stiffness, own.rest.copy()
-    for j in asked.sprung if SPRINGS in asked.elements else ():
+    for j in asked.sprung if Element.SPRINGS in asked.elements else ():
         stiffness[j], rest[j] = spring_of(spring[j] / gain[j])
     law = np.array([column.at if column.field == "law" else -1 for column in columns])
     return before.put(

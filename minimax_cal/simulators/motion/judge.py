@@ -19,7 +19,16 @@ from minimax_cal.dynamics.drives import command_of
 from minimax_cal.dynamics.given import MotionKnown
 from minimax_cal.dynamics.laws import Law
 from minimax_cal.dynamics.logs.table import NOTHING, Run
-from minimax_cal.dynamics.rows import EDGE_S, Arm, Logs, Scene, bent_bristles, prepare, rms_by_joint
+from minimax_cal.dynamics.rows import (
+    EDGE_S,
+    Arm,
+    Logs,
+    Scene,
+    at_times,
+    bent_bristles,
+    prepare,
+    rms_by_joint,
+)
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.robots.mjcf import mujoco
@@ -95,6 +104,7 @@ def installed(text: str, chain: Chain) -> Iterator[None]:
 # ---- a simulated arm along a log -----------------------------------------------------------------
 
 
+Pull = Callable[[Array, Array, Array], Array]  # torque of joint values, and how far they are off
 BANDWIDTH = 2.0 * np.pi * 5.0  # of drives that hold an arm to a log, where none are given [1/s]
 
 
@@ -104,6 +114,10 @@ class Gains:
 
     stiffness: Array
     damper: Array
+
+    def __call__(self, q: Array, off: Array, slow: Array) -> Array:
+        """(n,) torque where joints and their speeds are off by so much."""
+        return np.asarray(self.stiffness * off + self.damper * slow)
 
 
 def inverse_torque(chain: Chain, logs: Logs) -> Array:
@@ -133,7 +147,7 @@ def follow_commands(chain: Chain, run: Run, commands: Array, source: str) -> Arr
 
     commands: (m, n) at the times of the run [rad, m].  Raises RobotError for an unstable model.
     """
-    servos = np.array([chain.servo(joint) for joint in chain.joints])
+    servos = chain.servos
     speeds = ahead_of(chain.model, chain.names)
 
     def drive(data: Any, now: int) -> None:
@@ -142,7 +156,7 @@ def follow_commands(chain: Chain, run: Run, commands: Array, source: str) -> Arr
         if not now:
             fill_history(chain.model, data)
 
-    path = on_steps(run.time, commands, chain)
+    path = at_times(steps_of(run.time, chain), run.time, commands)
     rates = np.gradient(path, float(chain.model.opt.timestep), axis=0)
     return stepped(chain, run, drive, source)
 
@@ -154,39 +168,43 @@ def ahead_of(model: Any, names: Sequence[str]) -> dict[int, int]:
     return {number: j for j, number in enumerate(ids) if number >= 0}
 
 
-def follow_torques(
-    chain: Chain, run: Run, torque: Array, hold: Gains | Chain, source: str
-) -> Array:
+def follow_torques(chain: Chain, run: Run, torque: Array, pull: Pull, source: str) -> Array:
     """(m, n) joint values under measured torques and drives that hold the arm to the log.
 
-    torque: (m, n) at the times of the run [N m].  hold: gains of the drives, or the arm for whose
-    inertia they are critically damped.  They make up for what the model gets wrong: where it is
-    right, the arm follows the log by the measured torques alone.
+    torque: (m, n) at the times of the run [N m].  The drives make up for what the model gets wrong:
+    where it is right, the arm follows the log by the measured torques alone.
     """
-    model, at, dofs = chain.model, chain.places, chain.dofs
-    wanted = scipy.interpolate.CubicSpline(run.time, run.q)
-    time = steps_of(run.time, chain)
-    q, qd, ahead = wanted(time), wanted(time, 1), on_steps(run.time, torque, chain)
-    pull = by_gains(hold) if isinstance(hold, Gains) else by_inertia(hold)
+    wanted, time = scipy.interpolate.CubicSpline(run.time, run.q), steps_of(run.time, chain)
+    path = wanted(time), wanted(time, 1), at_times(time, run.time, torque)
+    return held_to(chain, run, path, pull, source)
+
+
+def follow_gains(chain: Chain, run: Run, commands: Array, gains: Pull, source: str) -> Array:
+    """(m, n) joint values where proportional and derivative drives bring an arm by commands."""
+    wanted = at_times(steps_of(run.time, chain), run.time, commands)
+    return held_to(chain, run, (wanted, 0.0 * wanted, 0.0 * wanted), gains, source)
+
+
+def held_to(
+    chain: Chain, run: Run, path: tuple[Array, Array, Array], pull: Pull, source: str
+) -> Array:
+    """(m, n) joint values under drives that hold an arm to joint values and speeds (steps, n).
+
+    path: these, and torque beside that of the drives [N m].
+    """
+    at, dofs = chain.places, chain.dofs
+    q, qd, ahead = path
 
     def drive(data: Any, now: int) -> None:
         off, slow = q[now] - data.qpos[at], qd[now] - data.qvel[dofs]
         data.qfrc_applied[dofs] = ahead[now] + pull(data.qpos[at], off, slow)
 
-    with own_drives_off(model):
+    with own_drives_off(chain.model):
         return stepped(chain, run, drive, source)
 
 
-Pull = Callable[[Array, Array, Array], Array]  # torque of joint values, and how far they are off
-
-
-def by_gains(gains: Gains) -> Pull:
-    """Drives of constant gains."""
-    return lambda q, off, slow: gains.stiffness * off + gains.damper * slow
-
-
 def by_inertia(chain: Chain) -> Pull:
-    """Drives whose gains follow the inertia of an arm."""
+    """Drives whose gains follow the inertia of an arm: critically damped."""
     mj, model = mujoco(), chain.model
     data, (at, dofs) = mj.MjData(model), (chain.places, chain.dofs)
     wanted, torque = np.zeros(model.nv), np.zeros(model.nv)
@@ -199,19 +217,6 @@ def by_inertia(chain: Chain) -> Pull:
         return np.asarray(torque[dofs])
 
     return pull
-
-
-def follow_gains(chain: Chain, run: Run, commands: Array, gains: Gains, source: str) -> Array:
-    """(m, n) joint values where proportional and derivative drives bring an arm by commands."""
-    model, at, dofs = chain.model, chain.places, chain.dofs
-    wanted = on_steps(run.time, commands, chain)
-
-    def drive(data: Any, now: int) -> None:
-        off = wanted[now] - data.qpos[at]
-        data.qfrc_applied[dofs] = gains.stiffness * off - gains.damper * data.qvel[dofs]
-
-    with own_drives_off(model):
-        return stepped(chain, run, drive, source)
 
 
 @contextmanager
@@ -235,12 +240,6 @@ def steps_of(time: Array, chain: Chain) -> Array:
     return np.asarray(time[0] + step * np.arange(int((time[-1] - time[0]) / step) + 1))
 
 
-def on_steps(time: Array, values: Array, chain: Chain) -> Array:
-    """Values (m, n) of a log at a model's steps, straight between rows."""
-    steps = steps_of(time, chain)
-    return np.stack([np.interp(steps, time, column) for column in values.T], axis=1)
-
-
 def stepped(chain: Chain, run: Run, drive: Callable[[Any, int], None], source: str) -> Array:
     """(m, n) joint values at the times of a run.  drive: sets what acts at a step."""
     mj, model = mujoco(), chain.model
@@ -254,7 +253,7 @@ def stepped(chain: Chain, run: Run, drive: Callable[[Any, int], None], source: s
         drive(data, now)
         mj.mj_step(model, data)
     check_stable(mj, data, source)
-    return np.stack([np.interp(run.time, time, column) for column in out.T], axis=1)
+    return at_times(run.time, time, out)
 
 
 def tracking(q: Array, run: Run) -> Array:
@@ -287,8 +286,8 @@ class Judge:
 
     arm: of the model as it is read, with gains and speeds.  inertia: (n,) largest about each joint
     of the model as given [kg m^2].  learning, held: on the even grid.  runs: that judge, as logged.
-    drives: in words, empty where nothing is driven.  hold: given gains, or the
-    model whose inertia those of usual drives follow.
+    drives: in words, empty where nothing is driven.  hold: given gains, or
+    those of usual drives.
     """
 
     arm: Arm
@@ -299,7 +298,7 @@ class Judge:
     runs: tuple[Run, ...]
     source: str
     drives: str = ""
-    hold: Gains | Chain | None = None
+    hold: Pull | None = None
 
     @staticmethod
     def of(opened: Opened, runs: Sequence[Run], known: MotionKnown, *, fast: bool = False) -> Judge:
@@ -324,8 +323,8 @@ class Judge:
         """
         chain = opened.chain
         commanded = all(run.command is not None for run in (*self.runs, *self.learning_runs))
-        own = all(chain.servo(joint) >= 0 for joint in chain.joints)
-        hold: Gains | Chain = chain
+        own = bool((chain.servos >= 0).all())
+        hold: Pull = by_inertia(chain)
         if gains is not None:
             try:
                 hold = Gains(*(np.broadcast_to(np.array(one, dtype=float), len(self.inertia))
@@ -344,10 +343,15 @@ class Judge:
         """The same runs and drives, for another model of the arm."""
         return replace(self, arm=replace(self.arm, robot=in_its_gravity(opened.chain)))
 
+    def read(self, numbers: Numbers | None) -> tuple[Array, float]:
+        """(n,) torque of the log per torque of the joint, and by how much it is late [s]."""
+        if numbers is None:
+            return np.ones(len(self.inertia)), 0.0
+        return numbers.gain, numbers.late
+
     def off(self, chain: Chain, logs: Logs, numbers: Numbers | None) -> Array:
         """(R, n) torque that a model gets wrong along some logs [unit of the log]."""
-        gain = np.ones(len(self.inertia)) if numbers is None else numbers.gain
-        late = 0.0 if numbers is None else numbers.late
+        gain, late = self.read(numbers)
         seen = logs.earlier(late) if late else logs
         said = inverse_torque(chain, logs) * gain / self.arm.gain
         known = self.known if logs is self.held else Scene.of(self.arm, logs).known_torque
@@ -377,16 +381,12 @@ class Judge:
         assert self.hold is not None
         if self.drives == OWN_SERVOS:
             return follow_commands(chain, run, command_of(run), self.source)
-        if self.drives == GIVEN_GAINS and isinstance(self.hold, Gains):
+        if self.drives == GIVEN_GAINS:
             return follow_gains(chain, run, command_of(run), self.hold, self.source)
-        gain = np.ones(len(self.inertia)) if numbers is None else numbers.gain
-        late = 0.0 if numbers is None else numbers.late
-        rows = slice(self.held.start[number], self.held.start[number + 1])
-        known, grid = self.known[rows], self.held.since[rows]
-        time = run.time - run.time[0]
-        carried = np.stack([np.interp(time, grid, column) for column in known.T], axis=1)
-        early = [np.interp(time + late, time, column) for column in (run.torque - carried).T]
-        torque = np.stack(early, axis=1) * self.arm.gain / gain
+        gain, late = self.read(numbers)
+        rows, time = self.held.spans[number], run.time - run.time[0]
+        carried = at_times(time, self.held.since[rows], self.known[rows])
+        torque = at_times(time + late, time, run.torque - carried) * self.arm.gain / gain
         return follow_torques(chain, run, torque, self.hold, self.source)
 
     def rung(self, name: str, chain: Chain, numbers: Numbers | None = None, module: str = "",

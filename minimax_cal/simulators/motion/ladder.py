@@ -29,7 +29,6 @@ from minimax_cal.simulators.motion.correct import (
     Bench,
     asked_of,
     correct,
-    lost,
     mean_log,
 )
 from minimax_cal.simulators.motion.drives import (
@@ -39,7 +38,7 @@ from minimax_cal.simulators.motion.drives import (
     write_actuators,
     write_ranges,
 )
-from minimax_cal.simulators.motion.fit import Study, has_bristles
+from minimax_cal.simulators.motion.fit import PRIOR, PRIOR_ASSUMED, Study, has_bristles
 from minimax_cal.simulators.motion.judge import ENDING, OWN_SERVOS, Judge
 from minimax_cal.simulators.motion.written import Opened, calibrated, open_model
 from minimax_cal.simulators.result import MotionGap, MotionRung
@@ -177,9 +176,8 @@ def by_torques(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Answ
     """By torques, and by commands where they were logged."""
     bench, served, rungs, effects = by_commands(bench, found, progress)
     made = correct(bench, found, progress)
-    return Answer(made.plain.opened, served, (*rungs, *made.rungs), effects, made.elements,
-                  (made.plain, bench.study), made.full.module, made.left_out, made.notices,
-                  (*lost(made), *drives.lost_late(effects)))  # fmt: skip
+    more = {"rungs": (*rungs, *made.rungs), "lost": (*made.lost, *drives.lost_late(effects))}
+    return Answer(**vars(made) | more, served=served, effects=effects)
 
 
 def by_commands(
@@ -262,5 +260,6 @@ def bench_of(
     """Where corrections of a model are fitted and judged.  asked: its `bristled` and `plain`."""
     assumed = opened.given.assumed or not weighed(opened.chain.robot).all()
     study = Study.of(opened.chain, judge.arm, judge.learning, found.models[-1].terms,
-                     largest_inertia(opened.chain), assumed=bool(assumed))  # fmt: skip
+                     largest_inertia(opened.chain),
+                     PRIOR_ASSUMED if assumed else PRIOR)  # fmt: skip
     return Bench(judge, opened, study, *asked)

@@ -54,8 +54,13 @@ def parameters_of(pseudo: Array) -> Array:
 
 def of_body(mass: float, centre: Array, about: Array) -> Array:
     """(4, 4) of a body.  centre: (3,) [m].  about: (3, 3) about its centre of gravity [kg m^2]."""
+    return of_second(mass, centre, 0.5 * np.trace(about) * np.eye(3) - about)
+
+
+def of_second(mass: float, centre: Array, second: Array) -> Array:
+    """(4, 4) of a body.  second: (3, 3) second moments about its centre of gravity [kg m^2]."""
     out = np.empty((4, 4))
-    out[:3, :3] = 0.5 * np.trace(about) * np.eye(3) - about + mass * np.outer(centre, centre)
+    out[:3, :3] = second + mass * np.outer(centre, centre)
     out[:3, 3] = out[3, :3] = mass * centre
     out[3, 3] = mass
     return out
@@ -68,12 +73,7 @@ def physical(pseudo: Array) -> Array:
     second = pseudo[:3, :3] - mass * np.outer(centre, centre)
     size, axes = np.linalg.eigh(second)
     least = max(THINNEST * float(size.max()), THINNEST * mass * WIDTH**2)
-    second = (axes * np.maximum(size, least)) @ axes.T
-    out = np.empty((4, 4))
-    out[:3, :3] = second + mass * np.outer(centre, centre)
-    out[:3, 3] = out[3, :3] = mass * centre
-    out[3, 3] = mass
-    return out
+    return of_second(mass, centre, (axes * np.maximum(size, least)) @ axes.T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,16 +20,16 @@ from minimax_cal.robots.mjcf import Given, mujoco, numbers, read_model
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.transforms import tail
 from minimax_cal.robots.urdf import MODELS, is_urdf
-from minimax_cal.simulators.arm import arm_of, assumed, stiff
-from minimax_cal.simulators.chain import Chain, braked, chain_along, chain_of
-from minimax_cal.simulators.elements import STEPS, carried, known, parents_of, section, tune
+from minimax_cal.simulators.arm import arm_of, stiff
+from minimax_cal.simulators.chain import TURNS, Chain, braked, chain_along, chain_of
+from minimax_cal.simulators.elements import STEPS, carried, forget, known, parents_of, section, tune
 from minimax_cal.simulators.mjcf import (
     content_for,
     corrected,
     counts_degrees,
     elements_of,
     new_tree,
-    told_masses,
+    own_masses,
 )
 from minimax_cal.simulators.motion.numbers import (
     Bodies,
@@ -41,7 +41,6 @@ from minimax_cal.simulators.motion.numbers import (
 )
 
 SAME = 1e-12  # relative change of a number that is none
-TURNS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 STOPS = 4e-6  # friction moves the tool of a new file, at each joint, by no more [m]
 OPEN = {"motorconst": "1", "resistance": "1e9", "input": "none"}  # a motor that drives nothing
 HISTORY = 2  # samples of a delayed signal beyond those of the delay
@@ -126,11 +125,8 @@ def write_bristles(root: ET.Element, chain: Chain, found: Numbers) -> None:
                 level = [stiffness, stiffness * found.damped[j], friction, friction, 1.0]
                 known(section(root, "actuator"), "dcmotor", bristle(name, k), joint=name,
                       lugre=level, **OPEN)  # fmt: skip
-                continue
-            for part in root.iter("actuator"):
-                for old in part.findall("dcmotor"):
-                    if old.get("name") == bristle(name, k):
-                        part.remove(old)
+            else:
+                forget(root, "actuator", "dcmotor", bristle(name, k))
 
 
 def write_delay(root: ET.Element, chain: Chain, found: Numbers) -> None:
@@ -159,7 +155,7 @@ def stiffen(root: ET.Element, chain: Chain, found: Numbers) -> None:
     A servo of gain k stops within friction / k of its command.
     """
     mass, com = masses_of(chain.robot, LEAST_MASS)
-    _, reach, _ = carried(stiff(chain.robot, (mass, com)))
+    reach, _ = carried(stiff(chain.robot, (mass, com)))
     needed = found.friction * np.where(chain.robot.prismatic, 1.0, reach) / STOPS
     for i, name in enumerate(chain.names):
         for servo in actuators_of(root, name):
@@ -278,9 +274,8 @@ def calibrated(opened: Opened, fit: Fit) -> tuple[Opened, tuple[str, ...]]:
         given = replace(opened.given, document=document)
         return opened.rebuilt(given).with_free_joints(), ()
     nominal = fit.nominal.robot
-    own = None if assumed(opened.chain.robot) else told_masses(opened.chain, nominal)
-    arm = arm_of(fit.cell, fit.train.q, own)
-    driven = any(opened.chain.servo(joint) >= 0 for joint in opened.chain.joints)
+    arm = arm_of(fit.cell, fit.train.q, own_masses(opened.chain, nominal))
+    driven = bool((opened.chain.servos >= 0).any())
     document, notices = corrected(opened.given, opened.chain, nominal, arm, names, driven=driven)
     if not driven and (arm.gain.any() or arm.coupled):
         notices += (
