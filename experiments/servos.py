@@ -32,7 +32,7 @@ from minimax_cal.simulators.elements import parents_of
 from minimax_cal.simulators.mjcf import largest_inertia
 from minimax_cal.simulators.motion.drives import serve
 from minimax_cal.simulators.motion.judge import Judge
-from minimax_cal.simulators.motion.written import open_model
+from minimax_cal.simulators.motion.numbers import open_model
 
 ARMS = ("ur10", "seven_axes", "irb2600", "scara_600")
 HZ, STEP = 250.0, 0.001  # of the log, of the real arm [s]

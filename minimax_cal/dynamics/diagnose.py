@@ -20,19 +20,22 @@ from minimax_cal.dynamics.budget import (
 )
 from minimax_cal.dynamics.given import LEAST_SCALE, MOST_SCALE, MotionKnown, runs_of
 from minimax_cal.dynamics.laws import ANGLE, CURVE, LAWS, USUAL, Law, Term, terms_of
-from minimax_cal.dynamics.links import LinkChange, body_as_given, carried, weighing
 from minimax_cal.dynamics.logs.table import CURRENT, Run
 from minimax_cal.dynamics.model import (
     FRICTION,
     RIGID,
     Body,
     Columns,
+    LinkChange,
     Normal,
     TorqueModel,
+    body_as_given,
+    carried,
     dictionary_of,
     first_body,
     parts_of,
     softened,
+    weighing,
 )
 from minimax_cal.dynamics.probes import Unexplained, unexplained
 from minimax_cal.dynamics.result import (

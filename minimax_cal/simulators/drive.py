@@ -104,14 +104,12 @@ class Driven:
     q: (m, n) where the joints were [rad, m].  speed: (m,) largest of all joints, springs with them,
     as a share of what counts as rest.  limited: (n,) share of the timesteps at which a joint's
     actuator was at its force limit.
-    driven: whether servos moved it; else its joints were set.
     """
 
     poses: Array
     q: Array
     speed: Array
     limited: Array
-    driven: bool
 
     @property
     def moving(self) -> Array:
@@ -152,7 +150,7 @@ def drive(
     with ThreadPoolExecutor(min(len(runs), os.cpu_count() or 1)) as pool:
         found = zip(*(visit for part in pool.map(one, runs) for visit in part), strict=True)
         poses, q, speed, limited = map(np.array, found)
-    return Driven(poses, q, speed, limited.mean(axis=0), True)
+    return Driven(poses, q, speed, limited.mean(axis=0))
 
 
 Visit = tuple[Array, Array, float, Array]  # a row of `Driven`
@@ -276,7 +274,7 @@ def set_joints(chain: Chain, commands: Array, play: Array | None) -> Driven:
         mj.mj_kinematics(model, data)
         out.append(body_pose(data, carrier(chain)))
     still, limited = np.zeros(len(commands)), np.zeros(commands.shape[1])
-    return Driven(np.array(out), commands, still, limited, False)
+    return Driven(np.array(out), commands, still, limited)
 
 
 def touching(chain: Chain, model: Any, q: Array) -> Array:

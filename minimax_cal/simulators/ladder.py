@@ -259,25 +259,24 @@ def simulator_gap(
     if not causes.held.any():
         raise OptionError(f"{causes.data.source}: no pose is held out; give holdout=0.2")
     run = Run(given, chain, causes, progress)
-    rungs, best = run.before(), run.corrected()
-    failed = best.fit.status is Status.FAILED
-    path = None if write is None or failed else Path(write)
-    made = run.last(best, path)
-    rungs += [*best.rungs[:-1], made.rung]
-    notices = (*rows.notices, *run.notices, *made.notices,
-               *disagreement([*rungs, *([made.commands] if made.commands else [])]))  # fmt: skip
+    rungs, (more, best) = run.before(), run.corrected()
+    path = None if write is None or best.status is Status.FAILED else Path(write)
+    last, commands = run.last(more[-1], best, path)
+    rungs += [*more[:-1], last]
+    every = [*rungs, commands] if commands else rungs
+    notices = (*rows.notices, *run.notices, *disagreement(every))
     return SimulatorGap(
         model=str(model),
         robot=chain.robot.name,
         rungs=tuple(rungs),
-        commands=made.commands,
+        commands=commands,
         floor=causes.floor.value if causes.floor else np.nan,
         floor_from=causes.floor.source if causes.floor else "",
         train_poses=int((~causes.held).sum()),
         holdout_poses=int(run.held.sum()),
-        status=best.fit.status,
-        beyond=plain(best.fit.beyond),
-        left_out=made.left_out,
+        status=best.status,
+        beyond=plain(best.beyond),
+        left_out=tuple(run.left_out),
         notices=tuple(dict.fromkeys(notices)),
         written="" if path is None else str(path),
         seconds=time.perf_counter() - began,
@@ -297,31 +296,11 @@ def check_model(chain: Chain, q: Array, source: str) -> None:
     drive(chain, q[:FIRST_MOVES], source)
 
 
-@dataclass(frozen=True, eq=False)
-class Best:
-    """What the simulator is best with.  rungs: from geometry on.  fit: with their effects together.
+class Run:
+    """One ladder in the making: model, poses and fits, and its notices.
 
     mapped: effects for a command map.  left_out: what is in neither, and why.
     """
-
-    rungs: tuple[Rung, ...]
-    fit: Fit
-    mapped: tuple[Term, ...]
-    left_out: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Last:
-    """The last rung, measured from the file that holds it, and with its command map."""
-
-    rung: Rung
-    commands: Rung | None
-    left_out: tuple[str, ...]
-    notices: tuple[str, ...]
-
-
-class Run:
-    """One ladder in the making: model, poses and fits, and its notices."""
 
     def __init__(self, given: Given, chain: Chain, causes: Causes, progress: Progress) -> None:
         self.given, self.chain, self.causes, self.progress = given, chain, causes, progress
@@ -334,66 +313,65 @@ class Run:
         self.held = causes.held[self.rows]
         self.nominal = causes.geometry.nominal
         self.notices: list[str] = []
+        self.mapped, self.left_out = list(causes.turning), list(causes.left_out)
         self.tell(f"{given.source}: the arm touches something", causes.data, touched, judge)
 
     def before(self) -> list[Rung]:
         """The model as given, and without the sag of its servos."""
         first = self.rung("as given", self.chain, self.nominal)
-        if not first[1]:
+        if (self.chain.servos < 0).any():
             self.notices.append(
                 f"{self.given.source}: not every joint has a position servo: joints are set, not "
                 "driven, in the model as given"
             )
-            return [replace(first[0], why="joints set, not driven")]
+            return [replace(first, why="joints set, not driven")]
         document, notices = corrected(self.given, self.chain, self.nominal.robot, None)
         self.notices += notices
-        stiff = self.rung("servo sag removed", self.of(document), self.nominal)[0]
-        fall = first[0].sag_mrad
+        stiff = self.rung("servo sag removed", self.of(document), self.nominal)
         return [
-            replace(first[0], why=f"servos sag by up to {fall:.3g} mrad"),
+            replace(first, why=f"servos sag by up to {first.sag_mrad:.3g} mrad"),
             replace(stiff, why="gains that hold the arm where it is commanded"),
         ]
 
-    def corrected(self) -> Best:
-        """A rung for geometry, and for each effect that the simulator holds and gains by.
+    def corrected(self) -> tuple[list[Rung], Fit]:
+        """A rung for geometry, and each effect that the simulator holds and gains by; their fit.
 
         Each is fitted with those before it and with nothing else: the values of a fit hold
         together, and an element with those of a fit that had more does not do what that fit says.
         """
         fit, taken = self.causes.geometry, list[Term]()
-        mapped, left_out = list(self.causes.turning), list(self.causes.left_out)
         rungs = [self.fitted("calibrated geometry", fit)]
         for term in self.causes.firm:
             self.progress(f"fit with {name_effect(*term.key)}")
             more = self.causes.fitted([*taken, term])
             if unheld(more.cell, more.train):
-                mapped.append(term)
+                self.mapped.append(term)
                 continue
             rung = self.fitted(term.step, more)
             if worse(rung, rungs[-1]):
                 change = f"{rungs[-1].holdout_rms_mm:.4f} -> {rung.holdout_rms_mm:.4f} mm"
-                left_out.append(
+                self.left_out.append(
                     f"{name_effect(*term.key)}: the simulated arm is worse with it ({change})"
                 )
                 continue
             fit, taken = more, [*taken, term]
             rungs.append(rung)
-        return Best(tuple(rungs), fit, tuple(mapped), tuple(left_out))
+        return rungs, fit
 
-    def last(self, best: Best, path: Path | None) -> Last:
+    def last(self, before: Rung, fit: Fit, path: Path | None) -> tuple[Rung, Rung | None]:
         """The last rung from its file, with targets, and what a command map does."""
-        fit, arm, before = best.fit, self.arm(best.fit), best.rungs[-1]
+        arm, commands = self.arm(fit), None
         document, notices = self.with_arm(arm, fit)
-        rung = self.rung(before.name, self.saved(document, path), fit.cell, arm, fit)[0]
-        commands = None
-        if best.mapped:
-            fit = self.causes.fitted([*fit.cell.effects.terms, *best.mapped])
+        rung = self.rung(before.name, self.saved(document, path), fit.cell, arm, fit)
+        if self.mapped:
+            fit = self.causes.fitted([*fit.cell.effects.terms, *self.mapped])
             arm = self.arm(fit)
         if arm.mapped.terms:
             commands = self.with_commands(arm, fit, path)
-        left_out = (*best.left_out, *arm.left_out)
-        notices = (*notices, *told(replace(arm, remainder=0.0, left_out=left_out)))
-        return Last(replace(rung, why=before.why), commands, left_out, notices)
+        self.left_out += arm.left_out
+        whole = replace(arm, remainder=0.0, left_out=tuple(self.left_out))
+        self.notices += (*notices, *told(whole))
+        return replace(rung, why=before.why), commands
 
     def saved(self, document: Document, path: Path | None) -> Chain:
         """The arm in a changed tree, from the file where one is written."""
@@ -417,7 +395,7 @@ class Run:
                 f"{model}: the model that the command map belongs to; {path} is the best without"
             )
         commands = Commands(replace(fit.cell, effects=whole.mapped)).follow(self.data)
-        rung, _ = self.rung("with its command map", chain, fit.cell, whole, fit, commands)
+        rung = self.rung("with its command map", chain, fit.cell, whole, fit, commands)
         return replace(rung, why="commands corrected for " + ", ".join(
             dict.fromkeys(name_effect(*term.key) for term in whole.mapped.terms)))  # fmt: skip
 
@@ -430,13 +408,12 @@ class Run:
     def fitted(self, name: str, fit: Fit) -> Rung:
         """The simulator with the arm of a fit."""
         arm = self.arm(fit)
-        return self.rung(name, self.of(self.with_arm(arm, fit)[0]), fit.cell, arm, fit)[0]
+        return self.rung(name, self.of(self.with_arm(arm, fit)[0]), fit.cell, arm, fit)
 
     def with_arm(self, arm: Arm, fit: Fit) -> tuple[Document, tuple[str, ...]]:
         """The model with an arm and its targets in it, and notices."""
         names = fit.cell.target_names
-        document, notices = corrected(self.given, self.chain, self.nominal.robot, arm, names)
-        return document, tuple(notices)
+        return corrected(self.given, self.chain, self.nominal.robot, arm, names)
 
     def of(self, document: Document) -> Chain:
         """The arm in a changed tree."""
@@ -450,8 +427,8 @@ class Run:
         arm: Arm | None = None,
         fit: Fit | None = None,
         commands: Array | None = None,
-    ) -> tuple[Rung, bool]:
-        """Drive a model to every pose and judge where it comes to rest; whether servos drove it."""
+    ) -> Rung:
+        """Drive a model to every pose and judge where it comes to rest."""
         q = self.data.q
         asked = q if commands is None else commands
         play = None if arm is None else resting(arm, self.data)
@@ -471,12 +448,11 @@ class Run:
         )
         held, train = (accuracy(error[:, judge & rows]) for rows in (self.held, ~self.held))
         off = np.abs(driven.q - asked)[judge][:, ~chain.robot.prismatic]
-        rung = Rung(
+        return Rung(
             name, held.rms_mm, held.max_mm, train.rms_mm, train.max_mm,
             1e3 * float(off.max(initial=0.0)), self.predicted(fit, judge & self.held),
             moving_poses=int(driven.moving.sum()), at_limit=float(driven.limited.max()),
         )  # fmt: skip
-        return rung, driven.driven
 
     def predicted(self, fit: Fit | None, rows: Array) -> float:
         """RMS of some driven poses by the formulas of a fit, NaN where it has others."""

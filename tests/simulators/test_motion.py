@@ -35,7 +35,7 @@ from experiments.driven_arms import (  # noqa: E402
 from minimax_cal.simulators.motion import numbers as bodies  # noqa: E402
 from minimax_cal.simulators.motion.fit import least_within, levelling, speeds  # noqa: E402
 from minimax_cal.simulators.motion.judge import Judge, follow_commands, installed, loaded  # noqa: E402
-from minimax_cal.simulators.motion.written import open_model  # noqa: E402
+from minimax_cal.simulators.motion.numbers import open_model  # noqa: E402
 from minimax_cal.simulators.result import MotionGap  # noqa: E402
 from minimax_cal.simulators.sdf import convert  # noqa: E402
 

@@ -32,7 +32,7 @@ from minimax_cal.simulators.motion.drives import (  # noqa: E402
     own_drives,
     with_drives,
 )
-from minimax_cal.simulators.motion.written import new_model, open_model  # noqa: E402
+from minimax_cal.simulators.motion.numbers import new_model, open_model  # noqa: E402
 from minimax_cal.simulators.result import MotionGap  # noqa: E402
 
 pytestmark = pytest.mark.skipif(

@@ -22,10 +22,12 @@ from minimax_cal.ground.stages import Progress
 from minimax_cal.robots.mjcf import is_driven
 from minimax_cal.simulators.motion.fit import Asked, Study, fit_bristles, fit_numbers
 from minimax_cal.simulators.motion.judge import Judge, Missed, installed, module_text
-from minimax_cal.simulators.motion.numbers import POWERS, Numbers, has_powers
-from minimax_cal.simulators.motion.written import (
+from minimax_cal.simulators.motion.numbers import (
+    POWERS,
     SHORTEST,
+    Numbers,
     Opened,
+    has_powers,
     stiffen,
     unwritten,
     write_numbers,

@@ -52,12 +52,14 @@ from minimax_cal.simulators.motion.correct import (
 )
 from minimax_cal.simulators.motion.fit import Study, fit_numbers
 from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge, ahead_of
-from minimax_cal.simulators.motion.numbers import Bodies, Numbers, given_numbers
-from minimax_cal.simulators.motion.written import (
+from minimax_cal.simulators.motion.numbers import (
     SHORTEST,
+    Bodies,
+    Numbers,
     Opened,
     actuators_of,
     delayed,
+    given_numbers,
     write_numbers,
 )
 from minimax_cal.simulators.result import WrittenElement
@@ -146,7 +148,7 @@ class Fits:
         each = tuple(fit_drive(learnt, held, j, drive) for j, drive in enumerate(given))
         for j, fit in enumerate(each):
             rows = held.joint(j)
-            rest = rows.rest(fit.drive, fit.beside) if fit else rows.torque
+            rest = fit.rest(rows) if fit else rows.torque
             left.append(float((rest**2).sum()))
         return Fits(share, each, held, 0.5 * mean_log(np.array(left)))
 
@@ -437,20 +439,19 @@ class Ranged:
 
 def of_drives(served: Served, joints: tuple[str, ...], count: int) -> Ranged:
     """Gains and delays, by stretches of the runs left out in turn.  count: of the runs."""
-    names, mean, changes = list[tuple[str, str, str]](), list[float](), list[dict[int, float]]()
-    for joint, fit, drive in zip(joints, served.fits, served.drives(), strict=True):
-        for k, name in enumerate(FITTED):
-            if fit and (fit.change[:, k] != 0.0).any():
-                names.append((name, joint, UNITS[name]))
-                mean.append(getattr(drive, name))
-                changes.append(dict(zip(fit.stretch.tolist(), fit.change[:, k], strict=True)))
-    every = sorted({stretch for change in changes for stretch in change})
+    told = [(fit, k, (name, joint, UNITS[name]), getattr(drive, name))
+            for joint, fit, drive in zip(joints, served.fits, served.drives(), strict=True) if fit
+            for k, name in enumerate(FITTED) if (fit.change[:, k] != 0.0).any()]  # fmt: skip
+    every = sorted({stretch for fit, *_ in told for stretch in fit.stretch.tolist()})
+    changes = [dict(zip(fit.stretch.tolist(), fit.change[:, k], strict=True))
+               for fit, k, *_ in told]  # fmt: skip
     change = np.array([[one.get(stretch, 0.0) for one in changes] for stretch in every])
     change = change.reshape(len(every), len(changes))
     run = np.array(every, dtype=int) // IN_A_RUN
     by_run = np.array([change[run == number].sum(axis=0) for number in range(count)])
     covariance = covariance_of(change) if every else np.zeros((0, 0))
-    return Ranged(tuple(names), np.array(mean), covariance, spread(by_run))
+    names, mean = tuple(name for *_, name, _ in told), np.array([one[-1] for one in told])
+    return Ranged(names, mean, covariance, spread(by_run))
 
 
 def spread(change: Array) -> Array:

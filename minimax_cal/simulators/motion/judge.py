@@ -35,8 +35,14 @@ from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.simulators.chain import Chain, fill_history
 from minimax_cal.simulators.drive import check_stable
 from minimax_cal.simulators.mjcf import largest_inertia
-from minimax_cal.simulators.motion.numbers import FRICTION, Numbers, bristles_in, given_bristles
-from minimax_cal.simulators.motion.written import Opened, in_its_gravity
+from minimax_cal.simulators.motion.numbers import (
+    FRICTION,
+    Numbers,
+    Opened,
+    bristles_in,
+    given_bristles,
+    in_its_gravity,
+)
 from minimax_cal.simulators.result import COMMANDS, MotionRung
 
 NUMBERS = "NUMBERS: dict[str, dict[str, Any]] = {}"  # in callback.py, to be filled

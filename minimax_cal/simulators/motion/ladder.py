@@ -40,7 +40,7 @@ from minimax_cal.simulators.motion.drives import (
 )
 from minimax_cal.simulators.motion.fit import PRIOR, PRIOR_ASSUMED, Study, has_bristles
 from minimax_cal.simulators.motion.judge import ENDING, OWN_SERVOS, Judge
-from minimax_cal.simulators.motion.written import Opened, calibrated, open_model
+from minimax_cal.simulators.motion.numbers import Opened, calibrated, open_model
 from minimax_cal.simulators.result import MotionGap, MotionRung
 
 MOTOR = "dcmotor"  # what holds friction beside a constraint
