@@ -29,7 +29,7 @@ from minimax_cal.dynamics.result import (
     table_by_joint,
     worth_by_joint,
 )
-from minimax_cal.dynamics.rows import QUARTERS, Logs, Scene, prepare, rms_by_joint
+from minimax_cal.dynamics.rows import QUARTERS, Logs, Scene, prepare, rms_by_joint, standard_errors
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.facts import Fact
@@ -103,7 +103,7 @@ class LeftOut:
     @property
     def judged(self) -> Array:
         """(R,) rows that some fit leaves out."""
-        return np.asarray(self.fold >= 0)
+        return self.fold >= 0
 
     @cached_property
     def compact(self) -> list[tuple[Array, Array]]:
@@ -165,11 +165,11 @@ def folds_of(logs: Logs, share: float, named: Sequence[str]) -> Array:
     count = len(logs.names)
     if named:
         out = np.array([0 if name in named else NEVER_OUT for name in logs.names])
-        return np.asarray(out[logs.run])
+        return out[logs.run]
     if count == 1:
-        return np.asarray(logs.quarter)
+        return logs.quarter
     parts = min(count, max(2, round(1.0 / share)))
-    return np.asarray((np.arange(count) % parts)[logs.run])
+    return (np.arange(count) % parts)[logs.run]
 
 
 def without_harmful(judge: LeftOut, terms: Sequence[Term]) -> list[Term]:
@@ -199,11 +199,6 @@ def without_harmful(judge: LeftOut, terms: Sequence[Term]) -> list[Term]:
             break
         now, kept = tried[best], [*fewer, []][best]
     return kept
-
-
-def standard_errors(values: Array) -> float:
-    """A mean (g,) in units of its standard error."""
-    return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-300))
 
 
 def by_loads(fold: Array, logs: Logs, terms: Sequence[Term]) -> Array:
@@ -282,7 +277,7 @@ class MotionEvaluation(Result):
 def missed(model: TorqueModel, logs: Logs, columns: Columns) -> Array:
     """(R, n) what a model misses.  columns: of a scene with its context."""
     seen = logs.earlier(model.delay) if model.delay else logs
-    return np.asarray(seen.y - model.predict(columns))
+    return seen.y - model.predict(columns)
 
 
 def evaluate_motion(

@@ -239,25 +239,26 @@ def examined(
     learns = fold < 0 if (fold < 0).any() else np.ones_like(fold, dtype=bool)
     learning = np.unique(logs.run[learns]).tolist()  # all, but runs that alone judge
     too_little = tuple(motion_lacking(logs.only(learning)))
-    progress("searching for causes")
-    found = search(arm, logs.only(learning), exclude)
+
+    def sought(why: str) -> Found:
+        progress(why)
+        return search(arm, logs.only(learning), exclude)
+
+    found = sought("searching for causes")
     soft = softened(found.columns, found.terms)
     if np.any(soft > arm.soft):
-        progress("searching again with softer friction")
         arm = replace(arm, soft=soft)
-        found = search(arm, logs.only(learning), exclude)
+        found = sought("searching again with softer friction")
     if units := list(unit_notices(found)):
-        progress("searching again with masses of each joint")
         arm = replace(arm, gain=np.zeros(0))
-        found = search(arm, logs.only(learning), exclude)
+        found = sought("searching again with masses of each joint")
     early, late, unsure = logs, 0.0, 0.0
     for one, (value, sigma) in zip(found.choice.found, found.choice.estimates, strict=True):
         if one.candidate.family == "delay" and abs(value[0]) > LATE:
             late, unsure = float(value[0]), float(sigma[0])
     if late:
-        progress("searching again without the delay")
         logs = logs.earlier(late)
-        found = search(arm, logs.only(learning), exclude)
+        found = sought("searching again without the delay")
     progress("judging causes on trajectories left out")
     found = helpful(found)
     columns = found.columns

@@ -19,7 +19,15 @@ import scipy
 
 from minimax_cal.dynamics.logs.table import NOTHING, Run
 from minimax_cal.dynamics.regressor import Motion
-from minimax_cal.dynamics.rows import SLOWEST, UNFITTED_S, Arm, Logs, prepare, sense_of
+from minimax_cal.dynamics.rows import (
+    SLOWEST,
+    UNFITTED_S,
+    Arm,
+    Logs,
+    prepare,
+    sense_of,
+    standard_errors,
+)
 from minimax_cal.ground.arrays import Array
 
 LATEST, LOOK = 0.1, 0.004  # the latest command that is looked for, and how closely [s]
@@ -101,7 +109,7 @@ class DriveFit:
 
 def stretch_of(run: Array | int, since: Array) -> Array:
     """(R,) numbers of the stretches of rows: of which run, and when in it [s]."""
-    return np.asarray(run * IN_A_RUN + (since / BLOCK_S).astype(int))
+    return run * IN_A_RUN + (since / BLOCK_S).astype(int)
 
 
 def command_of(run: Run) -> Array:
@@ -270,7 +278,7 @@ class Rows:
     def rest(self, drive: Drive, beside: Mapping[str, float]) -> Array:
         """(R,) torque that a drive, and what was fitted beside it, do not explain."""
         value = [drive.stiffness, drive.damper, *beside.values()]
-        return np.asarray(self.torque - self.columns(drive.delay, drive, list(beside)) @ value)
+        return self.torque - self.columns(drive.delay, drive, list(beside)) @ value
 
 
 def solve(rows: Rows, given: Drive, beside: Sequence[str]) -> DriveFit:
@@ -323,7 +331,7 @@ def solve_plainly(rows: Rows, held: Rows, given: Drive, always: Sequence[str]) -
 
 def covariance_of(change: Array) -> Array:
     """(p, p) of numbers that change so (G, p) without each stretch [jackknife]."""
-    return np.asarray((len(change) - 1.0) / len(change) * change.T @ change)
+    return (len(change) - 1.0) / len(change) * change.T @ change
 
 
 def left_out(matrix: Array, rest: Array, stretch: Array) -> Array:
@@ -420,9 +428,7 @@ def predicts(rows: Rows | Samples, rest: Array, before: Array) -> bool:
     index = np.unique(rows.stretch, return_inverse=True)[1].reshape(-1)
     squares = (np.bincount(index, one**2) + 1e-300 for one in (before, rest))
     gain = np.subtract(*map(np.log, squares))
-    if len(gain) < LEAST_BLOCKS:
-        return False
-    return float(gain.mean()) > PREDICTS * float(gain.std(ddof=1)) / math.sqrt(len(gain))
+    return len(gain) >= LEAST_BLOCKS and standard_errors(gain) > PREDICTS
 
 
 def is_another(kind: str, fit: DriveFit, given: Drive, held: Followed, j: int, late: float) -> bool:

@@ -262,4 +262,4 @@ def gravity(robot: Robot, q: Array) -> Array:
     """(m, n) torques that hold the arm's links at rest [N m, N].  q: (m, n)."""
     rest = np.zeros_like(q)
     columns = regressor(robot, Motion(q, rest, rest))
-    return np.asarray(columns @ inertial_parameters(robot).ravel())
+    return columns @ inertial_parameters(robot).ravel()

@@ -148,7 +148,7 @@ class Law:
             return self.made(scene, j, choice)
         found = self.per_unit({k: QUANTITIES[k](scene, j) for k in self.reads} | {**choice})
         rows = np.stack([np.broadcast_to(one, len(scene.load)) for one in found], axis=1)
-        return np.asarray(scene.sense[:, [j]] * rows if self.dry else rows)
+        return scene.sense[:, [j]] * rows if self.dry else rows
 
     def curve(self, v: Array, sense: Array, choice: Choice) -> list[Array]:
         """(k,) torque per unit over a speed, of each parameter; none of a law of anything else.
@@ -192,18 +192,21 @@ def payload(scene: Scene, j: int, choice: Choice) -> Array:
     return np.asarray(scene.regressor[:, :, -PER_LINK:] * each[:, None, None])
 
 
+def shifted(scene: Scene, j: int, by: Array | float) -> Array:
+    """(M, n, 1) torque of the whole body per unit of a shift of a joint [rad, m]."""
+    every = np.zeros_like(scene.load)
+    every[:, j] = by
+    return scene.shifted(every)[..., None]
+
+
 def compliant(scene: Scene, j: int, choice: Choice) -> Array:
     """A joint that turns back by its torque: the whole body moves otherwise [Spong 1987]."""
-    by = np.zeros_like(scene.load)
-    by[:, j] = -scene.load[:, j] * scene.divisor[j]
-    return scene.shifted(by)[..., None]
+    return shifted(scene, j, -scene.load[:, j] * scene.divisor[j])
 
 
 def encoder_zero(scene: Scene, j: int, choice: Choice) -> Array:
     """A joint whose zero is elsewhere."""
-    by = np.zeros_like(scene.load)
-    by[:, j] = 1.0
-    return scene.shifted(by)[..., None]
+    return shifted(scene, j, 1.0)
 
 
 def delay(scene: Scene, j: int, choice: Choice) -> Array:

@@ -85,7 +85,7 @@ class Columns:
     def error(self) -> Array:
         """(n, R) torques less those of what the flange is known to carry."""
         known = self.scene.logs.filtered(self.scene.known_torque)
-        return np.asarray((self.scene.logs.y - known).T)
+        return (self.scene.logs.y - known).T
 
     def of_each(self, terms: Sequence[Term]) -> Array:
         """(n, R, p) rigid body, usual friction, a variant of every law, and all that runs carry."""
@@ -109,7 +109,7 @@ def block_rows(each: Array) -> Array:
 
 def solve_ridged(gram: Array, pull: Array, ridge: float = RIDGE) -> Array:
     """(p,) least squares by products (p, p) with a unit diagonal and (p,)."""
-    return np.asarray(np.linalg.solve(gram + ridge * np.eye(len(gram)), pull))
+    return np.linalg.solve(gram + ridge * np.eye(len(gram)), pull)
 
 
 def solve_scaled(gram: Array, pull: Array, ridge: float = RIDGE) -> Array:
@@ -288,12 +288,12 @@ class Normal:
     @cached_property
     def gram(self) -> Array:
         """(p, p) products of the columns."""
-        return np.asarray(self.matrix.T @ self.matrix)
+        return self.matrix.T @ self.matrix
 
     @cached_property
     def pull(self) -> Array:
         """(p,) products of columns and error."""
-        return np.asarray(self.matrix.T @ self.error)
+        return self.matrix.T @ self.error
 
     def solve(self, parts: Sequence[str]) -> Array:
         """(p,) values of some parts, 0 elsewhere."""
@@ -510,9 +510,7 @@ def changed(
     def rms(values: Array) -> Array:
         rest = plain - raw[white.kept] @ values
         squares = np.bincount(white.joint, rest**2, minlength=len(white.kept))
-        return np.asarray(
-            np.sqrt(squares / np.maximum(np.bincount(white.joint, minlength=len(squares)), 1))
-        )
+        return np.sqrt(squares / np.maximum(np.bincount(white.joint, minlength=len(squares)), 1))
 
     before = rms(alone.solve([FRICTION]))
     return LinkChange(link, value[count:], sigma[count:], before, rms(value), others)

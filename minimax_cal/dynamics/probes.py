@@ -282,7 +282,7 @@ def blocks(m: Moments) -> Array:
     """(k,) folds of rows, each of short stretches of every run: what follows time is not foretold
     far from where it was seen.
     """
-    return np.asarray((m.scene.logs.since[m.at] / BLOCK_S).astype(int) % TIME_FOLDS)
+    return (m.scene.logs.since[m.at] / BLOCK_S).astype(int) % TIME_FOLDS
 
 
 def less(basis: Array, rows: Array) -> Array:

@@ -36,7 +36,7 @@ class Motion:
 def link_axes(links: Chain) -> Array:
     """(n, 3, 3, m) axes x, y, z of each link's own frame in the base, one a row."""
     z = np.concatenate([links.z[1:], links.axes[2:]])
-    return np.asarray(np.stack([cross(links.y, z), links.y, z], axis=1))
+    return np.stack([cross(links.y, z), links.y, z], axis=1)
 
 
 def moving_chain(robot: Robot, motion: Motion) -> tuple[Chain, Array]:
@@ -67,7 +67,7 @@ def moving_chain(robot: Robot, motion: Motion) -> tuple[Chain, Array]:
 
 def at_drives(robot: Robot, torque: Array) -> Array:
     """(m, n, ...) torque of each drive, in the controller's sense, of the chain's (n, ..., m)."""
-    return np.asarray(np.moveaxis(np.einsum("ij,i...->j...", robot.turning, torque), -1, 0))
+    return np.moveaxis(np.einsum("ij,i...->j...", robot.turning, torque), -1, 0)
 
 
 def wrench(rate: Array, change: Array, speeding: Array) -> tuple[Array, Array]:
@@ -175,4 +175,4 @@ def base_parameters(columns: Array, rank: float = RANK) -> Array:
     kept = size > rank * size.max(initial=0.0)
     out = np.zeros((columns.shape[1], int(kept.sum())))
     out[used] = right[kept].T * scale[used][:, None]
-    return np.asarray(np.linalg.qr(out)[0])
+    return np.linalg.qr(out)[0]

@@ -245,18 +245,17 @@ def changed_joints(without: Array, with_it: Array) -> dict[str, tuple[float, flo
 def check_parts(found: MotionDiagnosis) -> None:
     """Raise ValueError for parts that are not of one arm, and for effects that do not exist."""
     n, arm, run = found.arm.robot.joints, found.arm, found.held_run
-    rows: list[Any] = [arm.ratio, arm.soft, arm.fastest, found.curves]
-    rows += [row for step in found.budget for row in (step.holdout_rms, step.holdout_rms_moving)]
-    sizes: list[tuple[Any, tuple[int, ...]]] = [(row, (n,)) for row in rows]
-    sizes += [(arm.gain, (n if arm.shared else 0,)), (arm.known, (PER_LINK,))]
-    sizes += [(part, (n, len(run.time))) for part in (run.measured, run.predicted)]
-    for one in found.curves:
-        sizes += [(part, (len(one.speed),)) for part in (one.speed, one.torque, one.sigma)]
-    for model in found.models:
-        sizes += [(model.held, (n, len(YIELD)))]
-        for body in (model.body, model.context):
-            count = 1 if len(body.rigid) == 1 else n
-            sizes += [(body.usual, (n, 2)), (body.rigid, (count, PER_LINK * n))]
+    bodies = [body for model in found.models for body in (model.body, model.context)]
+    sizes: list[tuple[Any, tuple[int, ...]]] = [
+        *((row, (n,)) for row in (arm.ratio, arm.soft, arm.fastest, found.curves)),
+        *((row, (n,)) for s in found.budget for row in (s.holdout_rms, s.holdout_rms_moving)),
+        (arm.gain, (n if arm.shared else 0,)), (arm.known, (PER_LINK,)),
+        *((part, (n, len(run.time))) for part in (run.measured, run.predicted)),
+        *((p, (len(c.speed),)) for c in found.curves for p in (c.speed, c.torque, c.sigma)),
+        *((model.held, (n, len(YIELD))) for model in found.models),
+        *((body.usual, (n, 2)) for body in bodies),
+        *((body.rigid, (1 if len(body.rigid) == 1 else n, PER_LINK * n)) for body in bodies),
+    ]  # fmt: skip
     late = [model.delay for model in found.models]
     if any(np.shape(part) != size for part, size in sizes) or not np.isfinite(late).all():
         raise ValueError(f"its numbers are not of one arm of {n} joints and one run")

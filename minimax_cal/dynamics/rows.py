@@ -85,7 +85,7 @@ def smooth(values: Array, rate: float) -> Array:
         first = out[:, :1]  # at rest there before
         change = irfft(rfft(out - first, size) * gain, size)[:, : out.shape[1]]
         out = (first + change)[:, ::-1]
-    return np.asarray(out[:, pad : pad + len(values)].T.reshape(values.shape))
+    return out[:, pad : pad + len(values)].T.reshape(values.shape)
 
 
 def slope(values: Array, rate: float) -> Array:
@@ -93,7 +93,7 @@ def slope(values: Array, rate: float) -> Array:
     out = np.gradient(values, axis=0)
     wide = (values[4:] - values[:-4]) / 4.0
     out[2:-2] = (4.0 * out[2:-2] - wide) / 3.0
-    return np.asarray(out * rate)
+    return out * rate
 
 
 def at_times(to: Array, time: Array, values: Array) -> Array:
@@ -109,7 +109,7 @@ def taps(rate: float) -> Array:
     one[wide] = 1.0
     found = smooth(one, rate)
     seen = np.flatnonzero(np.abs(found) > LEAST_TAP * found[wide])
-    return np.asarray(found[seen[0] : seen[-1] + 1])
+    return found[seen[0] : seen[-1] + 1]
 
 
 @lru_cache(maxsize=32)
@@ -179,7 +179,7 @@ class Logs:
 
     def run_of(self, samples: Array) -> Array:
         """Which run samples are of."""
-        return np.asarray(np.searchsorted(self.start, samples, side="right") - 1)
+        return np.searchsorted(self.start, samples, side="right") - 1
 
     @cached_property
     def quarter(self) -> Array:
@@ -208,7 +208,7 @@ class Logs:
     @cached_property
     def moving(self) -> Array:
         """(R, n) the same of the rows."""
-        return np.asarray(self.sliding[self.picked])
+        return self.sliding[self.picked]
 
     @cached_property
     def fitted(self) -> Array:
@@ -232,7 +232,7 @@ class Logs:
     def filtered(self, columns: Array) -> Array:
         """Rows (R, ...) of columns (M, ...), filtered."""
         flat = self.operator @ columns.reshape(len(columns), -1)
-        return np.asarray(flat.reshape(len(self.picked), *columns.shape[1:]))
+        return flat.reshape(len(self.picked), *columns.shape[1:])
 
     def slope(self, values: Array) -> Array:
         """Derivative in time (M, ...) of values (M, ...), each run for itself."""
@@ -272,7 +272,7 @@ def prepare_run(run: Run) -> Logs:
     every = int(rate / SAMPLE_HZ)
 
     def even(values: Array) -> Array:
-        return np.asarray(scipy.interpolate.CubicSpline(run.time, values)(time))
+        return scipy.interpolate.CubicSpline(run.time, values)(time)
 
     q = smooth(even(run.q), rate)
     qd = slope(q, rate) if run.qd is None else smooth(even(run.qd), rate)
@@ -333,7 +333,7 @@ class Whitening:
     @cached_property
     def joint(self) -> Array:
         """(N,) which joint a row is of."""
-        return np.asarray(np.nonzero(self.kept)[0])
+        return np.nonzero(self.kept)[0]
 
     def rows(self, values: Array) -> Array:
         """(N,) values of all rows (R,), at those of every joint."""
@@ -363,13 +363,18 @@ def rms_by_joint(missed: Array, rows: Array | None = None) -> Array:
     return np.asarray(np.sqrt((missed**2 * rows).sum(axis=0) / count))
 
 
+def standard_errors(values: Array) -> float:
+    """A mean (g,) in units of its standard error."""
+    return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-300))
+
+
 def in_order(kept: Array, run: Array) -> Array:
     """(N,) fitted rows of the same joint and run just before, at most AR_ORDER."""
     out = np.zeros(kept.shape, dtype=int)
     for i in range(THIN, kept.shape[1]):
         before = i - THIN
         out[:, i] = np.where(kept[:, before] & (run[i] == run[before]), out[:, before] + 1, 0)
-    return np.asarray(np.minimum(out, AR_ORDER)[kept])
+    return np.minimum(out, AR_ORDER)[kept]
 
 
 def whitening(logs: Logs, rest: Array) -> Whitening:
@@ -418,7 +423,7 @@ YIELD = np.array([1e-4, 1e-3])  # way after which each of a joint's bristles sli
 
 def sense_of(qd: Array, soft: Array | float) -> Array:
     """Sign of a speed, in proportion to it below `soft`, as simulators have it."""
-    return np.asarray(np.clip(qd / soft, -1.0, 1.0))
+    return np.clip(qd / soft, -1.0, 1.0)
 
 
 def bent_bristles(logs: Logs, yields: Array) -> Array:
@@ -578,7 +583,7 @@ class Scene:
         moved = Motion(
             one.q + step * by, one.qd + step * rate, one.qdd + step * self.logs.slope(rate)
         )
-        return np.asarray((self.along(moved) - self.as_moved) / step / self.divisor)
+        return (self.along(moved) - self.as_moved) / step / self.divisor
 
     def with_body(self, rigid: Array, friction: Array) -> Scene:
         """The scene with another body and friction, its regressor kept."""

@@ -67,6 +67,16 @@ class Chain:
         """(n,) where they are in qvel and forces."""
         return np.array(self.model.jnt_dofadr[list(self.joints)])
 
+    @property
+    def step(self) -> float:
+        """Of time [s]."""
+        return float(self.model.opt.timestep)
+
+    def fresh(self) -> tuple[Any, Any, Any, Array, Array]:
+        """MuJoCo, the model, new data of it, and (n,) where joints are in qpos and in forces."""
+        mj = mujoco()
+        return mj, self.model, mj.MjData(self.model), self.places, self.dofs
+
     def in_model(self, model: Any) -> Chain:
         """The same joints in another compiled model, whose bodies stand where they did."""
         return replace(self, model=model, joints=self.ids_in(model))

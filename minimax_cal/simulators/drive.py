@@ -52,7 +52,7 @@ class Commands:
     def follow(self, data: Measurements) -> Array:
         """(m, n) the same for measured poses, with the way that led to each [rad, m]."""
         turn = self.cell.effects.turn(self.cell.scene(data))
-        return np.asarray(data.q + self.cell.robot.commanded(turn))
+        return data.q + self.cell.robot.commanded(turn)
 
 
 def load_commands(path: Path | str) -> Commands:
@@ -114,7 +114,7 @@ class Driven:
     @property
     def moving(self) -> Array:
         """(m,) True where it had not come to rest."""
-        return np.asarray(self.speed > 1.0)
+        return self.speed > 1.0
 
 
 def drive(
@@ -166,15 +166,13 @@ def visits(
     heard: Callable[[], object],
 ) -> list[Visit]:
     """A run of moves, one after the other, with a model of its own: a row each of `Driven`."""
-    mj, model = mujoco(), copy(chain.model)
-    chain_here = replace(chain, model=model)
-    data, sides = mj.MjData(model), plays(chain_here)
-    at = chain.places
-    moved = way_to(model, carrier(chain_here))
+    chain = replace(chain, model=copy(chain.model))
+    (mj, model, data, at, _), sides = chain.fresh(), plays(chain)
+    moved = way_to(model, carrier(chain))
     dofs = np.array([int(model.jnt_dofadr[joint]) for joint in moved])
     rest = np.where(model.jnt_type[list(moved)] == 2, STILL_SLIDE, STILL)
-    limits = Limits.of(chain_here, servos)
-    step = float(model.opt.timestep)
+    limits = Limits.of(chain, servos)
+    step = chain.step
     start = commands[rows[0] - 1]
     data.qpos[at], data.ctrl[servos] = start, start
     fill_history(model, data)
@@ -190,7 +188,7 @@ def visits(
         check_stable(mj, data, source)
         share = at_limit / (len(path) + count)
         speed = float((np.abs(data.qvel[dofs]) / rest).max())
-        out.append((body_pose(data, carrier(chain_here)), np.array(data.qpos[at]), speed, share))
+        out.append((body_pose(data, carrier(chain)), np.array(data.qpos[at]), speed, share))
         start = commands[row]
         heard()
     return out
@@ -202,7 +200,7 @@ def moves(start: Array, end: Array, slides: Array, step: float) -> Array:
     needed = PEAK * np.abs(way) / np.where(slides, FASTEST_SLIDE, FASTEST)
     count = max(1, round(max(MOVE, float(needed.max(initial=0.0))) / step))
     t = np.arange(1, count + 1)[:, None] / count
-    return np.asarray(start + way * t**3 * (10.0 - 15.0 * t + 6.0 * t**2))
+    return start + way * t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,10 +228,8 @@ class Limits:
 
     def reached(self, force: Array, torque: Array) -> Array:
         """(..., n) True where an actuator or its joint is at a limit."""
-        return np.asarray(
-            (force <= self.force[:, 0]) | (force >= self.force[:, 1])
-            | (torque <= self.torque[:, 0]) | (torque >= self.torque[:, 1])
-        )  # fmt: skip
+        return ((force <= self.force[:, 0]) | (force >= self.force[:, 1])
+            | (torque <= self.torque[:, 0]) | (torque >= self.torque[:, 1]))  # fmt: skip
 
 
 def follow(mj: Any, model: Any, data: Any, limits: Limits, path: Array, every: int = 1) -> Array:
@@ -248,7 +244,7 @@ def follow(mj: Any, model: Any, data: Any, limits: Limits, path: Array, every: i
         force.append(data.actuator_force[limits.servos])
         torque.append(data.qfrc_actuator[limits.dofs])
     at_limit = limits.reached(np.array(force), np.array(torque))
-    return np.asarray(np.diff([*starts, len(path)]) @ at_limit)
+    return np.diff([*starts, len(path)]) @ at_limit
 
 
 def check_stable(mj: Any, data: Any, source: str) -> None:
@@ -264,9 +260,7 @@ def check_stable(mj: Any, data: Any, source: str) -> None:
 
 def set_joints(chain: Chain, commands: Array, play: Array | None) -> Driven:
     """The same for a model without servos: its joints are set and nothing moves."""
-    model, mj, out = chain.model, mujoco(), []
-    data = mj.MjData(model)
-    at = chain.places
+    (mj, model, data, at, _), out = chain.fresh(), []
     for row in range(len(commands)):
         data.qpos[at] = commands[row]
         for joint, place in plays(chain).items():

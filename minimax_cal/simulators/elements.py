@@ -15,13 +15,14 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from minimax_cal.correcting.exporters.correct import laid
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.gravity import G, centres, inertia_of, torques
 from minimax_cal.robots.kinematics import chain, cross
 from minimax_cal.robots.mjcf import numbers
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_poses
-from minimax_cal.robots.transforms import head, inverse, level_to, link, shift, tail
+from minimax_cal.robots.transforms import head, inverse, level_to, shift, tail
 from minimax_cal.simulators.arm import Arm
 
 SETTLES = 15.0  # a servo's frequency at the largest inertia: 1.5 s of rest leave 4e-9 [rad/s]
@@ -214,11 +215,8 @@ def section(root: ET.Element, tag: str) -> ET.Element:
 
 def frames(robot: Robot) -> Array:
     """(n, 4, 4) frame of each joint in the base at joint values 0, z its axis [m]."""
-    out, at = [], np.eye(4)
-    for row in robot.mdh:
-        out.append(at @ head(row))
-        at = at @ link(row)
-    return np.array(out)
+    frames_of_links = zip(laid(robot, np.eye(4)), robot.mdh, strict=False)
+    return np.array([at @ head(row) for at, row in frames_of_links])
 
 
 def damping(stiffness: Array, inertia: Array) -> Array:
@@ -467,12 +465,13 @@ def mark(layout: Layout, body: ET.Element, name: str, pose: Array) -> None:
                 other.remove(old)
             for key in ("axisangle", "euler", "xyaxes", "zaxis", "fromto"):
                 old.attrib.pop(key, None)
-    known(body, "site", name, pos=pose[:3, 3], quat=quaternion(pose), size=0.005, group="4")
+    known(body, "site", name, **at_pose(pose), size=0.005, group="4")
 
 
-def quaternion(pose: Array) -> Array:
-    """(4,) as MuJoCo writes it, w first."""
-    return np.asarray(Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True))
+def at_pose(pose: Array) -> dict[str, Array]:
+    """Attributes of what stands at a pose (4, 4), w of the quaternion first."""
+    turn = Rotation.from_matrix(pose[:3, :3])
+    return {"pos": pose[:3, 3], "quat": turn.as_quat(scalar_first=True)}
 
 
 def sagging(body: ET.Element, end: Array, arm: Arm) -> ET.Element:
@@ -489,8 +488,7 @@ def sagging(body: ET.Element, end: Array, arm: Arm) -> ET.Element:
     for i in range(3):
         body = part(body, "body", name="tool" if i == 2 else f"tool_{i + 1}")
         if i == 0:
-            body.set("pos", numbers(end[:3, 3]))
-            body.set("quat", numbers(quaternion(end)))
+            body.attrib |= as_text(at_pose(end))
         part(body, "inertial", pos=spots[i], mass=FOOT, diaginertia=[FOOT * LEVER**2] * 3)
         if size[i] > NOTHING:
             spring(body, f"tool_{'xyz'[i]}", "hinge", np.zeros(3), axes[i],

@@ -35,7 +35,6 @@ from minimax_cal.robots.mjcf import (
     body_pose,
     find_assets,
     mujoco,
-    numbers,
     read_model,
     shifted,
 )
@@ -58,11 +57,12 @@ from minimax_cal.simulators.elements import (
     SAMPLES,
     Drives,
     Layout,
+    as_text,
+    at_pose,
     equip,
     known,
     parents_of,
     part,
-    quaternion,
     targets,
 )
 
@@ -130,7 +130,7 @@ def skeleton(root: ET.Element, arm: Arm) -> Layout:
     bodies, joints = [], []
     for i, pose in enumerate(origins(robot)[:-1]):
         at = arm.mount @ pose if i == 0 else pose
-        body = part(parent, "body", name=f"link{i + 1}", pos=at[:3, 3], quat=quaternion(at))
+        body = part(parent, "body", name=f"link{i + 1}", **at_pose(at))
         weigh(body, arm, i)
         joints.append(part(body, "joint", **joint_of(robot, i)))
         drawn(body, robot, i)
@@ -378,7 +378,7 @@ def drives_of(chain: Chain) -> Drives:
     return Drives(
         gain, damper + own, own, limits, largest_inertia(chain),
         braked(model)[list(chain.joints)] | (int(model.opt.integrator) not in IMPLICIT),
-        float(model.opt.timestep), free,
+        chain.step, free,
     )  # fmt: skip
 
 
@@ -387,11 +387,10 @@ def check_limits(chain: Chain, q: Array, source: str) -> None:
 
     q: (m, n) poses that the arm is to hold [rad, m].
     """
-    drives, (model, mj) = drives_of(chain), (chain.model, mujoco())
+    drives = drives_of(chain)
     if drives.gravity_free:
         return
-    data = mj.MjData(model)
-    at, dofs = chain.places, chain.dofs
+    mj, model, data, at, dofs = chain.fresh()
     for row in q:
         data.qpos[at] = row
         mj.mj_forward(model, data)
@@ -410,10 +409,8 @@ def check_limits(chain: Chain, q: Array, source: str) -> None:
 
 def largest_inertia(chain: Chain) -> Array:
     """(n,) about each joint, its motor's with it, over poses all over the workspace [kg m^2]."""
-    model, mj = chain.model, mujoco()
-    data, column = mj.MjData(model), np.zeros(model.nv)
-    at, dofs = chain.places, chain.dofs
-    out = np.zeros(len(dofs))
+    mj, model, data, at, dofs = chain.fresh()
+    column, out = np.zeros(model.nv), np.zeros(len(dofs))
     for row in random_joints(chain.robot, (SAMPLES,), np.random.default_rng(0)):
         data.qpos[at] = row
         mj.mj_forward(model, data)
@@ -455,8 +452,7 @@ def place(
         pose = own @ inverse(compiled) @ pose
     for name in TURNS:
         body.attrib.pop(name, None)
-    body.set("pos", numbers(pose[:3, 3]))
-    body.set("quat", numbers(quaternion(pose)))
+    body.attrib |= as_text(at_pose(pose))
 
 
 # ---- the exporter `mjcf` -------------------------------------------------------------------------
@@ -466,15 +462,20 @@ def write(job: Job) -> Export:
     """A new MJCF, or the given one corrected; a command map beside it where effects need one."""
     if job.model:
         return correct(job)
-    cell = job.cell or Cell(job.robot, np.eye(4), (), np.zeros((0, 3)))
-    arm = arm_of(cell, job.q)
-    content = text_of(new_tree(arm, cell.target_names))
+    cell, arm, content = new_file(job)
     off = None
     if find_spec("mujoco") and cell.target_names:
         chain = chain_of(mujoco().MjModel.from_xml_string(content.decode()), job.robot.joints,
                          job.source)  # fmt: skip
         off = Written(chain, cell, arm, np.eye(4)).off
     return Export(content, (assumptions(job.robot), *told(arm)), beside(cell, arm), off)
+
+
+def new_file(job: Job) -> tuple[Cell, Arm, bytes]:
+    """The arm of a job in its place, its elements, and the MJCF of these."""
+    cell = job.cell or Cell(job.robot, np.eye(4), (), np.zeros((0, 3)))
+    arm = arm_of(cell, job.q)
+    return cell, arm, text_of(new_tree(arm, cell.target_names))
 
 
 def carries(cell: Cell) -> tuple[Term, ...]:

@@ -16,12 +16,10 @@ from minimax_cal.correcting.exporters.job import Export, Job
 from minimax_cal.correcting.exporters.urdf import assumptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
-from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots.mjcf import body_pose, mujoco, numbers, read_model
 from minimax_cal.robots.transforms import inverse, to_rpy
-from minimax_cal.simulators.arm import arm_of
 from minimax_cal.simulators.chain import at_zero, braked, pose_at
-from minimax_cal.simulators.mjcf import new_tree, text_of
+from minimax_cal.simulators.mjcf import new_file
 
 VERSION = "1.9"
 KINDS = {2: "prismatic", 3: "revolute"}  # of mjtJoint: a slide, a hinge
@@ -32,8 +30,7 @@ UNLIMITED = 1e16  # what SDFormat takes for no limit
 
 def write(job: Job) -> Export:
     """A new SDF of an arm: geometry, masses, limits and targets."""
-    cell = job.cell or Cell(job.robot, np.eye(4), (), np.zeros((0, 3)))
-    made = text_of(new_tree(arm_of(cell, job.q), cell.target_names))
+    made = new_file(job)[2]
     found = as_sdf(mujoco().MjModel.from_xml_string(made.decode()), job.robot.name, job.source)
     return replace(found, notices=(assumptions(job.robot), *found.notices))
 
@@ -47,7 +44,7 @@ def convert(path: Path) -> Export:
 def relative(model: Any, data: Any, body: int) -> Array:
     """(4, 4) pose of a body in that of its parent."""
     parent = int(model.body_parentid[body])
-    return np.asarray(inverse(body_pose(data, parent)) @ body_pose(data, body))
+    return inverse(body_pose(data, parent)) @ body_pose(data, body)
 
 
 def as_sdf(model: Any, name: str, source: str) -> Export:

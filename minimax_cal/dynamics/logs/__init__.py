@@ -52,24 +52,12 @@ class LogFiles:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {
-            "joints": self.runs[0].joints,
-            "unit": self.runs[0].unit,
-            "runs": [
-                {
-                    "name": run.name,
-                    "source": run.source,
-                    "format": title,
-                    "rows": len(run.time),
-                    "duration_s": run.duration,
-                    "step_s": run.step,
-                    "payload_kg": run.payload,
-                    "columns": columns,
-                }
-                for run, title, columns in zip(self.runs, self.titles, self.columns, strict=True)
-            ],
-            "notices": self.notices,
-        }
+        keys = ("name", "source", "format", "rows", "duration_s", "step_s", "payload_kg", "columns")
+        rows = ((run.name, run.source, title, len(run.time), run.duration, run.step, run.payload,
+                 columns) for run, title, columns in zip(self.runs, self.titles, self.columns,
+                                                         strict=True))  # fmt: skip
+        told, first = [dict(zip(keys, row, strict=True)) for row in rows], self.runs[0]
+        return {"joints": first.joints, "unit": first.unit, "runs": told, "notices": self.notices}
 
     def table(self) -> Table:
         """A row a run."""
@@ -165,8 +153,8 @@ def in_order(log: Log, joints: Sequence[str]) -> Log:
         raise DataError(f"{log.source}: has {n} joints{names}, but the robot has {len(joints)}")
     if not log.joints:
         return log
-    along = along_arm([name if name.endswith("_joint") else f"{name}_joint" for name in log.joints])
     named = [name if name.endswith("_joint") else f"{name}_joint" for name in log.joints]
+    along = along_arm(named)
     order = [named.index(name) for name in along]
     names = ", ".join(log.joints[i] for i in order)
     how = "along the arm" if order != list(range(n)) else "as in the file; check their order"

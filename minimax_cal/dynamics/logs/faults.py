@@ -116,7 +116,7 @@ def in_its_unit(draft: Draft) -> Draft:
 
 def wrapped(angle: Array) -> Array:
     """Angles in -pi to pi."""
-    return np.asarray((angle + np.pi) % TURN - np.pi)
+    return (angle + np.pi) % TURN - np.pi
 
 
 def unwrapped(draft: Draft) -> Draft:

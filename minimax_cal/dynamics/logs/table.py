@@ -381,9 +381,9 @@ class Columns:
             raise DataError(f"{path}:1: no column of time; name it t_s")
         time = values["t"] - values["t"][np.isfinite(values["t"])][:1].sum()
         step = typical_step(time)
-        unit = unit or next((u for u, f in TIMES.items() if is_step(f * step)), "")
+        other = next((u for u, f in TIMES.items() if is_step(f * step)), "")
+        unit = unit or other
         if step > 0.0 and not is_step(TIMES.get(unit, np.nan) * step):
-            other = next((u for u, f in TIMES.items() if is_step(f * step)), "")
             mend = f"; name it t_{other} if it is in {other}" if other else "; log 50 rows a second"
             raise DataError(
                 f"{path}: column of time: steps of {step:.3g} {unit or '(no unit)'} are no "
@@ -417,6 +417,7 @@ def is_step(seconds: float) -> bool:
 
 TURN = 2.0 * np.pi
 COMMANDS = "q_cmd"
+DERIVATIVES = {"qd": "speeds", "qdd": "accelerations"}
 UNITS = {"tau": TORQUE, "i": CURRENT, COMMANDS: NOTHING}
 
 
@@ -489,7 +490,7 @@ def commanded(values: Array | None, q: Array) -> Array | None:
     """Commanded joint values (m, n) without the whole turns by which they differ from q (m, n)."""
     if values is None or values.shape != q.shape or not np.isfinite(values).all():
         return None
-    return np.asarray(values + TURN * np.round((q - values) / TURN))
+    return values + TURN * np.round((q - values) / TURN)
 
 
 def drafts_of(log: Log, name: str) -> list[Draft]:
@@ -505,29 +506,21 @@ def drafts_of(log: Log, name: str) -> list[Draft]:
         raise DataError(f"{log.source}: no row holds a {what} of every joint; log them together")
     out = []
     for label in dict.fromkeys(labels):
-        row = np.flatnonzero((labels == label) & whole)
+        mine = labels == label
+        row = np.flatnonzero(mine & whole)
         if not len(row):
             raise DataError(f"{log.source}: run {label} holds no whole row; delete it")
-        title = f"{name}:{label}" if label else name
-        draft = Draft(
-            log=log,
-            name=title,
-            source=log.source,
-            kind=kind,
-            unit=UNITS[kind],
-            row=row,
-            time=values["t"][row] - values["t"][row[0]],
-            q=values["q"][row],
-            qd=values["qd"][row] if "qd" in values else None,
-            qdd=values["qdd"][row] if "qdd" in values else None,
-            torque=values[kind][row],
-            notices=log.notices,
-        )
-        lost_rows = int(((labels == label) & ~whole).sum())
-        if lost_rows:
-            lacking = f"{lost_rows} of {lost_rows + len(row)} rows lack a joint value or torque"
+        own = {each: block[row] for each, block in values.items()}
+        torn = [each for each in DERIVATIVES if each in own and not np.isfinite(own[each]).all()]
+        qd, qdd = (None if each in torn else own.get(each) for each in DERIVATIVES)
+        title, time = f"{name}:{label}" if label else name, own["t"] - own["t"][0]
+        draft = Draft(title, log.source, time, own["q"], qd, qdd, own[kind], UNITS[kind],
+                      notices=log.notices, log=log, kind=kind, row=row)  # fmt: skip
+        if lost_rows := int(mine.sum()) - len(row):
+            lacking = f"{lost_rows} of {mine.sum()} rows lack a joint value or torque"
             draft = draft.saying(f"{lacking}: left out")
-        out.append(without_holes(draft))
+        said = (f"{DERIVATIVES[each]} lack in some rows: not used" for each in torn)
+        out.append(draft.saying(*said))
     return out
 
 
@@ -548,12 +541,3 @@ def torque_kind(log: Log) -> str:
         f"{log.source}:1: no column of torque or current; drive this motion and log tau1_Nm (or "
         "i1_A), tau2_Nm, ..."
     )
-
-
-def without_holes(draft: Draft) -> Draft:
-    """The draft, its derivatives given only where they are given in every row."""
-    if draft.qd is not None and not np.isfinite(draft.qd).all():
-        draft = replace(draft, qd=None).saying("speeds lack in some rows: not used")
-    if draft.qdd is not None and not np.isfinite(draft.qdd).all():
-        draft = replace(draft, qdd=None).saying("accelerations lack in some rows: not used")
-    return draft

@@ -20,6 +20,7 @@ from minimax_cal.dynamics.result import (
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress
 from minimax_cal.robots.mjcf import is_driven
+from minimax_cal.simulators.chain import Chain
 from minimax_cal.simulators.motion.fit import Asked, Study, fit_bristles, fit_numbers
 from minimax_cal.simulators.motion.judge import Judge, Missed, installed, module_text
 from minimax_cal.simulators.motion.numbers import (
@@ -88,7 +89,11 @@ class Bench:
     def made_of(self, asked: Asked, numbers: Numbers) -> Candidate:
         """The model with these numbers, and how far it misses."""
         opened = self.written(numbers)
-        text = self.module(opened, numbers) if asked.laws else ""
+        text = self.module(opened.chain, numbers) if asked.laws else ""
+        return self.judged(asked, opened, numbers, text)
+
+    def judged(self, asked: Asked, opened: Opened, numbers: Numbers, text: str) -> Candidate:
+        """A model, and how far it misses with a module."""
         with installed(text, opened.chain):
             missed = self.judge.torque(opened.chain, numbers)
         self.made[asked] = Candidate(asked, numbers, opened, missed, text)
@@ -110,17 +115,14 @@ class Bench:
                 bristles=found.bristles, yields=found.yields, damped=found.damped
             )
             text = module_text(chain, numbers, study.scene.arm.gain, self.judge.arm.ratio)
-            numbers = numbers.put(gain=found.gain)
-            with installed(text, chain):
-                missed = self.judge.torque(chain, numbers)
             opened = replace(plain.opened, chain=chain)
-            self.made[asked] = Candidate(asked, numbers, opened, missed, text)
+            return self.judged(asked, opened, numbers.put(gain=found.gain), text)
         return self.made[asked] if laws else plain
 
     def with_bristles(self, numbers: Numbers) -> Numbers:
         """Numbers with bristles too, by the same runs."""
         opened = self.written(numbers)
-        with installed(self.module(opened, numbers) if numbers.laws else "", opened.chain):
+        with installed(self.module(opened.chain, numbers) if numbers.laws else "", opened.chain):
             off = self.judge.off(opened.chain, self.judge.learning, numbers)
         return fit_bristles(self.study, numbers, off)
 
@@ -142,10 +144,9 @@ class Bench:
             stiffen(document.root, self.opened.chain, numbers)
         return self.opened.again(document)
 
-    def module(self, opened: Opened, numbers: Numbers) -> str:
+    def module(self, chain: Chain, numbers: Numbers) -> str:
         """The text of the module for laws that no element holds."""
-        arm = self.judge.arm
-        return module_text(opened.chain, numbers, arm.gain, arm.ratio)
+        return module_text(chain, numbers, self.judge.arm.gain, self.judge.arm.ratio)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,18 +169,18 @@ class Corrected:
 
 def asked_of(found: MotionDiagnosis, bench: Bench) -> tuple[Asked, tuple[Term, ...]]:
     """Everything that elements may hold, and the laws that none holds."""
-    terms, model = found.models[-1].terms, bench.opened.chain.model
+    terms, chain = found.models[-1].terms, bench.opened.chain
     link = next((int(e.place[1:]) - 1 for e in found.effects
                  if e.effect in ("payload", "link_inertia") and e.worth), -1)  # fmt: skip
     late = found.models[-1].delay
     late += sum(float(term.value[0]) for term in terms if term.effect == "delay")
     of_command = late < 0.0 and bench.judge.commanded  # which the commands themselves show
-    if abs(late) < SHORTEST * float(model.opt.timestep) or of_command:
+    if abs(late) < SHORTEST * chain.step or of_command:
         late = 0.0
-    chain = bench.opened.chain
-    motors = [is_driven(model, joint) and chain.servo(joint) < 0 for joint in chain.joints]
+    pairs = zip(chain.joints, chain.servos, strict=True)
+    motors = [is_driven(chain.model, joint) and servo < 0 for joint, servo in pairs]
     geared = tuple(j for j in held_at(terms, Element.GAIN) if motors[j])
-    curved = held_at(terms, Element.LEVELLED) if has_powers(model) else ()
+    curved = held_at(terms, Element.LEVELLED) if has_powers(chain.model) else ()
     sprung = held_at(terms, Element.SPRINGS)
     there = {Element.FRICTION: True, Element.MASSES: True, Element.ARMATURE: True,
              Element.LEVELLED: curved, Element.SPRINGS: sprung, Element.GAIN: geared,

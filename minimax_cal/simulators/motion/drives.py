@@ -37,10 +37,10 @@ from minimax_cal.dynamics.regressor import Motion
 from minimax_cal.dynamics.result import MotionEffect, changed_joints
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError, RobotError
-from minimax_cal.ground.files import check_writable, json_text, plain, write_whole
+from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.measuring.faults.fault import Amount
 from minimax_cal.robots.document import Document
-from minimax_cal.robots.mjcf import mujoco, numbers
+from minimax_cal.robots.mjcf import numbers
 from minimax_cal.simulators.chain import Chain, braked
 from minimax_cal.simulators.elements import forget, known, parents_of, section, tune
 from minimax_cal.simulators.mjcf import IMPLICIT, elements_of, servos_of
@@ -163,7 +163,7 @@ def serve(judge: Judge, opened: Opened, *, plain: bool = False) -> Served:
 
     plain: without delays, which other simulators do not read.
     """
-    chain, least = opened.chain, SHORTEST * float(opened.chain.model.opt.timestep)
+    chain, least = opened.chain, SHORTEST * opened.chain.step
     own, damping, first = own_drives(chain), np.zeros(len(chain.dofs)), share_of(chain)
     if judge.held.unit == NOTHING:
         damping = np.array(chain.model.dof_damping[chain.dofs])
@@ -204,11 +204,10 @@ def damped_by_joints(judge: Judge, opened: Opened) -> bool:
 
 def body_of(chain: Chain) -> Body:
     """Torque that the masses of a model alone take for a motion, whatever carries them."""
-    mj, model = mujoco(), copy(chain.model)
+    mj, model, data, at, dofs = replace(chain, model=copy(chain.model)).fresh()
     model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONSTRAINT)
     for name in ("dof_armature", "dof_damping", "jnt_stiffness", "body_gravcomp"):
         getattr(model, name)[:] = 0.0
-    data, at, dofs = mj.MjData(model), chain.places, chain.dofs
 
     def body(motion: Motion) -> Array:
         out = np.empty(motion.q.shape)
@@ -290,7 +289,7 @@ def with_drives(opened: Opened, served: Served, kinds: Sequence[str] = KINDS) ->
 def write_drives(document: Document, chain: Chain, drives: Sequence[Drive]) -> None:
     """Give the servos of a model the numbers of drives, where these are others than it has."""
     root, model = document.root, chain.model
-    step, floating = float(model.opt.timestep), bool(model.body_gravcomp[chain.bodies[0]])
+    step, floating = chain.step, bool(model.body_gravcomp[chain.bodies[0]])
     joints = elements_of(root, chain)
     for j, (drive, own) in enumerate(zip(drives, own_drives(chain), strict=True)):
         name, number = chain.names[j], chain.joints[j]
@@ -375,7 +374,7 @@ def as_actuators(chain: Chain, served: Served | None) -> list[dict[str, Any]]:
 
     served: what its logs say of speeds that no model holds.
     """
-    dofs, step = chain.dofs, float(chain.model.opt.timestep)
+    dofs, step = chain.dofs, chain.step
     fits = served.fits if served else (None,) * len(dofs)
     held = ("dof_armature", "dof_frictionloss", "dof_damping")
     body = np.array([getattr(chain.model, name)[dofs] for name in held]).T.tolist()
@@ -408,19 +407,9 @@ def actuators_text(found: list[dict[str, Any]], step: float, name: str) -> dict[
     return {"json": json_text(plain(content)), "isaac": isaac}
 
 
-def check_files(actuators: tuple[str, Path | str] | None, ranges: Path | str | None) -> None:
-    """Raise CalibrationError for a format that is none, and for files that cannot be written."""
-    if actuators is not None:
-        if actuators[0] not in ("isaac", "json"):
-            raise OptionError(f"actuators={actuators[0]!r}: give isaac or json, and a file")
-        check_writable(Path(actuators[1]))
-    if ranges is not None:
-        check_writable(Path(ranges))
-
-
 def write_actuators(path: Path | str, form: str, chain: Chain, served: Served | None) -> None:
     """Write the actuators of a model in a format that simulators take."""
-    step, found = float(chain.model.opt.timestep), as_actuators(chain, served)
+    step, found = chain.step, as_actuators(chain, served)
     write_whole(Path(path), actuators_text(found, step, chain.robot.name)[form])
 
 

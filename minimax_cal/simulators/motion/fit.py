@@ -132,7 +132,7 @@ class Study:
         """(N,) whitened torques less those of a known payload; so much earlier [s]."""
         logs = self.scene.logs.earlier(late) if late else self.scene.logs
         known = logs.filtered(self.scene.known_torque)
-        return np.asarray(self.white.white((logs.y - known).T[self.white.kept]))
+        return self.white.white((logs.y - known).T[self.white.kept])
 
     def with_masses(self, found: Numbers) -> Study:
         """The same logs, for a model that has masses and armature already."""
@@ -412,7 +412,7 @@ def softness(chain: Chain, numbers: Numbers) -> tuple[Array, Array]:
     dofs = chain.dofs
     reference, impedance = np.array(model.dof_solref[dofs]), np.array(model.dof_solimp[dofs])
     start, end = np.clip(impedance[:, :2].T, *IMPEDANCES)
-    time = np.maximum(reference[:, 0], 2.0 * float(model.opt.timestep))
+    time = np.maximum(reference[:, 0], 2.0 * chain.step)
     rate = np.where(reference[:, 0] > 0.0, 2.0 / (end * time), -reference[:, 1] / end)
     return start / (1.0 - start) / weights(chain, numbers), rate
 
@@ -459,7 +459,7 @@ def fit_bristles(study: Study, numbers: Numbers, missed: Array) -> Numbers:
         held = held_friction(scene.stuck(yields), missed) * (scene.divisor / numbers.gain)[:, None]
         whole = np.maximum(held.sum(axis=1), 1e-300)
         held *= np.minimum(1.0, numbers.friction / whole)[:, None]
-        slow = (float(study.chain.model.opt.timestep) / STABLE) ** 2 / inertia
+        slow = (study.chain.step / STABLE) ** 2 / inertia
         yields = np.maximum(YIELD, held.shape[1] * held * slow[:, None])
     damping = 2.0 * DAMPED * np.sqrt(inertia / np.maximum((held / yields).sum(axis=1), 1e-300))
     return numbers.put(bristles=held, yields=yields, damped=damping)

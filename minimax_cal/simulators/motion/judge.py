@@ -128,8 +128,7 @@ class Gains:
 
 def inverse_torque(chain: Chain, logs: Logs) -> Array:
     """(M, n) torque that a model takes for the motion of logs, as its drives feel it [N m]."""
-    mj, model = mujoco(), chain.model
-    data, (at, dofs) = mj.MjData(model), (chain.places, chain.dofs)
+    mj, model, data, at, dofs = chain.fresh()
     out = np.empty(logs.motion.q.shape)
     joint, number, bristle = np.array(bristles_in(chain), dtype=int).reshape(-1, 3).T
     yields = given_bristles(chain)[1]
@@ -163,7 +162,7 @@ def follow_commands(chain: Chain, run: Run, commands: Array, source: str) -> Arr
             fill_history(chain.model, data)
 
     path = at_times(steps_of(run.time, chain), run.time, commands)
-    rates = np.gradient(path, float(chain.model.opt.timestep), axis=0)
+    rates = np.gradient(path, chain.step, axis=0)
     return stepped(chain, run, drive, source)
 
 
@@ -211,8 +210,7 @@ def held_to(
 
 def by_inertia(chain: Chain) -> Pull:
     """Drives whose gains follow the inertia of an arm: critically damped."""
-    mj, model = mujoco(), chain.model
-    data, (at, dofs) = mj.MjData(model), (chain.places, chain.dofs)
+    mj, model, data, at, dofs = chain.fresh()
     wanted, torque = np.zeros(model.nv), np.zeros(model.nv)
 
     def pull(q: Array, off: Array, slow: Array) -> Array:
@@ -220,7 +218,7 @@ def by_inertia(chain: Chain) -> Pull:
         mj.mj_fwdPosition(model, data)
         wanted[dofs] = BANDWIDTH**2 * off + 2.0 * BANDWIDTH * slow
         mj.mj_mulM(model, data, torque, wanted)
-        return np.asarray(torque[dofs])
+        return torque[dofs]
 
     return pull
 
@@ -242,14 +240,13 @@ def own_drives_off(model: Any) -> Iterator[None]:
 
 def steps_of(time: Array, chain: Chain) -> Array:
     """Times of a model's steps along a log [s]."""
-    step = float(chain.model.opt.timestep)
+    step = chain.step
     return np.asarray(time[0] + step * np.arange(int((time[-1] - time[0]) / step) + 1))
 
 
 def stepped(chain: Chain, run: Run, drive: Callable[[Any, int], None], source: str) -> Array:
     """(m, n) joint values at the times of a run.  drive: sets what acts at a step."""
-    mj, model = mujoco(), chain.model
-    data, (at, dofs) = mj.MjData(model), (chain.places, chain.dofs)
+    mj, model, data, at, dofs = chain.fresh()
     start = scipy.interpolate.CubicSpline(run.time, run.q)
     data.qpos[at], data.qvel[dofs] = start(run.time[0]), start(run.time[0], 1)
     time = steps_of(run.time, chain)
@@ -361,7 +358,7 @@ class Judge:
         seen = logs.earlier(late) if late else logs
         said = inverse_torque(chain, logs) * gain / self.arm.gain
         known = self.known if logs is self.held else Scene.of(self.arm, logs).known_torque
-        return np.asarray(seen.y - logs.filtered(said + known))
+        return seen.y - logs.filtered(said + known)
 
     def torque(self, chain: Chain, numbers: Numbers | None = None) -> Missed:
         """What a model gets wrong on the runs that judge."""
@@ -380,7 +377,7 @@ class Judge:
             q = self.follow(chain, run, number, numbers)
             squares += tracking(q, run) ** 2 * run.duration
             weight += run.duration
-        return np.asarray(np.sqrt(squares / weight))
+        return np.sqrt(squares / weight)
 
     def follow(self, chain: Chain, run: Run, number: int, numbers: Numbers | None) -> Array:
         """(m, n) where the drives bring the arm along a run that judges."""

@@ -34,7 +34,6 @@ from minimax_cal.simulators.motion.correct import (
 from minimax_cal.simulators.motion.drives import (
     Answer,
     by_positions,
-    check_files,
     write_actuators,
     write_ranges,
 )
@@ -113,8 +112,7 @@ def motion_gap(
     >>> print(mc.motion_gap("arm.xml", ["run1.csv", "run2.csv"], write="corrected.xml").summary())
     """
     began = time.perf_counter()
-    check_request(write, friction, plain=plain)
-    check_files(actuators, randomize)
+    check_request(write, friction, actuators, randomize, plain=plain)
     progress("reading the model and the logs")
     runs = read_logs(model, logs)
     opened = open_model(model, runs[0].joints if runs else 0, tip)
@@ -241,7 +239,14 @@ def told_or_found(
     return found
 
 
-def check_request(write: Path | str | None, friction: str | None, *, plain: bool) -> None:
+def check_request(
+    write: Path | str | None,
+    friction: str | None,
+    actuators: tuple[str, Path | str] | None,
+    ranges: Path | str | None,
+    *,
+    plain: bool,
+) -> None:
     """Raise CalibrationError for what cannot be written, what holds no friction, and no MuJoCo."""
     if write is not None:
         check_writable(write, MODELS)
@@ -252,6 +257,11 @@ def check_request(write: Path | str | None, friction: str | None, *, plain: bool
         raise OptionError(f"plain: other simulators leave out {MOTOR}; leave plain or friction")
     if friction == MOTOR and not has_bristles():
         raise OptionError(f"friction={MOTOR}: this MuJoCo has no motors without input; update it")
+    if actuators and actuators[0] not in ("isaac", "json"):
+        raise OptionError(f"actuators={actuators[0]!r}: give isaac or json, and a file")
+    for path in (actuators and actuators[1], ranges):
+        if path is not None:
+            check_writable(path)
 
 
 def bench_of(

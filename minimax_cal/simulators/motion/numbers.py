@@ -93,12 +93,16 @@ def of_second(mass: float, centre: Array, second: Array) -> Array:
     return out
 
 
+def principal(pseudo: Array, mass: float) -> tuple[Array, Array, Array]:
+    """Centre of gravity (3,), principal second moments (3,) about it, and their axes (3, 3)."""
+    centre = pseudo[:3, 3] / mass
+    return centre, *np.linalg.eigh(pseudo[:3, :3] - mass * np.outer(centre, centre))
+
+
 def physical(pseudo: Array) -> Array:
     """The nearest body that exists: no mass below LIGHTEST, none thinner than THINNEST."""
     mass = max(float(pseudo[3, 3]), LIGHTEST)
-    centre = pseudo[:3, 3] / mass
-    second = pseudo[:3, :3] - mass * np.outer(centre, centre)
-    size, axes = np.linalg.eigh(second)
+    centre, size, axes = principal(pseudo, mass)
     least = max(THINNEST * float(size.max()), THINNEST * mass * WIDTH**2)
     return of_second(mass, centre, (axes * np.maximum(size, least)) @ axes.T)
 
@@ -144,7 +148,7 @@ class Bodies:
     def at(self, coordinates: Array) -> Array:
         """(n, 4, 4) bodies at coordinates (n, 10); 0 is as drawn."""
         half = np.linalg.cholesky(self.drawn) @ upper(coordinates)
-        return np.asarray(half @ np.swapaxes(half, -1, -2))
+        return half @ np.swapaxes(half, -1, -2)
 
     def slopes(self, coordinates: Array) -> Array:
         """(n, 10, 10) derivative of each link's parameters by its body's coordinates, one a row."""
@@ -167,7 +171,7 @@ def inside(model: Any, data: Any, bodies: Sequence[int], frame: Array) -> Array:
         about = turn @ np.diag(model.body_inertia[body]) @ turn.T
         out += of_body(float(model.body_mass[body]), np.array(data.xipos[body]), about)
     back = inverse(frame)
-    return np.asarray(back @ out @ back.T)
+    return back @ out @ back.T
 
 
 def upper(coordinates: Array) -> Array:
@@ -181,9 +185,7 @@ def upper(coordinates: Array) -> Array:
 def inertial(pseudo: Array) -> dict[str, Array]:
     """Attributes of an <inertial>: pos, quat, mass, diaginertia, of a body in its frame."""
     mass = float(pseudo[3, 3])
-    centre = pseudo[:3, 3] / mass
-    second = pseudo[:3, :3] - mass * np.outer(centre, centre)
-    size, axes = np.linalg.eigh(second)
+    centre, size, axes = principal(pseudo, mass)
     size = np.maximum(size, THINNEST * size.max())  # else rounding makes it thinner than nothing
     axes = axes * np.linalg.det(axes)
     turn = Rotation.from_matrix(transform(axes, np.zeros(3))[:3, :3])
@@ -398,7 +400,7 @@ def write_bristles(root: ET.Element, chain: Chain, found: Numbers) -> None:
 
 def write_delay(root: ET.Element, chain: Chain, found: Numbers) -> None:
     """A command that acts late, or a torque that is read late."""
-    late = delayed(abs(found.late), float(chain.model.opt.timestep))
+    late = delayed(abs(found.late), chain.step)
     for name in chain.names if late else ():
         if found.late > 0.0:
             sensors = section(root, "sensor")
@@ -430,7 +432,7 @@ def stiffen(root: ET.Element, chain: Chain, found: Numbers) -> None:
                 continue
             inertia = float(servo.get("kv", "0")) ** 2 / (4.0 * float(servo.get("kp", "1")))
             damper = 2.0 * np.sqrt(needed[i] * inertia)
-            step = float(chain.model.opt.timestep)
+            step = chain.step
             tune(servo, needed[i], max(damper, STEPS * step * needed[i]))
 
 
