@@ -133,7 +133,12 @@ def bumps(x: Array) -> list[Array]:
     """Smooth bumps over the range of a driver (k,)."""
     low, high = np.quantile(x, [0.02, 0.98])
     width = max(float(high - low), 1e-12) / BUMPS
-    return [np.exp(-(((x - low) / width - k) ** 2)) for k in range(BUMPS + 1)]
+    return hills((x - low) / width)
+
+
+def hills(x: Array) -> list[Array]:
+    """Smooth bumps about 0, 1, ... BUMPS."""
+    return [np.exp(-((x - k) ** 2)) for k in range(BUMPS + 1)]
 
 
 def by_angle(m: Moments) -> list[Array]:
@@ -220,7 +225,7 @@ def by_time(m: Moments) -> list[Array]:
         mine = run == r
         if mine.any():
             since = logs.since[m.at] / max(float(logs.since[m.at][mine].max()), 1e-9)
-            out += [mine * np.exp(-((BUMPS * since - k) ** 2)) for k in range(BUMPS + 1)]
+            out += [mine * hill for hill in hills(BUMPS * since)]
     return m.both_ways(out)
 
 

@@ -17,6 +17,7 @@ from minimax_cal.robots.robot import Robot
 
 PER_LINK = 10  # inertial parameters of a link
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # order of the entries of an inertia
+SQUARE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # which of these a matrix has where
 RANK = 1e-7  # of the largest singular value: combinations that turn no joint by more have no say
 
 
@@ -123,9 +124,7 @@ def inverse_dynamics(robot: Robot, motion: Motion, parameters: Array) -> Array:
     axes = link_axes(links)
     mass = parameters[:, 0, None, None]
     first = np.einsum("nabm,na->nbm", axes, parameters[:, 1:4])
-    own = np.empty((robot.joints, 3, 3))
-    for number, (i, j) in enumerate(UPPER):
-        own[:, i, j] = own[:, j, i] = parameters[:, 4 + number]
+    own = parameters[:, 4 + SQUARE]
 
     def about(w: Array) -> Array:
         inner = own @ np.einsum("nabm,nbm->nam", axes, w)
@@ -142,11 +141,8 @@ def inverse_dynamics(robot: Robot, motion: Motion, parameters: Array) -> Array:
 
 def link_parameters(mass: float, com: Array, inertia: Array) -> Array:
     """(10,) of a body.  com: (3,) [m].  inertia: (6,) about the centre of gravity [kg m^2]."""
-    about = np.empty((3, 3))
-    for value, (i, j) in zip(inertia, UPPER, strict=True):
-        about[i, j] = about[j, i] = value
-    about = about + mass * (com @ com * np.eye(3) - np.outer(com, com))
-    return np.array([mass, *(mass * com), *(about[i, j] for i, j in UPPER)])
+    about = inertia[SQUARE] + mass * (com @ com * np.eye(3) - np.outer(com, com))
+    return np.array([mass, *(mass * com), *about[np.triu_indices(3)]])
 
 
 def inertial_parameters(robot: Robot) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -108,8 +108,7 @@ def springs_of(
     u, inverse = u[:, kept], (back[kept].T / size[kept]) @ u[:, kept].T
     mass, com = masses
     clear, goal = condensed(fields - (fields @ u) @ u.T, right - u @ (u.T @ right))
-    points, none = len(right) / 3.0, np.zeros((3, 3))
-    soft = np.zeros(0)
+    points, soft = len(right) / 3.0, np.zeros(0)
     if kinds:
         each = np.einsum("l,elr->re", moments(mass, com), clear)
         felt = np.linalg.norm(each, axis=0)
@@ -129,8 +128,8 @@ def springs_of(
         "base": values.get(("base", 0), 0.0), "mass": mass, "com": com,
         "remainder": 1e-3 * float(np.sqrt((rest**2).sum() / points)),
     }  # fmt: skip
-    sag = (TRACELESS @ change[tool : tool + 8]).reshape(3, 3) if len(change) > tool else none
-    drawn = float(change[tool + 8]) if len(change) > tool else 0.0
+    *turns, drawn = np.append(change[tool:], np.zeros(9))[:9].tolist()
+    sag = (TRACELESS @ turns).reshape(3, 3)
     return Springs(held, sag, drawn, change[:count], change[count:tool])
 
 
@@ -181,15 +180,10 @@ def per_moment(scene: Scene, kind: str, place: int) -> Array:
     }
     verb = verbs[kind]
     out, n = [], scene.joints
-    for link in range(n):
-        mass, com = np.zeros(n), np.zeros((n, 3))
-        mass[link] = 1.0
-        alone = verb(scene, mass=mass, com=com)
-        out.append(alone)
-        for axis in range(3):
-            moved = com.copy()
-            moved[link, axis] = 1.0
-            out.append(verb(scene, mass=mass, com=moved) - alone)
+    for mass in np.eye(n):
+        centres = (np.outer(mass, axis) for axis in np.eye(4)[:, 1:])
+        alone, *moved = (verb(scene, mass=mass, com=com) for com in centres)
+        out += [alone, *(one - alone for one in moved)]
     return np.array(out)
 
 
@@ -261,6 +255,7 @@ def started(soft: Array, kinds: Sequence[str]) -> Array:
 
 SAMPLES = 120  # poses at which laws and springs are compared
 NEGLIGIBLE = 1e-9  # [rad]
+LEVER = 0.1  # from the flange to what it carries [m]
 
 
 @dataclass(frozen=True)
@@ -307,6 +302,19 @@ class Arm:
     mapped: Fitted = NOTHING
     left_out: tuple[str, ...] = ()
     remainder: float = 0.0
+
+    @cached_property
+    def reach(self) -> Array:
+        """(n,) largest lever of what is beyond each joint [m]."""
+        robot = self.robot
+        length = np.abs(robot.mdh[:, :2]).sum(axis=1) + np.linalg.norm(self.com, axis=1)
+        slide = np.where(robot.prismatic, np.clip(np.abs(robot.upper), 0.0, 2.0), 0.0)
+        return np.cumsum((length + slide)[::-1])[::-1] + LEVER
+
+    @cached_property
+    def inertia(self) -> Array:
+        """(n,) largest of that about each joint [kg m^2]."""
+        return np.asarray(np.cumsum(self.mass[::-1])[::-1] * self.reach**2)
 
 
 def assumed(robot: Robot) -> bool:

@@ -105,7 +105,7 @@ def chain_of(model: Any, count: int, source: str, tip: str = "", *, unknown: boo
 
     tip: its last body.  unknown: whether its masses are assumed.  Raises RobotError.
     """
-    step = float(model.opt.timestep)
+    step = model.opt.timestep
     if step < SHORTEST:
         raise RobotError(
             f"{source}: its timestep of {step:g} s is too short for an arm to come to rest; give "
@@ -120,7 +120,7 @@ def chain_along(
     """The arm of some joints (n,) of a model, by their ids from the foot.  Raises RobotError."""
     tip = body_name(model, int(model.jnt_bodyid[joints[-1]]))
     seen = to_robot(tree_of(model, source, joints), tip)
-    down = np.array(model.opt.gravity)
+    down = model.opt.gravity
     size = float(np.linalg.norm(down))
     robot = robot_from_dict(seen.content, source)
     if size > 0.0:
@@ -137,9 +137,14 @@ def chain_along(
     return Chain(model, joints, seen, robot, base, size)
 
 
+def id_of(model: Any, kind: str, name: str) -> int:
+    """Of an element of a name, -1 where there is none.  kind: as `JOINT`."""
+    return int(mujoco().mj_name2id(model, getattr(mujoco().mjtObj, f"mjOBJ_{kind}"), name))
+
+
 def told_robot(model: Any, source: str) -> Robot | None:
     """The robot that a file of ours holds whole."""
-    number = mujoco().mj_name2id(model, mujoco().mjtObj.mjOBJ_TEXT, ROBOT)
+    number = id_of(model, "TEXT", ROBOT)
     if number < 0:
         return None
     start, size = int(model.text_adr[number]), int(model.text_size[number])
@@ -188,7 +193,7 @@ def braked(model: Any) -> Array:
 
     Whatever the integrator of the scene that the file is attached to, it takes that implicitly.
     """
-    ours = mujoco().mj_name2id(model, mujoco().mjtObj.mjOBJ_TEXT, ROBOT) >= 0
+    ours = id_of(model, "TEXT", ROBOT) >= 0
     bias = model.actuator_biasprm
     bare = [i for i in range(model.nu) if ours and bias[i, 1] < 0.0 and bias[i, 2] == 0.0]
     joints = range(model.njnt)
@@ -197,19 +202,9 @@ def braked(model: Any) -> Array:
 
 def carrier(chain: Chain) -> int:
     """Id of the body that carries the targets: a tool of ours that sags, else the last one."""
-    found = int(mujoco().mj_name2id(chain.model, mujoco().mjtObj.mjOBJ_BODY, "tool"))
-    last = chain.bodies[-1]
-    ours = found >= 0 and way_holds(chain.model, found, last)
-    return found if ours else last
-
-
-def way_holds(model: Any, body: int, other: int) -> bool:
-    """Whether a body hangs on another."""
-    while body > 0:
-        if body == other:
-            return True
-        body = int(model.body_parentid[body])
-    return False
+    found, bodies = id_of(chain.model, "BODY", "tool"), chain.bodies
+    ours = found >= 0 and holders(chain.model, bodies)[found] == len(bodies) - 1
+    return found if ours else bodies[-1]
 
 
 def fill_history(model: Any, data: Any) -> None:

@@ -31,7 +31,7 @@ from minimax_cal.robots.kinematics import hat, rotation
 from minimax_cal.robots.mjcf import body_pose, mujoco, way_to
 from minimax_cal.robots.transforms import inverse
 from minimax_cal.simulators.arm import Arm
-from minimax_cal.simulators.chain import Chain, carrier, fill_history, holders
+from minimax_cal.simulators.chain import Chain, carrier, fill_history, holders, id_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +131,7 @@ def drive(
     neighbours; each run begins at rest at the pose before its first one.
     Raises RobotError where MuJoCo finds that the model is unstable.
     """
-    servos = chain.servos
-    if (servos < 0).any():
+    if (chain.servos < 0).any():
         return set_joints(chain, commands, play)
     count = len(commands)
     runs = np.array_split(np.arange(count), min(RUNS, count))
@@ -145,7 +144,7 @@ def drive(
 
     def one(rows: Array) -> list[Visit]:
         sides = np.zeros(commands.shape) if play is None else play
-        return visits(chain, servos, commands, sides, rows, source, heard)
+        return visits(chain, commands, sides, rows, source, heard)
 
     with ThreadPoolExecutor(min(len(runs), os.cpu_count() or 1)) as pool:
         found = zip(*(visit for part in pool.map(one, runs) for visit in part), strict=True)
@@ -158,7 +157,6 @@ Visit = tuple[Array, Array, float, Array]  # a row of `Driven`
 
 def visits(
     chain: Chain,
-    servos: Array,
     commands: Array,
     play: Array,
     rows: Array,
@@ -169,26 +167,23 @@ def visits(
     chain = replace(chain, model=copy(chain.model))
     (mj, model, data, at, _), sides = chain.fresh(), plays(chain)
     moved = way_to(model, carrier(chain))
-    dofs = np.array([int(model.jnt_dofadr[joint]) for joint in moved])
-    rest = np.where(model.jnt_type[list(moved)] == 2, STILL_SLIDE, STILL)
-    limits = Limits.of(chain, servos)
-    step = chain.step
-    start = commands[rows[0] - 1]
-    data.qpos[at], data.ctrl[servos] = start, start
+    dofs, kinds = model.jnt_dofadr[list(moved)], model.jnt_type[list(moved)]
+    rest = np.where(kinds == 2, STILL_SLIDE, STILL)
+    limits, step, start = Limits.of(chain), chain.step, commands[rows[0] - 1]
+    data.qpos[at], data.ctrl[limits.servos] = start, start
     fill_history(model, data)
     count, out = round(REST / step), list[Visit]()
-    follow(mj, model, data, limits, np.tile(start, (count, 1)), LOOKS)
+    steered(model, data, limits, np.tile(start, (count, 1)), LOOKS)
     for row in rows:
         for joint, place in sides.items():
             model.qpos_spring[place] = play[row, joint]
         path = moves(start, commands[row], chain.robot.prismatic, step)
-        at_limit = follow(mj, model, data, limits, path)
-        rest_path = np.tile(commands[row], (count, 1))
-        at_limit = at_limit + follow(mj, model, data, limits, rest_path, LOOKS)
+        at_limit = steered(model, data, limits, path)
+        at_limit += steered(model, data, limits, np.tile(commands[row], (count, 1)), LOOKS)
         check_stable(mj, data, source)
         share = at_limit / (len(path) + count)
         speed = float((np.abs(data.qvel[dofs]) / rest).max())
-        out.append((body_pose(data, carrier(chain)), np.array(data.qpos[at]), speed, share))
+        out.append((body_pose(data, carrier(chain)), data.qpos[at], speed, share))
         start = commands[row]
         heard()
     return out
@@ -216,9 +211,9 @@ class Limits:
     torque: Array
 
     @staticmethod
-    def of(chain: Chain, servos: Array) -> Limits:
+    def of(chain: Chain) -> Limits:
         """Those of a model, a little inside, so that rounding does not hide what is at one."""
-        m, joints = chain.model, list(chain.joints)
+        m, joints, servos = chain.model, list(chain.joints), chain.servos
         open_ends = np.array([-np.inf, np.inf])
         force = np.where(m.actuator_forcelimited[servos, None], m.actuator_forcerange[servos],
                          open_ends)  # fmt: skip
@@ -232,12 +227,13 @@ class Limits:
             | (torque <= self.torque[:, 0]) | (torque >= self.torque[:, 1]))  # fmt: skip
 
 
-def follow(mj: Any, model: Any, data: Any, limits: Limits, path: Array, every: int = 1) -> Array:
+def steered(model: Any, data: Any, limits: Limits, path: Array, every: int = 1) -> Array:
     """(n,) at how many timesteps each joint is at a limit along commands (steps, n).
 
     every: timesteps between two looks, and two commands.
     """
-    force, torque, starts = list[Array](), list[Array](), range(0, len(path), every)
+    mj, starts = mujoco(), range(0, len(path), every)
+    force, torque = list[Array](), list[Array]()
     for k in starts:
         data.ctrl[limits.servos] = path[k]
         mj.mj_step(model, data, min(every, len(path) - k))
@@ -282,7 +278,7 @@ def touching(chain: Chain, model: Any, q: Array) -> Array:
         data.qpos[chain.places] = values
         mj.mj_fwdPosition(model, data)
         sides = carried[model.geom_bodyid[data.contact.geom]].any(axis=-1)
-        out[row] = bool((sides & (data.contact.dist < 0.0)).any())
+        out[row] = (sides & (data.contact.dist < 0.0)).any()
     return out
 
 
@@ -290,7 +286,7 @@ def plays(chain: Chain) -> dict[int, int]:
     """Joint, and where the position in its play is in qpos."""
     model, out = chain.model, {}
     for i in range(len(chain.joints)):
-        found = mujoco().mj_name2id(model, mujoco().mjtObj.mjOBJ_JOINT, f"play{i + 1}")
+        found = id_of(model, "JOINT", f"play{i + 1}")
         if found >= 0:
             out[i] = int(model.jnt_qposadr[found])
     return out
@@ -357,7 +353,7 @@ def stand(chain: Chain, names: tuple[str, ...], commands: Array, play: Array | N
         data.act[states[states >= 0]] = command[states >= 0]
         for joint, place in sides.items():
             data.qpos[place] = model.qpos_spring[place] = 0.0 if play is None else play[row, joint]
-        q = np.array(data.qpos[at])
+        q = data.qpos[at]
         for _ in range(ROUNDS):
             here = force(q)
             slope = np.array([force(q + step) - here for step in SMALL * np.eye(len(q))]).T / SMALL

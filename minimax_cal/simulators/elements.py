@@ -23,7 +23,7 @@ from minimax_cal.robots.mjcf import numbers
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_poses
 from minimax_cal.robots.transforms import head, inverse, level_to, shift, tail
-from minimax_cal.simulators.arm import Arm
+from minimax_cal.simulators.arm import LEVER, Arm
 
 SETTLES = 15.0  # a servo's frequency at the largest inertia: 1.5 s of rest leave 4e-9 [rad/s]
 LEAST_RATIO, SLOWEST = 0.7, 7.5  # a given damper stays from this damping ratio to this pole [1/s]
@@ -32,7 +32,6 @@ WIDEST = 10.0  # gains are at most so much larger than the largest that a smooth
 SAG = 2e-6  # gravity moves the tool of a joint that is stiff by no more [m]
 STEPS = 2.0  # a damper's own time is at least so many timesteps: then no stiffness shakes
 NOTHING = 1e-12
-LEVER = 0.1  # from the flange to what it carries [m]
 SAMPLES = 200  # poses at which loads are looked for
 
 
@@ -88,8 +87,7 @@ def choose_servos(arm: Arm, drives: Drives, *, springs: bool = False) -> Servos:
     inertia = np.maximum(inertia, drives.inertia)
     needed = SETTLES**2 * inertia
     ordinary = np.maximum(drives.gain, np.maximum(needed, SMALLEST * needed.max()))
-    reach, _ = carried(arm)
-    lever = np.where(arm.robot.prismatic, 1.0, reach)
+    lever = np.where(arm.robot.prismatic, 1.0, arm.reach)
     soft = arm.turn > NOTHING
     compliance = np.where(soft, arm.turn, np.inf)
     share = min(1.0, float((arm.turn * ordinary).max()))
@@ -124,19 +122,8 @@ def loads(arm: Arm) -> tuple[Array, Array]:
     torque = torques(links, arm.mass, arm.com, robot.up)
     force = G * beyond[:, None] * np.einsum("nam,a->nm", links.z, robot.up)
     slides = robot.prismatic[:, None]
-    return (
-        np.asarray(np.where(slides, beyond[:, None], inertia).max(axis=1)),
-        np.asarray(np.abs(np.where(slides, force, torque)).max(axis=1)),
-    )
-
-
-def carried(arm: Arm) -> tuple[Array, Array]:
-    """(n,) each: largest lever of what is beyond a joint [m], largest inertia of that [kg m^2]."""
-    robot = arm.robot
-    length = np.abs(robot.mdh[:, :2]).sum(axis=1) + np.linalg.norm(arm.com, axis=1)
-    slide = np.where(robot.prismatic, np.clip(np.abs(robot.upper), 0.0, 2.0), 0.0)
-    reach = np.cumsum((length + slide)[::-1])[::-1] + LEVER
-    return reach, np.cumsum(arm.mass[::-1])[::-1] * reach**2
+    inertia, torque = np.where(slides, beyond[:, None], inertia), np.where(slides, force, torque)
+    return inertia.max(axis=1), np.abs(torque).max(axis=1)
 
 
 # ---- elements ------------------------------------------------------------------------------------
@@ -217,11 +204,6 @@ def frames(robot: Robot) -> Array:
     """(n, 4, 4) frame of each joint in the base at joint values 0, z its axis [m]."""
     frames_of_links = zip(laid(robot, np.eye(4)), robot.mdh, strict=False)
     return np.array([at @ head(row) for at, row in frames_of_links])
-
-
-def damping(stiffness: Array, inertia: Array) -> Array:
-    """Dampers that let springs come to rest without swinging [N m s/rad]."""
-    return np.asarray(TIME * stiffness + 2.0 * np.sqrt(stiffness * inertia))
 
 
 def equip(layout: Layout, arm: Arm, *, springs: bool = False, driven: bool = True) -> None:
@@ -328,7 +310,7 @@ def spring(
 
     loaded: whether it feels all of gravity, or as much as the actuators do.
     """
-    own = damping(np.array(stiffness), np.array(inertia))
+    own = TIME * stiffness + 2.0 * np.sqrt(stiffness * inertia)  # lets it come to rest
     new = ET.Element("joint", as_text({
         "name": name, "type": kind, "pos": at, "axis": axis, "stiffness": [stiffness],
         "springref": "0", "ref": "0", "limited": "false", "damping": [own], "frictionloss": "0",
@@ -344,24 +326,22 @@ def spring(
 
 def flexes(layout: Layout, arm: Arm, servos: Servos) -> None:
     """A spring on the axis of each joint whose servo does not hold its compliance."""
-    _, inertia = carried(arm)
     for i in np.flatnonzero(servos.sprung):
         spring(
             layout.bodies[i], f"flex{i + 1}", "slide" if arm.robot.prismatic[i] else "hinge",
-            layout.anchors[i], layout.axes[i], 1.0 / float(arm.turn[i]), float(inertia[i]),
+            layout.anchors[i], layout.axes[i], 1.0 / arm.turn[i], arm.inertia[i],
         )  # fmt: skip
 
 
 def plays(layout: Layout, arm: Arm, share: float) -> None:
     """A hinge with stops half the play away on either side, and a spring that holds it."""
-    reach, inertia = carried(arm)
-    _, torque = loads(arm)
+    (_, torque), inertia = loads(arm), arm.inertia
     for i in np.flatnonzero(arm.play):
         half = 0.5 * abs(arm.play[i])
-        held = max(share * float(torque[i] * reach[i]) / SAG, float(inertia[i]) / TIME**2)
+        held = max(share * (torque[i] * arm.reach[i]) / SAG, inertia[i] / TIME**2)
         new = spring(
             layout.bodies[i], f"play{i + 1}", "hinge", layout.anchors[i], layout.axes[i],
-            held, float(inertia[i]), loaded=False,
+            held, inertia[i], loaded=False,
         )  # fmt: skip
         new.set("limited", "true")
         ends = np.array([-1.01, 1.01]) * half  # the spring ends inside the stops
@@ -370,7 +350,6 @@ def plays(layout: Layout, arm: Arm, share: float) -> None:
 
 def bends(layout: Layout, arm: Arm) -> None:
     """Hinges at the Gauss points of a link: together the compliance of a cantilever, exactly."""
-    _, inertia = carried(arm)
     for i, flexibility in arm.bend.items():
         row = arm.robot.mdh[i]
         start, end = np.array([0.0, 0.0, -row[1]]), np.array([row[0], 0.0, 0.0])
@@ -386,7 +365,7 @@ def bends(layout: Layout, arm: Arm) -> None:
                 soft = flexibility * length * (1.0 if letter == "x" else 0.5)
                 spring(
                     body, f"bend{i + 1}_{letter}{point + 1}", "hinge", at, seat[:3, :3] @ axis,
-                    1.0 / soft, float(inertia[i + 1]),
+                    1.0 / soft, arm.inertia[i + 1],
                 )  # fmt: skip
 
 
@@ -406,13 +385,12 @@ def base(layout: Layout, arm: Arm) -> None:
     body, robot = layout.bodies[0], arm.robot
     foot = layout.seats[0] @ inverse(head(robot.mdh[0]))
     if arm.base > 0.0:
-        _, inertia = carried(arm)
         level = level_to(robot.up)
         first = next(i for i, child in enumerate(body) if child.tag in ("joint", "freejoint"))
         for letter, axis in zip("xy", level, strict=True):
             new = spring(
                 body, f"base_flex_{letter}", "hinge", foot[:3, 3], foot[:3, :3] @ axis,
-                1.0 / arm.base, float(inertia[0]),
+                1.0 / arm.base, arm.inertia[0],
             )  # fmt: skip
             body.remove(new)
             body.insert(first, new)
@@ -437,7 +415,7 @@ def balancer(layout: Layout, arm: Arm, stiffness: Array) -> None:
         inside = layout.seats[i] @ inverse(at[i])
         part(layout.bodies[i], "site", name=f"balancer_{name}",
              pos=inside[:3, :3] @ point + inside[:3, 3], size=0.005)  # fmt: skip
-    pull = -told.k * float(stiffness[0]) / (told.eye * ANCHOR**2)
+    pull = -told.k * stiffness[0] / (told.eye * ANCHOR**2)
     tendon = part(section(layout.root, "tendon"), "spatial", name="balancer", stiffness=pull,
                   springlength=told.rest * ANCHOR)  # fmt: skip
     part(tendon, "site", site="balancer_anchor")
@@ -451,7 +429,7 @@ def targets(layout: Layout, arm: Arm, names: Sequence[str]) -> None:
     """The flange, and a site for each target on the tool."""
     end = layout.seats[-1] @ tail(arm.robot.mdh[-1])
     mark(layout, layout.bodies[-1], "flange", end)
-    soft = bool(np.abs(arm.sag).max() > NOTHING or arm.drawn.max() > 0.0)
+    soft = np.abs(arm.sag).max() > NOTHING or arm.drawn.max() > 0.0
     body = sagging(layout.bodies[-1], end, arm) if soft else layout.bodies[-1]
     for name, point in zip(names, arm.spots, strict=True):
         mark(layout, body, name, shift(*point) if soft else end @ shift(*point))
@@ -497,7 +475,7 @@ def sagging(body: ET.Element, end: Array, arm: Arm) -> ET.Element:
         if arm.drawn[i] <= 0.0:
             continue
         spring(body, f"tool_slide_{'xyz'[i]}", "slide", np.zeros(3), np.eye(3)[i],
-               G * FOOT / float(arm.drawn[i]), FOOT)  # fmt: skip
+               G * FOOT / arm.drawn[i], FOOT)  # fmt: skip
     return body
 
 

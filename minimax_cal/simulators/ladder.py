@@ -450,8 +450,8 @@ class Run:
         off = np.abs(driven.q - asked)[judge][:, ~chain.robot.prismatic]
         return Rung(
             name, held.rms_mm, held.max_mm, train.rms_mm, train.max_mm,
-            1e3 * float(off.max(initial=0.0)), self.predicted(fit, judge & self.held),
-            moving_poses=int(driven.moving.sum()), at_limit=float(driven.limited.max()),
+            1e3 * off.max(initial=0.0), self.predicted(fit, judge & self.held),
+            moving_poses=int(driven.moving.sum()), at_limit=driven.limited.max(),
         )  # fmt: skip
 
     def predicted(self, fit: Fit | None, rows: Array) -> float:

@@ -30,14 +30,7 @@ from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.robots.document import Document
 from minimax_cal.robots.gravity import LEAST_MASS, G, inertia_of, masses_of
-from minimax_cal.robots.mjcf import (
-    Given,
-    body_pose,
-    find_assets,
-    mujoco,
-    read_model,
-    shifted,
-)
+from minimax_cal.robots.mjcf import Given, body_pose, find_assets, mujoco, read_model, shifted
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_joints
 from minimax_cal.robots.transforms import SAME, difference, head, inverse, tail
@@ -282,14 +275,8 @@ def ours(layout: Layout, arm: Arm) -> None:
 def in_gravity(arm: Arm, gravity: float) -> Arm:
     """The same sag under another gravity [m/s^2]."""
     factor = G / gravity if gravity else 1.0
-    return replace(
-        arm,
-        turn=arm.turn * factor,
-        base=arm.base * factor,
-        bend={link: value * factor for link, value in arm.bend.items()},
-        sag=arm.sag * factor,
-        drawn=arm.drawn * factor,
-    )
+    scaled = {name: getattr(arm, name) * factor for name in ("turn", "base", "sag", "drawn")}
+    return replace(arm, bend={i: value * factor for i, value in arm.bend.items()}, **scaled)
 
 
 def seats(
@@ -324,8 +311,8 @@ def seats(
         here = body_pose(data, parent)
         if i:
             here = new[i - 1] @ inverse(old[i - 1]) @ here
-        ref = float(model.qpos0[model.jnt_qposadr[chain.joints[i]]])
-        motion = joint.motion(np.array([ref]))[0]
+        ref = model.qpos0[[model.jnt_qposadr[chain.joints[i]]]]
+        motion = joint.motion(ref)[0]
         place(given, bodies[i], parents, inverse(here) @ at @ motion @ inverse(anchor), chain, i)
     return Layout(
         root=tree,
@@ -333,8 +320,8 @@ def seats(
         bodies=tuple(bodies),
         joints=tuple(joints),
         seats=np.array(out),
-        anchors=np.array([model.jnt_pos[j] for j in chain.joints]),
-        axes=np.array([model.jnt_axis[j] for j in chain.joints]),
+        anchors=model.jnt_pos[list(chain.joints)],
+        axes=model.jnt_axis[list(chain.joints)],
         drives=drives_of(chain),
         degrees=counts_degrees(given.document.root),
     )
@@ -361,7 +348,7 @@ def servos_of(chain: Chain) -> tuple[Array, Array, Array]:
             limits[i] = model.jnt_actfrcrange[joint]
         if servo < 0:
             continue
-        gear = float(model.actuator_gear[servo, 0])
+        gear = model.actuator_gear[servo, 0]
         gain[i], damper[i] = -model.actuator_biasprm[servo, 1:3] * gear**2
         if model.actuator_forcelimited[servo]:
             ends = np.sort(model.actuator_forcerange[servo] * gear)
@@ -371,13 +358,13 @@ def servos_of(chain: Chain) -> tuple[Array, Array, Array]:
 
 def drives_of(chain: Chain) -> Drives:
     """The servos of a model as MuJoCo sees them."""
-    model, own = chain.model, np.array(chain.model.dof_damping[chain.dofs])
+    model, own = chain.model, chain.model.dof_damping[chain.dofs]
     gain, damper, limits = servos_of(chain)
     floating = model.body_gravcomp[list(chain.bodies)] > 0.0
     free = bool(floating.any() and not model.jnt_actgravcomp[list(chain.joints)].any())
     return Drives(
         gain, damper + own, own, limits, largest_inertia(chain),
-        braked(model)[list(chain.joints)] | (int(model.opt.integrator) not in IMPLICIT),
+        braked(model)[list(chain.joints)] | (model.opt.integrator not in IMPLICIT),
         chain.step, free,
     )  # fmt: skip
 
@@ -399,7 +386,7 @@ def check_limits(chain: Chain, q: Array, source: str) -> None:
         if short.any():
             i = int(np.argmax(short))
             unit = "N" if chain.robot.prismatic[i] else "N m"
-            most = float(np.abs(drives.limits[i]).min())
+            most = np.abs(drives.limits[i]).min()
             raise RobotError(
                 f"{source}: joint {chain.names[i]}: gravity asks for {abs(needed[i]):.4g} {unit} at"
                 f" a measured pose, its force limit is {most:.4g} {unit}; raise the limit "

@@ -241,7 +241,7 @@ class MotionGap(Result):
     def headline(self) -> str:
         """The result in a sentence or two."""
         if not self.kept:
-            error = float(np.linalg.norm(self.rungs[0].tracking_rms_mrad))
+            error = np.linalg.norm(self.rungs[0].tracking_rms_mrad)
             return (
                 f"No correction lowers the joint error under {self.drives} on held-out motion "
                 f"({', '.join(self.held_out)}), {error:.3g} mrad: nothing is written."
@@ -260,7 +260,7 @@ class MotionGap(Result):
 
     def driven(self) -> str:
         """How the joint error changes."""
-        ends = [float(np.linalg.norm(self.rungs[k].tracking_rms_mrad)) for k in (0, -1)]
+        ends = [np.linalg.norm(self.rungs[k].tracking_rms_mrad) for k in (0, -1)]
         return f"the joint error under {self.drives} from {ends[0]:.3g} to {ends[1]:.3g} mrad"
 
     def sentences(self) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from minimax_cal.simulators.mjcf import new_file
 VERSION = "1.9"
 KINDS = {2: "prismatic", 3: "revolute"}  # of mjtJoint: a slide, a hinge
 SHAPES = {2: "sphere", 3: "capsule", 5: "cylinder", 6: "box"}  # of mjtGeom
-CENTRAL = ((0, 0, "ixx"), (0, 1, "ixy"), (0, 2, "ixz"), (1, 1, "iyy"), (1, 2, "iyz"), (2, 2, "izz"))
+CENTRAL = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 UNLIMITED = 1e16  # what SDFormat takes for no limit
 
 
@@ -105,20 +105,20 @@ def write_link(arm: ET.Element, model: Any, data: Any, body: int) -> None:
     link = ET.SubElement(arm, "link", {"name": name_of(model, body)})
     frame_pose(link, relative(model, data, body), name_of(model, parent) if parent else "")
     inertial = ET.SubElement(link, "inertial")
-    element(inertial, "mass", float(model.body_mass[body]))
+    element(inertial, "mass", model.body_mass[body])
     frame_pose(inertial, pose_at(model.body_ipos[body]))
     turn = pose_at(model.body_ipos[body], model.body_iquat[body])[:3, :3]
     tensor = turn @ np.diag(model.body_inertia[body]) @ turn.T
     moments = ET.SubElement(inertial, "inertia")
-    for i, j, tag in CENTRAL:
-        element(moments, tag, float(tensor[i, j]))
+    for tag, value in zip(CENTRAL, tensor[np.triu_indices(3)].tolist(), strict=True):
+        element(moments, tag, value)
     for geom in np.flatnonzero(model.geom_bodyid == body):
         write_visual(link, model, int(geom))
 
 
 def write_visual(link: ET.Element, model: Any, geom: int) -> None:
     """A simple shape; nothing of a mesh."""
-    shape = SHAPES.get(int(model.geom_type[geom]))
+    shape = SHAPES.get(model.geom_type[geom])
     if shape is None:
         return
     visual = ET.SubElement(link, "visual", {"name": f"geom{geom}"})
@@ -128,7 +128,7 @@ def write_visual(link: ET.Element, model: Any, geom: int) -> None:
     if shape == "box":
         element(made, "size", numbers(2.0 * size))
         return
-    element(made, "radius", float(size[0]))
+    element(made, "radius", size[0])
     if shape != "sphere":
         element(made, "length", 2.0 * float(size[1]))
 
@@ -138,7 +138,7 @@ def write_joint(arm: ET.Element, model: Any, data: Any, body: int) -> None:
     parent, moves = int(model.body_parentid[body]), bool(model.body_jntnum[body])
     j = int(model.body_jntadr[body])
     name = str(model.joint(j).name) or f"joint{j}" if moves else f"{name_of(model, body)}_fixed"
-    kind = KINDS[int(model.jnt_type[j])] if moves else "fixed"
+    kind = KINDS[model.jnt_type[j]] if moves else "fixed"
     joint = ET.SubElement(arm, "joint", {"name": name, "type": kind})
     element(joint, "parent", name_of(model, parent) if parent else "world")
     element(joint, "child", name_of(model, body))
@@ -151,16 +151,16 @@ def write_joint(arm: ET.Element, model: Any, data: Any, body: int) -> None:
     element(axis, "xyz", numbers(inward[:3, :3] @ data.xaxis[j]))
     limit = ET.SubElement(axis, "limit")
     ends = model.jnt_range[j] if model.jnt_limited[j] else (-UNLIMITED, UNLIMITED)
-    element(limit, "lower", float(ends[0]))
-    element(limit, "upper", float(ends[1]))
+    element(limit, "lower", ends[0])
+    element(limit, "upper", ends[1])
     if model.jnt_actfrclimited[j]:
-        element(limit, "effort", float(np.abs(model.jnt_actfrcrange[j]).max()))
+        element(limit, "effort", np.abs(model.jnt_actfrcrange[j]).max())
     dynamics = ET.SubElement(axis, "dynamics")
     dof = int(model.jnt_dofadr[j])
-    element(dynamics, "damping", 0.0 if braked(model)[j] else float(model.dof_damping[dof]))
-    element(dynamics, "friction", float(model.dof_frictionloss[dof]))
-    element(dynamics, "spring_reference", float(model.qpos_spring[model.jnt_qposadr[j]]))
-    element(dynamics, "spring_stiffness", float(model.jnt_stiffness[j]))
+    element(dynamics, "damping", 0.0 if braked(model)[j] else model.dof_damping[dof])
+    element(dynamics, "friction", model.dof_frictionloss[dof])
+    element(dynamics, "spring_reference", model.qpos_spring[model.jnt_qposadr[j]])
+    element(dynamics, "spring_stiffness", model.jnt_stiffness[j])
 
 
 def lost_of(model: Any) -> list[str]:

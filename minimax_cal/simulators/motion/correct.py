@@ -12,11 +12,7 @@ import numpy as np
 
 from minimax_cal.dynamics.diagnose import MATTERS
 from minimax_cal.dynamics.laws import CURVE, IN_FILE, LAWS, WORDS, Element, Term
-from minimax_cal.dynamics.result import (
-    MotionDiagnosis,
-    MotionEffect,
-    changed_joints,
-)
+from minimax_cal.dynamics.result import MotionDiagnosis, MotionEffect, changed_joints
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress
 from minimax_cal.robots.mjcf import is_driven
@@ -111,9 +107,7 @@ class Bench:
             study = self.study.of_file(chain, found.gain)
             own = Asked((plain.asked.elements & {Element.DELAY}) | {Element.FRICTION}, laws=laws,
                         late=plain.asked.late)  # fmt: skip
-            numbers = fit_numbers(study, own).put(
-                bristles=found.bristles, yields=found.yields, damped=found.damped
-            )
+            numbers = fit_numbers(study, own).put(**found.at_rest)
             text = module_text(chain, numbers, study.scene.arm.gain, self.judge.arm.ratio)
             opened = replace(plain.opened, chain=chain)
             return self.judged(asked, opened, numbers.put(gain=found.gain), text)
@@ -269,8 +263,8 @@ def at_rest(bench: Bench, plain: Candidate, full: Candidate) -> tuple[Candidate,
         return plain, full
     if full is plain:
         return more, more
-    held = {name: getattr(more.numbers, name) for name in ("bristles", "yields", "damped")}
-    return bench.made_of(plain.asked.adding(Element.BRISTLES), plain.numbers.put(**held)), more
+    numbers = plain.numbers.put(**more.numbers.at_rest)
+    return bench.made_of(plain.asked.adding(Element.BRISTLES), numbers), more
 
 
 def without_law(asked: Asked, effect: str) -> Asked:

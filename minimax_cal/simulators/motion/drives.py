@@ -44,12 +44,7 @@ from minimax_cal.robots.mjcf import numbers
 from minimax_cal.simulators.chain import Chain, braked
 from minimax_cal.simulators.elements import forget, known, parents_of, section, tune
 from minimax_cal.simulators.mjcf import IMPLICIT, elements_of, servos_of
-from minimax_cal.simulators.motion.correct import (
-    HISTORY_FIRST,
-    Candidate,
-    Corrected,
-    mean_log,
-)
+from minimax_cal.simulators.motion.correct import HISTORY_FIRST, Candidate, Corrected, mean_log
 from minimax_cal.simulators.motion.fit import Study, fit_numbers
 from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge, ahead_of
 from minimax_cal.simulators.motion.numbers import (
@@ -166,7 +161,7 @@ def serve(judge: Judge, opened: Opened, *, plain: bool = False) -> Served:
     chain, least = opened.chain, SHORTEST * opened.chain.step
     own, damping, first = own_drives(chain), np.zeros(len(chain.dofs)), share_of(chain)
     if judge.held.unit == NOTHING:
-        damping = np.array(chain.model.dof_damping[chain.dofs])
+        damping = chain.model.dof_damping[chain.dofs]
     given = [replace(one, damper=one.damper + by) for one, by in zip(own, damping, strict=True)]
     body = body_of(chain)
     seen = followed(judge, body)
@@ -199,7 +194,7 @@ def damped_by_joints(judge: Judge, opened: Opened) -> bool:
     body = body_of(chain)
     fits = Fits.of(followed(judge, body), own_drives(chain), share_of(chain), body).each
     parts = [fit.drive.damper / damping[j] for j, fit in enumerate(fits) if fit]
-    return bool(parts) and float(np.median(parts)) < NO_DAMPER
+    return bool(parts) and np.median(parts) < NO_DAMPER
 
 
 def body_of(chain: Chain) -> Body:
@@ -294,7 +289,7 @@ def write_drives(document: Document, chain: Chain, drives: Sequence[Drive]) -> N
     for j, (drive, own) in enumerate(zip(drives, own_drives(chain), strict=True)):
         name, number = chain.names[j], chain.joints[j]
         servo = next(e for e in actuators_of(root, name) if e.tag in ("position", "general"))
-        gear = float(model.actuator_gear[chain.servo(number), 0])
+        gear = model.actuator_gear[chain.servo(number), 0]
         regulated = drive.taking(own, GAINS) != drive
         if regulated:
             tune(servo, drive.stiffness / gear**2, (1.0 - drive.ahead) * drive.damper / gear**2)
@@ -305,7 +300,7 @@ def write_drives(document: Document, chain: Chain, drives: Sequence[Drive]) -> N
         for actuator in actuators_of(root, name) if regulated or drive.delay != own.delay else ():
             write_late(actuator, drive.delay, step)
     shaken = np.array([d.damper for d in drives]) * step * model.dof_invweight0[chain.dofs]
-    if int(model.opt.integrator) not in IMPLICIT and shaken.max() > SHAKES:
+    if model.opt.integrator not in IMPLICIT and shaken.max() > SHAKES:
         section(root, "option").set("integrator", "implicitfast")
 
 

@@ -312,14 +312,14 @@ def least_within(
             new = np.maximum(new, least)
             with np.errstate(over="ignore", invalid="ignore"):  # too far a step is refused
                 after = residual(new)
-                gained = float(left @ left - after @ after)
+                gained = left @ left - after @ after
             if gained >= 0.0:
                 break
             damping *= 10.0
         if not gained >= 0.0:
             return x
         x, left, damping = new, after, max(0.1 * damping, LEAST_DAMPING)
-        if gained <= CLOSE * float(left @ left):
+        if gained <= CLOSE * (left @ left):
             break
     return x
 
@@ -327,8 +327,7 @@ def least_within(
 def damped_step(gram: Array, pull: Array, damping: float, free: Array) -> Array:
     """(p,) step of the free ones; 0 of the others."""
     out = np.zeros(len(pull))
-    if free.any():
-        out[free] = -solve_scaled(gram[np.ix_(free, free)], pull[free], damping)
+    out[free] = -solve_scaled(gram[np.ix_(free, free)], pull[free], damping)
     return out
 
 
@@ -410,7 +409,7 @@ def softness(chain: Chain, numbers: Numbers) -> tuple[Array, Array]:
     """(n,) D [kg m^2] and b [1/s] of the friction of each joint, as a model has it."""
     model = chain.model
     dofs = chain.dofs
-    reference, impedance = np.array(model.dof_solref[dofs]), np.array(model.dof_solimp[dofs])
+    reference, impedance = model.dof_solref[dofs], model.dof_solimp[dofs]
     start, end = np.clip(impedance[:, :2].T, *IMPEDANCES)
     time = np.maximum(reference[:, 0], 2.0 * chain.step)
     rate = np.where(reference[:, 0] > 0.0, 2.0 / (end * time), -reference[:, 1] / end)

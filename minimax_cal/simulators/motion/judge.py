@@ -32,7 +32,7 @@ from minimax_cal.dynamics.rows import (
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.robots.mjcf import mujoco
-from minimax_cal.simulators.chain import Chain, fill_history
+from minimax_cal.simulators.chain import Chain, fill_history, id_of
 from minimax_cal.simulators.drive import check_stable
 from minimax_cal.simulators.mjcf import largest_inertia
 from minimax_cal.simulators.motion.numbers import (
@@ -56,11 +56,11 @@ def module_text(chain: Chain, numbers: Numbers, unit: Array, ratio: Array) -> st
     laws = {term.effect: term.law for term in numbers.laws}
     for j, name in enumerate(chain.names):
         pairs = zip(numbers.laws, numbers.value, strict=True)
-        mine = [(t.effect, amounts_of(t.law, value, float(unit[j]), float(numbers.gain[j])),
+        mine = [(t.effect, amounts_of(t.law, value, unit[j], numbers.gain[j]),
                  dict(t.tuned)) for t, value in pairs if t.joint == j]  # fmt: skip
         told[name] = {
             "frictionloss": float(numbers.loss[j]),
-            "damping": [float(v) for v in numbers.damping[j]],
+            "damping": numbers.damping[j].tolist(),
             "fastest": float(numbers.fastest[j]),
             "laws": mine,
         }
@@ -131,7 +131,7 @@ def inverse_torque(chain: Chain, logs: Logs) -> Array:
     mj, model, data, at, dofs = chain.fresh()
     out = np.empty(logs.motion.q.shape)
     joint, number, bristle = np.array(bristles_in(chain), dtype=int).reshape(-1, 3).T
-    yields = given_bristles(chain)[1]
+    yields = given_bristles(chain)["yields"]
     bent = (bent_bristles(logs, yields) * yields)[:, joint, number]
     floating = ~model.jnt_actgravcomp[list(chain.joints)].astype(bool)
     motion = logs.motion
@@ -168,8 +168,7 @@ def follow_commands(chain: Chain, run: Run, commands: Array, source: str) -> Arr
 
 def ahead_of(model: Any, names: Sequence[str]) -> dict[int, int]:
     """Ids of actuators that take the commanded speed of some joints, and of which (from 0)."""
-    mj = mujoco()
-    ids = (mj.mj_name2id(model, mj.mjtObj.mjOBJ_ACTUATOR, f"{name}_ahead") for name in names)
+    ids = (id_of(model, "ACTUATOR", f"{name}_ahead") for name in names)
     return {number: j for j, number in enumerate(ids) if number >= 0}
 
 
@@ -372,12 +371,10 @@ class Judge:
 
     def tracking(self, chain: Chain, numbers: Numbers | None = None) -> Array:
         """(n,) RMS joint error under the drives over the runs that judge [rad, m]."""
-        squares, weight = np.zeros(len(self.inertia)), 0.0
-        for number, run in enumerate(self.runs):
-            q = self.follow(chain, run, number, numbers)
-            squares += tracking(q, run) ** 2 * run.duration
-            weight += run.duration
-        return np.sqrt(squares / weight)
+        off = [tracking(self.follow(chain, run, number, numbers), run)
+               for number, run in enumerate(self.runs)]  # fmt: skip
+        weights = [run.duration for run in self.runs]
+        return np.asarray(np.sqrt(np.average(np.square(off), axis=0, weights=weights)))
 
     def follow(self, chain: Chain, run: Run, number: int, numbers: Numbers | None) -> Array:
         """(m, n) where the drives bring the arm along a run that judges."""

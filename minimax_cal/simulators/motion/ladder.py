@@ -24,19 +24,7 @@ from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.robots.urdf import MODELS
 from minimax_cal.simulators.mjcf import largest_inertia
 from minimax_cal.simulators.motion import drives
-from minimax_cal.simulators.motion.correct import (
-    STAYS,
-    Bench,
-    asked_of,
-    correct,
-    mean_log,
-)
-from minimax_cal.simulators.motion.drives import (
-    Answer,
-    by_positions,
-    write_actuators,
-    write_ranges,
-)
+from minimax_cal.simulators.motion.correct import STAYS, Bench, asked_of, correct, mean_log
 from minimax_cal.simulators.motion.fit import PRIOR, PRIOR_ASSUMED, Study, has_bristles
 from minimax_cal.simulators.motion.judge import ENDING, OWN_SERVOS, Judge
 from minimax_cal.simulators.motion.numbers import Opened, calibrated, open_model
@@ -132,7 +120,7 @@ def motion_gap(
             first.append(judge.rung("calibrated geometry", opened.chain))
         if judge.held.unit == NOTHING:
             progress("fitting the drives to their commands")
-            made = by_positions(judge, opened, plain=plain)
+            made = drives.by_positions(judge, opened, plain=plain)
         else:
             found = told_or_found(judge, opened, diagnosis, known.payload, progress)
             judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
@@ -145,10 +133,10 @@ def motion_gap(
     if path is not None:
         write_whole(path, made.opened.content(path))
     if actuators is not None and not nothing:
-        write_actuators(actuators[1], actuators[0], made.opened.chain, made.served)
+        drives.write_actuators(actuators[1], actuators[0], made.opened.chain, made.served)
     if randomize is not None and not nothing:
         count = len(judge.learning_runs)
-        write_ranges(randomize, made.fitted, made.served, opened.chain.names, count)
+        drives.write_ranges(randomize, made.fitted, made.served, opened.chain.names, count)
     if beside is not None:
         write_whole(beside, made.module)
     told = (text for run in runs for text in run.notices)
@@ -170,12 +158,12 @@ def motion_gap(
     )
 
 
-def by_torques(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Answer:
+def by_torques(bench: Bench, found: MotionDiagnosis, progress: Progress) -> drives.Answer:
     """By torques, and by commands where they were logged."""
     bench, served, rungs, effects = by_commands(bench, found, progress)
     made = correct(bench, found, progress)
     more = {"rungs": (*rungs, *made.rungs), "lost": (*made.lost, *drives.lost_late(effects))}
-    return Answer(**vars(made) | more, served=served, effects=effects)
+    return drives.Answer(**vars(made) | more, served=served, effects=effects)
 
 
 def by_commands(

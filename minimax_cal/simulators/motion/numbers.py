@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from minimax_cal.correcting.exporters.correct import laid
 from minimax_cal.dynamics.laws import Term
-from minimax_cal.dynamics.regressor import UPPER, inertial_parameters
+from minimax_cal.dynamics.regressor import SQUARE, inertial_parameters
 from minimax_cal.dynamics.rows import YIELD
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.arrays import Array
@@ -41,8 +41,9 @@ from minimax_cal.simulators.chain import (
     chain_along,
     chain_of,
     holders,
+    id_of,
 )
-from minimax_cal.simulators.elements import STEPS, carried, forget, known, parents_of, section, tune
+from minimax_cal.simulators.elements import STEPS, forget, known, parents_of, section, tune
 from minimax_cal.simulators.mjcf import (
     content_for,
     corrected,
@@ -52,7 +53,7 @@ from minimax_cal.simulators.mjcf import (
     own_masses,
 )
 
-PLACES = tuple((i, j) for i in range(4) for j in range(i, 4))  # of the ten coordinates in U
+ROWS, COLUMNS = np.triu_indices(4)  # places of the ten coordinates in U
 THINNEST = 1e-6  # of a body's largest second moment: no principal one is smaller
 LIGHTEST = 1e-4  # of a body without a mass, to begin with [kg]
 WIDTH = 0.05  # of a body without a size, to begin with [m]
@@ -60,9 +61,7 @@ WIDTH = 0.05  # of a body without a size, to begin with [m]
 
 def pseudo_inertia(parameters: Array) -> Array:
     """(..., 4, 4) of inertial parameters (..., 10) about the origin of a frame."""
-    about = np.zeros((*parameters.shape[:-1], 3, 3))
-    for number, (i, j) in enumerate(UPPER):
-        about[..., i, j] = about[..., j, i] = parameters[..., 4 + number]
+    about = parameters[..., 4 + SQUARE]
     half = 0.5 * np.trace(about, axis1=-2, axis2=-1)
     out = np.empty((*parameters.shape[:-1], 4, 4))
     out[..., :3, :3] = half[..., None, None] * np.eye(3) - about
@@ -75,8 +74,9 @@ def parameters_of(pseudo: Array) -> Array:
     """(..., 10) inertial parameters of pseudo-inertias (..., 4, 4)."""
     second = pseudo[..., :3, :3]
     about = np.trace(second, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - second
-    inertia = np.stack([about[..., i, j] for i, j in UPPER], axis=-1)
-    return np.concatenate([pseudo[..., 3, 3, None], pseudo[..., :3, 3], inertia], axis=-1)
+    rows, columns = np.triu_indices(3)
+    parts = [pseudo[..., 3, 3, None], pseudo[..., :3, 3], about[..., rows, columns]]
+    return np.concatenate(parts, axis=-1)
 
 
 def of_body(mass: float, centre: Array, about: Array) -> Array:
@@ -86,10 +86,8 @@ def of_body(mass: float, centre: Array, about: Array) -> Array:
 
 def of_second(mass: float, centre: Array, second: Array) -> Array:
     """(4, 4) of a body.  second: (3, 3) second moments about its centre of gravity [kg m^2]."""
-    out = np.empty((4, 4))
-    out[:3, :3] = second + mass * np.outer(centre, centre)
-    out[:3, 3] = out[3, :3] = mass * centre
-    out[3, 3] = mass
+    out = mass * np.outer([*centre, 1.0], [*centre, 1.0])
+    out[:3, :3] += second
     return out
 
 
@@ -155,10 +153,9 @@ class Bodies:
         lower = self.to_link @ np.linalg.cholesky(self.drawn)
         factor = upper(coordinates)
         whole = lower @ factor
-        rows, columns = np.array(PLACES).T
-        size = np.where(rows == columns, factor[:, rows, columns], 1.0)
-        left = np.moveaxis(lower[:, :, rows] * size[:, None], 1, 2)  # (n, 10, 4)
-        right = np.moveaxis(whole[:, :, columns], 1, 2)
+        size = np.where(ROWS == COLUMNS, factor[:, ROWS, COLUMNS], 1.0)
+        left = np.moveaxis(lower[:, :, ROWS] * size[:, None], 1, 2)  # (n, 10, 4)
+        right = np.moveaxis(whole[:, :, COLUMNS], 1, 2)
         change = left[..., :, None] * right[..., None, :]
         return parameters_of(change + np.swapaxes(change, -1, -2))
 
@@ -167,18 +164,18 @@ def inside(model: Any, data: Any, bodies: Sequence[int], frame: Array) -> Array:
     """(4, 4) of some bodies of a model together, in a frame of the world (4, 4)."""
     out = np.zeros((4, 4))
     for body in bodies:
-        turn = np.array(data.ximat[body]).reshape(3, 3)
+        turn = data.ximat[body].reshape(3, 3)
         about = turn @ np.diag(model.body_inertia[body]) @ turn.T
-        out += of_body(float(model.body_mass[body]), np.array(data.xipos[body]), about)
+        out += of_body(float(model.body_mass[body]), data.xipos[body], about)
     back = inverse(frame)
     return back @ out @ back.T
 
 
 def upper(coordinates: Array) -> Array:
     """(n, 4, 4) upper triangular matrices of coordinates (n, 10)."""
-    out = np.zeros((len(coordinates), 4, 4))
-    for k, (i, j) in enumerate(PLACES):
-        out[:, i, j] = np.exp(coordinates[:, k]) if i == j else coordinates[:, k]
+    out, own = np.zeros((len(coordinates), 4, 4)), np.arange(4)
+    out[:, ROWS, COLUMNS] = coordinates
+    out[:, own, own] = np.exp(out[:, own, own])
     return out
 
 
@@ -244,6 +241,11 @@ class Numbers:
         """(n,) friction that no bristle holds."""
         return np.asarray(np.maximum(self.friction - self.bristles.sum(axis=1), 0.0))
 
+    @property
+    def at_rest(self) -> dict[str, Any]:
+        """The numbers of its bristles."""
+        return {name: getattr(self, name) for name in ("bristles", "yields", "damped")}
+
     def put(self, **changes: Any) -> Numbers:
         """With other fields."""
         return replace(self, **changes)
@@ -256,18 +258,16 @@ def given_numbers(chain: Chain, bodies: Bodies) -> Numbers:
     spring = np.column_stack(
         [model.jnt_stiffness[joints], of_powers(model, "jnt_stiffnesspoly", joints)]
     )
-    held, yields, damped = given_bristles(chain)
+    held = given_bristles(chain)
     return Numbers(
         bodies=bodies.drawn,
-        armature=np.array(model.dof_armature[dofs]),
-        friction=np.array(model.dof_frictionloss[dofs]) + held.sum(axis=1),
+        armature=model.dof_armature[dofs],
+        friction=model.dof_frictionloss[dofs] + held["bristles"].sum(axis=1),
         damping=damping,
         stiffness=spring,
-        rest=np.array(model.qpos_spring[chain.places]),
+        rest=model.qpos_spring[chain.places],
         gain=np.ones(len(dofs)),
-        bristles=held,
-        yields=yields,
-        damped=damped,
+        **held,
     )
 
 
@@ -278,13 +278,12 @@ def bristle(joint: str, number: int) -> str:
 
 def bristles_in(chain: Chain) -> list[tuple[int, int, int]]:
     """Joint, number and id of every bristle of a model."""
-    mj, model = mujoco(), chain.model
-    places = [(j, k, mj.mj_name2id(model, mj.mjtObj.mjOBJ_ACTUATOR, bristle(name, k)))
+    places = [(j, k, id_of(chain.model, "ACTUATOR", bristle(name, k)))
               for j, name in enumerate(chain.names) for k in range(len(YIELD))]  # fmt: skip
     return [place for place in places if place[2] >= 0]
 
 
-def given_bristles(chain: Chain) -> tuple[Array, Array, Array]:
+def given_bristles(chain: Chain) -> dict[str, Any]:
     """Friction (n, k), ways (n, k) and dampers (n,) of a model's bristles, as in `Numbers`."""
     damped = np.zeros(len(chain.joints))
     held, yields = np.zeros((len(damped), len(YIELD))), np.tile(YIELD, (len(damped), 1))
@@ -292,7 +291,7 @@ def given_bristles(chain: Chain) -> tuple[Array, Array, Array]:
         stiffness, damper = chain.model.actuator_dynprm[number, STIFFNESS : STIFFNESS + 2]
         held[j, k] = chain.model.actuator_biasprm[number, FRICTION]
         yields[j, k], damped[j] = held[j, k] / stiffness, damper / stiffness
-    return held, yields, damped
+    return {"bristles": held, "yields": yields, "damped": damped}
 
 
 def of_powers(model: Any, name: str, places: Array) -> Array:
@@ -375,7 +374,7 @@ def write_gains(root: ET.Element, chain: Chain, found: Numbers) -> None:
         if gain == 1.0:
             continue
         for actuator in actuators_of(root, name):
-            old = [float(v) for v in str(actuator.get("gear", "1")).split()]
+            old = [float(v) for v in actuator.get("gear", "1").split()]
             actuator.set("gear", numbers([old[0] / gain, *old[1:]]))
 
 
@@ -423,9 +422,8 @@ def stiffen(root: ET.Element, chain: Chain, found: Numbers) -> None:
 
     A servo of gain k stops within friction / k of its command.
     """
-    mass, com = masses_of(chain.robot, LEAST_MASS)
-    reach, _ = carried(stiff(chain.robot, (mass, com)))
-    needed = found.friction * np.where(chain.robot.prismatic, 1.0, reach) / STOPS
+    arm = stiff(chain.robot, masses_of(chain.robot, LEAST_MASS))
+    needed = found.friction * np.where(chain.robot.prismatic, 1.0, arm.reach) / STOPS
     for i, name in enumerate(chain.names):
         for servo in actuators_of(root, name):
             if servo.tag != "position" or needed[i] <= float(servo.get("kp", "0")):
