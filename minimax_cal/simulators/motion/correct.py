@@ -308,7 +308,7 @@ def worths(bench: Bench, plain: Candidate) -> Iterator[WrittenElement]:
             rows = "whole" if name == Element.BRISTLES else "moving"
             ends = (getattr(one.missed, rows) for one in (bare, plain))
             worth = changed_joints(*ends)
-            yield WrittenElement(name, "file", name.attributes, worth)
+            yield WrittenElement(name.value, "file", name.attributes, worth)
 
 
 def law_worths(bench: Bench, plain: Candidate, full: Candidate) -> Iterator[WrittenElement]:

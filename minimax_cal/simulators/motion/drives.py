@@ -482,7 +482,7 @@ def write_ranges(
     whole = block_diag(*(part.covariance for part in parts))
     sigma = iter(np.sqrt(np.diag(whole)).tolist())
     parameters = [
-        {"name": name, "joint": joint, "mean": float(mean), "sigma": next(sigma),
+        {"name": name, "joint": joint, "mean": mean, "sigma": next(sigma),
          "between_runs": float(between), "unit": unit}
         for part in parts
         for (name, joint, unit), mean, between in zip(part.names, part.mean, part.between,
@@ -537,7 +537,7 @@ def by_positions(judge: Judge, opened: Opened, *, plain: bool) -> Answer:
     steps += [(f"+ {name}", with_body(driven, served, names[: number + 1]))
               for number, name in enumerate(names)]  # fmt: skip
     rungs = tuple(judge.rung(name, one.chain) for name, one in steps)
-    elements = tuple(WrittenElement(name, "file", HELD[name][1], {}) for name in names)
+    elements = tuple(WrittenElement(name.value, "file", HELD[name][1], {}) for name in names)
     return Answer(with_body(driven, served, names), rungs, elements, None, "", (), (SCALE,),
                   tuple(lost_late(effects)), served=served, effects=effects)  # fmt: skip
 

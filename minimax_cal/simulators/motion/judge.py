@@ -309,7 +309,7 @@ class Judge:
         Raises CalibrationError.
         """
         if fast:
-            runs = sorted(runs, key=lambda run: float(speed_of(run)))
+            runs = sorted(runs, key=speed_of)
         robot = in_its_gravity(opened.chain)
         gains = known.torque_gains(robot, runs)
         learning, held = divided(known.loaded(runs), known.holdout, known.holdout_run)
