@@ -18,13 +18,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from experiments.simulator_gap import robot_called
-from minimax_cal.dynamics.run import TORQUE, Run
+from minimax_cal.dynamics.logs.table import TORQUE, Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.gravity import tubes
 from minimax_cal.robots.mjcf import mujoco, numbers
 from minimax_cal.robots.robot import Robot
 from minimax_cal.simulators.mjcf import text_of
-from minimax_cal.simulators.motion.written import new_model
+from minimax_cal.simulators.motion.numbers import new_model
 
 ARMS = ("ur10", "ur5e", "irb2600", "scara_600")
 STEP = 0.001  # of the real arm [s]

@@ -34,12 +34,10 @@ from experiments.sweep import Study, study_options
 from minimax_cal.dynamics.diagnose import family
 from minimax_cal.dynamics.given import MotionKnown
 from minimax_cal.dynamics.laws import USUAL, terms_of
-from minimax_cal.dynamics.model import first_body
+from minimax_cal.dynamics.model import Columns, dictionary_of, first_body
 from minimax_cal.dynamics.regressor import PER_LINK
 from minimax_cal.dynamics.result import MotionEffect
-from minimax_cal.dynamics.rows import Logs, Whitening, prepare, whitening
-from minimax_cal.dynamics.scene import Arm, Scene
-from minimax_cal.dynamics.search import Columns, dictionary_of
+from minimax_cal.dynamics.rows import Arm, Logs, Scene, Whitening, prepare, whitening
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table

@@ -15,13 +15,13 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from experiments.sweep import needed
+from minimax_cal.dynamics.logs.table import Run
 from minimax_cal.dynamics.regressor import (
     Motion,
     inertial_parameters,
     inverse_dynamics,
     link_parameters,
 )
-from minimax_cal.dynamics.run import Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.robot import Robot, robot_from_dict
 

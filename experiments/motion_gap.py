@@ -28,8 +28,8 @@ from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
 from minimax_cal.robots.mjcf import mujoco
+from minimax_cal.simulators.motion.judge import loaded
 from minimax_cal.simulators.motion.ladder import MOTOR
-from minimax_cal.simulators.motion.module import loaded
 
 WITHHELD = (  # of the cases of an arm, in turn
     ("friction", "payload"),

@@ -20,8 +20,8 @@ import minimax_cal as mc
 from experiments.real import SHARED, here
 from experiments.sweep import Study, study_options
 from minimax_cal.dynamics.given import runs_of
+from minimax_cal.dynamics.logs.table import Run
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
-from minimax_cal.dynamics.run import Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.robots.robot import Robot, load_robot, robot_from_dict

@@ -23,16 +23,16 @@ import minimax_cal as mc
 from experiments.driven_arms import DrivenArm, Motion, commands, drawn_arm, served
 from experiments.sweep import Study, study_options
 from minimax_cal.dynamics.given import MotionKnown
-from minimax_cal.dynamics.run import NOTHING, TORQUE, Run
+from minimax_cal.dynamics.logs.table import NOTHING, TORQUE, Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
 from minimax_cal.robots.mjcf import mujoco, numbers
 from minimax_cal.simulators.chain import chain_of, fill_history
 from minimax_cal.simulators.elements import parents_of
-from minimax_cal.simulators.given import largest_inertia
+from minimax_cal.simulators.mjcf import largest_inertia
 from minimax_cal.simulators.motion.drives import serve
 from minimax_cal.simulators.motion.judge import Judge
-from minimax_cal.simulators.motion.opened import open_model
+from minimax_cal.simulators.motion.numbers import open_model
 
 ARMS = ("ur10", "seven_axes", "irb2600", "scara_600")
 HZ, STEP = 250.0, 0.001  # of the log, of the real arm [s]

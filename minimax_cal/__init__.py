@@ -15,12 +15,12 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
     from minimax_cal.diagnosing.many import diagnose_many
     from minimax_cal.diagnosing.result import Diagnosis
+    from minimax_cal.dynamics.budget import evaluate_motion
     from minimax_cal.dynamics.diagnose import diagnose_motion
-    from minimax_cal.dynamics.evaluate import evaluate_motion
     from minimax_cal.dynamics.laws import register_law
     from minimax_cal.dynamics.logs import read_runs
+    from minimax_cal.dynamics.logs.table import Run
     from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
-    from minimax_cal.dynamics.run import Run
     from minimax_cal.fitting.calibrate import calibrate, calibrate_many
     from minimax_cal.fitting.fit import Fit, load_fit
     from minimax_cal.fitting.options import Options
@@ -58,11 +58,10 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.reporting.plots.figures import plot_errors
     from minimax_cal.reporting.report import report
     from minimax_cal.robots.robot import Robot, builtin_robots, load_robot
-    from minimax_cal.simulators.commands import load_commands
+    from minimax_cal.simulators.drive import load_commands
     from minimax_cal.simulators.ladder import simulator_gap
     from minimax_cal.simulators.motion.ladder import motion_gap
-    from minimax_cal.simulators.motion.result import MotionGap
-    from minimax_cal.simulators.result import SimulatorGap
+    from minimax_cal.simulators.result import MotionGap, SimulatorGap
     from minimax_cal.solvers.minimize import minimize_max
 
     __version__: str
@@ -176,13 +175,13 @@ MODULES = {  # name: where it is defined
     "diagnose_many": "diagnosing.many",
     "RelativeDiagnosis": "diagnosing.instruments_result",
     "diagnose_relative": "diagnosing.instruments",
-    "Run": "dynamics.run",
+    "Run": "dynamics.logs.table",
     "register_law": "dynamics.laws",
     "read_runs": "dynamics.logs",
     "MotionDiagnosis": "dynamics.result",
     "load_motion": "dynamics.result",
     "diagnose_motion": "dynamics.diagnose",
-    "evaluate_motion": "dynamics.evaluate",
+    "evaluate_motion": "dynamics.budget",
     "plan": "planning.plan",
     "plan_cameras": "planning.cameras",
     "plan_motion": "planning.motion_plan",
@@ -192,9 +191,9 @@ MODULES = {  # name: where it is defined
     "deliver": "correcting.deliverable",
     "export": "correcting.export",
     "SimulatorGap": "simulators.result",
-    "load_commands": "simulators.commands",
+    "load_commands": "simulators.drive",
     "simulator_gap": "simulators.ladder",
-    "MotionGap": "simulators.motion.result",
+    "MotionGap": "simulators.result",
     "motion_gap": "simulators.motion.ladder",
     "fleet": "reporting.fleet.overview",
     "plot_errors": "reporting.plots.figures",

@@ -23,7 +23,6 @@ PACKAGES = ("minimax_cal", "qp_backends", "experiments", "tests")
 FEATURES = {  # that may not grow either, wherever they stand
     "the drive": {
         "minimax_cal/dynamics/drives.py", "minimax_cal/simulators/motion/drives.py",
-        "minimax_cal/simulators/motion/actuators.py", "minimax_cal/simulators/motion/positions.py",
     },
 }  # fmt: skip
 TOKENS = 0.8

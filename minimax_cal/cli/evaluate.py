@@ -17,7 +17,7 @@ from minimax_cal.cli.options import (
     options_of,
     result_options,
 )
-from minimax_cal.dynamics.evaluate import MotionEvaluation, evaluate_motion
+from minimax_cal.dynamics.budget import MotionEvaluation, evaluate_motion
 from minimax_cal.dynamics.result import MotionDiagnosis
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import saved_content

@@ -15,7 +15,7 @@ KINDS = {  # by name the class that reads such a file
     "pixels": "fitting.several.pixel_result.PixelCalibration",
     "diagnosis": "diagnosing.result.Diagnosis",
     "simulator_gap": "simulators.result.SimulatorGap",
-    "motion_gap": "simulators.motion.result.MotionGap",
+    "motion_gap": "simulators.result.MotionGap",
     "motion_diagnosis": "dynamics.result.MotionDiagnosis",
 }
 

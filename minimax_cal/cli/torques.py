@@ -19,7 +19,7 @@ from minimax_cal.cli.options import (
 )
 from minimax_cal.dynamics.diagnose import diagnose_motion
 from minimax_cal.dynamics.given import MotionKnown, read_logs, runs_of
-from minimax_cal.dynamics.run import Run
+from minimax_cal.dynamics.logs import Run
 from minimax_cal.ground.files import check_writable, json_text
 from minimax_cal.ground.options import Option
 from minimax_cal.reporting.plots.motion import save_motion

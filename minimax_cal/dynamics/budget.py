@@ -3,17 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
+from minimax_cal.dynamics.given import runs_of
 from minimax_cal.dynamics.laws import Term
-from minimax_cal.dynamics.model import Normal, held_friction
-from minimax_cal.dynamics.result import changed_joints, worth_by_joint
-from minimax_cal.dynamics.rows import QUARTERS, Logs, rms_by_joint
-from minimax_cal.dynamics.search import FRICTION, RIGID, Columns, solve_scaled
+from minimax_cal.dynamics.logs.table import Run
+from minimax_cal.dynamics.model import (
+    FRICTION,
+    Columns,
+    Normal,
+    TorqueModel,
+    held_friction,
+    parts_of,
+    solve_scaled,
+)
+from minimax_cal.dynamics.result import (
+    MotionDiagnosis,
+    changed_joints,
+    load_motion,
+    table_by_joint,
+    worth_by_joint,
+)
+from minimax_cal.dynamics.rows import QUARTERS, Logs, Scene, prepare, rms_by_joint, standard_errors
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.facts import Fact
+from minimax_cal.ground.results import Result
+from minimax_cal.ground.tables import Table
 
 NEVER_OUT = -1  # number of the fold of rows that are always fitted
 
@@ -22,26 +43,23 @@ NEVER_OUT = -1  # number of the fold of rows that are always fitted
 class LeftOut:
     """Fits without each fold of trajectories in turn, and what they miss there.
 
-    raw: (n, R, p) columns as in `Normal`, not whitened.  error: (n, R) torques; early: the same
-    before a delay was taken out.  fold: (R,).  gram: (f, p, p) and pull: (f, p) of the rows fitted
-    without each fold.
+    early: (n, R) torques before a delay was taken out.  fold: (R,).  gram: (f, p, p) and pull:
+    (f, p) of the rows fitted without each fold.
     """
 
     normal: Normal
-    raw: Array
-    error: Array
     early: Array
     fold: Array
     gram: Array
     pull: Array
 
     @staticmethod
-    def of(normal: Normal, error: Array, early: Array, fold: Array) -> LeftOut:
+    def of(normal: Normal, early: Array, fold: Array) -> LeftOut:
         """The fits of whitened rows.  fold: (R,) of every row."""
         own = np.broadcast_to(fold, normal.white.kept.shape)[normal.white.kept]
         products = [products_of(normal, own == f) for f in range(-1, int(fold.max()) + 1)]
         gram, pull = (np.array([each[k] for each in products]) for k in (0, 1))
-        return LeftOut(normal, normal.raw, error, early, fold,
+        return LeftOut(normal, early, fold,
                        gram.sum(axis=0) - gram[1:], pull.sum(axis=0) - pull[1:])  # fmt: skip
 
     @property
@@ -85,13 +103,14 @@ class LeftOut:
     @property
     def judged(self) -> Array:
         """(R,) rows that some fit leaves out."""
-        return np.asarray(self.fold >= 0)
+        return self.fold >= 0
 
     @cached_property
     def compact(self) -> list[tuple[Array, Array]]:
         """Of each joint the columns (q,) that add to its rows, and these rows (R, q)."""
-        each = [np.flatnonzero(rows.any(axis=0)) for rows in self.raw]
-        return [(used, rows[:, used]) for used, rows in zip(each, self.raw, strict=True)]
+        raw = self.normal.raw
+        each = [np.flatnonzero(rows.any(axis=0)) for rows in raw]
+        return [(used, rows[:, used]) for used, rows in zip(each, raw, strict=True)]
 
     def values(self, index: Array) -> Array:
         """(f, p) values of some columns, of the fit without each fold."""
@@ -109,7 +128,7 @@ class LeftOut:
         delayed: whether a delay was taken out.  without: columns that are left out besides.
         """
         index = np.setdiff1d(self.normal.index(parts), np.array(without, dtype=int))
-        seen = self.error if delayed else self.early
+        seen = self.normal.columns.error if delayed else self.early
         value = self.values(index).T.copy()
         fitted = np.stack([rows @ value[used] for used, rows in self.compact])
         own = np.where(self.fold == NEVER_OUT, 0, self.fold)
@@ -146,11 +165,11 @@ def folds_of(logs: Logs, share: float, named: Sequence[str]) -> Array:
     count = len(logs.names)
     if named:
         out = np.array([0 if name in named else NEVER_OUT for name in logs.names])
-        return np.asarray(out[logs.run])
+        return out[logs.run]
     if count == 1:
-        return np.asarray(logs.quarter)
+        return logs.quarter
     parts = min(count, max(2, round(1.0 / share)))
-    return np.asarray((np.arange(count) % parts)[logs.run])
+    return (np.arange(count) % parts)[logs.run]
 
 
 def without_harmful(judge: LeftOut, terms: Sequence[Term]) -> list[Term]:
@@ -182,11 +201,6 @@ def without_harmful(judge: LeftOut, terms: Sequence[Term]) -> list[Term]:
     return kept
 
 
-def standard_errors(values: Array) -> float:
-    """A mean (g,) in units of its standard error."""
-    return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-300))
-
-
 def by_loads(fold: Array, logs: Logs, terms: Sequence[Term]) -> Array:
     """(R,) folds in which runs whose load no other fold has are left out by quarters.
 
@@ -211,11 +225,6 @@ def steps_of(terms: Sequence[Term]) -> list[tuple[str, tuple[Term, ...]]]:
     return out
 
 
-def parts_of(terms: Sequence[Term]) -> list[str]:
-    """The parts of a fit with usual friction and some laws."""
-    return [RIGID, FRICTION, *(term.text for term in terms)]
-
-
 def drawn_missed(columns: Columns, error: Array) -> Array:
     """(R, n) what the model as given misses; with a gain of each joint where none is given."""
     arm = columns.scene.arm
@@ -225,3 +234,95 @@ def drawn_missed(columns: Columns, error: Array) -> Array:
             (drawn**2).sum(axis=1, keepdims=True), 1e-300
         )
     return np.asarray((error - drawn).T)
+
+
+# ---- on logs that no fit saw ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MotionStepError:
+    """What a step misses, by joint: RMS of all rows, and of those that move."""
+
+    name: str
+    rms: tuple[float, ...]
+    rms_moving: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class MotionEvaluation(Result):
+    """How well each step of a motion diagnosis predicts torques of other logs [unit]."""
+
+    KIND = "motion_evaluation"
+    COMMAND = "evaluate"
+    unit: str
+    steps: Annotated[tuple[MotionStepError, ...], Fact(key="rungs", fewest=1)]
+    runs: tuple[str, ...]
+    notices: tuple[str, ...]
+
+    def beside(self, *, poses: bool = True) -> dict[str, Any]:
+        """What the last step misses."""
+        return {"rms": self.steps[-1].rms, "rms_moving": self.steps[-1].rms_moving}
+
+    def headline(self) -> str:
+        """What the last step misses, in the middle of the joints."""
+        size = f"{np.median(self.steps[-1].rms):.3g} {self.unit}"
+        return f"RMS torque missed, median of the joints: {size}."
+
+    def table(self) -> Table:
+        """RMS of all rows by joint, step by step."""
+        title = f"RMS torque [{self.unit}] on {', '.join(self.runs)}, all rows"
+        return table_by_joint(title, "step", self.steps, "rms")
+
+
+def missed(model: TorqueModel, logs: Logs, columns: Columns) -> Array:
+    """(R, n) what a model misses.  columns: of a scene with its context."""
+    seen = logs.earlier(model.delay) if model.delay else logs
+    return seen.y - model.predict(columns)
+
+
+def evaluate_motion(
+    motion: MotionDiagnosis | str | Path, logs: Sequence[Run | str | Path] | str | Path
+) -> MotionEvaluation:
+    """RMS torque that a motion diagnosis misses on other logs; nothing is fitted.
+
+    Parameters
+    ----------
+    motion
+        Loaded, or its path.
+    logs
+        Files or runs.
+
+    Returns
+    -------
+    MotionEvaluation
+        Both sides pass the 8 Hz zero-phase filter, at 25 rows a second.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
+    >>> print(mc.evaluate_motion("motion.json", ["other.csv"]).table())
+    """
+    found = load_motion(motion)
+    arm = found.arm
+    runs = runs_of(arm.robot, arm.robot, logs)
+    if runs[0].unit != found.unit:
+        raise OptionError(
+            f"{runs[0].source}: is in {runs[0].unit}, the diagnosis in {found.unit}; give logs of "
+            "the same kind"
+        )
+    prepared = prepare(runs)
+    if not arm.known.any():
+        prepared = replace(prepared, payload=np.full_like(prepared.payload, np.nan))
+    scene = Scene.of(arm, prepared)
+    columns = cache(lambda context: Columns(context.in_scene(scene)))
+    steps = []
+    for model in found.models:
+        off = missed(model, prepared, columns(model.context))
+        ends = rms_by_joint(off), rms_by_joint(off, prepared.moving)
+        steps.append(MotionStepError(model.name, *(tuple(end.tolist()) for end in ends)))
+    said = tuple(text for run in runs for text in run.notices)
+    return MotionEvaluation(found.unit, tuple(steps), prepared.names, said)

@@ -15,15 +15,28 @@ from minimax_cal.dynamics.budget import (
     by_loads,
     drawn_missed,
     folds_of,
-    parts_of,
     steps_of,
     without_harmful,
 )
-from minimax_cal.dynamics.given import MotionKnown, runs_of
-from minimax_cal.dynamics.laws import ANGLE, CURVE, LAWS, USUAL, Term, terms_of
-from minimax_cal.dynamics.links import LinkChange, body_as_given, carried, weighing
-from minimax_cal.dynamics.logs.with_robot import LEAST_SCALE, MOST_SCALE
-from minimax_cal.dynamics.model import Body, Normal, TorqueModel, first_body
+from minimax_cal.dynamics.given import LEAST_SCALE, MOST_SCALE, MotionKnown, runs_of
+from minimax_cal.dynamics.laws import ANGLE, CURVE, LAWS, USUAL, Law, Term, terms_of
+from minimax_cal.dynamics.logs.table import CURRENT, Run
+from minimax_cal.dynamics.model import (
+    FRICTION,
+    RIGID,
+    Body,
+    Columns,
+    LinkChange,
+    Normal,
+    TorqueModel,
+    body_as_given,
+    carried,
+    dictionary_of,
+    first_body,
+    parts_of,
+    softened,
+    weighing,
+)
 from minimax_cal.dynamics.probes import Unexplained, unexplained
 from minimax_cal.dynamics.result import (
     Alternative,
@@ -34,14 +47,9 @@ from minimax_cal.dynamics.result import (
     MotionStep,
     NotTestable,
     Verdict,
-    best_worth,
     worth_by_joint,
 )
-from minimax_cal.dynamics.rows import ROW_HZ, Logs, prepare, whitening
-from minimax_cal.dynamics.run import CURRENT, Run
-from minimax_cal.dynamics.scene import Arm, Scene, sense_of
-from minimax_cal.dynamics.search import FRICTION, RIGID, Columns, dictionary_of, generous
-from minimax_cal.dynamics.softness import softened
+from minimax_cal.dynamics.rows import ROW_HZ, Arm, Logs, Scene, prepare, sense_of, whitening
 from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import LEVEL, MINOR
 from minimax_cal.evidence.selection import Choice, select
@@ -174,7 +182,7 @@ def search(arm: Arm, logs: Logs, exclude: Sequence[str]) -> Found:
     terms = [term for term in every if term.effect != "payload"]
     if len(terms) < len(every):
         terms += weighing(columns, terms, carried(columns, terms))
-    white = whitening(logs, generous(columns, terms))
+    white = columns.whitening(terms)
     choice = select(Library.of(dictionary_of(columns, white), terms, []))
     chosen = tuple(one.candidate.term for one in choice.found)
     hidden = [(effect, "all", "motion in which the rigid body does not imitate it")
@@ -205,8 +213,7 @@ def unit_notices(found: Found) -> Iterator[str]:
 
 def fitted(found: Found, columns: Columns) -> Normal:
     """Rows of what was found, whitened by what it leaves of them."""
-    first = whitening(columns.scene.logs, generous(columns, found.terms))
-    rough = Normal.of(columns, first, found.terms)
+    rough = Normal.of(columns, columns.whitening(found.terms), found.terms)
     rest = rough.rest(rough.solve(parts_of(found.terms)))
     return Normal.of(columns, whitening(columns.scene.logs, rest), found.terms)
 
@@ -214,9 +221,9 @@ def fitted(found: Found, columns: Columns) -> Normal:
 def helpful(found: Found) -> Found:
     """What was found, less the laws that harm the joints of runs left out more than they help."""
     logs = found.columns.scene.logs
-    normal, known = fitted(found, found.columns), found.columns.error
+    normal = fitted(found, found.columns)
     fold = by_loads(folds_of(logs, FOLD, ()), logs, found.terms)
-    kept = without_harmful(LeftOut.of(normal, known, known, fold), found.terms)
+    kept = without_harmful(LeftOut.of(normal, found.columns.error, fold), found.terms)
     choice = replace(found.choice, found=tuple(
         one for one in found.choice.found if one.candidate.term in kept))  # fmt: skip
     return replace(found, choice=choice, terms=tuple(kept))
@@ -232,25 +239,26 @@ def examined(
     learns = fold < 0 if (fold < 0).any() else np.ones_like(fold, dtype=bool)
     learning = np.unique(logs.run[learns]).tolist()  # all, but runs that alone judge
     too_little = tuple(motion_lacking(logs.only(learning)))
-    progress("searching for causes")
-    found = search(arm, logs.only(learning), exclude)
+
+    def sought(why: str) -> Found:
+        progress(why)
+        return search(arm, logs.only(learning), exclude)
+
+    found = sought("searching for causes")
     soft = softened(found.columns, found.terms)
     if np.any(soft > arm.soft):
-        progress("searching again with softer friction")
         arm = replace(arm, soft=soft)
-        found = search(arm, logs.only(learning), exclude)
+        found = sought("searching again with softer friction")
     if units := list(unit_notices(found)):
-        progress("searching again with masses of each joint")
         arm = replace(arm, gain=np.zeros(0))
-        found = search(arm, logs.only(learning), exclude)
+        found = sought("searching again with masses of each joint")
     early, late, unsure = logs, 0.0, 0.0
     for one, (value, sigma) in zip(found.choice.found, found.choice.estimates, strict=True):
         if one.candidate.family == "delay" and abs(value[0]) > LATE:
             late, unsure = float(value[0]), float(sigma[0])
     if late:
-        progress("searching again without the delay")
         logs = logs.earlier(late)
-        found = search(arm, logs.only(learning), exclude)
+        found = sought("searching again without the delay")
     progress("judging causes on trajectories left out")
     found = helpful(found)
     columns = found.columns
@@ -258,9 +266,8 @@ def examined(
         columns = Columns(found.context.in_scene(Scene.of(arm, logs)))
     normal = fitted(found, columns)
     fold, whole = by_loads(fold, logs, found.terms), fold
-    known = columns.error
-    before = known + (early.y - logs.y).T
-    judge = LeftOut.of(normal, known, before, fold)
+    before = columns.error + (early.y - logs.y).T
+    judge = LeftOut.of(normal, before, fold)
     group = found.choice.library.rows.group
     again = repeated(found.choice, halves(group, HALVINGS), level=LEVEL)
     given, change = body_as_given(normal)
@@ -332,15 +339,16 @@ def laws_found(found: Found, judge: LeftOut, again: Repeats) -> Iterator[MotionE
 
 def parameters_of(term: Term, value: Array, sigma: Array, scene: Scene) -> tuple[Amount, ...]:
     """The numbers of a law in the unit of the log, and those that were tuned."""
-    said = {"t": scene.logs.unit, "": "1"}
-    law = term.law
-    fitted_ones = [
-        Amount(name, float(v), said.get(unit, unit.replace("t", scene.logs.unit, 1)), float(s))
-        for name, unit, v, s in zip(law.names, law.units, value, sigma, strict=False)
-    ]
-    tuned = [Amount(name, v, law.tuned[name].unit if name in law.tuned else "1")
+    tuned = [Amount(name, v, term.law.tuned[name].unit if name in term.law.tuned else "1")
              for name, v in term.tuned.items()]  # fmt: skip
-    return (*fitted_ones, *tuned)
+    return (*amounts_of(term.law, value, sigma, scene.logs.unit), *tuned)
+
+
+def amounts_of(law: Law, value: Array, sigma: Array, of_log: str) -> Iterator[Amount]:
+    """The parameters of a law.  of_log: the unit of the log."""
+    said = {"t": of_log, "": "1"}
+    for name, unit, v, s in zip(law.names, law.units, value, sigma, strict=False):
+        yield Amount(name, float(v), said.get(unit, unit.replace("t", of_log, 1)), float(s))
 
 
 def others_of(choice: Choice, number: int) -> tuple[Alternative, ...]:
@@ -385,10 +393,7 @@ def changed_link(change: LinkChange) -> MotionEffect:
     count = len(change.before)
     effect = "payload" if change.link == count - 1 else "link_inertia"
     law = LAWS["payload"]
-    parameters = tuple(
-        Amount(name, float(v), unit, float(s))
-        for name, unit, v, s in zip(law.names, law.units, change.value, change.sigma, strict=True)
-    )
+    parameters = tuple(amounts_of(law, change.value, change.sigma, ""))
     worth = worth_by_joint(change.before, change.after)
     others = tuple(Alternative("payload" if k == count - 1 else "link_inertia", f"L{k + 1}", 1.0,
                                law.separate) for k in change.others)  # fmt: skip
@@ -398,7 +403,7 @@ def changed_link(change: LinkChange) -> MotionEffect:
 
 def gain_of(one: MotionEffect) -> float:
     """By how much an effect lowers the relative squares of the joint at which it closes most."""
-    _, (before, after) = best_worth(one)
+    _, (before, after) = one.best
     return (before**2 - after**2) / max(before**2, 1e-300)
 
 
@@ -483,7 +488,7 @@ def held_run(judge: LeftOut, logs: Logs) -> HeldRun:
     """A stretch of a run as a fit without it predicts it."""
     run = int(logs.run[np.argmax(judge.judged)])
     rows = np.flatnonzero((logs.run == run) & judge.judged)[:SHOWN_ROWS]
-    measured = judge.error[:, rows]
+    measured = judge.normal.columns.error[:, rows]
     predicted = measured - judge.whole[rows].T
 
     def brief(values: Array) -> Array:

@@ -17,10 +17,17 @@ from typing import Any, cast
 import numpy as np
 import scipy
 
+from minimax_cal.dynamics.logs.table import NOTHING, Run
 from minimax_cal.dynamics.regressor import Motion
-from minimax_cal.dynamics.rows import SLOWEST, UNFITTED_S, Logs, prepare
-from minimax_cal.dynamics.run import NOTHING, Run
-from minimax_cal.dynamics.scene import Arm, sense_of
+from minimax_cal.dynamics.rows import (
+    SLOWEST,
+    UNFITTED_S,
+    Arm,
+    Logs,
+    prepare,
+    sense_of,
+    standard_errors,
+)
 from minimax_cal.ground.arrays import Array
 
 LATEST, LOOK = 0.1, 0.004  # the latest command that is looked for, and how closely [s]
@@ -68,26 +75,41 @@ class Drive:
 class DriveFit:
     """What logs say of a joint's drive.
 
-    change: (G, 4) by which each stretch (G,), left out, changes FITTED.  limits: standard
-    deviations of torque and speed.  beside: what was fitted with it.
+    change: (G, 4 + k) by which each stretch (G,), left out, changes FITTED, and what was fitted
+    beside these.  beside: that, by name.  limits: standard deviations of torque and speed.
     """
 
     drive: Drive
     change: Array
     stretch: Array
-    limits: tuple[float, float]
     beside: dict[str, float]
+    limits: tuple[float, float] = (0.0, 0.0)
 
     @property
     def sigma(self) -> dict[str, float]:
         """Standard deviations by name."""
-        own = np.sqrt(np.diag(covariance_of(self.change))).tolist()
+        own = np.sqrt(np.diag(covariance_of(self.change)))[: len(FITTED)].tolist()
         return dict(zip((*FITTED, "torque", "speed"), (*own, *self.limits), strict=True))
+
+    @property
+    def apart(self) -> dict[str, float]:
+        """What was fitted beside that is no number of the drive."""
+        return {name: value for name, value in self.beside.items() if name != AHEAD}
+
+    def rest(self, rows: Rows) -> Array:
+        """(R,) torque of some rows that it does not explain."""
+        return rows.rest(self.drive, self.apart)
+
+    def told(self, name: str, given: Drive) -> bool:
+        """Whether something that was fitted beside is there for sure."""
+        at = 2 if name == AHEAD else len(FITTED) + list(self.beside).index(name)
+        off = self.drive.ahead - given.ahead if name == AHEAD else self.beside[name]
+        return abs(off) > STANDS * float(np.sqrt(covariance_of(self.change)[at, at]))
 
 
 def stretch_of(run: Array | int, since: Array) -> Array:
     """(R,) numbers of the stretches of rows: of which run, and when in it [s]."""
-    return np.asarray(run * IN_A_RUN + (since / BLOCK_S).astype(int))
+    return run * IN_A_RUN + (since / BLOCK_S).astype(int)
 
 
 def command_of(run: Run) -> Array:
@@ -152,12 +174,10 @@ class Followed:
         logs = self.logs
         used = ~logs.gap & (self.measured | self.slides[:, j])
         at = logs.picked[used[logs.picked]]
-        run = np.searchsorted(logs.start, at, side="right") - 1
+        run = logs.run_of(at)
         stretch = stretch_of(run, logs.since[at])
-        curves = [
-            scipy.interpolate.CubicSpline(logs.since[a:b], self.told.torque[a:b, j])
-            for a, b in zip(logs.start[:-1], logs.start[1:], strict=True)
-        ]
+        curves = [scipy.interpolate.CubicSpline(logs.since[own], self.told.torque[own, j])
+                  for own in logs.spans]  # fmt: skip
         torque = logs.torque[:, j] * self.gain[j] - self.carried[:, j]
         q, qd, qdd = (one[at, j] for one in (logs.motion.q, logs.motion.qd, logs.motion.qdd))
         return Rows(torque[at], q, qd, qdd, self.sense[at, j], logs.since[at], run, stretch,
@@ -172,8 +192,7 @@ class Followed:
     def samples(self, j: int, drive: Drive) -> Samples:
         """Every row of the logs as logged, at a joint: torque, and what a drive would ask for."""
         out: list[Array] = []
-        for number, run in enumerate(self.runs):
-            rows = slice(self.logs.start[number], self.logs.start[number + 1])
+        for number, (run, rows) in enumerate(zip(self.runs, self.logs.spans, strict=True)):
             time, grid = run.time - run.time[0], self.logs.since[rows]
             smooth = (self.logs.motion.qd, self.carried, self.logs.torque)
             qd, carried, torque = (np.interp(time, grid, one[rows, j]) for one in smooth)
@@ -259,36 +278,10 @@ class Rows:
     def rest(self, drive: Drive, beside: Mapping[str, float]) -> Array:
         """(R,) torque that a drive, and what was fitted beside it, do not explain."""
         value = [drive.stiffness, drive.damper, *beside.values()]
-        return np.asarray(self.torque - self.columns(drive.delay, drive, list(beside)) @ value)
+        return self.torque - self.columns(drive.delay, drive, list(beside)) @ value
 
 
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """Least squares: a drive, what was fitted beside it, and how (G, 4 + k) each stretch, left out,
-    changes FITTED and that.
-    """
-
-    drive: Drive
-    beside: dict[str, float]
-    change: Array
-
-    @property
-    def apart(self) -> dict[str, float]:
-        """What was fitted beside that is no number of the drive."""
-        return {name: value for name, value in self.beside.items() if name != AHEAD}
-
-    def rest(self, rows: Rows) -> Array:
-        """(R,) torque of some rows that it does not explain."""
-        return rows.rest(self.drive, self.apart)
-
-    def told(self, name: str, given: Drive) -> bool:
-        """Whether something that was fitted beside is there for sure."""
-        at = 2 if name == AHEAD else len(FITTED) + list(self.beside).index(name)
-        off = self.drive.ahead - given.ahead if name == AHEAD else self.beside[name]
-        return abs(off) > STANDS * float(np.sqrt(covariance_of(self.change)[at, at]))
-
-
-def solve(rows: Rows, given: Drive, beside: Sequence[str]) -> Solved:
+def solve(rows: Rows, given: Drive, beside: Sequence[str]) -> DriveFit:
     """Gains and delay by least squares, with what is fitted beside them."""
 
     def linear(late: float) -> tuple[Array, Array, float]:
@@ -318,10 +311,11 @@ def solve(rows: Rows, given: Drive, beside: Sequence[str]) -> Solved:
     drive = replace(given, stiffness=float(value[0]), damper=float(value[1]), ahead=share,
                     delay=late)  # fmt: skip
     named = dict(zip(beside, value[2:].tolist(), strict=True))
-    return Solved(drive, named, np.hstack([own, change[:, 2:-1]]))
+    change = np.hstack([own, change[:, 2:-1]])
+    return DriveFit(drive, change, np.unique(rows.stretch), named)
 
 
-def solve_plainly(rows: Rows, held: Rows, given: Drive, always: Sequence[str]) -> Solved:
+def solve_plainly(rows: Rows, held: Rows, given: Drive, always: Sequence[str]) -> DriveFit:
     """The same with no more beside than is there for sure, and predicts rows held out.
 
     always: what is fitted in any case.
@@ -337,7 +331,7 @@ def solve_plainly(rows: Rows, held: Rows, given: Drive, always: Sequence[str]) -
 
 def covariance_of(change: Array) -> Array:
     """(p, p) of numbers that change so (G, p) without each stretch [jackknife]."""
-    return np.asarray((len(change) - 1.0) / len(change) * change.T @ change)
+    return (len(change) - 1.0) / len(change) * change.T @ change
 
 
 def left_out(matrix: Array, rest: Array, stretch: Array) -> Array:
@@ -377,18 +371,17 @@ def fit_drive(learnt: Followed, judged: Followed, j: int, given: Drive) -> Drive
         seen = learnt.samples(j, found.drive)
         torque, slack = torque_limit(seen) if learnt.measured else NO_LIMIT
         speed, off = speed_limit(seen, torque) if learnt.measured else NO_LIMIT
-        used, rows = rows, learnt.clear(j, CLEAR * torque, LIMIT * speed)
-    gains = np.array([found.drive.stiffness, found.drive.damper])
-    unsure = STANDS * np.sqrt(np.diag(covariance_of(found.change))[:2])
-    if not (gains[0] > unsure[0] and gains[1] > -unsure[1]):
+        rows = learnt.clear(j, CLEAR * torque, LIMIT * speed)
+    fitted, sigma = found.drive, found.sigma
+    if not (fitted.stiffness > STANDS * sigma["stiffness"]
+            and fitted.damper > -STANDS * sigma["damper"]):  # fmt: skip
         return None
     limit = given.torque if not np.isfinite(torque) else torque
     if learnt.measured and np.quantile(np.abs(seen.torque), 0.999) > BEYOND * limit:
         limit = float(np.abs(seen.torque).max())
-    drive = replace(found.drive, damper=max(found.drive.damper, 0.0), torque=float(limit),
+    drive = replace(fitted, damper=max(fitted.damper, 0.0), torque=float(limit),
                     speed=float(min(speed, given.speed)))  # fmt: skip
-    change, stretch = found.change[:, : len(FITTED)], np.unique(used.stretch)
-    return DriveFit(drive, change, stretch, (slack, off), found.apart)
+    return replace(found, drive=drive, limits=(slack, off))
 
 
 def torque_limit(seen: Samples) -> tuple[float, float]:
@@ -435,9 +428,7 @@ def predicts(rows: Rows | Samples, rest: Array, before: Array) -> bool:
     index = np.unique(rows.stretch, return_inverse=True)[1].reshape(-1)
     squares = (np.bincount(index, one**2) + 1e-300 for one in (before, rest))
     gain = np.subtract(*map(np.log, squares))
-    if len(gain) < LEAST_BLOCKS:
-        return False
-    return float(gain.mean()) > PREDICTS * float(gain.std(ddof=1)) / math.sqrt(len(gain))
+    return len(gain) >= LEAST_BLOCKS and standard_errors(gain) > PREDICTS
 
 
 def is_another(kind: str, fit: DriveFit, given: Drive, held: Followed, j: int, late: float) -> bool:
@@ -459,5 +450,5 @@ def is_another(kind: str, fit: DriveFit, given: Drive, held: Followed, j: int, l
     if kind == DELAY and off["delay"] < late:
         return False
     rows = held.clear(j, CLEAR * drive.torque, LIMIT * drive.speed)
-    ends = (rows.rest(one, fit.beside) for one in (drive, drive.taking(given, kind)))
+    ends = (rows.rest(one, fit.apart) for one in (drive, drive.taking(given, kind)))
     return predicts(rows, *ends)

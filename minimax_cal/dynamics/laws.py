@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 
 from minimax_cal.dynamics.regressor import PER_LINK
-from minimax_cal.dynamics.rows import CUTOFF_HZ
-from minimax_cal.dynamics.scene import Scene, sense_of
+from minimax_cal.dynamics.rows import CUTOFF_HZ, Scene, sense_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Table
@@ -31,9 +31,6 @@ NO_GAIN = "drive gains (N m per A) of all joints"
 KNOWN_LOAD, OTHER_RUNS = "a run with a known payload", "longer runs of another kind"
 SLOW_AND_FAST = "a run with a slow part and one at full speed"
 NO_ELEMENT = "a model has no element for it"
-FRICTION, MASSES, ARMATURE = "friction", "masses", "armature"  # elements of a simulator's file
-LEVELLED, SPRINGS, GAIN, DELAY = "friction curve", "springs", "drive gain", "delay"
-BRISTLES, MODULE = "friction at rest", "module"
 CURVE, ANGLE = "friction_curve", "torque_by_angle"  # families
 # Of one joint along the motion, by the names that laws use for them; the module knows IN_MODULE.
 QUANTITIES: dict[str, Callable[[Scene, int], Any]] = {
@@ -45,6 +42,47 @@ QUANTITIES: dict[str, Callable[[Scene, int], Any]] = {
     "gear": lambda s, j: abs(s.arm.ratio[j]),  # its ratio
 }
 IN_MODULE = QUANTITIES.keys() - {"a"}
+
+
+OTHERS = "MJX, USD and SDF"  # that read a file of MuJoCo
+
+
+class Element(StrEnum):
+    """What holds laws beside a simulator: elements of its file, and the module beside it.
+
+    attributes: of MuJoCo's file.  lost, readers: what other readers of it leave out, and which.
+    """
+
+    attributes: str
+    lost: str
+    readers: str
+
+    def __new__(
+        cls, name: str, attributes: str = "", lost: str = "", readers: str = OTHERS
+    ) -> Self:
+        """A name with its facts."""
+        made = str.__new__(cls, name)
+        made._value_, made.attributes, made.lost, made.readers = name, attributes, lost, readers
+        return made
+
+    FRICTION = "friction", "frictionloss, damping"
+    MASSES = "masses", "inertial"
+    ARMATURE = "armature", "armature"
+    LEVELLED = "friction curve", "damping of v, v|v|, v^3", "all but the first number of `damping`"
+    SPRINGS = "springs", "stiffness, springref", "all but the first number of `stiffness`"
+    GAIN = "drive gain", "gear"
+    DELAY = "delay", "delay", "`delay`"
+    BRISTLES = ("friction at rest", "frictionloss, dcmotor with lugre",
+                "`dcmotor`, with which MJX loads no file", "USD and SDF")  # fmt: skip
+    MODULE = "module", "", "what no element holds", "all simulators but MuJoCo"
+
+    @property
+    def left_out(self) -> str:
+        """Who leaves out what of it, for people."""
+        return f"{self.readers} leave out {self.lost} ({self}); see plain="
+
+
+IN_FILE = tuple(one for one in Element if one.attributes)  # in the order in which they are shown
 
 
 @dataclass(frozen=True)
@@ -91,7 +129,7 @@ class Law:
     at: Literal["joint", "all", "last link"] = "joint"
     repeats: bool = False
     separate: str = OTHER_RUNS
-    held: tuple[str, ...] = (MODULE,)
+    held: tuple[Element, ...] = (Element.MODULE,)
     why: str = NO_ELEMENT
 
     @cached_property
@@ -110,7 +148,7 @@ class Law:
             return self.made(scene, j, choice)
         found = self.per_unit({k: QUANTITIES[k](scene, j) for k in self.reads} | {**choice})
         rows = np.stack([np.broadcast_to(one, len(scene.load)) for one in found], axis=1)
-        return np.asarray(scene.sense[:, [j]] * rows if self.dry else rows)
+        return scene.sense[:, [j]] * rows if self.dry else rows
 
     def curve(self, v: Array, sense: Array, choice: Choice) -> list[Array]:
         """(k,) torque per unit over a speed, of each parameter; none of a law of anything else.
@@ -154,18 +192,21 @@ def payload(scene: Scene, j: int, choice: Choice) -> Array:
     return np.asarray(scene.regressor[:, :, -PER_LINK:] * each[:, None, None])
 
 
+def shifted(scene: Scene, j: int, by: Array | float) -> Array:
+    """(M, n, 1) torque of the whole body per unit of a shift of a joint [rad, m]."""
+    every = np.zeros_like(scene.load)
+    every[:, j] = by
+    return scene.shifted(every)[..., None]
+
+
 def compliant(scene: Scene, j: int, choice: Choice) -> Array:
     """A joint that turns back by its torque: the whole body moves otherwise [Spong 1987]."""
-    by = np.zeros_like(scene.load)
-    by[:, j] = -scene.load[:, j] * scene.divisor[j]
-    return scene.shifted(by)[..., None]
+    return shifted(scene, j, -scene.load[:, j] * scene.divisor[j])
 
 
 def encoder_zero(scene: Scene, j: int, choice: Choice) -> Array:
     """A joint whose zero is elsewhere."""
-    by = np.zeros_like(scene.load)
-    by[:, j] = 1.0
-    return scene.shifted(by)[..., None]
+    return shifted(scene, j, 1.0)
 
 
 def delay(scene: Scene, j: int, choice: Choice) -> Array:
@@ -265,11 +306,11 @@ EVERY = (
     # a lubricant that thins with shear: a power of the speed below one
     Law("degressive", "viscous friction that levels off", ("np.abs(v) ** power",), dry=True,
         tuned={"power": Tuned((0.25, 0.5, 0.7), bounds=(0.1, 0.85))}, nonnegative=True,
-        held=(LEVELLED, MODULE), **IN_CURVE),
+        held=(Element.LEVELLED, Element.MODULE), **IN_CURVE),
     # it falls from rest with the speed [Armstrong-Helouvry 1994]
     Law("stribeck", "Stribeck friction", ("np.exp(-((v / speed) ** 2))",), dry=True,
         tuned={"speed": Tuned((0.03, 0.08, 0.2), bounds=(0.01, 0.35))}, needs=is_slow,
-        nonnegative=True, held=(LEVELLED, MODULE), **IN_CURVE),
+        nonnegative=True, held=(Element.LEVELLED, Element.MODULE), **IN_CURVE),
     # friction that is not yet there just after a reversal [Dahl 1968]
     Law("presliding", "presliding", ("-np.exp(-way / length)",), dry=True,
         tuned={"length": Tuned(unit="rad", bounds=(0.0, np.inf))}, choices=by_length,
@@ -282,20 +323,21 @@ EVERY = (
     Law("warm_up", "friction that falls with warmth", made=warm_up, choices=by_warmth, needs=warms,
         tuned={"seconds": Tuned(unit="s", bounds=(0.0, np.inf))}, held=()),
     Law("armature", "rotor inertia", ("a",), names=("inertia",), units=("t s^2/rad",),
-        nonnegative=True, held=(ARMATURE,)),
+        nonnegative=True, held=(Element.ARMATURE,)),
     # its rotor is no law: of parallel joints it is what a rotor of one joint and the links are
     Law("coupled_drive", "drive that turns by two joints", (), ("Coulomb", "viscous"),
         ("t", "t s/rad"), coupled_drive, choices=by_sign, needs=has_neighbour, nonnegative=True,
         tuned={"sign": Tuned()}, held=(), why="give `coupling` in the robot file"),
-    Law("drive_gain", "drive gain", ("load",), needs=has_gains, separate=KNOWN_LOAD, held=(GAIN,),
-        why="scales what is logged, and no motor of the model holds it: give drive_gain=", **SHARE),
+    Law("drive_gain", "drive gain", ("load",), needs=has_gains, separate=KNOWN_LOAD,
+        held=(Element.GAIN,), **SHARE,
+        why="scales what is logged, and no motor of the model holds it: give drive_gain="),
     Law("torque_offset", "torque offset", ("1.0",), names=("offset",), held=(),
         why="the torque is read with an offset, which is none of the arm's", **BY_ANGLE),
     Law("torque_ripple", "torque ripple of the gear",
         ("np.cos(multiple * gear * q)", "np.sin(multiple * gear * q)"),
         tuned={"multiple": Tuned((1.0, 2.0))}, needs=has_ratio, repeats=True, **WAVES),
     Law("cable", "cable or spring", (), ("first", "second"), ("t/rad", "t/rad^2"), cable,
-        tuned={"order": Tuned((1.0, 2.0))}, needs=moves, held=(SPRINGS,), **BY_ANGLE),
+        tuned={"order": Tuned((1.0, 2.0))}, needs=moves, held=(Element.SPRINGS,), **BY_ANGLE),
     # a compensator of gravity, beyond the first wave, which masses imitate
     Law("gravity_spring", "gravity compensator", ("np.cos(2.0 * q)", "np.sin(2.0 * q)"),
         needs=turns, **BY_ANGLE, **WAVES),
@@ -309,7 +351,7 @@ EVERY = (
         needs=has_gains, nonnegative=True, typical=1e-3, of_torque=False, held=(),
         why="give a static calibration (fit=), whose springs a model holds"),
     Law("delay", "delay of the torque", (), ("time",), ("s",), delay, typical=0.02, of_torque=False,
-        at="all", held=(DELAY,)),
+        at="all", held=(Element.DELAY,)),
     Law("encoder_zero", "encoder zero", (), ("offset",), ("rad",), encoder_zero, needs=has_gains,
         typical=0.02, of_torque=False, held=()),
 )  # fmt: skip
@@ -350,7 +392,7 @@ def register_law(law: Law) -> Law:
         raise OptionError(f"law {law.name!r}: is built in, or no name; give it one of its own")
     if len({len(law.names), len(law.units), len(law.torque or law.names)}) > 1:
         raise OptionError(f"law {law.name}: give a name and a unit for each of its parameters")
-    if MODULE in law.held and not law.reads <= IN_MODULE:
+    if Element.MODULE in law.held and not law.reads <= IN_MODULE:
         unknown = ", ".join(sorted(law.reads - IN_MODULE))
         raise OptionError(f"law {law.name}: the module beside a file knows no {unknown}")
     LAWS[law.name], WORDS[law.name] = law, law.words

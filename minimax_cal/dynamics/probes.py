@@ -9,14 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.special import stdtr
 
 from minimax_cal.dynamics.model import Normal
-from minimax_cal.dynamics.rows import CUTOFF_HZ, FILTER_ORDER, SAMPLE_HZ
-from minimax_cal.dynamics.scene import Scene
+from minimax_cal.dynamics.rows import CUTOFF_HZ, FILTER_ORDER, SAMPLE_HZ, Scene
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
 
@@ -62,38 +60,27 @@ class Moments:
     """What a scene knows of some rows, for one joint.
 
     scene: of all samples.  joint: from 0.  at: (k,) samples.  past: what all joints did before.
+    q, qd, qdd, sense: (k, n) of the joints.  load: (k, n) torques that the body puts on them, over
+    the largest.
     """
 
     scene: Scene
     joint: int
     at: Array
     past: Past
+    q: Array
+    qd: Array
+    qdd: Array
+    sense: Array
+    load: Array
 
-    @cached_property
-    def q(self) -> Array:
-        """(k, n) joint values."""
-        return np.asarray(self.scene.logs.motion.q[self.at])
-
-    @cached_property
-    def qd(self) -> Array:
-        """(k, n) speeds."""
-        return np.asarray(self.scene.logs.motion.qd[self.at])
-
-    @cached_property
-    def qdd(self) -> Array:
-        """(k, n) accelerations."""
-        return np.asarray(self.scene.logs.motion.qdd[self.at])
-
-    @cached_property
-    def sense(self) -> Array:
-        """(k, n) directions."""
-        return np.asarray(self.scene.sense[self.at])
-
-    @cached_property
-    def load(self) -> Array:
-        """(k, n) torques that the body puts on the joints, over the largest."""
-        size = np.maximum(np.abs(self.scene.load).max(axis=0), 1e-12)
-        return np.asarray(self.scene.load[self.at] / size)
+    @staticmethod
+    def of(scene: Scene, joint: int, at: Array, past: Past) -> Moments:
+        """With what joints do there."""
+        motion, load = scene.logs.motion.at(at), scene.load
+        size = np.maximum(np.abs(load).max(axis=0), 1e-12)
+        return Moments(scene, joint, at, past, motion.q, motion.qd, motion.qdd, scene.sense[at],
+                       load[at] / size)  # fmt: skip
 
     def both_ways(self, columns: list[Array]) -> list[Array]:
         """Columns alone and with the direction."""
@@ -123,14 +110,14 @@ class Past:
         lagged = np.empty((*q.shape, len(PLAYS)))
         way = np.maximum(np.ptp(q, axis=0), 1e-12)[:, None] * np.array(PLAYS)
         stays = np.exp(-1.0 / SAMPLE_HZ / np.array(RECENT_S))
-        for a, b in zip(scene.logs.start[:-1], scene.logs.start[1:], strict=True):
+        for run in scene.logs.spans:
             now, average = np.zeros_like(way), np.zeros((q.shape[1], len(RECENT_S)))
-            step = np.diff(q[a:b], axis=0, prepend=q[a : a + 1])[:, :, None]
-            new = np.abs(qd[a:b, :, None]) * (1.0 - stays)
-            for i in range(b - a):
+            step = np.diff(q[run], axis=0, prepend=q[run][:1])[:, :, None]
+            new = np.abs(qd[run, :, None]) * (1.0 - stays)
+            for i in range(len(new)):
                 now = np.clip(now + step[i], -way, way)
                 average = stays * average + new[i]
-                lagged[a + i], recent[a + i] = now, average
+                lagged[run.start + i], recent[run.start + i] = now, average
         return Past(recent, lagged / way)
 
 
@@ -146,7 +133,12 @@ def bumps(x: Array) -> list[Array]:
     """Smooth bumps over the range of a driver (k,)."""
     low, high = np.quantile(x, [0.02, 0.98])
     width = max(float(high - low), 1e-12) / BUMPS
-    return [np.exp(-(((x - low) / width - k) ** 2)) for k in range(BUMPS + 1)]
+    return hills((x - low) / width)
+
+
+def hills(x: Array) -> list[Array]:
+    """Smooth bumps about 0, 1, ... BUMPS."""
+    return [np.exp(-((x - k) ** 2)) for k in range(BUMPS + 1)]
 
 
 def by_angle(m: Moments) -> list[Array]:
@@ -192,7 +184,7 @@ def by_acceleration(m: Moments) -> list[Array]:
     """The joint's acceleration, its derivative, and accelerations that went before."""
     logs, j = m.scene.logs, m.joint
     qdd = m.qdd[:, j]
-    first = logs.start[np.searchsorted(logs.start, m.at, side="right") - 1]
+    first = logs.start[logs.run_of(m.at)]
     earlier = [logs.motion.qdd[np.maximum(m.at - int(s * SAMPLE_HZ), first), j] for s in BEFORE_S]
     return [qdd, np.abs(qdd), np.abs(qdd) * m.sense[:, j],
             logs.slope(logs.motion.qdd[:, j])[m.at], *earlier]  # fmt: skip
@@ -227,13 +219,13 @@ def by_friction_of_others(m: Moments) -> list[Array]:
 def by_time(m: Moments) -> list[Array]:
     """The time since the run began, of every run for itself."""
     logs = m.scene.logs
-    run = np.searchsorted(logs.start, m.at, side="right") - 1
+    run = logs.run_of(m.at)
     out = []
     for r in range(len(logs.names)):
         mine = run == r
         if mine.any():
             since = logs.since[m.at] / max(float(logs.since[m.at][mine].max()), 1e-9)
-            out += [mine * np.exp(-((BUMPS * since - k) ** 2)) for k in range(BUMPS + 1)]
+            out += [mine * hill for hill in hills(BUMPS * since)]
     return m.both_ways(out)
 
 
@@ -278,7 +270,7 @@ def unexplained(normal: Normal, value: Array) -> list[Unexplained]:
         basis = orthonormal(normal.raw[j, kept][:, value != 0.0])
         left = less(basis, plain[mine])
         noise = float(np.sqrt(np.mean(plain[mine] ** 2)))
-        moments = Moments(scene, j, scene.logs.picked[kept], past)
+        moments = Moments.of(scene, j, scene.logs.picked[kept], past)
         group = np.unique(normal.group[mine], return_inverse=True)[1]
         for name, columns in DRIVERS.items():
             fold = blocks(moments) if name == TIME else group
@@ -295,7 +287,7 @@ def blocks(m: Moments) -> Array:
     """(k,) folds of rows, each of short stretches of every run: what follows time is not foretold
     far from where it was seen.
     """
-    return np.asarray((m.scene.logs.since[m.at] / BLOCK_S).astype(int) % TIME_FOLDS)
+    return (m.scene.logs.since[m.at] / BLOCK_S).astype(int) % TIME_FOLDS
 
 
 def less(basis: Array, rows: Array) -> Array:

@@ -17,6 +17,7 @@ from minimax_cal.robots.robot import Robot
 
 PER_LINK = 10  # inertial parameters of a link
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # order of the entries of an inertia
+SQUARE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # which of these a matrix has where
 RANK = 1e-7  # of the largest singular value: combinations that turn no joint by more have no say
 
 
@@ -36,7 +37,7 @@ class Motion:
 def link_axes(links: Chain) -> Array:
     """(n, 3, 3, m) axes x, y, z of each link's own frame in the base, one a row."""
     z = np.concatenate([links.z[1:], links.axes[2:]])
-    return np.asarray(np.stack([cross(links.y, z), links.y, z], axis=1))
+    return np.stack([cross(links.y, z), links.y, z], axis=1)
 
 
 def moving_chain(robot: Robot, motion: Motion) -> tuple[Chain, Array]:
@@ -67,7 +68,7 @@ def moving_chain(robot: Robot, motion: Motion) -> tuple[Chain, Array]:
 
 def at_drives(robot: Robot, torque: Array) -> Array:
     """(m, n, ...) torque of each drive, in the controller's sense, of the chain's (n, ..., m)."""
-    return np.asarray(np.moveaxis(np.einsum("ij,i...->j...", robot.turning, torque), -1, 0))
+    return np.moveaxis(np.einsum("ij,i...->j...", robot.turning, torque), -1, 0)
 
 
 def wrench(rate: Array, change: Array, speeding: Array) -> tuple[Array, Array]:
@@ -123,9 +124,7 @@ def inverse_dynamics(robot: Robot, motion: Motion, parameters: Array) -> Array:
     axes = link_axes(links)
     mass = parameters[:, 0, None, None]
     first = np.einsum("nabm,na->nbm", axes, parameters[:, 1:4])
-    own = np.empty((robot.joints, 3, 3))
-    for number, (i, j) in enumerate(UPPER):
-        own[:, i, j] = own[:, j, i] = parameters[:, 4 + number]
+    own = parameters[:, 4 + SQUARE]
 
     def about(w: Array) -> Array:
         inner = own @ np.einsum("nabm,nbm->nam", axes, w)
@@ -142,11 +141,8 @@ def inverse_dynamics(robot: Robot, motion: Motion, parameters: Array) -> Array:
 
 def link_parameters(mass: float, com: Array, inertia: Array) -> Array:
     """(10,) of a body.  com: (3,) [m].  inertia: (6,) about the centre of gravity [kg m^2]."""
-    about = np.empty((3, 3))
-    for value, (i, j) in zip(inertia, UPPER, strict=True):
-        about[i, j] = about[j, i] = value
-    about = about + mass * (com @ com * np.eye(3) - np.outer(com, com))
-    return np.array([mass, *(mass * com), *(about[i, j] for i, j in UPPER)])
+    about = inertia[SQUARE] + mass * (com @ com * np.eye(3) - np.outer(com, com))
+    return np.array([mass, *(mass * com), *about[np.triu_indices(3)]])
 
 
 def inertial_parameters(robot: Robot) -> Array:
@@ -175,4 +171,4 @@ def base_parameters(columns: Array, rank: float = RANK) -> Array:
     kept = size > rank * size.max(initial=0.0)
     out = np.zeros((columns.shape[1], int(kept.sum())))
     out[used] = right[kept].T * scale[used][:, None]
-    return np.asarray(np.linalg.qr(out)[0])
+    return np.linalg.qr(out)[0]

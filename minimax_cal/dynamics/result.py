@@ -14,7 +14,7 @@ from minimax_cal.dynamics.laws import USUAL, WORDS
 from minimax_cal.dynamics.model import TorqueModel
 from minimax_cal.dynamics.probes import Unexplained
 from minimax_cal.dynamics.regressor import PER_LINK
-from minimax_cal.dynamics.scene import YIELD, Arm
+from minimax_cal.dynamics.rows import YIELD, Arm
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import APART, Fact
 from minimax_cal.ground.records import stored
@@ -64,6 +64,11 @@ class MotionEffect:
     family: str = ""
 
     @property
+    def best(self) -> tuple[str, tuple[float, float]]:
+        """The joint at which it closes most, and the RMS without and with it."""
+        return max(self.worth.items(), key=lambda item: item[1][0] ** 2 - item[1][1] ** 2)
+
+    @property
     def words(self) -> str:
         """For people, as `joint flexibility at J2`; of a payload with the runs that carry it."""
         runs = ", ".join(p.name for p in self.parameters[PER_LINK:] if self.effect == "payload")
@@ -72,7 +77,7 @@ class MotionEffect:
     def row(self) -> tuple[str, ...]:
         """Of a table: words, the surest number, the worth where it is most, and whether it is."""
         p = max(self.parameters, key=lambda each: abs(each.value) / (each.sigma or 1.0))
-        joint, (before, after) = best_worth(self)
+        joint, (before, after) = self.best
         return (self.words, f"{p.value:.3g} ± {p.sigma:.1g} {p.unit}",
                 f"{joint}: {before:.3g} to {after:.3g}",
                 "yes" if self.established else "possible")  # fmt: skip
@@ -237,26 +242,20 @@ def changed_joints(without: Array, with_it: Array) -> dict[str, tuple[float, flo
     return {joint: (a, b) for joint, (a, b) in worth if abs(a - b) > SHOWN * a}
 
 
-def best_worth(one: MotionEffect) -> tuple[str, tuple[float, float]]:
-    """The joint at which an effect closes most, and the RMS without and with it."""
-    return max(one.worth.items(), key=lambda item: item[1][0] ** 2 - item[1][1] ** 2)
-
-
 def check_parts(found: MotionDiagnosis) -> None:
     """Raise ValueError for parts that are not of one arm, and for effects that do not exist."""
     n, arm, run = found.arm.robot.joints, found.arm, found.held_run
-    rows: list[Any] = [arm.ratio, arm.soft, arm.fastest, found.curves]
-    rows += [row for step in found.budget for row in (step.holdout_rms, step.holdout_rms_moving)]
-    sizes: list[tuple[Any, tuple[int, ...]]] = [(row, (n,)) for row in rows]
-    sizes += [(arm.gain, (n if arm.shared else 0,)), (arm.known, (PER_LINK,))]
-    sizes += [(part, (n, len(run.time))) for part in (run.measured, run.predicted)]
-    for one in found.curves:
-        sizes += [(part, (len(one.speed),)) for part in (one.speed, one.torque, one.sigma)]
-    for model in found.models:
-        sizes += [(model.held, (n, len(YIELD)))]
-        for body in (model.body, model.context):
-            count = 1 if len(body.rigid) == 1 else n
-            sizes += [(body.usual, (n, 2)), (body.rigid, (count, PER_LINK * n))]
+    bodies = [body for model in found.models for body in (model.body, model.context)]
+    sizes: list[tuple[Any, tuple[int, ...]]] = [
+        *((row, (n,)) for row in (arm.ratio, arm.soft, arm.fastest, found.curves)),
+        *((row, (n,)) for s in found.budget for row in (s.holdout_rms, s.holdout_rms_moving)),
+        (arm.gain, (n if arm.shared else 0,)), (arm.known, (PER_LINK,)),
+        *((part, (n, len(run.time))) for part in (run.measured, run.predicted)),
+        *((p, (len(c.speed),)) for c in found.curves for p in (c.speed, c.torque, c.sigma)),
+        *((model.held, (n, len(YIELD))) for model in found.models),
+        *((body.usual, (n, 2)) for body in bodies),
+        *((body.rigid, (1 if len(body.rigid) == 1 else n, PER_LINK * n)) for body in bodies),
+    ]  # fmt: skip
     late = [model.delay for model in found.models]
     if any(np.shape(part) != size for part, size in sizes) or not np.isfinite(late).all():
         raise ValueError(f"its numbers are not of one arm of {n} joints and one run")

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import scipy
@@ -19,9 +19,18 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.linalg import toeplitz
 from scipy.sparse import block_diag, coo_array, csr_array
 
-from minimax_cal.dynamics.regressor import Motion
-from minimax_cal.dynamics.run import Run, rows_of
+from minimax_cal.dynamics.logs.table import Run, rows_of
+from minimax_cal.dynamics.regressor import (
+    PER_LINK,
+    Motion,
+    base_parameters,
+    inertial_parameters,
+    inverse_dynamics,
+    regressor,
+)
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.facts import APART
+from minimax_cal.robots.robot import Robot
 
 SAMPLE_HZ = 100.0  # of what the columns are computed from
 ROW_HZ = 25.0  # of rows
@@ -76,7 +85,7 @@ def smooth(values: Array, rate: float) -> Array:
         first = out[:, :1]  # at rest there before
         change = irfft(rfft(out - first, size) * gain, size)[:, : out.shape[1]]
         out = (first + change)[:, ::-1]
-    return np.asarray(out[:, pad : pad + len(values)].T.reshape(values.shape))
+    return out[:, pad : pad + len(values)].T.reshape(values.shape)
 
 
 def slope(values: Array, rate: float) -> Array:
@@ -84,7 +93,12 @@ def slope(values: Array, rate: float) -> Array:
     out = np.gradient(values, axis=0)
     wide = (values[4:] - values[:-4]) / 4.0
     out[2:-2] = (4.0 * out[2:-2] - wide) / 3.0
-    return np.asarray(out * rate)
+    return out * rate
+
+
+def at_times(to: Array, time: Array, values: Array) -> Array:
+    """Values (m, n) at some times, straight between those that they have (m,)."""
+    return np.stack([np.interp(to, time, column) for column in values.T], axis=1)
 
 
 @lru_cache(maxsize=4)
@@ -95,7 +109,7 @@ def taps(rate: float) -> Array:
     one[wide] = 1.0
     found = smooth(one, rate)
     seen = np.flatnonzero(np.abs(found) > LEAST_TAP * found[wide])
-    return np.asarray(found[seen[0] : seen[-1] + 1])
+    return found[seen[0] : seen[-1] + 1]
 
 
 @lru_cache(maxsize=32)
@@ -148,16 +162,24 @@ class Logs:
         return float(len(self.since) / SAMPLE_HZ)
 
     @cached_property
+    def spans(self) -> list[slice]:
+        """The samples of each run."""
+        return list(map(slice, self.start[:-1].tolist(), self.start[1:].tolist()))
+
+    @cached_property
     def picked(self) -> Array:
         """(R,) samples that are rows."""
-        step = int(SAMPLE_HZ / ROW_HZ)
-        ends = zip(self.start[:-1], self.start[1:], strict=True)
-        return np.concatenate([np.arange(a, b, step) for a, b in ends])
+        every, step = np.arange(len(self.since)), int(SAMPLE_HZ / ROW_HZ)
+        return np.concatenate([every[run][::step] for run in self.spans])
 
     @cached_property
     def run(self) -> Array:
         """(R,) which run a row is of."""
-        return np.asarray(np.searchsorted(self.start, self.picked, side="right") - 1)
+        return self.run_of(self.picked)
+
+    def run_of(self, samples: Array) -> Array:
+        """Which run samples are of."""
+        return np.searchsorted(self.start, samples, side="right") - 1
 
     @cached_property
     def quarter(self) -> Array:
@@ -173,9 +195,9 @@ class Logs:
         still[1:] |= qd[1:] * qd[:-1] < 0.0
         out = np.empty(qd.shape, dtype=bool)
         reach = round(seconds * SAMPLE_HZ)
-        for a, b in zip(self.start[:-1], self.start[1:], strict=True):
-            count = np.cumsum(np.pad(still[a:b], ((reach + 1, reach), (0, 0))), axis=0)
-            out[a:b] = count[2 * reach + 1 :] == count[: -2 * reach - 1]
+        for run in self.spans:
+            count = np.cumsum(np.pad(still[run], ((reach + 1, reach), (0, 0))), axis=0)
+            out[run] = count[2 * reach + 1 :] == count[: -2 * reach - 1]
         return out
 
     @cached_property
@@ -186,7 +208,7 @@ class Logs:
     @cached_property
     def moving(self) -> Array:
         """(R, n) the same of the rows."""
-        return np.asarray(self.sliding[self.picked])
+        return self.sliding[self.picked]
 
     @cached_property
     def fitted(self) -> Array:
@@ -210,27 +232,23 @@ class Logs:
     def filtered(self, columns: Array) -> Array:
         """Rows (R, ...) of columns (M, ...), filtered."""
         flat = self.operator @ columns.reshape(len(columns), -1)
-        return np.asarray(flat.reshape(len(self.picked), *columns.shape[1:]))
+        return flat.reshape(len(self.picked), *columns.shape[1:])
 
     def slope(self, values: Array) -> Array:
         """Derivative in time (M, ...) of values (M, ...), each run for itself."""
-        ends = zip(self.start[:-1], self.start[1:], strict=True)
-        return np.concatenate([slope(values[a:b], SAMPLE_HZ) for a, b in ends])
+        return np.concatenate([slope(values[run], SAMPLE_HZ) for run in self.spans])
 
     def earlier(self, late: float) -> Logs:
         """The logs with torques that were logged so much after the motion [s] put back in time."""
-        ends = zip(self.start[:-1], self.start[1:], strict=True)
         moved = [
-            scipy.interpolate.CubicSpline(self.since[a:b], self.torque[a:b])(
-                np.clip(self.since[a:b] + late, self.since[a], self.since[b - 1])
-            )
-            for a, b in ends
+            scipy.interpolate.CubicSpline(since, torque)(np.clip(since + late, since[0], since[-1]))
+            for since, torque in ((self.since[run], self.torque[run]) for run in self.spans)
         ]
-        return replace(self, torque=np.concatenate(moved))  # fmt: skip
+        return replace(self, torque=np.concatenate(moved))
 
     def only(self, runs: Sequence[int]) -> Logs:
         """The logs of some runs."""
-        keep = np.concatenate([np.arange(self.start[r], self.start[r + 1]) for r in runs])
+        keep = np.concatenate([np.arange(len(self.since))[self.spans[r]] for r in runs])
         long = np.diff(self.start)[list(runs)]
         return replace(
             self,
@@ -254,7 +272,7 @@ def prepare_run(run: Run) -> Logs:
     every = int(rate / SAMPLE_HZ)
 
     def even(values: Array) -> Array:
-        return np.asarray(scipy.interpolate.CubicSpline(run.time, values)(time))
+        return scipy.interpolate.CubicSpline(run.time, values)(time)
 
     q = smooth(even(run.q), rate)
     qd = slope(q, rate) if run.qd is None else smooth(even(run.qd), rate)
@@ -265,14 +283,11 @@ def prepare_run(run: Run) -> Logs:
     temperature = np.full((m, n), np.nan)
     if run.temperature is not None:
         given = run.temperature.reshape(len(run.time), -1)
-        each = [np.interp(time[::every], run.time, column) for column in given.T]
-        temperature = np.broadcast_to(np.array(each).T, (m, n))
-    wide = np.flatnonzero(np.diff(run.time) > GAP_S)
-    holes = [(run.time[0], run.time[0]), (run.time[-1], run.time[-1]),
-             *((run.time[i], run.time[i + 1]) for i in wide)]  # fmt: skip
-    gap = np.zeros(m, dtype=bool)
-    for begin, end in holes:
-        gap |= (time[::every] > begin - EDGE_S) & (time[::every] < end + EDGE_S)
+        temperature = np.broadcast_to(at_times(time[::every], run.time, given), (m, n))
+    wide, (first, last) = np.flatnonzero(np.diff(run.time) > GAP_S), run.time[[0, -1]]
+    begin, end = ([first, *run.time[wide + side], last] for side in (0, 1))
+    since = time[::every, None]
+    near = (since > np.array(begin) - EDGE_S) & (since < np.array(end) + EDGE_S)
     return Logs(
         (run.name,),
         motion,
@@ -281,7 +296,7 @@ def prepare_run(run: Run) -> Logs:
         np.full(m, np.nan if run.payload is None else run.payload),
         temperature,
         np.array([0, m]),
-        gap,
+        np.asarray(near.any(axis=1)),
         run.unit,
     )
 
@@ -318,7 +333,11 @@ class Whitening:
     @cached_property
     def joint(self) -> Array:
         """(N,) which joint a row is of."""
-        return np.asarray(np.nonzero(self.kept)[0])
+        return np.nonzero(self.kept)[0]
+
+    def rows(self, values: Array) -> Array:
+        """(N,) values of all rows (R,), at those of every joint."""
+        return np.broadcast_to(values, self.kept.shape)[self.kept]
 
     def white(self, rows: Array) -> Array:
         """Rows (N, ...) of all joints with a noise of unit variance and no memory."""
@@ -344,13 +363,18 @@ def rms_by_joint(missed: Array, rows: Array | None = None) -> Array:
     return np.asarray(np.sqrt((missed**2 * rows).sum(axis=0) / count))
 
 
+def standard_errors(values: Array) -> float:
+    """A mean (g,) in units of its standard error."""
+    return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-300))
+
+
 def in_order(kept: Array, run: Array) -> Array:
     """(N,) fitted rows of the same joint and run just before, at most AR_ORDER."""
     out = np.zeros(kept.shape, dtype=int)
     for i in range(THIN, kept.shape[1]):
         before = i - THIN
         out[:, i] = np.where(kept[:, before] & (run[i] == run[before]), out[:, before] + 1, 0)
-    return np.asarray(np.minimum(out, AR_ORDER)[kept])
+    return np.minimum(out, AR_ORDER)[kept]
 
 
 def whitening(logs: Logs, rest: Array) -> Whitening:
@@ -387,3 +411,183 @@ def predictors(rest: Array, place: Array, least: float) -> Array:
         variance = covariance[0] - found @ covariance[1 : order + 1]
         out[order, AR_ORDER] = 1.0 / np.sqrt(max(variance, least**2, 1e-300))
     return out
+
+
+# ---- an arm along its logs -----------------------------------------------------------------------
+
+
+KEPT = ("regressor", "base_rows", "known_torque", "sense", "bristles", "since_reversal")
+SOFT = 0.0025  # of a joint's largest speed: where friction changes its sign
+YIELD = np.array([1e-4, 1e-3])  # way after which each of a joint's bristles slides [rad, m]
+
+
+def sense_of(qd: Array, soft: Array | float) -> Array:
+    """Sign of a speed, in proportion to it below `soft`, as simulators have it."""
+    return np.clip(qd / soft, -1.0, 1.0)
+
+
+def bent_bristles(logs: Logs, yields: Array) -> Array:
+    """(M, n, k) how far bristles are bent along a motion, -1 to 1.  yields: (k,) or (n, k).
+
+    A joint that stops or turns round keeps the friction of those that it has not bent over yet:
+    Maxwell-slip elements, each after the law of Dahl [Al-Bender, Lampaert, Swevers 2005].
+    """
+    out = np.zeros((*logs.torque.shape, yields.shape[-1]))
+    for run in logs.spans:
+        q = logs.motion.q[run]
+        way = np.diff(q, axis=0, prepend=q[:1])[..., None] / yields
+        stays = np.exp(-np.abs(way))
+        bent, step = np.sign(way) * (1.0 - stays), 1
+        while step < len(q):  # bent[i] += stays[i] * bent[i - 1], all i at once by doubling
+            bent[step:] += stays[step:] * bent[:-step]
+            stays[step:] *= stays[:-step].copy()
+            step *= 2
+        out[run] = bent
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """An arm, and how its torques are read.
+
+    gain: (n,) torque per unit of the log, 1 where it holds torques [N m/A, or none]; empty where a
+    current has none, and then each joint has inertial parameters of its own.
+    ratio: (n,) gear ratios, NaN where not given.  soft, fastest: (n,) speeds over which friction
+    changes its sign, and the largest [rad/s, m/s].  known: (10,) of what the flange carries in runs
+    that say so, per kilogram.
+    """
+
+    robot: Annotated[Robot, APART]
+    gain: Array
+    ratio: Array
+    soft: Array
+    fastest: Array
+    known: Array
+
+    @staticmethod
+    def of(robot: Robot, gain: Array, ratio: Array, known: Array, logs: Logs) -> Arm:
+        """With the speeds that the logs show."""
+        fastest = np.maximum(np.abs(logs.motion.qd).max(axis=0), SLOWEST)
+        return Arm(robot, gain, ratio, np.maximum(SOFT * fastest, 1e-4), fastest, known)
+
+    @cached_property
+    def drawn(self) -> Array:
+        """(10 n,) inertial parameters as the robot file gives them."""
+        return inertial_parameters(self.robot).ravel()
+
+    @property
+    def shared(self) -> bool:
+        """Whether all joints have the same inertial parameters."""
+        return bool(len(self.gain))
+
+    @cached_property
+    def base(self) -> Array:
+        """(10 n, r) combinations of inertial parameters that any motion can show."""
+        n = self.robot.joints
+        rng = np.random.default_rng(0)
+        q, qd, qdd = rng.normal(size=(3, 10 * n, n))
+        columns = regressor(self.robot, Motion(q, qd, qdd))
+        return base_parameters(columns.reshape(-1, PER_LINK * n))
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """An arm along the trajectories of some logs: what the laws of joint torque are functions of.
+
+    Columns are made of the motion at every sample, in the unit of the log, and then filtered to
+    rows.
+
+    rigid: (n, 10 n) inertial parameters as they are last known, by joint; equal rows where joints
+    share them.  friction: (M, n) of every joint as it is last known, in the unit of the log.
+    """
+
+    arm: Arm
+    logs: Logs
+    rigid: Array
+    friction: Array
+
+    @staticmethod
+    def of(arm: Arm, logs: Logs) -> Scene:
+        """With the rigid body as drawn and no friction."""
+        rigid = np.broadcast_to(arm.drawn, (logs.joints, len(arm.drawn)))
+        return Scene(arm, logs, rigid, np.zeros_like(logs.torque))
+
+    @cached_property
+    def divisor(self) -> Array:
+        """(n,) torque per unit of the log; 1 where it is not known."""
+        return self.arm.gain if self.arm.shared else np.ones(self.logs.joints)
+
+    @cached_property
+    def regressor(self) -> Array:
+        """(M, n, 10 n) in the unit of the log."""
+        return regressor(self.arm.robot, self.logs.motion) / self.divisor[:, None]
+
+    @cached_property
+    def base_rows(self) -> Array:
+        """(R, n, r) of the combinations that any motion can show."""
+        return self.logs.filtered(self.regressor @ self.arm.base)
+
+    @cached_property
+    def known_torque(self) -> Array:
+        """(M, n) of what the flange carries and a run says [unit of the log]."""
+        carried = np.nan_to_num(self.logs.payload)[:, None]
+        return np.asarray(carried * (self.regressor[:, :, -PER_LINK:] @ self.arm.known))
+
+    @cached_property
+    def load(self) -> Array:
+        """(M, n) torque that the body puts on every joint, in the unit of the log."""
+        rigid = np.einsum("mjp,jp->mj", self.regressor, self.rigid)
+        return np.asarray(rigid + self.known_torque)
+
+    @cached_property
+    def sense(self) -> Array:
+        """(M, n) sign of the speed, soft where it changes."""
+        return sense_of(self.logs.motion.qd, self.arm.soft)
+
+    @cached_property
+    def bristles(self) -> Array:
+        """(R, n, k) how far bristles are bent, -1 to 1, less the sense; 0 while a joint slides."""
+        return self.stuck(YIELD)
+
+    def stuck(self, yields: Array) -> Array:
+        """The same of bristles that yield after other ways (k,) or (n, k)."""
+        off = bent_bristles(self.logs, yields) - self.sense[..., None]
+        return self.logs.filtered(~self.logs.sliding[..., None] * off)
+
+    @cached_property
+    def since_reversal(self) -> Array:
+        """(M, n) how far a joint is from where it last turned round, or began [rad, m]."""
+        out = np.zeros_like(self.logs.torque)
+        for run in self.logs.spans:
+            q, back = self.logs.motion.q[run], self.logs.motion.qd[run] > 0.0
+            flips = np.zeros(back.shape, dtype=bool)
+            flips[1:] = back[1:] != back[:-1]
+            last = np.maximum.accumulate(np.where(flips, np.arange(len(q))[:, None], 0), axis=0)
+            out[run] = np.abs(q - np.take_along_axis(q, last, axis=0))
+        return out
+
+    def along(self, motion: Motion) -> Array:
+        """(M, n) torque of the body along another motion, by recursion."""
+        return inverse_dynamics(self.arm.robot, motion, self.rigid[0].reshape(-1, PER_LINK))
+
+    @cached_property
+    def as_moved(self) -> Array:
+        """(M, n) torque of the body by the same recursion as where the motion is shifted."""
+        return self.along(self.logs.motion)
+
+    def shifted(self, by: Array) -> Array:
+        """(M, n) torque of the body per unit of a shift `by` (M, n) of the motion [rad, m]."""
+        one = self.logs.motion
+        step = 1e-6 / max(float(np.abs(by).max()), 1e-300)
+        rate = self.logs.slope(by)
+        moved = Motion(
+            one.q + step * by, one.qd + step * rate, one.qdd + step * self.logs.slope(rate)
+        )
+        return (self.along(moved) - self.as_moved) / step / self.divisor
+
+    def with_body(self, rigid: Array, friction: Array) -> Scene:
+        """The scene with another body and friction, its regressor kept."""
+        new = replace(self, rigid=rigid, friction=friction)
+        for name in vars(self).keys() & KEPT:
+            vars(new)[name] = vars(self)[name]
+        return new

@@ -6,16 +6,18 @@ c does.  What has no element, but turns joints only, goes into a command map; th
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
-from minimax_cal.modelling.effects.bending import BASE_FLEX, LINK_BENDING, TOOL_FLEX
+from minimax_cal.modelling.effects.bending import BASE_FLEX, LINK_BENDING, TOOL_FLEX, bent, tilted
 from minimax_cal.modelling.effects.compliance import (
     GRAVITY_COMPENSATOR,
     JOINT_COMPLIANCE,
@@ -23,7 +25,7 @@ from minimax_cal.modelling.effects.compliance import (
     stiffens,
 )
 from minimax_cal.modelling.effects.gears import BACKLASH, ENCODER_GAIN, JOINT_COUPLING, joints_at
-from minimax_cal.modelling.effects.scene import Effect, Scene, joint_of, mask_of, unmasked
+from minimax_cal.modelling.effects.scene import Effect, Scene, joint_of, mask_of, turning, unmasked
 from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Fitted, Term
 from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.model import model_of
@@ -32,10 +34,228 @@ from minimax_cal.robots.gravity import LEAST_MASS, masses_of, weighed
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_poses
 from minimax_cal.robots.transforms import inverse
-from minimax_cal.simulators.springs import Springs, springs_of
+
+Masses = tuple[Array, Array]  # (n,) [kg] and (n, 3) centres of gravity in the link frames [m]
+
+BELIEF = 0.01  # what a mass or spring off by e, or a centre by 0.1 m, counts as [mm of all points]
+NEAR = 0.1  # [m]
+FELT = 1e-3  # of the largest: what moves less tells nothing of its spring
+MOST = 30.0  # no spring is softer than the softest by itself, by this factor
+RESOLVED = 1e-4  # of the largest singular value: what geometry is asked to take over
+LEAST = 1e-12  # a smaller compliance is none [rad/(N m)]
+
+
+TRACELESS = np.linalg.svd(np.eye(3).reshape(1, 9))[2][1:].T  # (9, 8) matrices without a trace
+
+
+@dataclass(frozen=True, eq=False)
+class Springs:
+    """held: of an arm: `turn`, `bend`, `base`, `mass`, `com`, and `remainder`: RMS distance from
+    the laws, or from the measurements [m].
+
+    sag, drawn: of the tool: (3, 3) turn per direction of gravity [rad], and along its z [m].
+    change: of geometry, base and targets, in the order of `Names` [m, rad].  firm: of the
+    parameters of effects that elements hold exactly.
+    """
+
+    held: dict[str, Any]
+    sag: Array
+    drawn: float
+    change: Array
+    firm: Array
+
+
+def springs_of(
+    scene: Scene,
+    laws: Fitted,
+    left: Array,
+    geometry: Array,
+    firm: Sequence[Term],
+    masses: Masses,
+    *,
+    fixed: bool,
+) -> Springs:
+    """Springs and masses of one arm that give way as laws say at the poses of a scene.
+
+    A fit without known masses takes the torques of upper arm, forearm and wrist apart, joint by
+    joint.  A simulator has one set of masses for all joints, so masses, centres of gravity and
+    compliances are chosen together: displacements are bilinear in compliances and in the first
+    moments of the links.  What geometry, base and targets can take over does not count; they change
+    with the springs.
+
+    left: (k, 3, m) what the laws leave of measurements, in base axes, NaN where not measured, so
+    that the springs explain these; 0 where the laws count alone [m].
+    geometry: (k, 3, m, p) motion of the points per unit of every parameter of the geometry.
+    firm: effects that elements hold exactly; their values change with the springs.
+    masses: to begin with, or to keep where they are fixed.
+    """
+    wanted = sum(
+        (np.tensordot(v, t.columns(scene).displacement(scene), 1)
+         for t, v in laws.pairs),
+        np.zeros(scene.points.shape),
+    )  # fmt: skip
+    seen = np.isfinite(left).reshape(-1)
+    kinds = places_of(scene, laws)
+    fields = 1e3 * np.array([per_moment(scene, *kind) for kind in kinds])
+    fields = fields.reshape(len(kinds), 4 * scene.joints, wanted.size)[..., seen]
+    right = 1e3 * (wanted + left).reshape(-1)[seen]
+    parts = [1e3 * part.reshape(wanted.size, -1)[seen]
+             for part in beside(scene, laws, geometry, firm)]  # fmt: skip
+    columns, count = np.hstack(parts), parts[0].shape[1]
+    tool = count + sum(part.shape[1] for part in parts[1 : 1 + len(firm)])
+    u, size, back = np.linalg.svd(columns, full_matrices=False)
+    kept = size > RESOLVED * size[0]
+    u, inverse = u[:, kept], (back[kept].T / size[kept]) @ u[:, kept].T
+    mass, com = masses
+    clear, goal = condensed(fields - (fields @ u) @ u.T, right - u @ (u.T @ right))
+    points, soft = len(right) / 3.0, np.zeros(0)
+    if kinds:
+        each = np.einsum("l,elr->re", moments(mass, com), clear)
+        felt = np.linalg.norm(each, axis=0)
+        soft = scipy.optimize.nnls(each * (felt > FELT * felt.max()), goal)[0]
+    if kinds and not fixed:
+        soft = started(soft, [kind for kind, _ in kinds])
+        soft, mass, com = together(clear, goal, soft, masses, points)
+        felt = np.linalg.norm(np.einsum("l,elr->er", moments(mass, com), clear), axis=1) * soft
+        soft = np.where(felt > FELT * felt.max(), soft, 0.0)
+    sizes = np.einsum("e,l->el", soft, moments(mass, com))
+    rest = goal - np.einsum("el,elr->r", sizes, clear)
+    change = inverse @ (right - np.einsum("el,elr->r", sizes, fields))
+    values = dict(zip(kinds, (float(c) if c > LEAST else 0.0 for c in soft), strict=True))
+    held = {
+        "turn": np.array([values.get(("joint", j), 0.0) for j in range(scene.joints)]),
+        "bend": {i: c for (kind, i), c in values.items() if kind == "link" and c > 0.0},
+        "base": values.get(("base", 0), 0.0), "mass": mass, "com": com,
+        "remainder": 1e-3 * float(np.sqrt((rest**2).sum() / points)),
+    }  # fmt: skip
+    *turns, drawn = np.append(change[tool:], np.zeros(9))[:9].tolist()
+    sag = (TRACELESS @ turns).reshape(3, 3)
+    return Springs(held, sag, drawn, change[:count], change[count:tool])
+
+
+def beside(scene: Scene, laws: Fitted, geometry: Array, firm: Sequence[Term]) -> Iterator[Array]:
+    """Motions (k, 3, m, d) of what is fitted with the springs: geometry, firm effects, the tool."""
+    yield geometry
+    for term in firm:
+        yield np.moveaxis(term.columns(scene).displacement(scene), 0, -1)
+    if any(EFFECTS[term.effect].moves == "tool" for term in laws.terms):
+        yield tool_columns(scene)
+
+
+def places_of(scene: Scene, laws: Fitted) -> list[tuple[str, int]]:
+    """What gives way: joints, links, the base; for a whole arm all joints that turn."""
+    out: dict[tuple[str, int], None] = {}
+    for term in laws.terms:
+        if "parts" in term.choice:
+            joints = [part // 4 for part in unmasked(term.choice["parts"])]
+            out |= {("joint", j): None for j in (turning(scene) if term.place == "all" else joints)}
+        elif term.place[0] == "L":
+            out[("link", joint_of(term.place))] = None
+        elif EFFECTS[term.effect].moves == "foot":
+            out[("base", 0)] = None
+    return list(out)
+
+
+def tool_columns(scene: Scene) -> Array:
+    """(k, 3, m, 9) motion of the points for every way in which weights can make the tool sag.
+
+    Eight turns per direction of gravity, none of them about gravity itself; drawn along z.
+    """
+    whole = Term(TOOL_FLEX.name, "all", {"lever": 2.0}).columns(scene).displacement(scene)
+    turns = np.einsum("dkcm,de->kcme", whole[:9], TRACELESS)
+    return np.concatenate([turns, whole[9][..., None]], axis=-1)
+
+
+def moments(mass: Array, com: Array) -> Array:
+    """(4 n,) mass and first moments of each link [kg, kg m]."""
+    return np.concatenate([mass[:, None], mass[:, None] * com], axis=1).reshape(-1)
+
+
+def per_moment(scene: Scene, kind: str, place: int) -> Array:
+    """(4 n, k, 3, m) displacement of a spring of compliance 1, for each mass and first moment."""
+    verbs: dict[str, Callable[..., Array]] = {
+        "joint": partial(turned, joint=place),
+        "link": partial(bent, link=place),
+        "base": tilted,
+    }
+    verb = verbs[kind]
+    out, n = [], scene.joints
+    for mass in np.eye(n):
+        centres = (np.outer(mass, axis) for axis in np.eye(4)[:, 1:])
+        alone, *moved = (verb(scene, mass=mass, com=com) for com in centres)
+        out += [alone, *(one - alone for one in moved)]
+    return np.array(out)
+
+
+def turned(scene: Scene, mass: Array, com: Array, joint: int) -> Array:
+    """(k, 3, m) motion of the targets when a joint turns by the torque about it."""
+    return np.asarray(scene.torque(mass, com)[joint] * scene.jacobian[joint])
+
+
+def condensed(fields: Array, right: Array) -> tuple[Array, Array]:
+    """The same least squares in as many rows as there are fields.
+
+    fields: (e, l, rows).  right: (rows,).
+    """
+    e, moments_, rows = fields.shape
+    every = np.vstack([fields.reshape(-1, rows), right]).T
+    triangle = np.asarray(np.linalg.qr(every, mode="r"))
+    return triangle[:, :-1].T.reshape(e, moments_, -1), triangle[:, -1]
+
+
+def together(
+    fields: Array, right: Array, soft: Array, masses: Masses, points: float
+) -> tuple[Array, Array, Array]:
+    """Compliances, masses and centres that imitate displacements best [mm].
+
+    fields: (e, 4 n, rows) per unit of compliance and moment.  right: (rows,).  soft: (e,) to begin
+    with.  points: how many there are.
+    """
+    mass, com = masses
+    e, n = len(soft), len(mass)
+    start = np.concatenate([np.log(soft), np.zeros(4 * n)])
+    weight = BELIEF * np.sqrt(points / (e + 4.0 * n))
+
+    def split(x: Array) -> tuple[Array, Array, Array]:
+        factors, off = x[e : e + n], x[e + n :].reshape(n, 3)
+        return np.exp(x[:e]), mass * np.exp(factors), com + NEAR * off
+
+    def residual(x: Array) -> Array:
+        c, m, at = split(x)
+        left = np.einsum("el,elr->r", np.outer(c, moments(m, at)), fields) - right
+        return np.concatenate([left, weight * (x - start)])
+
+    def jacobian(x: Array) -> Array:
+        c, m, at = split(x)
+        by_soft = np.einsum("l,elr->er", moments(m, at), fields) * c[:, None]
+        by_moment = np.einsum("e,elr->lr", c, fields).reshape(n, 4, -1) * m[:, None, None]
+        by_mass = by_moment[:, 0] + np.einsum("na,nar->nr", at, by_moment[:, 1:])
+        by_com = NEAR * by_moment[:, 1:].reshape(3 * n, -1)
+        return np.vstack([np.concatenate([by_soft, by_mass, by_com]).T, weight * np.eye(len(x))])
+
+    ends = np.concatenate([np.full(e, 2.0 * np.log(MOST)), np.full(4 * n, 3.0)])
+    found = scipy.optimize.least_squares(
+        residual, start, jacobian, bounds=(start - ends, start + ends), max_nfev=300
+    )
+    return split(found.x)
+
+
+def started(soft: Array, kinds: Sequence[str]) -> Array:
+    """Compliances to begin with: those of 0 like the others of their kind."""
+    out = soft.copy()
+    known = soft > LEAST
+    for i in np.flatnonzero(~known):
+        alike = [j for j in range(len(kinds)) if known[j] and kinds[j] == kinds[int(i)]]
+        out[i] = np.exp(np.log(soft[alike or known]).mean()) if known.any() else LEAST
+    return out
+
+
+# ---- the arm -------------------------------------------------------------------------------------
+
 
 SAMPLES = 120  # poses at which laws and springs are compared
 NEGLIGIBLE = 1e-9  # [rad]
+LEVER = 0.1  # from the flange to what it carries [m]
 
 
 @dataclass(frozen=True)
@@ -82,6 +302,19 @@ class Arm:
     mapped: Fitted = NOTHING
     left_out: tuple[str, ...] = ()
     remainder: float = 0.0
+
+    @cached_property
+    def reach(self) -> Array:
+        """(n,) largest lever of what is beyond each joint [m]."""
+        robot = self.robot
+        length = np.abs(robot.mdh[:, :2]).sum(axis=1) + np.linalg.norm(self.com, axis=1)
+        slide = np.where(robot.prismatic, np.clip(np.abs(robot.upper), 0.0, 2.0), 0.0)
+        return np.cumsum((length + slide)[::-1])[::-1] + LEVER
+
+    @cached_property
+    def inertia(self) -> Array:
+        """(n,) largest of that about each joint [kg m^2]."""
+        return np.asarray(np.cumsum(self.mass[::-1])[::-1] * self.reach**2)
 
 
 def assumed(robot: Robot) -> bool:
@@ -158,18 +391,8 @@ def with_springs(arm: Arm, found: Springs, state: State) -> Arm:
     after = state.step(found.change)
     mount = inverse(state.base) @ after.base
     arm = with_tool(arm, found.sag, found.drawn)
-    return replace(
-        arm,
-        robot=arm.robot.with_mdh(after.mdh),
-        spots=after.target_positions,
-        mount=mount @ arm.mount,
-        mass=found.mass,
-        com=found.com,
-        turn=found.turn,
-        bend=found.bend,
-        base=found.base,
-        remainder=found.remainder,
-    )
+    robot, spots = arm.robot.with_mdh(after.mdh), after.target_positions
+    return replace(arm, robot=robot, spots=spots, mount=mount @ arm.mount, **found.held)
 
 
 def with_tool(arm: Arm, sag: Array, drawn: float) -> Arm:
@@ -229,22 +452,21 @@ def parts_of(cell: Cell, scene: Scene, arm: Arm) -> Parts:
 
 def held_terms(cell: Cell) -> tuple[Term, ...]:
     """The effects of a cell that elements hold, or a command map; those of 0 need nothing."""
-    scene = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
-    bare = stiff(cell.robot, masses_of(cell.robot, LEAST_MASS))
-
-    def is_held(term: Term, values: Array) -> bool:
-        parts = Parts(bare)
-        if values.any():
-            ELEMENTS.get(term.effect, without_element)(parts, scene, term, values)
-        return not parts.left_out
-
-    return tuple(term for term, values in cell.effects.pairs if is_held(term, values))
+    data = still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot)
+    alone = ((term, replace(cell, effects=Fitted.of([(term, values)])))
+             for term, values in cell.effects.pairs)  # fmt: skip
+    return tuple(term for term, one in alone if not bare_parts(one, data).left_out)
 
 
 def unheld(cell: Cell, data: Measurements) -> tuple[Term, ...]:
     """Those effects of a cell that, with its values, only a command map can hold."""
-    parts = parts_of(cell, cell.scene(data), stiff(cell.robot, masses_of(cell.robot, LEAST_MASS)))
-    return tuple(term for term, _ in parts.mapped if term in cell.effects.terms)
+    mapped = bare_parts(cell, data).mapped
+    return tuple(term for term, _ in mapped if term in cell.effects.terms)
+
+
+def bare_parts(cell: Cell, data: Measurements) -> Parts:
+    """What is to hold each effect of a cell at some poses, whatever the arm weighs."""
+    return parts_of(cell, cell.scene(data), stiff(cell.robot, masses_of(cell.robot, LEAST_MASS)))
 
 
 Element = Callable[[Parts, Scene, Term, Array], None]
@@ -307,18 +529,15 @@ def softness(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
     parts.soft.append((term, values))
 
 
-def encoder(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
-    """The gear of the actuator."""
-    gain = parts.arm.gain.copy()
-    gain[joints_at(term.place, term.choice)] += values
-    parts.put(gain=gain)
+def on_joints(name: str) -> Element:
+    """A field of the arm by joints: the gear of an actuator, or the play of a hinge with stops."""
 
+    def element(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
+        held = getattr(parts.arm, name).copy()
+        held[joints_at(term.place, term.choice)] += values
+        parts.put(**{name: held})
 
-def backlash(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
-    """A hinge with stops on the joint's axis."""
-    play = parts.arm.play.copy()
-    play[joints_at(term.place, term.choice)] += values
-    parts.put(play=play)
+    return element
 
 
 def coupling(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
@@ -353,8 +572,8 @@ def balancer(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
 
 
 FIRM: dict[str, Element] = {
-    ENCODER_GAIN.name: encoder,
-    BACKLASH.name: backlash,
+    ENCODER_GAIN.name: on_joints("gain"),
+    BACKLASH.name: on_joints("play"),
     JOINT_COUPLING.name: coupling,
 }
 ELEMENTS: dict[str, Element] = {

@@ -21,6 +21,8 @@ from minimax_cal.robots.urdf import UrdfRobot, to_robot
 
 ROBOT = "minimax_cal_robot"  # the text under which a file of ours holds its robot whole
 SAME_ROBOT = 1e-6  # a file's own robot may differ from its bodies by no more [m, rad]
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # the quaternion of no turn, as MuJoCo has it
+TURNS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")  # forms of an orientation
 Bodies = Sequence[int]
 SHORTEST = 1e-5  # timestep with which an arm comes to rest in seconds [s]
 
@@ -65,6 +67,16 @@ class Chain:
         """(n,) where they are in qvel and forces."""
         return np.array(self.model.jnt_dofadr[list(self.joints)])
 
+    @property
+    def step(self) -> float:
+        """Of time [s]."""
+        return float(self.model.opt.timestep)
+
+    def fresh(self) -> tuple[Any, Any, Any, Array, Array]:
+        """MuJoCo, the model, new data of it, and (n,) where joints are in qpos and in forces."""
+        mj = mujoco()
+        return mj, self.model, mj.MjData(self.model), self.places, self.dofs
+
     def in_model(self, model: Any) -> Chain:
         """The same joints in another compiled model, whose bodies stand where they did."""
         return replace(self, model=model, joints=self.ids_in(model))
@@ -72,6 +84,11 @@ class Chain:
     def ids_in(self, model: Any) -> tuple[int, ...]:
         """Of the joints of the same names in another model."""
         return tuple(int(model.joint(name).id) for name in self.names)
+
+    @property
+    def servos(self) -> Array:
+        """(n,) ids of the position actuators of its joints, -1 where there is none."""
+        return np.array([self.servo(joint) for joint in self.joints])
 
     def servo(self, joint: int) -> int:
         """Id of the position actuator of a joint; -1 where there is none."""
@@ -88,7 +105,7 @@ def chain_of(model: Any, count: int, source: str, tip: str = "", *, unknown: boo
 
     tip: its last body.  unknown: whether its masses are assumed.  Raises RobotError.
     """
-    step = float(model.opt.timestep)
+    step = model.opt.timestep
     if step < SHORTEST:
         raise RobotError(
             f"{source}: its timestep of {step:g} s is too short for an arm to come to rest; give "
@@ -103,7 +120,7 @@ def chain_along(
     """The arm of some joints (n,) of a model, by their ids from the foot.  Raises RobotError."""
     tip = body_name(model, int(model.jnt_bodyid[joints[-1]]))
     seen = to_robot(tree_of(model, source, joints), tip)
-    down = np.array(model.opt.gravity)
+    down = model.opt.gravity
     size = float(np.linalg.norm(down))
     robot = robot_from_dict(seen.content, source)
     if size > 0.0:
@@ -120,9 +137,14 @@ def chain_along(
     return Chain(model, joints, seen, robot, base, size)
 
 
+def id_of(model: Any, kind: str, name: str) -> int:
+    """Of an element of a name, -1 where there is none.  kind: as `JOINT`."""
+    return int(mujoco().mj_name2id(model, getattr(mujoco().mjtObj, f"mjOBJ_{kind}"), name))
+
+
 def told_robot(model: Any, source: str) -> Robot | None:
     """The robot that a file of ours holds whole."""
-    number = mujoco().mj_name2id(model, mujoco().mjtObj.mjOBJ_TEXT, ROBOT)
+    number = id_of(model, "TEXT", ROBOT)
     if number < 0:
         return None
     start, size = int(model.text_adr[number]), int(model.text_size[number])
@@ -171,7 +193,7 @@ def braked(model: Any) -> Array:
 
     Whatever the integrator of the scene that the file is attached to, it takes that implicitly.
     """
-    ours = mujoco().mj_name2id(model, mujoco().mjtObj.mjOBJ_TEXT, ROBOT) >= 0
+    ours = id_of(model, "TEXT", ROBOT) >= 0
     bias = model.actuator_biasprm
     bare = [i for i in range(model.nu) if ours and bias[i, 1] < 0.0 and bias[i, 2] == 0.0]
     joints = range(model.njnt)
@@ -180,19 +202,9 @@ def braked(model: Any) -> Array:
 
 def carrier(chain: Chain) -> int:
     """Id of the body that carries the targets: a tool of ours that sags, else the last one."""
-    found = int(mujoco().mj_name2id(chain.model, mujoco().mjtObj.mjOBJ_BODY, "tool"))
-    last = chain.bodies[-1]
-    ours = found >= 0 and way_holds(chain.model, found, last)
-    return found if ours else last
-
-
-def way_holds(model: Any, body: int, other: int) -> bool:
-    """Whether a body hangs on another."""
-    while body > 0:
-        if body == other:
-            return True
-        body = int(model.body_parentid[body])
-    return False
+    found, bodies = id_of(chain.model, "BODY", "tool"), chain.bodies
+    ours = found >= 0 and holders(chain.model, bodies)[found] == len(bodies) - 1
+    return found if ours else bodies[-1]
 
 
 def fill_history(model: Any, data: Any) -> None:
@@ -220,13 +232,17 @@ def holders(model: Any, bodies: Bodies) -> Array:
     return holder
 
 
+def pose_at(position: Array, quaternion: Array = UPRIGHT) -> Array:
+    """(4, 4) of a position and MuJoCo's quaternion, w first."""
+    turn = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    return transform(turn, np.array(position))
+
+
 def own_pose(attributes: dict[str, str], compiler: dict[str, str]) -> Array:
     """(4, 4) that position and orientation of an element mean, in whatever form they stand."""
-    keys = ("pos", "quat", "axisangle", "euler", "xyaxes", "zaxis")
-    kept = " ".join(f'{k}="{attributes[k]}"' for k in keys if k in attributes)
+    kept = " ".join(f'{k}="{attributes[k]}"' for k in ("pos", *TURNS) if k in attributes)
     told = " ".join(f'{k}="{compiler[k]}"' for k in ("angle", "eulerseq") if k in compiler)
     model = mujoco().MjModel.from_xml_string(
         f"<mujoco><compiler {told}/><worldbody><body {kept}/></worldbody></mujoco>"
     )
-    turn = Rotation.from_quat(model.body_quat[1], scalar_first=True).as_matrix()
-    return transform(turn, np.array(model.body_pos[1]))
+    return pose_at(model.body_pos[1], model.body_quat[1])

@@ -16,19 +16,77 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, replace
+from pathlib import Path
 from threading import Lock
 from typing import Any
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import RobotError
-from minimax_cal.robots.gravity import G, centres, inertia_of, torques
-from minimax_cal.robots.kinematics import chain, cross
+from minimax_cal.ground.errors import CalibrationError, RobotError
+from minimax_cal.ground.files import saved_content
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.cell import Cell, cell_from_dict, still
+from minimax_cal.robots.kinematics import hat, rotation
 from minimax_cal.robots.mjcf import body_pose, mujoco, way_to
-from minimax_cal.robots.sampling import random_poses
+from minimax_cal.robots.transforms import inverse
 from minimax_cal.simulators.arm import Arm
-from minimax_cal.simulators.chain import Chain, carrier, fill_history, holders
+from minimax_cal.simulators.chain import Chain, carrier, fill_history, holders, id_of
+
+
+@dataclass(frozen=True, eq=False)
+class Commands:
+    """A command map: call it with joint values to get what to command.
+
+    cell: the arm with the effects that the map holds.
+    """
+
+    cell: Cell
+
+    def __call__(self, q: Array) -> Array:
+        """The commands for joint values q, (n,) or (m, n) [rad, m]."""
+        rows = np.atleast_2d(np.asarray(q, dtype=float))
+        told = still(rows, self.cell.target_names, self.cell.robot)
+        return self.follow(told).reshape(np.shape(q))
+
+    def follow(self, data: Measurements) -> Array:
+        """(m, n) the same for measured poses, with the way that led to each [rad, m]."""
+        turn = self.cell.effects.turn(self.cell.scene(data))
+        return data.q + self.cell.robot.commanded(turn)
+
+
+def load_commands(path: Path | str) -> Commands:
+    """The command map that an export to mjcf wrote beside a file.
+
+    Parameters
+    ----------
+    path
+        Of the map.
+
+    Returns
+    -------
+    Commands
+        It takes and gives the controller's joint values [rad, m].
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
+    >>> data.ctrl[:] = mc.load_commands("arm.commands.json")(q)
+    """
+    content = saved_content(path)
+    if content.get("kind") != "commands" or "cell" not in content:
+        raise CalibrationError(
+            f"{path}: is no command map; an export to mjcf writes one where it is needed"
+        )
+    return Commands(cell_from_dict(content["cell"], str(path)))
+
+
+# ---- driven --------------------------------------------------------------------------------------
+
 
 MOVE, REST = 2.0, 1.5  # a move lasts at least, and a rest after it [s]
 FASTEST, FASTEST_SLIDE = 1.0, 0.25  # no joint is commanded faster [rad/s, m/s]
@@ -46,19 +104,17 @@ class Driven:
     q: (m, n) where the joints were [rad, m].  speed: (m,) largest of all joints, springs with them,
     as a share of what counts as rest.  limited: (n,) share of the timesteps at which a joint's
     actuator was at its force limit.
-    driven: whether servos moved it; else its joints were set.
     """
 
     poses: Array
     q: Array
     speed: Array
     limited: Array
-    driven: bool
 
     @property
     def moving(self) -> Array:
         """(m,) True where it had not come to rest."""
-        return np.asarray(self.speed > 1.0)
+        return self.speed > 1.0
 
 
 def drive(
@@ -75,8 +131,7 @@ def drive(
     neighbours; each run begins at rest at the pose before its first one.
     Raises RobotError where MuJoCo finds that the model is unstable.
     """
-    servos = np.array([chain.servo(joint) for joint in chain.joints])
-    if (servos < 0).any():
+    if (chain.servos < 0).any():
         return set_joints(chain, commands, play)
     count = len(commands)
     runs = np.array_split(np.arange(count), min(RUNS, count))
@@ -89,68 +144,46 @@ def drive(
 
     def one(rows: Array) -> list[Visit]:
         sides = np.zeros(commands.shape) if play is None else play
-        return visits(chain, servos, commands, sides, rows, source, heard)
+        return visits(chain, commands, sides, rows, source, heard)
 
     with ThreadPoolExecutor(min(len(runs), os.cpu_count() or 1)) as pool:
-        found = [visit for part in pool.map(one, runs) for visit in part]
-    return Driven(
-        poses=np.array([visit.pose for visit in found]),
-        q=np.array([visit.q for visit in found]),
-        speed=np.array([visit.speed for visit in found]),
-        limited=np.mean([visit.limited for visit in found], axis=0),
-        driven=True,
-    )
+        found = zip(*(visit for part in pool.map(one, runs) for visit in part), strict=True)
+        poses, q, speed, limited = map(np.array, found)
+    return Driven(poses, q, speed, limited.mean(axis=0))
 
 
-@dataclass(frozen=True, eq=False)
-class Visit:
-    """One row of `Driven`."""
-
-    pose: Array
-    q: Array
-    speed: float
-    limited: Array
+Visit = tuple[Array, Array, float, Array]  # a row of `Driven`
 
 
 def visits(
     chain: Chain,
-    servos: Array,
     commands: Array,
     play: Array,
     rows: Array,
     source: str,
     heard: Callable[[], object],
 ) -> list[Visit]:
-    """A run of moves, one after the other, with a model of its own."""
-    mj, model = mujoco(), copy(chain.model)
-    chain_here = replace(chain, model=model)
-    data, sides = mj.MjData(model), plays(chain_here)
-    at = chain.places
-    moved = way_to(model, carrier(chain_here))
-    dofs = np.array([int(model.jnt_dofadr[joint]) for joint in moved])
-    rest = np.where(model.jnt_type[list(moved)] == 2, STILL_SLIDE, STILL)
-    limits = Limits.of(chain_here, servos)
-    step = float(model.opt.timestep)
-    start = commands[rows[0] - 1]
-    data.qpos[at], data.ctrl[servos] = start, start
+    """A run of moves, one after the other, with a model of its own: a row each of `Driven`."""
+    chain = replace(chain, model=copy(chain.model))
+    (mj, model, data, at, _), sides = chain.fresh(), plays(chain)
+    moved = way_to(model, carrier(chain))
+    dofs, kinds = model.jnt_dofadr[list(moved)], model.jnt_type[list(moved)]
+    rest = np.where(kinds == 2, STILL_SLIDE, STILL)
+    limits, step, start = Limits.of(chain), chain.step, commands[rows[0] - 1]
+    data.qpos[at], data.ctrl[limits.servos] = start, start
     fill_history(model, data)
-    settle(mj, model, data, limits, round(REST / step))
-    out = []
+    count, out = round(REST / step), list[Visit]()
+    steered(model, data, limits, np.tile(start, (count, 1)), LOOKS)
     for row in rows:
         for joint, place in sides.items():
             model.qpos_spring[place] = play[row, joint]
         path = moves(start, commands[row], chain.robot.prismatic, step)
-        looks = (
-            move(mj, model, data, servos, path, limits),
-            settle(mj, model, data, limits, round(REST / step)),
-        )
+        at_limit = steered(model, data, limits, path)
+        at_limit += steered(model, data, limits, np.tile(commands[row], (count, 1)), LOOKS)
         check_stable(mj, data, source)
-        (moved_at, moved_for), (rested_at, rested_for) = looks
-        share = (moved_at + rested_at) / (moved_for + rested_for)
-        out.append(Visit(
-            body_pose(data, carrier(chain_here)), np.array(data.qpos[at]),
-            float((np.abs(data.qvel[dofs]) / rest).max()), share,
-        ))  # fmt: skip
+        share = at_limit / (len(path) + count)
+        speed = float((np.abs(data.qvel[dofs]) / rest).max())
+        out.append((body_pose(data, carrier(chain)), data.qpos[at], speed, share))
         start = commands[row]
         heard()
     return out
@@ -162,7 +195,7 @@ def moves(start: Array, end: Array, slides: Array, step: float) -> Array:
     needed = PEAK * np.abs(way) / np.where(slides, FASTEST_SLIDE, FASTEST)
     count = max(1, round(max(MOVE, float(needed.max(initial=0.0))) / step))
     t = np.arange(1, count + 1)[:, None] / count
-    return np.asarray(start + way * t**3 * (10.0 - 15.0 * t + 6.0 * t**2))
+    return start + way * t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,9 +211,9 @@ class Limits:
     torque: Array
 
     @staticmethod
-    def of(chain: Chain, servos: Array) -> Limits:
+    def of(chain: Chain) -> Limits:
         """Those of a model, a little inside, so that rounding does not hide what is at one."""
-        m, joints = chain.model, list(chain.joints)
+        m, joints, servos = chain.model, list(chain.joints), chain.servos
         open_ends = np.array([-np.inf, np.inf])
         force = np.where(m.actuator_forcelimited[servos, None], m.actuator_forcerange[servos],
                          open_ends)  # fmt: skip
@@ -190,34 +223,24 @@ class Limits:
 
     def reached(self, force: Array, torque: Array) -> Array:
         """(..., n) True where an actuator or its joint is at a limit."""
-        return np.asarray(
-            (force <= self.force[:, 0]) | (force >= self.force[:, 1])
-            | (torque <= self.torque[:, 0]) | (torque >= self.torque[:, 1])
-        )  # fmt: skip
+        return ((force <= self.force[:, 0]) | (force >= self.force[:, 1])
+            | (torque <= self.torque[:, 0]) | (torque >= self.torque[:, 1]))  # fmt: skip
 
 
-def move(
-    mj: Any, model: Any, data: Any, servos: Array, path: Array, limits: Limits
-) -> tuple[Array, int]:
-    """Follow commands, one a timestep; how many of them at each limit, and how many there are."""
-    force, torque = np.empty(path.shape), np.empty(path.shape)
-    for k, command in enumerate(path):
-        data.ctrl[servos] = command
-        mj.mj_step(model, data)
-        force[k], torque[k] = data.actuator_force[servos], data.qfrc_actuator[limits.dofs]
-    return limits.reached(force, torque).sum(axis=0), len(path)
+def steered(model: Any, data: Any, limits: Limits, path: Array, every: int = 1) -> Array:
+    """(n,) at how many timesteps each joint is at a limit along commands (steps, n).
 
-
-def settle(mj: Any, model: Any, data: Any, limits: Limits, count: int) -> tuple[Array, int]:
-    """Stay at a command; the same, from a look every few timesteps."""
-    at_limit, done = np.zeros(len(limits.servos), dtype=int), 0
-    while done < count:
-        steps = min(LOOKS, count - done)
-        mj.mj_step(model, data, steps)
-        found = limits.reached(data.actuator_force[limits.servos], data.qfrc_actuator[limits.dofs])
-        at_limit += steps * found
-        done += steps
-    return at_limit, count
+    every: timesteps between two looks, and two commands.
+    """
+    mj, starts = mujoco(), range(0, len(path), every)
+    force, torque = list[Array](), list[Array]()
+    for k in starts:
+        data.ctrl[limits.servos] = path[k]
+        mj.mj_step(model, data, min(every, len(path) - k))
+        force.append(data.actuator_force[limits.servos])
+        torque.append(data.qfrc_actuator[limits.dofs])
+    at_limit = limits.reached(np.array(force), np.array(torque))
+    return np.diff([*starts, len(path)]) @ at_limit
 
 
 def check_stable(mj: Any, data: Any, source: str) -> None:
@@ -233,9 +256,7 @@ def check_stable(mj: Any, data: Any, source: str) -> None:
 
 def set_joints(chain: Chain, commands: Array, play: Array | None) -> Driven:
     """The same for a model without servos: its joints are set and nothing moves."""
-    model, mj, out = chain.model, mujoco(), []
-    data = mj.MjData(model)
-    at = chain.places
+    (mj, model, data, at, _), out = chain.fresh(), []
     for row in range(len(commands)):
         data.qpos[at] = commands[row]
         for joint, place in plays(chain).items():
@@ -243,7 +264,7 @@ def set_joints(chain: Chain, commands: Array, play: Array | None) -> Driven:
         mj.mj_kinematics(model, data)
         out.append(body_pose(data, carrier(chain)))
     still, limited = np.zeros(len(commands)), np.zeros(commands.shape[1])
-    return Driven(np.array(out), commands, still, limited, False)
+    return Driven(np.array(out), commands, still, limited)
 
 
 def touching(chain: Chain, model: Any, q: Array) -> Array:
@@ -257,7 +278,7 @@ def touching(chain: Chain, model: Any, q: Array) -> Array:
         data.qpos[chain.places] = values
         mj.mj_fwdPosition(model, data)
         sides = carried[model.geom_bodyid[data.contact.geom]].any(axis=-1)
-        out[row] = bool((sides & (data.contact.dist < 0.0)).any())
+        out[row] = (sides & (data.contact.dist < 0.0)).any()
     return out
 
 
@@ -265,126 +286,125 @@ def plays(chain: Chain) -> dict[int, int]:
     """Joint, and where the position in its play is in qpos."""
     model, out = chain.model, {}
     for i in range(len(chain.joints)):
-        found = mujoco().mj_name2id(model, mujoco().mjtObj.mjOBJ_JOINT, f"play{i + 1}")
+        found = id_of(model, "JOINT", f"play{i + 1}")
         if found >= 0:
             out[i] = int(model.jnt_qposadr[found])
     return out
 
 
-# ---- servos --------------------------------------------------------------------------------------
+# ---- where a written file lets its targets stand -------------------------------------------------
 
 
-SETTLES = 15.0  # a servo's frequency at the largest inertia: 1.5 s of rest leave 4e-9 [rad/s]
-LEAST_RATIO, SLOWEST = 0.7, 7.5  # a given damper stays from this damping ratio to this pole [1/s]
-SMALLEST = 0.1  # of the largest gain, for joints that carry little: as published models have them
-WIDEST = 10.0  # gains are at most so much larger than the largest that a smooth move needs
-SAG = 2e-6  # gravity moves the tool of a joint that is stiff by no more [m]
-STEPS = 2.0  # a damper's own time is at least so many timesteps: then no stiffness shakes
-NOTHING = 1e-12
-LEVER = 0.1  # from the flange to what it carries [m]
-SAMPLES = 200  # poses at which loads are looked for
+ROUNDS, CLOSE = 20, 1e-12  # of Newton's method, and the largest step that is none [rad, m]
+SMALL = 1e-7  # to find slopes of forces [rad, m]
 
 
 @dataclass(frozen=True, eq=False)
-class Drives:
-    """The servos of a model as they are, all at the joints; of a new one there are none.
+class Written:
+    """An arm in a written model.  cell: which it is to be.  base: (4, 4) of it in the world [m]."""
 
-    gain, damper: (n,) [N m/rad, N m s/rad]; own: (n,) the part of damper that the joint itself has.
-    limits: (n, 2) of the torque of each joint's actuators [N m].
-    inertia: (n,) largest about each joint [kg m^2].  timestep: [s].
-    gravity_free: whether actuators carry no gravity because the model's bodies float already.
-    braked: (n,) True where the joint is to hold its servo's damper, which is implicit there.
+    chain: Chain
+    cell: Cell
+    arm: Arm
+    base: Array
+
+    def off(self, data: Measurements) -> Array:
+        """(k, m, 3) from where the targets stand to where the cell says, as the instrument sees it.
+
+        Its command map corrects the commands [m].
+        """
+        asked = Commands(replace(self.cell, effects=self.arm.mapped)).follow(data)
+        points = stand(self.chain, data.target_names, asked, resting(self.arm, data))
+        to = self.cell.base @ inverse(self.base)
+        chosen = [self.cell.target_names.index(name) for name in data.target_names]
+        said = self.cell.seen(data)[:, chosen]
+        return np.moveaxis(said - points @ to[:3, :3].T - to[:3, 3], 1, 0)
+
+
+def resting(arm: Arm, data: Measurements) -> Array | None:
+    """(m, n) where joints rest in their play, by the moves that led to each pose [rad]."""
+    if not arm.play.any():
+        return None
+    sides = [data.columns[f"approach{i + 1}"] for i in range(data.q.shape[1])]
+    return np.asarray(0.5 * arm.play * np.stack(sides, axis=1))
+
+
+def stand(chain: Chain, names: tuple[str, ...], commands: Array, play: Array | None) -> Array:
+    """(m, k, 3) sites of these names, in the world, with all forces of the arm in balance [m].
+
+    commands: (m, n) [rad, m].  play: (m, n) where each joint rests in its play [rad].
     """
+    mj, model = mujoco(), copy(chain.model)
+    data, sides, servos = mj.MjData(model), plays(chain), chain.servos
+    joints = list(way_to(model, int(model.site(names[0]).bodyid[0])))
+    at, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+    states = model.actuator_actadr[servos]
+    out = np.empty((len(commands), len(names), 3))
 
-    gain: Array
-    damper: Array
-    own: Array
-    limits: Array
-    inertia: Array
-    braked: Array
-    timestep: float = 0.002
-    gravity_free: bool = False
+    def force(q: Array) -> Array:
+        data.qpos[at] = q
+        mj.mj_forward(model, data)
+        return np.array(data.qfrc_smooth[dofs])
 
-    @staticmethod
-    def none(joints: int) -> Drives:
-        """Of a new file."""
-        nothing = np.zeros(joints)
-        ends = np.array([[-np.inf, np.inf]] * joints)
-        return Drives(nothing, nothing, nothing, ends, nothing, np.ones(joints, dtype=bool))
+    for row, command in enumerate(commands):
+        mj.mj_resetData(model, data)
+        data.qpos[chain.places] = data.ctrl[servos] = command
+        fill_history(model, data)
+        data.act[states[states >= 0]] = command[states >= 0]
+        for joint, place in sides.items():
+            data.qpos[place] = model.qpos_spring[place] = 0.0 if play is None else play[row, joint]
+        q = data.qpos[at]
+        for _ in range(ROUNDS):
+            here = force(q)
+            slope = np.array([force(q + step) - here for step in SMALL * np.eye(len(q))]).T / SMALL
+            step = np.linalg.solve(slope, here)
+            q = q - step
+            if np.abs(step).max() < CLOSE:
+                break
+        force(q)
+        out[row] = [data.site(name).xpos for name in names]
+    return out
 
 
-@dataclass(frozen=True, eq=False)
-class Servos:
-    """share: of gravity that bends the joints, s.  gain, damper: (n,) [N m/rad, N m s/rad].
+# ---- base and targets that suit given flange poses best ------------------------------------------
 
-    sprung: (n,) True where a spring of its own holds the joint's compliance.
-    kept: (n,) True where gain and damper are those that the model has.
+
+PLACINGS = 30  # of Gauss and Newton, until a step is none
+
+
+def placed_error(
+    poses: Array, data: Measurements, train: Array, start: tuple[Array, Array]
+) -> Array:
+    """Measured minus predicted (k, m, 3), NaN where not measured [m].
+
+    poses: (m, 4, 4) of the flange in some base frame [m].  train: (m,) mask of the poses that place
+    base and targets.  start: base (4, 4) in the measurement frame and targets (k, 3) in the flange.
     """
-
-    share: float
-    gain: Array
-    damper: Array
-    sprung: Array
-    kept: Array
-
-
-def choose_servos(arm: Arm, drives: Drives, *, springs: bool = False) -> Servos:
-    """Gains that settle within a rest of 1.5 s, and the share of gravity that makes them exact.
-
-    springs: whether springs of their own hold what joints give way, and no gain.
-    """
-    inertia, torque = loads(arm)
-    inertia = np.maximum(inertia, drives.inertia)
-    needed = SETTLES**2 * inertia
-    ordinary = np.maximum(drives.gain, np.maximum(needed, SMALLEST * needed.max()))
-    _, reach, _ = carried(arm)
-    lever = np.where(arm.robot.prismatic, 1.0, reach)
-    soft = arm.turn > NOTHING
-    compliance = np.where(soft, arm.turn, np.inf)
-    share = min(1.0, float((arm.turn * ordinary).max()))
-    stiff = np.maximum(ordinary, share * torque * lever / SAG)
-    gain = np.where(soft, share / compliance, stiff)
-    sprung = np.zeros(len(gain), dtype=bool)
-    if springs or gain.max() > WIDEST * ordinary.max():
-        share, gain, sprung = 0.0, ordinary, soft
-    critical = 2.0 * np.sqrt(gain * inertia)
-    kept = np.isclose(gain, drives.gain, rtol=1e-9)
-    kept &= (drives.damper >= LEAST_RATIO * critical) & (drives.damper <= gain / SLOWEST)
-    new = np.maximum(critical, STEPS * drives.timestep * gain)
-    return Servos(share, gain, np.where(kept, drives.damper, new), sprung, kept)
+    turn, origin = start[0][:3, :3], start[0][:3, 3]
+    spots = start[1]
+    for _ in range(PLACINGS):
+        error, columns = linear(poses[train], data.y[train], turn, origin, spots)
+        seen = np.isfinite(error).all(axis=-1)
+        step = np.linalg.lstsq(
+            columns[seen].reshape(-1, columns.shape[-1]), error[seen].reshape(-1), rcond=1e-10
+        )[0]
+        origin = origin + turn @ step[:3]
+        turn = turn @ rotation(step[3:6])
+        spots = spots + step[6:].reshape(-1, 3)
+        if np.abs(step).max() < CLOSE:
+            break
+    error, _ = linear(poses, data.y, turn, origin, spots)
+    return np.moveaxis(error, 1, 0)
 
 
-def loads(arm: Arm, q: Array | None = None) -> tuple[Array, Array]:
-    """(n,) largest inertia [kg m^2] and gravity torque [N m] of each joint, of slides kg and N.
-
-    q: (m, n) poses, all over the workspace unless given [rad, m].
-    """
-    robot = arm.robot
-    if q is None:
-        q = random_poses(robot, SAMPLES, np.random.default_rng(0))
-    links = chain(robot.mdh, robot.turned(q), robot.prismatic)
-    at = centres(links, arm.com)
-    beyond = np.cumsum(arm.mass[::-1])[::-1]
-    own = [inertia_of(robot.mdh, i, m) for i, m in enumerate(arm.mass)]
-    turning = np.cumsum(np.array(own)[::-1])[::-1]
-    inertia = np.zeros((robot.joints, len(q)))
-    for i in range(robot.joints):
-        lever = cross(links.z[i][None], at[i:] - links.before[i][None])
-        inertia[i] = np.einsum("k,kam,kam->m", arm.mass[i:], lever, lever) + turning[i]
-    torque = torques(links, arm.mass, arm.com, robot.up)
-    force = G * beyond[:, None] * np.einsum("nam,a->nm", links.z, robot.up)
-    slides = robot.prismatic[:, None]
-    return (
-        np.asarray(np.where(slides, beyond[:, None], inertia).max(axis=1)),
-        np.asarray(np.abs(np.where(slides, force, torque)).max(axis=1)),
-    )
-
-
-def carried(arm: Arm) -> tuple[Array, Array, Array]:
-    """For each joint: weight beyond it [N], largest lever of that [m], largest inertia [kg m^2]."""
-    robot = arm.robot
-    length = np.abs(robot.mdh[:, :2]).sum(axis=1) + np.linalg.norm(arm.com, axis=1)
-    slide = np.where(robot.prismatic, np.clip(np.abs(robot.upper), 0.0, 2.0), 0.0)
-    reach = np.cumsum((length + slide)[::-1])[::-1] + LEVER
-    mass = np.cumsum(arm.mass[::-1])[::-1]
-    return mass * G, reach, mass * reach**2
+def linear(poses: Array, y: Array, turn: Array, origin: Array, spots: Array) -> tuple[Array, Array]:
+    """Errors (m, k, 3) and their columns (m, k, 3, 6 + 3 k): shift, turn of the base; targets."""
+    inside = np.einsum("mij,kj->mki", poses[:, :3, :3], spots) + poses[:, None, :3, 3]
+    error = y - inside @ turn.T - origin
+    m, k = inside.shape[:2]
+    columns = np.zeros((m, k, 3, 6 + 3 * k))
+    columns[..., :3] = turn
+    columns[..., 3:6] = -turn @ hat(inside)
+    for i in range(k):
+        columns[:, i, :, 6 + 3 * i : 9 + 3 * i] = turn @ poses[:, :3, :3]
+    return error, columns

@@ -8,29 +8,126 @@ actuator's force, and joints that are springs let none pass (`actuatorfrcrange`)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from minimax_cal.correcting.exporters.correct import laid
 from minimax_cal.ground.arrays import Array
-from minimax_cal.robots.gravity import G
+from minimax_cal.robots.gravity import G, centres, inertia_of, torques
+from minimax_cal.robots.kinematics import chain, cross
 from minimax_cal.robots.mjcf import numbers
 from minimax_cal.robots.robot import Robot
-from minimax_cal.robots.transforms import head, inverse, level_to, link, shift, tail
-from minimax_cal.simulators.arm import Arm
-from minimax_cal.simulators.drive import (
-    LEVER,
-    NOTHING,
-    SAG,
-    Drives,
-    Servos,
-    carried,
-    choose_servos,
-    loads,
-)
+from minimax_cal.robots.sampling import random_poses
+from minimax_cal.robots.transforms import head, inverse, level_to, shift, tail
+from minimax_cal.simulators.arm import LEVER, Arm
+
+SETTLES = 15.0  # a servo's frequency at the largest inertia: 1.5 s of rest leave 4e-9 [rad/s]
+LEAST_RATIO, SLOWEST = 0.7, 7.5  # a given damper stays from this damping ratio to this pole [1/s]
+SMALLEST = 0.1  # of the largest gain, for joints that carry little: as published models have them
+WIDEST = 10.0  # gains are at most so much larger than the largest that a smooth move needs
+SAG = 2e-6  # gravity moves the tool of a joint that is stiff by no more [m]
+STEPS = 2.0  # a damper's own time is at least so many timesteps: then no stiffness shakes
+NOTHING = 1e-12
+SAMPLES = 200  # poses at which loads are looked for
+
+
+@dataclass(frozen=True, eq=False)
+class Drives:
+    """The servos of a model as they are, all at the joints; of a new one there are none.
+
+    gain, damper: (n,) [N m/rad, N m s/rad]; own: (n,) the part of damper that the joint itself has.
+    limits: (n, 2) of the torque of each joint's actuators [N m].
+    inertia: (n,) largest about each joint [kg m^2].  timestep: [s].
+    gravity_free: whether actuators carry no gravity because the model's bodies float already.
+    braked: (n,) True where the joint is to hold its servo's damper, which is implicit there.
+    """
+
+    gain: Array
+    damper: Array
+    own: Array
+    limits: Array
+    inertia: Array
+    braked: Array
+    timestep: float = 0.002
+    gravity_free: bool = False
+
+    @staticmethod
+    def none(joints: int) -> Drives:
+        """Of a new file."""
+        nothing = np.zeros(joints)
+        ends = np.array([[-np.inf, np.inf]] * joints)
+        return Drives(nothing, nothing, nothing, ends, nothing, np.ones(joints, dtype=bool))
+
+
+@dataclass(frozen=True, eq=False)
+class Servos:
+    """share: of gravity that bends the joints, s.  gain, damper: (n,) [N m/rad, N m s/rad].
+
+    sprung: (n,) True where a spring of its own holds the joint's compliance.
+    kept: (n,) True where gain and damper are those that the model has.
+    """
+
+    share: float
+    gain: Array
+    damper: Array
+    sprung: Array
+    kept: Array
+
+
+def choose_servos(arm: Arm, drives: Drives, *, springs: bool = False) -> Servos:
+    """Gains that settle within a rest of 1.5 s, and the share of gravity that makes them exact.
+
+    springs: whether springs of their own hold what joints give way, and no gain.
+    """
+    inertia, torque = loads(arm)
+    inertia = np.maximum(inertia, drives.inertia)
+    needed = SETTLES**2 * inertia
+    ordinary = np.maximum(drives.gain, np.maximum(needed, SMALLEST * needed.max()))
+    lever = np.where(arm.robot.prismatic, 1.0, arm.reach)
+    soft = arm.turn > NOTHING
+    compliance = np.where(soft, arm.turn, np.inf)
+    share = min(1.0, float((arm.turn * ordinary).max()))
+    stiff = np.maximum(ordinary, share * torque * lever / SAG)
+    gain = np.where(soft, share / compliance, stiff)
+    sprung = np.zeros(len(gain), dtype=bool)
+    if springs or gain.max() > WIDEST * ordinary.max():
+        share, gain, sprung = 0.0, ordinary, soft
+    critical = 2.0 * np.sqrt(gain * inertia)
+    kept = np.isclose(gain, drives.gain, rtol=1e-9)
+    kept &= (drives.damper >= LEAST_RATIO * critical) & (drives.damper <= gain / SLOWEST)
+    new = np.maximum(critical, STEPS * drives.timestep * gain)
+    return Servos(share, gain, np.where(kept, drives.damper, new), sprung, kept)
+
+
+def loads(arm: Arm) -> tuple[Array, Array]:
+    """(n,) largest inertia [kg m^2] and gravity torque [N m] of each joint, of slides kg and N.
+
+    Over poses all over the workspace.
+    """
+    robot = arm.robot
+    q = random_poses(robot, SAMPLES, np.random.default_rng(0))
+    links = chain(robot.mdh, robot.turned(q), robot.prismatic)
+    at = centres(links, arm.com)
+    beyond = np.cumsum(arm.mass[::-1])[::-1]
+    own = [inertia_of(robot.mdh, i, m) for i, m in enumerate(arm.mass)]
+    turning = np.cumsum(np.array(own)[::-1])[::-1]
+    inertia = np.zeros((robot.joints, len(q)))
+    for i in range(robot.joints):
+        lever = cross(links.z[i][None], at[i:] - links.before[i][None])
+        inertia[i] = np.einsum("k,kam,kam->m", arm.mass[i:], lever, lever) + turning[i]
+    torque = torques(links, arm.mass, arm.com, robot.up)
+    force = G * beyond[:, None] * np.einsum("nam,a->nm", links.z, robot.up)
+    slides = robot.prismatic[:, None]
+    inertia, torque = np.where(slides, beyond[:, None], inertia), np.where(slides, force, torque)
+    return inertia.max(axis=1), np.abs(torque).max(axis=1)
+
+
+# ---- elements ------------------------------------------------------------------------------------
+
 
 TIME = 0.02  # in which a spring comes to rest [s]
 ROTOR = 0.01  # inertia of a spring itself, of what it carries: parallel hinges need some
@@ -63,23 +160,33 @@ class Layout:
     degrees: bool = False
 
 
-def part(parent: ET.Element, tag: str, **attributes: object) -> ET.Element:
-    """A new element; arrays become numbers."""
-    text = {
+def as_text(attributes: Mapping[str, object]) -> dict[str, str]:
+    """Attributes as they stand in a file; arrays become numbers."""
+    return {
         key: value if isinstance(value, str) else numbers(np.asarray(value, dtype=float))
         for key, value in attributes.items()
     }
-    return ET.SubElement(parent, tag, text)
+
+
+def part(parent: ET.Element, tag: str, **attributes: object) -> ET.Element:
+    """A new element."""
+    return ET.SubElement(parent, tag, as_text(attributes))
 
 
 def known(parent: ET.Element, tag: str, name: str = "", **attributes: object) -> ET.Element:
     """The element of a name in its parent with other attributes, a new one where there is none."""
     for element in parent.findall(tag):
         if element.get("name", "") == name:
-            for key, value in attributes.items():
-                element.set(key, value if isinstance(value, str) else numbers(np.asarray(value)))
+            element.attrib |= as_text(attributes)
             return element
     return part(parent, tag, **({"name": name} if name else {}), **attributes)
+
+
+def forget(root: ET.Element, holder: str, tag: str, name: str) -> None:
+    """Take the elements of a name out of the sections that hold them."""
+    for one in root.iter(holder):
+        for old in [e for e in one.findall(tag) if e.get("name") == name]:
+            one.remove(old)
 
 
 def parents_of(root: ET.Element) -> dict[ET.Element, ET.Element]:
@@ -95,16 +202,8 @@ def section(root: ET.Element, tag: str) -> ET.Element:
 
 def frames(robot: Robot) -> Array:
     """(n, 4, 4) frame of each joint in the base at joint values 0, z its axis [m]."""
-    out, at = [], np.eye(4)
-    for row in robot.mdh:
-        out.append(at @ head(row))
-        at = at @ link(row)
-    return np.array(out)
-
-
-def damping(stiffness: Array, inertia: Array) -> Array:
-    """Dampers that let springs come to rest without swinging [N m s/rad]."""
-    return np.asarray(TIME * stiffness + 2.0 * np.sqrt(stiffness * inertia))
+    frames_of_links = zip(laid(robot, np.eye(4)), robot.mdh, strict=False)
+    return np.array([at @ head(row) for at, row in frames_of_links])
 
 
 def equip(layout: Layout, arm: Arm, *, springs: bool = False, driven: bool = True) -> None:
@@ -153,9 +252,7 @@ def write_servos(layout: Layout, arm: Arm, servos: Servos) -> None:
                 layout.joints[i].set("damping", numbers([damper]))
                 damper = 0.0
             tune(servo, gain, max(damper - layout.drives.own[i], 0.0) / gear**2)
-        for custom in layout.root.findall("custom"):  # of a calibration before this one
-            for old in [e for e in custom if e.get("name") == f"{name}_deflection"]:
-                custom.remove(old)
+        forget(layout.root, "custom", "text", f"{name}_deflection")  # of a calibration before
         if arm.turn[i] > NOTHING and not servos.sprung[i]:
             said = (f"the gain of {servo.get('name')} is a spring: under gravity {name} turns by "
                     f"{arm.turn[i]:.6g} rad/(N m); another gain is another deflection")  # fmt: skip
@@ -213,19 +310,15 @@ def spring(
 
     loaded: whether it feels all of gravity, or as much as the actuators do.
     """
-    new = ET.Element(
-        "joint",
-        {
-            "name": name, "type": kind, "pos": numbers(at), "axis": numbers(axis),
-            "stiffness": numbers([stiffness]), "springref": "0", "ref": "0", "limited": "false",
-            "damping": numbers([damping(np.array(stiffness), np.array(inertia))]),
-            "frictionloss": "0", "armature": numbers([ROTOR * inertia]),
-        },
-    )  # fmt: skip
+    own = TIME * stiffness + 2.0 * np.sqrt(stiffness * inertia)  # lets it come to rest
+    new = ET.Element("joint", as_text({
+        "name": name, "type": kind, "pos": at, "axis": axis, "stiffness": [stiffness],
+        "springref": "0", "ref": "0", "limited": "false", "damping": [own], "frictionloss": "0",
+        "armature": [ROTOR * inertia],
+    }))  # fmt: skip
     if loaded:
-        new.set("actuatorgravcomp", "true")
-        new.set("actuatorfrclimited", "true")
-        new.set("actuatorfrcrange", numbers([-PASSES, PASSES]))
+        passes = {"actuatorfrclimited": "true", "actuatorfrcrange": [-PASSES, PASSES]}
+        new.attrib |= as_text({"actuatorgravcomp": "true", **passes})
     places = [i for i, child in enumerate(body) if child.tag == "joint"]
     body.insert(places[-1] + 1 if places else 0, new)
     return new
@@ -233,24 +326,22 @@ def spring(
 
 def flexes(layout: Layout, arm: Arm, servos: Servos) -> None:
     """A spring on the axis of each joint whose servo does not hold its compliance."""
-    _, _, inertia = carried(arm)
     for i in np.flatnonzero(servos.sprung):
         spring(
             layout.bodies[i], f"flex{i + 1}", "slide" if arm.robot.prismatic[i] else "hinge",
-            layout.anchors[i], layout.axes[i], 1.0 / float(arm.turn[i]), float(inertia[i]),
+            layout.anchors[i], layout.axes[i], 1.0 / arm.turn[i], arm.inertia[i],
         )  # fmt: skip
 
 
 def plays(layout: Layout, arm: Arm, share: float) -> None:
     """A hinge with stops half the play away on either side, and a spring that holds it."""
-    _, reach, inertia = carried(arm)
-    _, torque = loads(arm)
+    (_, torque), inertia = loads(arm), arm.inertia
     for i in np.flatnonzero(arm.play):
         half = 0.5 * abs(arm.play[i])
-        held = max(share * float(torque[i] * reach[i]) / SAG, float(inertia[i]) / TIME**2)
+        held = max(share * (torque[i] * arm.reach[i]) / SAG, inertia[i] / TIME**2)
         new = spring(
             layout.bodies[i], f"play{i + 1}", "hinge", layout.anchors[i], layout.axes[i],
-            held, float(inertia[i]), loaded=False,
+            held, inertia[i], loaded=False,
         )  # fmt: skip
         new.set("limited", "true")
         ends = np.array([-1.01, 1.01]) * half  # the spring ends inside the stops
@@ -259,7 +350,6 @@ def plays(layout: Layout, arm: Arm, share: float) -> None:
 
 def bends(layout: Layout, arm: Arm) -> None:
     """Hinges at the Gauss points of a link: together the compliance of a cantilever, exactly."""
-    _, _, inertia = carried(arm)
     for i, flexibility in arm.bend.items():
         row = arm.robot.mdh[i]
         start, end = np.array([0.0, 0.0, -row[1]]), np.array([row[0], 0.0, 0.0])
@@ -275,7 +365,7 @@ def bends(layout: Layout, arm: Arm) -> None:
                 soft = flexibility * length * (1.0 if letter == "x" else 0.5)
                 spring(
                     body, f"bend{i + 1}_{letter}{point + 1}", "hinge", at, seat[:3, :3] @ axis,
-                    1.0 / soft, float(inertia[i + 1]),
+                    1.0 / soft, arm.inertia[i + 1],
                 )  # fmt: skip
 
 
@@ -295,13 +385,12 @@ def base(layout: Layout, arm: Arm) -> None:
     body, robot = layout.bodies[0], arm.robot
     foot = layout.seats[0] @ inverse(head(robot.mdh[0]))
     if arm.base > 0.0:
-        _, _, inertia = carried(arm)
         level = level_to(robot.up)
         first = next(i for i, child in enumerate(body) if child.tag in ("joint", "freejoint"))
         for letter, axis in zip("xy", level, strict=True):
             new = spring(
                 body, f"base_flex_{letter}", "hinge", foot[:3, 3], foot[:3, :3] @ axis,
-                1.0 / arm.base, float(inertia[0]),
+                1.0 / arm.base, arm.inertia[0],
             )  # fmt: skip
             body.remove(new)
             body.insert(first, new)
@@ -326,7 +415,7 @@ def balancer(layout: Layout, arm: Arm, stiffness: Array) -> None:
         inside = layout.seats[i] @ inverse(at[i])
         part(layout.bodies[i], "site", name=f"balancer_{name}",
              pos=inside[:3, :3] @ point + inside[:3, 3], size=0.005)  # fmt: skip
-    pull = -told.k * float(stiffness[0]) / (told.eye * ANCHOR**2)
+    pull = -told.k * stiffness[0] / (told.eye * ANCHOR**2)
     tendon = part(section(layout.root, "tendon"), "spatial", name="balancer", stiffness=pull,
                   springlength=told.rest * ANCHOR)  # fmt: skip
     part(tendon, "site", site="balancer_anchor")
@@ -340,7 +429,7 @@ def targets(layout: Layout, arm: Arm, names: Sequence[str]) -> None:
     """The flange, and a site for each target on the tool."""
     end = layout.seats[-1] @ tail(arm.robot.mdh[-1])
     mark(layout, layout.bodies[-1], "flange", end)
-    soft = bool(np.abs(arm.sag).max() > NOTHING or arm.drawn.max() > 0.0)
+    soft = np.abs(arm.sag).max() > NOTHING or arm.drawn.max() > 0.0
     body = sagging(layout.bodies[-1], end, arm) if soft else layout.bodies[-1]
     for name, point in zip(names, arm.spots, strict=True):
         mark(layout, body, name, shift(*point) if soft else end @ shift(*point))
@@ -354,12 +443,13 @@ def mark(layout: Layout, body: ET.Element, name: str, pose: Array) -> None:
                 other.remove(old)
             for key in ("axisangle", "euler", "xyaxes", "zaxis", "fromto"):
                 old.attrib.pop(key, None)
-    known(body, "site", name, pos=pose[:3, 3], quat=quaternion(pose), size=0.005, group="4")
+    known(body, "site", name, **at_pose(pose), size=0.005, group="4")
 
 
-def quaternion(pose: Array) -> Array:
-    """(4,) as MuJoCo writes it, w first."""
-    return np.asarray(Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True))
+def at_pose(pose: Array) -> dict[str, Array]:
+    """Attributes of what stands at a pose (4, 4), w of the quaternion first."""
+    turn = Rotation.from_matrix(pose[:3, :3])
+    return {"pos": pose[:3, 3], "quat": turn.as_quat(scalar_first=True)}
 
 
 def sagging(body: ET.Element, end: Array, arm: Arm) -> ET.Element:
@@ -376,8 +466,7 @@ def sagging(body: ET.Element, end: Array, arm: Arm) -> ET.Element:
     for i in range(3):
         body = part(body, "body", name="tool" if i == 2 else f"tool_{i + 1}")
         if i == 0:
-            body.set("pos", numbers(end[:3, 3]))
-            body.set("quat", numbers(quaternion(end)))
+            body.attrib |= as_text(at_pose(end))
         part(body, "inertial", pos=spots[i], mass=FOOT, diaginertia=[FOOT * LEVER**2] * 3)
         if size[i] > NOTHING:
             spring(body, f"tool_{'xyz'[i]}", "hinge", np.zeros(3), axes[i],
@@ -386,7 +475,7 @@ def sagging(body: ET.Element, end: Array, arm: Arm) -> ET.Element:
         if arm.drawn[i] <= 0.0:
             continue
         spring(body, f"tool_slide_{'xyz'[i]}", "slide", np.zeros(3), np.eye(3)[i],
-               G * FOOT / float(arm.drawn[i]), FOOT)  # fmt: skip
+               G * FOOT / arm.drawn[i], FOOT)  # fmt: skip
     return body
 
 

@@ -6,10 +6,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
+import numpy as np
+
+from minimax_cal.dynamics.result import MotionEffect, table_by_joint
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.ground.facts import Fact, derived
+from minimax_cal.ground.files import plain
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.effects.words import name_step
@@ -128,3 +132,157 @@ class SimulatorGap(Result):
         elif self.beyond.get("narrow"):
             text += f". Outside the measured region nothing is claimed: {self.beyond['reason']}"
         return text + "."
+
+
+# ---- along trajectories --------------------------------------------------------------------------
+
+
+COMMANDS = "the logged commands"  # that drive a model, as `drives` says at its end
+
+
+@dataclass(frozen=True)
+class MotionRung:
+    """How far a model misses on held-out runs, by joint.
+
+    torque_rms_Nm: of the torque that the measured motion takes [N m, slides N].
+    torque_rms: the same in the unit of the log; torque_rms_moving: of rows neither at rest nor just
+    after a reversal.  tracking_rms_mrad: of where its drives bring it
+    [mrad, slides mm], empty where it was not driven.
+    """
+
+    name: str
+    torque_rms_Nm: tuple[float, ...]
+    torque_rms: tuple[float, ...]
+    torque_rms_moving: tuple[float, ...]
+    tracking_rms_mrad: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class WrittenElement:
+    """Numbers of a model that were corrected.
+
+    held_by: `file`, or `module` where no element of MuJoCo holds it.  worth: of each joint that it
+    changes, the held-out RMS torque of moving rows without and with it, in the unit of the log.
+    """
+
+    name: str
+    held_by: Literal["file", "module"]
+    attributes: str
+    worth: Mapping[str, tuple[float, float]]
+
+    def words(self, unit: str) -> str:
+        """For people: where it counts most [unit]."""
+        if not self.worth:
+            return f"{self.name} ({self.attributes})"
+        joint, (before, after) = max(self.worth.items(), key=lambda one: one[1][0] / one[1][1])
+        size = f"{joint} {before:.3g} to {after:.3g} {unit}"
+        return f"{self.name} ({self.attributes}): {size} held out"
+
+
+def of_drive(one: MotionEffect) -> str:
+    """What a drive has that the model's has not, and its worth, for people."""
+    amounts = ", ".join(
+        f"{p.name.replace('_', ' ')} {p.value:.4g}" + f" ± {p.sigma:.1g}" * (p.sigma > 0.0)
+        + f" {p.unit}" * (p.unit != "1") for p in one.parameters if p.value or p.sigma
+    )  # fmt: skip
+    if not one.worth:
+        return f"not in the file: {one.words} ({amounts}), for which MuJoCo has no element"
+    joint, (before, after) = one.best
+    size = f"joint error at {joint} {before:.3g} to {after:.3g} mrad"
+    return f"corrected {one.words} ({amounts}): {size} held out"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MotionGap(Result):
+    """The gap between a simulator's model and logs of the arm, measured in the simulator.
+
+    rungs: as given, then with each element.  elements: what was corrected, with its worth.
+    left_out: what is in neither file nor module, and what that costs.  drives: what moved the arm.
+    held_out: runs that no fit saw, or quarters of one.  written, module: paths, empty if none.
+    effects: of its drives, each with the held-out joint error [mrad] without and with it.
+    along: tells its file from that of poses.
+    """
+
+    KIND = "simulator_gap"
+    COMMAND = "gap"
+    model: str
+    robot: str
+    unit: str
+    rungs: Annotated[tuple[MotionRung, ...], Fact(fewest=1)]
+    elements: tuple[WrittenElement, ...]
+    left_out: tuple[str, ...]
+    drives: str
+    held_out: tuple[str, ...]
+    notices: tuple[str, ...]
+    written: str
+    module: str
+    seconds: float
+    effects: tuple[MotionEffect, ...] = ()
+    along: Literal["trajectories"] = "trajectories"
+
+    def __post_init__(self) -> None:
+        rows = [(r.torque_rms_Nm, r.torque_rms, r.torque_rms_moving) for r in self.rungs]
+        if len({len(row) for some in rows for row in some}) > 1:
+            raise ValueError("its steps are not of one number of joints")
+
+    def __repr__(self) -> str:
+        return f"<MotionGap of {self.model}: {self.headline()}>"
+
+    @property
+    def commanded(self) -> bool:
+        """Whether logged commands drove the model."""
+        return self.drives.endswith(COMMANDS)
+
+    @property
+    def kept(self) -> bool:
+        """Whether something was kept, where commands drove the model."""
+        return not self.commanded or len(self.rungs) > 1
+
+    def headline(self) -> str:
+        """The result in a sentence or two."""
+        if not self.kept:
+            error = np.linalg.norm(self.rungs[0].tracking_rms_mrad)
+            return (
+                f"No correction lowers the joint error under {self.drives} on held-out motion "
+                f"({', '.join(self.held_out)}), {error:.3g} mrad: nothing is written."
+            )
+        first, last = self.rungs[0], self.rungs[-1]
+        if not first.torque_rms:
+            return f"{self.driven().capitalize()}."
+        share = np.array(last.torque_rms_moving) / np.maximum(first.torque_rms_moving, 1e-300)
+        worst = int(np.argmax(share))
+        said = (
+            "Torque that the model gets wrong on held-out motion falls to "
+            f"{100.0 * np.median(share):.2g} % (median of the joints; worst J{worst + 1}, "
+            f"{100.0 * share[worst]:.2g} %)"
+        )
+        return f"{said}, {self.driven()}." if first.tracking_rms_mrad else f"{said}."
+
+    def driven(self) -> str:
+        """How the joint error changes."""
+        ends = [np.linalg.norm(self.rungs[k].tracking_rms_mrad) for k in (0, -1)]
+        return f"the joint error under {self.drives} from {ends[0]:.3g} to {ends[1]:.3g} mrad"
+
+    def sentences(self) -> tuple[str, ...]:
+        """What was corrected and its worth, what the file alone lacks, and what nothing holds."""
+        said = {"file": "corrected", "module": "not in the file, in its module:"}
+        drives = (of_drive(one) for one in self.effects)
+        each = (f"{said[one.held_by]} {one.words(self.unit)}" for one in self.elements)
+        return (*drives, *each, *(f"not in the model: {text}" for text in self.left_out))
+
+    def short(self) -> dict[str, Any]:
+        """What another result says of the file that was written."""
+        names = ("written", "module", "elements", "left_out")
+        return {name: plain(getattr(self, name)) for name in names}
+
+    def table(self) -> Table:
+        """RMS torque of each joint, rung by rung."""
+        title = f"RMS torque [{self.unit}] while moving, held out ({', '.join(self.held_out)})"
+        return table_by_joint(title, "model", self.rungs, "torque_rms_moving")
+
+    def tables(self) -> tuple[Table, ...]:
+        """Torques, and joint errors where drives moved the arm."""
+        title = f"RMS joint error [mrad] under {self.drives}"
+        driven = table_by_joint(title, "model", self.rungs, "tracking_rms_mrad")
+        own = (self.table(),) if self.unit else ()
+        return (*own, driven) if self.drives else own

@@ -5,36 +5,32 @@ The frame of a link is that of its body; a joint stands at its anchor, its axis 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from minimax_cal.correcting.exporters.job import Export, Job
 from minimax_cal.correcting.exporters.urdf import assumptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
-from minimax_cal.modelling.cell import Cell
-from minimax_cal.robots.mjcf import mujoco, numbers, read_model
-from minimax_cal.robots.transforms import to_rpy, transform
-from minimax_cal.simulators.arm import arm_of
-from minimax_cal.simulators.chain import braked
-from minimax_cal.simulators.mjcf import new_tree, text_of
+from minimax_cal.robots.mjcf import body_pose, mujoco, numbers, read_model
+from minimax_cal.robots.transforms import inverse, to_rpy
+from minimax_cal.simulators.chain import at_zero, braked, pose_at
+from minimax_cal.simulators.mjcf import new_file
 
 VERSION = "1.9"
 KINDS = {2: "prismatic", 3: "revolute"}  # of mjtJoint: a slide, a hinge
 SHAPES = {2: "sphere", 3: "capsule", 5: "cylinder", 6: "box"}  # of mjtGeom
-CENTRAL = ((0, 0, "ixx"), (0, 1, "ixy"), (0, 2, "ixz"), (1, 1, "iyy"), (1, 2, "iyz"), (2, 2, "izz"))
+CENTRAL = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 UNLIMITED = 1e16  # what SDFormat takes for no limit
 
 
 def write(job: Job) -> Export:
     """A new SDF of an arm: geometry, masses, limits and targets."""
-    cell = job.cell or Cell(job.robot, np.eye(4), (), np.zeros((0, 3)))
-    made = text_of(new_tree(arm_of(cell, job.q), cell.target_names))
+    made = new_file(job)[2]
     found = as_sdf(mujoco().MjModel.from_xml_string(made.decode()), job.robot.name, job.source)
     return replace(found, notices=(assumptions(job.robot), *found.notices))
 
@@ -45,45 +41,28 @@ def convert(path: Path) -> Export:
     return as_sdf(model, path.stem, str(path))
 
 
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """A compiled model with all joints at zero.  at: (nbody, 4, 4) poses of the bodies."""
-
-    model: Any
-    data: Any
-    at: Array
-
-    @staticmethod
-    def of(model: Any) -> Placed:
-        """With forward kinematics."""
-        data = mujoco().MjData(model)
-        data.qpos[:] = 0.0
-        mujoco().mj_kinematics(model, data)
-        at = np.tile(np.eye(4), (model.nbody, 1, 1))
-        at[:, :3, :3], at[:, :3, 3] = data.xmat.reshape(-1, 3, 3), data.xpos
-        return Placed(model, data, at)
-
-    def relative(self, body: int) -> Array:
-        """(4, 4) pose of a body in that of its parent."""
-        return np.asarray(np.linalg.inv(self.at[self.model.body_parentid[body]]) @ self.at[body])
+def relative(model: Any, data: Any, body: int) -> Array:
+    """(4, 4) pose of a body in that of its parent."""
+    parent = int(model.body_parentid[body])
+    return inverse(body_pose(data, parent)) @ body_pose(data, body)
 
 
 def as_sdf(model: Any, name: str, source: str) -> Export:
     """The file, and what of the model it does not hold.  Raises RobotError."""
     check_joints(model, source)
-    placed = Placed.of(model)
+    data = at_zero(model, range(model.njnt))
     root = ET.Element("sdf", {"version": VERSION})
     arm = ET.SubElement(root, "model", {"name": name})
     root.insert(0, ET.Comment(" written by minimax-cal; world = base of the robot; m, rad, kg "))
     for body in range(1, model.nbody):
-        write_link(arm, placed, body)
-        write_joint(arm, placed, body)
+        write_link(arm, model, data, body)
+        write_joint(arm, model, data, body)
     for site in range(model.nsite):
         frame = ET.SubElement(arm, "frame", {
             "name": f"{model.site(site).name or f'site{site}'}",
             "attached_to": name_of(model, int(model.site_bodyid[site])),
         })  # fmt: skip
-        frame_pose(frame, placed_at(model.site_pos[site], model.site_quat[site]))
+        frame_pose(frame, pose_at(model.site_pos[site], model.site_quat[site]))
     ET.indent(root)
     content = ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
     return Export(content, tuple(lost_of(model)))
@@ -120,76 +99,68 @@ def frame_pose(parent: ET.Element, at: Array, relative_to: str = "") -> None:
         pose.set("relative_to", relative_to)
 
 
-def placed_at(position: Any, quaternion: Any = (1.0, 0.0, 0.0, 0.0)) -> Array:
-    """(4, 4) of a position and MuJoCo's quaternion (w, x, y, z)."""
-    w, x, y, z = quaternion
-    return transform(Rotation.from_quat([x, y, z, w]).as_matrix(), np.asarray(position))
-
-
-def write_link(arm: ET.Element, placed: Placed, body: int) -> None:
+def write_link(arm: ET.Element, model: Any, data: Any, body: int) -> None:
     """A body with its mass and what is to be seen of it."""
-    model = placed.model
     parent = int(model.body_parentid[body])
     link = ET.SubElement(arm, "link", {"name": name_of(model, body)})
-    frame_pose(link, placed.relative(body), name_of(model, parent) if parent else "")
+    frame_pose(link, relative(model, data, body), name_of(model, parent) if parent else "")
     inertial = ET.SubElement(link, "inertial")
-    element(inertial, "mass", float(model.body_mass[body]))
-    frame_pose(inertial, placed_at(model.body_ipos[body]))
-    turn = placed_at(model.body_ipos[body], model.body_iquat[body])[:3, :3]
+    element(inertial, "mass", model.body_mass[body])
+    frame_pose(inertial, pose_at(model.body_ipos[body]))
+    turn = pose_at(model.body_ipos[body], model.body_iquat[body])[:3, :3]
     tensor = turn @ np.diag(model.body_inertia[body]) @ turn.T
     moments = ET.SubElement(inertial, "inertia")
-    for i, j, tag in CENTRAL:
-        element(moments, tag, float(tensor[i, j]))
+    for tag, value in zip(CENTRAL, tensor[np.triu_indices(3)].tolist(), strict=True):
+        element(moments, tag, value)
     for geom in np.flatnonzero(model.geom_bodyid == body):
         write_visual(link, model, int(geom))
 
 
 def write_visual(link: ET.Element, model: Any, geom: int) -> None:
     """A simple shape; nothing of a mesh."""
-    shape = SHAPES.get(int(model.geom_type[geom]))
+    shape = SHAPES.get(model.geom_type[geom])
     if shape is None:
         return
     visual = ET.SubElement(link, "visual", {"name": f"geom{geom}"})
-    frame_pose(visual, placed_at(model.geom_pos[geom], model.geom_quat[geom]))
+    frame_pose(visual, pose_at(model.geom_pos[geom], model.geom_quat[geom]))
     made = ET.SubElement(ET.SubElement(visual, "geometry"), shape)
     size = model.geom_size[geom]
     if shape == "box":
         element(made, "size", numbers(2.0 * size))
         return
-    element(made, "radius", float(size[0]))
+    element(made, "radius", size[0])
     if shape != "sphere":
         element(made, "length", 2.0 * float(size[1]))
 
 
-def write_joint(arm: ET.Element, placed: Placed, body: int) -> None:
+def write_joint(arm: ET.Element, model: Any, data: Any, body: int) -> None:
     """What holds a body to its parent: a joint with limits and dynamics, or a fixed one."""
-    model, parent = placed.model, int(placed.model.body_parentid[body])
-    moves = bool(model.body_jntnum[body])
+    parent, moves = int(model.body_parentid[body]), bool(model.body_jntnum[body])
     j = int(model.body_jntadr[body])
     name = str(model.joint(j).name) or f"joint{j}" if moves else f"{name_of(model, body)}_fixed"
-    kind = KINDS[int(model.jnt_type[j])] if moves else "fixed"
+    kind = KINDS[model.jnt_type[j]] if moves else "fixed"
     joint = ET.SubElement(arm, "joint", {"name": name, "type": kind})
     element(joint, "parent", name_of(model, parent) if parent else "world")
     element(joint, "child", name_of(model, body))
     if not moves:
         return
-    inward = np.linalg.inv(placed.at[body])
-    anchor = inward @ [*placed.data.xanchor[j], 1.0]
-    frame_pose(joint, placed_at(anchor[:3]))
+    inward = inverse(body_pose(data, body))
+    anchor = inward @ [*data.xanchor[j], 1.0]
+    frame_pose(joint, pose_at(anchor[:3]))
     axis = ET.SubElement(joint, "axis")
-    element(axis, "xyz", numbers(inward[:3, :3] @ placed.data.xaxis[j]))
+    element(axis, "xyz", numbers(inward[:3, :3] @ data.xaxis[j]))
     limit = ET.SubElement(axis, "limit")
     ends = model.jnt_range[j] if model.jnt_limited[j] else (-UNLIMITED, UNLIMITED)
-    element(limit, "lower", float(ends[0]))
-    element(limit, "upper", float(ends[1]))
+    element(limit, "lower", ends[0])
+    element(limit, "upper", ends[1])
     if model.jnt_actfrclimited[j]:
-        element(limit, "effort", float(np.abs(model.jnt_actfrcrange[j]).max()))
+        element(limit, "effort", np.abs(model.jnt_actfrcrange[j]).max())
     dynamics = ET.SubElement(axis, "dynamics")
     dof = int(model.jnt_dofadr[j])
-    element(dynamics, "damping", 0.0 if braked(model)[j] else float(model.dof_damping[dof]))
-    element(dynamics, "friction", float(model.dof_frictionloss[dof]))
-    element(dynamics, "spring_reference", float(model.qpos_spring[model.jnt_qposadr[j]]))
-    element(dynamics, "spring_stiffness", float(model.jnt_stiffness[j]))
+    element(dynamics, "damping", 0.0 if braked(model)[j] else model.dof_damping[dof])
+    element(dynamics, "friction", model.dof_frictionloss[dof])
+    element(dynamics, "spring_reference", model.qpos_spring[model.jnt_qposadr[j]])
+    element(dynamics, "spring_stiffness", model.jnt_stiffness[j])
 
 
 def lost_of(model: Any) -> list[str]:

@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 import minimax_cal as mc
+from minimax_cal.dynamics.logs.table import Run
 from minimax_cal.dynamics.regressor import (
     Motion,
     inertial_parameters,
     inverse_dynamics,
     link_parameters,
 )
-from minimax_cal.dynamics.run import Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.robot import robot_from_dict
 

@@ -17,9 +17,8 @@ from minimax_cal.dynamics.drives import (
     speed_limit,
     torque_limit,
 )
-from minimax_cal.dynamics.rows import prepare
-from minimax_cal.dynamics.run import TORQUE, Run
-from minimax_cal.dynamics.scene import Arm
+from minimax_cal.dynamics.logs.table import TORQUE, Run
+from minimax_cal.dynamics.rows import Arm, prepare
 from tests.dynamics.motions import three_joints
 
 HZ, SECONDS, NOISE = 250.0, 12.0, 0.2

@@ -9,11 +9,10 @@ from dynamics.motions import simulated, three_joints
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.dynamics.laws import LAWS, MODULE, QUANTITIES, WORDS, Law, Tuned, laws_table
-from minimax_cal.dynamics.rows import prepare
-from minimax_cal.dynamics.scene import Arm, Scene, sense_of
+from minimax_cal.dynamics.laws import LAWS, QUANTITIES, WORDS, Element, Law, Tuned, laws_table
+from minimax_cal.dynamics.rows import Arm, Scene, prepare, sense_of
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.simulators.motion.module import laws_text
+from minimax_cal.simulators.motion.judge import laws_text
 
 DOCS = Path(__file__).parents[2] / "docs" / "torques.md"
 WAVE = Law(
@@ -35,7 +34,7 @@ def registered() -> Iterator[Law]:
     del LAWS[WAVE.name], WORDS[WAVE.name]
 
 
-@pytest.mark.parametrize("name", [name for name, law in LAWS.items() if MODULE in law.held])
+@pytest.mark.parametrize("name", [name for name, law in LAWS.items() if Element.MODULE in law.held])
 def test_the_module_says_what_the_rows_say(name: str, scene: Scene) -> None:
     law, j = LAWS[name], 1
     written = eval(f"{{{laws_text({name: law})}}}", {"np": np})

@@ -15,9 +15,8 @@ from dynamics.motions import fourier
 from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
-from minimax_cal.dynamics.given import runs_of
+from minimax_cal.dynamics.given import against_robot, gravity, runs_of
 from minimax_cal.dynamics.logs import are_logs, import_logs, read_runs, runs_text
-from minimax_cal.dynamics.logs.with_robot import against_robot, gravity
 from minimax_cal.ground.arrays import Array
 
 N = 3

@@ -8,8 +8,7 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.dynamics.probes import Past, beside, foretold, less
 from minimax_cal.dynamics.regressor import Motion
-from minimax_cal.dynamics.rows import prepare
-from minimax_cal.dynamics.scene import Arm, Scene, sense_of
+from minimax_cal.dynamics.rows import Arm, Scene, prepare, sense_of
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
 

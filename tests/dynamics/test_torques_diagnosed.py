@@ -16,11 +16,9 @@ import minimax_cal as mc
 from experiments.motion_cases import MUJOCO, RATIO, Case, make
 from minimax_cal.cli import torques
 from minimax_cal.dynamics.laws import Term
-from minimax_cal.dynamics.links import weighing
+from minimax_cal.dynamics.model import Columns, weighing
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
-from minimax_cal.dynamics.rows import ROW_HZ, prepare
-from minimax_cal.dynamics.scene import Arm, Scene
-from minimax_cal.dynamics.search import Columns
+from minimax_cal.dynamics.rows import ROW_HZ, Arm, Scene, prepare
 from minimax_cal.ground.arrays import Array
 
 ARM = three_joints()

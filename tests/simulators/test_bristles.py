@@ -16,13 +16,9 @@ from tests.problems_mjcf import drive_alone
 mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
 
 from minimax_cal.dynamics.rows import prepare  # noqa: E402
-from minimax_cal.simulators.motion.bodies import Bodies  # noqa: E402
-from minimax_cal.simulators.motion.bristles import has_bristles  # noqa: E402
-from minimax_cal.simulators.motion.driven import inverse_torque  # noqa: E402
-from minimax_cal.simulators.motion.module import installed  # noqa: E402
-from minimax_cal.simulators.motion.numbers import given_numbers  # noqa: E402
-from minimax_cal.simulators.motion.opened import open_model  # noqa: E402
-from minimax_cal.simulators.motion.written import write_numbers  # noqa: E402
+from minimax_cal.simulators.motion.fit import has_bristles  # noqa: E402
+from minimax_cal.simulators.motion.judge import installed, inverse_torque  # noqa: E402
+from minimax_cal.simulators.motion.numbers import Bodies, given_numbers, open_model, write_numbers  # noqa: E402
 
 pytestmark = pytest.mark.skipif(not has_bristles(), reason="needs MuJoCo 3.16 or later")
 HELD = np.array([[0.0, 4.0], [1.0, 2.0], [0.5, 0.0]])

@@ -13,7 +13,7 @@ import minimax_cal as mc
 from minimax_cal.correcting.export import exported
 from minimax_cal.correcting.exporters.job import job_of
 from minimax_cal.modelling.cell import still
-from minimax_cal.simulators.exporter import write
+from minimax_cal.simulators.mjcf import write
 from minimax_cal.simulators.result import SimulatorGap
 from tests.conftest import run
 from tests.problems_mjcf import drive_alone, published_like, ur10_like

@@ -25,8 +25,8 @@ mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax
 from experiments import simulator_gap as study  # noqa: E402
 from minimax_cal.robots.mjcf import read_model  # noqa: E402
 from minimax_cal.simulators import ladder  # noqa: E402
-from minimax_cal.simulators.causes import carried_over  # noqa: E402
 from minimax_cal.simulators.chain import chain_of  # noqa: E402
+from minimax_cal.simulators.ladder import carried_over  # noqa: E402
 
 AGREES = 0.01  # between simulator and fit, held-out RMS [mm]
 PLACED = 0.15  # of an error that the poses it is judged by have placed

@@ -17,7 +17,7 @@ from minimax_cal.robots.gravity import tubes
 from minimax_cal.robots.robot import robot_from_dict
 from minimax_cal.simulators.arm import arm_of
 from minimax_cal.simulators.elements import across_themselves
-from minimax_cal.simulators.exporter import write
+from minimax_cal.simulators.mjcf import write
 from tests.conftest import run
 
 mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")

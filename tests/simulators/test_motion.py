@@ -13,8 +13,8 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.dynamics.given import MotionKnown, Payload, read_logs
 from minimax_cal.dynamics.logs import runs_text
+from minimax_cal.dynamics.logs.table import Run
 from minimax_cal.dynamics.regressor import link_parameters
-from minimax_cal.dynamics.run import Run
 from minimax_cal.ground.errors import OptionError
 from tests.conftest import run
 from tests.dynamics.motions import run_of, three_joints
@@ -32,13 +32,11 @@ from experiments.driven_arms import (  # noqa: E402
     save_model,
     with_motors,
 )
-from minimax_cal.simulators.motion import bodies  # noqa: E402
-from minimax_cal.simulators.motion.driven import follow_commands  # noqa: E402
+from minimax_cal.simulators.motion import numbers as bodies  # noqa: E402
 from minimax_cal.simulators.motion.fit import least_within, levelling, speeds  # noqa: E402
-from minimax_cal.simulators.motion.judge import Judge  # noqa: E402
-from minimax_cal.simulators.motion.module import installed, loaded  # noqa: E402
-from minimax_cal.simulators.motion.opened import open_model  # noqa: E402
-from minimax_cal.simulators.motion.result import MotionGap  # noqa: E402
+from minimax_cal.simulators.motion.judge import Judge, follow_commands, installed, loaded  # noqa: E402
+from minimax_cal.simulators.motion.numbers import open_model  # noqa: E402
+from minimax_cal.simulators.result import MotionGap  # noqa: E402
 from minimax_cal.simulators.sdf import convert  # noqa: E402
 
 STEP = 0.002

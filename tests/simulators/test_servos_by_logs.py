@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.dynamics.drives import Drive
-from minimax_cal.dynamics.run import NOTHING, TORQUE, Run
+from minimax_cal.dynamics.logs.table import NOTHING, TORQUE, Run
 from tests.conftest import run
 from tests.dynamics.motions import three_joints
 
@@ -32,9 +32,8 @@ from minimax_cal.simulators.motion.drives import (  # noqa: E402
     own_drives,
     with_drives,
 )
-from minimax_cal.simulators.motion.opened import open_model  # noqa: E402
-from minimax_cal.simulators.motion.result import MotionGap  # noqa: E402
-from minimax_cal.simulators.motion.written import new_model  # noqa: E402
+from minimax_cal.simulators.motion.numbers import new_model, open_model  # noqa: E402
+from minimax_cal.simulators.result import MotionGap  # noqa: E402
 
 pytestmark = pytest.mark.skipif(
     not hasattr(mujoco, "mj_initCtrlHistory"), reason="no delays in this MuJoCo"

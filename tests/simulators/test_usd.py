@@ -10,10 +10,13 @@ usd = pytest.importorskip("mujoco_usd_converter", reason="needs mujoco-usd-conve
 
 from pxr import Gf, Usd, UsdPhysics  # noqa: E402
 
-from minimax_cal.simulators.motion.bodies import Bodies  # noqa: E402
-from minimax_cal.simulators.motion.numbers import given_numbers, has_powers  # noqa: E402
-from minimax_cal.simulators.motion.opened import open_model  # noqa: E402
-from minimax_cal.simulators.motion.written import write_numbers  # noqa: E402
+from minimax_cal.simulators.motion.numbers import (  # noqa: E402
+    Bodies,
+    given_numbers,
+    has_powers,
+    open_model,
+    write_numbers,
+)
 
 
 def test_what_usd_holds_of_a_written_model(tmp_path):

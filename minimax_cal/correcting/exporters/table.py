@@ -52,7 +52,7 @@ def later(module: str, verb: str) -> Callable[..., Any]:
     return lambda *given: getattr(import_module(module), verb)(*given)
 
 
-MJCF, SDF = "minimax_cal.simulators.exporter", "minimax_cal.simulators.sdf"
+MJCF, SDF = "minimax_cal.simulators.mjcf", "minimax_cal.simulators.sdf"
 EXPORTERS: dict[str, Exporter] = {
     "urdf": Exporter(urdf.write, couples=True),
     "ur-yaml": Exporter(ur_yaml.write),

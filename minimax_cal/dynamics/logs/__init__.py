@@ -7,21 +7,28 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from minimax_cal.dynamics.logs.bags import is_bag, read_bag
-from minimax_cal.dynamics.logs.draft import Draft, drafts_of
-from minimax_cal.dynamics.logs.faults import checked
-from minimax_cal.dynamics.logs.repeats import check_repeats
-from minimax_cal.dynamics.logs.table import Log, log_sheet, read_table
-from minimax_cal.dynamics.logs.write import runs_text
-from minimax_cal.dynamics.run import Run
+from minimax_cal.dynamics.logs.faults import check_repeats, checked
+from minimax_cal.dynamics.logs.table import (
+    TORQUE,
+    Draft,
+    Log,
+    Run,
+    drafts_of,
+    log_sheet,
+    read_table,
+)
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.files import csv_text
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.importers import units_of
 from minimax_cal.reading.formats import is_log
 from minimax_cal.reading.words import along_arm
 
-__all__ = ["LogFiles", "are_logs", "import_logs", "read_runs", "runs_text"]
+__all__ = ["LogFiles", "Run", "are_logs", "import_logs", "read_runs", "runs_text"]
 
 LOOKED_AT = 50  # lines that show whether a file is a log
 
@@ -45,24 +52,12 @@ class LogFiles:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {
-            "joints": self.runs[0].joints,
-            "unit": self.runs[0].unit,
-            "runs": [
-                {
-                    "name": run.name,
-                    "source": run.source,
-                    "format": title,
-                    "rows": len(run.time),
-                    "duration_s": run.duration,
-                    "step_s": run.step,
-                    "payload_kg": run.payload,
-                    "columns": columns,
-                }
-                for run, title, columns in zip(self.runs, self.titles, self.columns, strict=True)
-            ],
-            "notices": self.notices,
-        }
+        keys = ("name", "source", "format", "rows", "duration_s", "step_s", "payload_kg", "columns")
+        rows = ((run.name, run.source, title, len(run.time), run.duration, run.step, run.payload,
+                 columns) for run, title, columns in zip(self.runs, self.titles, self.columns,
+                                                         strict=True))  # fmt: skip
+        told, first = [dict(zip(keys, row, strict=True)) for row in rows], self.runs[0]
+        return {"joints": first.joints, "unit": first.unit, "runs": told, "notices": self.notices}
 
     def table(self) -> Table:
         """A row a run."""
@@ -158,8 +153,8 @@ def in_order(log: Log, joints: Sequence[str]) -> Log:
         raise DataError(f"{log.source}: has {n} joints{names}, but the robot has {len(joints)}")
     if not log.joints:
         return log
-    along = along_arm([name if name.endswith("_joint") else f"{name}_joint" for name in log.joints])
     named = [name if name.endswith("_joint") else f"{name}_joint" for name in log.joints]
+    along = along_arm(named)
     order = [named.index(name) for name in along]
     names = ", ".join(log.joints[i] for i in order)
     how = "along the arm" if order != list(range(n)) else "as in the file; check their order"
@@ -210,3 +205,56 @@ def looks_like_log(path: Path) -> bool:
         return is_log(log_sheet(path, LOOKED_AT).header)
     except DataError:
         return False
+
+
+def runs_text(runs: Sequence[Run], sliding: Array) -> str:
+    """CSV of runs of one arm that `read_runs` reads.  sliding: (n,) joints in mm.
+
+    Raises DataError for runs in different units.
+    """
+    units = {run.unit for run in runs}
+    if len(units) > 1 or len({run.joints for run in runs}) > 1:
+        raise DataError(
+            f"{runs[0].source}: the runs differ in joints or units; write one at a time"
+        )
+    n, many = runs[0].joints, len(runs) > 1
+    length = ["mm" if slides else "rad" for slides in sliding]
+    scale = np.where(sliding, 1e3, 1.0)
+    drive = ["A" if TORQUE not in units else "N" if slides else "Nm" for slides in sliding]
+    letter = "tau" if TORQUE in units else "i"
+    blocks: list[tuple[list[str], list[Array | None]]] = []
+    for kind, suffix in (("q", ""), ("qd", "_s"), ("qdd", "_s2")):
+        given = [getattr(run, kind) for run in runs]
+        if any(value is not None for value in given):
+            names = [f"{kind}{j + 1}_{u}{suffix}" for j, u in enumerate(length)]
+            blocks.append((names, [None if v is None else v * scale for v in given]))
+    blocks.append(([f"{letter}{j + 1}_{u}" for j, u in enumerate(drive)], [r.torque for r in runs]))
+    blocks += [block for block in (warmth(runs, n), payload(runs)) if block]
+    lines = [["run"] * many + ["t_s"] + [name for names, _ in blocks for name in names]]
+    for at, run in enumerate(runs):
+        empty = np.full((len(run.time), n), np.nan)
+        parts = [empty[:, : len(names)] if (own := values[at]) is None else own
+                 for names, values in blocks]  # fmt: skip
+        for time, row in zip(run.time, np.hstack(parts), strict=True):
+            cells = ["" if np.isnan(value) else f"{value:.9g}" for value in row]
+            lines.append([run.name] * many + [f"{time:.6f}"] + cells)
+    return csv_text(lines)
+
+
+def warmth(runs: Sequence[Run], n: int) -> tuple[list[str], list[Array | None]] | None:
+    """Columns of temperature, where runs have them alike."""
+    given = [run.temperature for run in runs if run.temperature is not None]
+    if not given:
+        return None
+    one = all(value.ndim == 1 for value in given)
+    names = ["temperature_C"] if one else [f"temperature{j + 1}_C" for j in range(n)]
+    wide = [None if r.temperature is None else np.atleast_2d(r.temperature.T).T for r in runs]
+    return names, [v if v is None or v.shape[1] == len(names) else np.repeat(v, n, 1) for v in wide]
+
+
+def payload(runs: Sequence[Run]) -> tuple[list[str], list[Array | None]] | None:
+    """The column of payload, where a run has one."""
+    if all(run.payload is None for run in runs):
+        return None
+    values = [None if r.payload is None else np.full((len(r.time), 1), r.payload) for r in runs]
+    return ["payload_kg"], list(values)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.dynamics.logs.table import Log
-from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.optional import optional
 from minimax_cal.reading.formats import SI
@@ -66,11 +65,10 @@ def log_of(path: Path, topic: str, messages: Sequence[tuple[int, Any]]) -> Log:
     stamped = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for _, m in same]
     received = [1e-9 * (t - same[0][0]) for t, _ in same]
     time = np.array(stamped if any(stamped) else received) - (stamped[0] if any(stamped) else 0.0)
-    values: dict[str, Array] = {"t": time}
-    for kind, member in MEMBERS.items():
-        rows = [np.asarray(getattr(m, member), dtype=float) for _, m in same]
-        if all(len(row) == len(names) for row in rows):
-            values[kind] = np.array(rows)
+    rows = {kind: [np.asarray(getattr(m, member), dtype=float) for _, m in same]
+            for kind, member in MEMBERS.items()}  # fmt: skip
+    held = {kind: np.array(each) for kind, each in rows.items()
+            if all(len(row) == len(names) for row in each)}  # fmt: skip
     other = len(messages) - len(same)
     said = (
         f"{path}: {other} messages of {topic} have other joints than {', '.join(names)}: left out"
@@ -79,13 +77,9 @@ def log_of(path: Path, topic: str, messages: Sequence[tuple[int, Any]]) -> Log:
         source=str(path),
         title="ROS bag",
         line=np.arange(1, len(same) + 1),
-        values=values,
-        headers={
-            kind: tuple(f"{MEMBERS[kind]} of {n}" for n in names)
-            for kind in values
-            if kind in MEMBERS
-        },
-        units={kind: (SI[kind],) * len(names) for kind in values if kind in MEMBERS},
+        values={"t": time, **held},
+        headers={kind: tuple(f"{MEMBERS[kind]} of {n}" for n in names) for kind in held},
+        units={kind: (SI[kind],) * len(names) for kind in held},
         joints=names,
         notices=(said,) if other else (),
     )

@@ -1,11 +1,12 @@
-"""A table of a log as columns in SI, whatever tool wrote it."""
+"""A run, and how it is made of a log: its columns in SI, whatever tool wrote it, cut into runs."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,70 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.reading.formats import FORMATS, Format, Place, format_of
 from minimax_cal.reading.sheet import MOST_TORN, Sheet, cut, numbers_of, open_text
 from minimax_cal.reading.words import SIZES, near
+
+TORQUE = "N m"  # of a revolute joint; N of one that slides
+CURRENT = "A"
+NOTHING = ""  # where neither was logged, but commands
+ROWS = ("time", "q", "qd", "qdd", "torque", "temperature", "command")  # what has a value a row
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One trajectory of n joints at m times.
+
+    name: of the run, unique among those read together.  source: path of the file.
+    time: (m,) increasing, evenly spaced or not [s].
+    q: (m, n) joint values in the robot file's order, without jumps by whole turns [rad, m].
+    qd, qdd: (m, n) the controller's own derivatives, where it logged them [rad/s, rad/s^2].
+    torque: (m, n) measured at the joints or motors [unit]; 0 where it was not.
+    unit: TORQUE, CURRENT or NOTHING.
+    payload: mass at the flange, where it was reported [kg].
+    temperature: (m, n), or (m,) of the whole arm [C].
+    command: (m, n) joint values that were commanded, where all were logged [rad, m].
+    notices: what the reader should know about the log.
+    """
+
+    name: str
+    source: str
+    time: Array
+    q: Array
+    qd: Array | None
+    qdd: Array | None
+    torque: Array
+    unit: str
+    payload: float | None = None
+    temperature: Array | None = None
+    notices: tuple[str, ...] = ()
+    command: Array | None = None
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return int(self.q.shape[1])
+
+    @property
+    def duration(self) -> float:
+        """Time from the first row to the last [s]."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def step(self) -> float:
+        """Typical time between rows [s]."""
+        return float(np.median(np.diff(self.time)))
+
+    def at(self, rows: Array) -> Run:
+        """Some rows, time as it is.  rows: (m,) mask."""
+        return replace(self, **rows_of(self, ROWS, rows))
+
+
+def rows_of(record: Any, names: Sequence[str], rows: Array) -> dict[str, Any]:
+    """Some rows of fields of a record, None where it has none."""
+    every = {name: getattr(record, name) for name in names}
+    return {name: None if value is None else value[rows] for name, value in every.items()}
+
+
+# ---- a table -------------------------------------------------------------------------------------
+
 
 MOST_JOINTS = 100  # of any machine; guards against a number that is none of a joint
 MOST = 1e6  # of a joint value, speed, acceleration, torque or current, in any unit
@@ -316,9 +381,9 @@ class Columns:
             raise DataError(f"{path}:1: no column of time; name it t_s")
         time = values["t"] - values["t"][np.isfinite(values["t"])][:1].sum()
         step = typical_step(time)
-        unit = unit or next((u for u, f in TIMES.items() if is_step(f * step)), "")
+        other = next((u for u, f in TIMES.items() if is_step(f * step)), "")
+        unit = unit or other
         if step > 0.0 and not is_step(TIMES.get(unit, np.nan) * step):
-            other = next((u for u, f in TIMES.items() if is_step(f * step)), "")
             mend = f"; name it t_{other} if it is in {other}" if other else "; log 50 rows a second"
             raise DataError(
                 f"{path}: column of time: steps of {step:.3g} {unit or '(no unit)'} are no "
@@ -345,3 +410,134 @@ def typical_step(time: Array) -> float:
 def is_step(seconds: float) -> bool:
     """Whether rows of a log may follow each other so."""
     return SHORTEST_STEP <= seconds <= LONGEST_STEP
+
+
+# ---- a run in the making -------------------------------------------------------------------------
+
+
+TURN = 2.0 * np.pi
+COMMANDS = "q_cmd"
+DERIVATIVES = {"qd": "speeds", "qdd": "accelerations"}
+UNITS = {"tau": TORQUE, "i": CURRENT, COMMANDS: NOTHING}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Draft(Run):
+    """A run whose rows are still those of a log.
+
+    log: the file's columns.  kind: of its torque columns, tau or i, else q_cmd.  row: (m,) rows of
+    the log.
+    """
+
+    log: Log
+    kind: str
+    row: Array
+
+    @property
+    def measured(self) -> bool:
+        """Whether torques or currents were logged; else commands stand in their place."""
+        return self.kind != COMMANDS
+
+    def saying(self, *notices: str) -> Draft:
+        """With more notices."""
+        where = f"{self.log.source}: " + (f"run {self.name}: " if self.log.run else "")
+        return replace(self, notices=(*self.notices, *(where + text for text in notices)))
+
+    def column(self, kind: str, joint: int) -> str:
+        """The name of a joint's column in the file."""
+        return self.log.headers[kind][joint]
+
+    def line(self, row: int) -> int:
+        """The line of the file of a row."""
+        return int(self.log.line[self.row[row]])
+
+    def error(self, text: str, row: int | None = None) -> DataError:
+        """What is wrong, and where."""
+        at = "" if row is None else f":{self.line(row)}"
+        inside = f"run {self.name}: " if self.log.run and row is None else ""
+        return DataError(f"{self.log.source}{at}: {inside}{text}")
+
+    def keeping(self, rows: Array) -> Draft:
+        """The same at some rows only.  rows: (m,) mask."""
+        return replace(self, **rows_of(self, (*ROWS, "row"), rows))
+
+    def lines(self, rows: Array) -> str:
+        """Some lines of the file, to people."""
+        some = ", ".join(str(self.line(row)) for row in rows[:SHOWN])
+        return f"line{'s' * (len(rows) > 1)} {some}" + (" ..." if len(rows) > SHOWN else "")
+
+    def run(self) -> Run:
+        """The finished run.  Raises DataError for a payload that changes."""
+        values = {kind: value[self.row] for kind, value in self.log.values.items()}
+        payload = values.get("payload", np.empty(0))
+        payload = np.unique(payload[np.isfinite(payload)])
+        if len(payload) > 1:
+            raise self.error(
+                f"the payload changes from {payload[0]:g} to {payload[-1]:g} kg within a run; give "
+                "each payload a run of its own"
+            )
+        warmth = values.get("temperature")
+        more = {
+            "torque": self.torque if self.measured else 0.0 * self.torque,
+            "payload": float(payload[0]) if len(payload) else None,
+            "temperature": warmth if warmth is not None and np.isfinite(warmth).all() else None,
+            "command": commanded(values.get(COMMANDS), self.q),
+        }
+        return Run(**{each.name: getattr(self, each.name) for each in fields(Run)} | more)
+
+
+def commanded(values: Array | None, q: Array) -> Array | None:
+    """Commanded joint values (m, n) without the whole turns by which they differ from q (m, n)."""
+    if values is None or values.shape != q.shape or not np.isfinite(values).all():
+        return None
+    return values + TURN * np.round((q - values) / TURN)
+
+
+def drafts_of(log: Log, name: str) -> list[Draft]:
+    """The trajectories of a log, in the order of their first rows.  Raises DataError."""
+    kind = torque_kind(log)
+    values = log.values
+    labels = np.array(log.run) if log.run else np.full(len(log.line), "")
+    needed = (values["t"][:, None], values["q"], values[kind])
+    whole = np.all([np.isfinite(block).all(axis=1) for block in needed], axis=0)
+    if not whole.any():
+        lost = next(b for b in needed if not np.isfinite(b).all(axis=1).any())
+        what = "time" if lost is needed[0] else "joint value" if lost is needed[1] else "torque"
+        raise DataError(f"{log.source}: no row holds a {what} of every joint; log them together")
+    out = []
+    for label in dict.fromkeys(labels):
+        mine = labels == label
+        row = np.flatnonzero(mine & whole)
+        if not len(row):
+            raise DataError(f"{log.source}: run {label} holds no whole row; delete it")
+        own = {each: block[row] for each, block in values.items()}
+        torn = [each for each in DERIVATIVES if each in own and not np.isfinite(own[each]).all()]
+        qd, qdd = (None if each in torn else own.get(each) for each in DERIVATIVES)
+        title, time = f"{name}:{label}" if label else name, own["t"] - own["t"][0]
+        draft = Draft(title, log.source, time, own["q"], qd, qdd, own[kind], UNITS[kind],
+                      notices=log.notices, log=log, kind=kind, row=row)  # fmt: skip
+        if lost_rows := int(mine.sum()) - len(row):
+            lacking = f"{lost_rows} of {mine.sum()} rows lack a joint value or torque"
+            draft = draft.saying(f"{lacking}: left out")
+        said = (f"{DERIVATIVES[each]} lack in some rows: not used" for each in torn)
+        out.append(draft.saying(*said))
+    return out
+
+
+def torque_kind(log: Log) -> str:
+    """Which columns hold what the drives did.  Raises DataError where none do."""
+    for kind in ("tau", "i"):
+        if kind in log.values and np.isfinite(log.values[kind]).any():
+            return kind
+    if COMMANDS in log.values and log.values[COMMANDS].shape == log.values["q"].shape:
+        return COMMANDS
+    if log.values.keys() & {"tau_cmd", "i_cmd"}:
+        name = next(log.headers[k][0] for k in ("tau_cmd", "i_cmd") if k in log.values)
+        raise DataError(
+            f"{log.source}:1: {name} is the command; add the measured torque or current (tau1_Nm, "
+            "i1_A)"
+        )
+    raise DataError(
+        f"{log.source}:1: no column of torque or current; drive this motion and log tau1_Nm (or "
+        "i1_A), tau2_Nm, ..."
+    )

@@ -26,8 +26,7 @@ from minimax_cal.ground.words import visible
 from minimax_cal.measuring.history import numbered, visits
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.simulators.motion.result import MotionGap
-from minimax_cal.simulators.result import SimulatorGap
+from minimax_cal.simulators.result import MotionGap, SimulatorGap
 
 Result = (
     Fit

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from minimax_cal.simulators.motion.result import MotionGap
+    from minimax_cal.simulators.result import MotionGap
 
 ROW_INCHES = 1.7  # of a joint
 

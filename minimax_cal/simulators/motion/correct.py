@@ -11,57 +11,27 @@ from functools import partial
 import numpy as np
 
 from minimax_cal.dynamics.diagnose import MATTERS
-from minimax_cal.dynamics.laws import (
-    ARMATURE,
-    BRISTLES,
-    CURVE,
-    DELAY,
-    FRICTION,
-    GAIN,
-    LAWS,
-    LEVELLED,
-    MASSES,
-    MODULE,
-    SPRINGS,
-    WORDS,
-    Term,
-)
-from minimax_cal.dynamics.result import (
-    MotionDiagnosis,
-    MotionEffect,
-    best_worth,
-    changed_joints,
-)
+from minimax_cal.dynamics.laws import CURVE, IN_FILE, LAWS, WORDS, Element, Term
+from minimax_cal.dynamics.result import MotionDiagnosis, MotionEffect, changed_joints
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress
 from minimax_cal.robots.mjcf import is_driven
-from minimax_cal.simulators.motion.bristles import fit_bristles
-from minimax_cal.simulators.motion.fit import Asked, Study, fit_numbers
-from minimax_cal.simulators.motion.judge import Judge, Missed
-from minimax_cal.simulators.motion.module import installed, module_text
-from minimax_cal.simulators.motion.numbers import POWERS, Numbers, has_powers
-from minimax_cal.simulators.motion.opened import Opened
-from minimax_cal.simulators.motion.result import MotionRung, WrittenElement
-from minimax_cal.simulators.motion.written import SHORTEST, stiffen, unwritten, write_numbers
+from minimax_cal.simulators.chain import Chain
+from minimax_cal.simulators.motion.fit import Asked, Study, fit_bristles, fit_numbers
+from minimax_cal.simulators.motion.judge import Judge, Missed, installed, module_text
+from minimax_cal.simulators.motion.numbers import (
+    POWERS,
+    SHORTEST,
+    Numbers,
+    Opened,
+    has_powers,
+    stiffen,
+    unwritten,
+    write_numbers,
+)
+from minimax_cal.simulators.result import MotionRung, WrittenElement
 
-ATTRIBUTES = {  # of the elements, in the order in which they are shown
-    FRICTION: "frictionloss, damping",
-    MASSES: "inertial",
-    ARMATURE: "armature",
-    LEVELLED: "damping of v, v|v|, v^3",
-    SPRINGS: "stiffness, springref",
-    GAIN: "gear",
-    DELAY: "delay",
-    BRISTLES: "frictionloss, dcmotor with lugre",
-}
 STAYS = 1e-3  # fall of the mean log RMS torque by which an element stays
-LOST = {  # of an element, what readers of the file leave out, and which
-    LEVELLED: ("all but the first number of `damping`", "MJX, USD and SDF"),
-    SPRINGS: ("all but the first number of `stiffness`", "MJX, USD and SDF"),
-    DELAY: ("`delay`", "MJX, USD and SDF"),
-    BRISTLES: ("`dcmotor`, with which MJX loads no file", "USD and SDF"),
-    MODULE: ("what no element holds", "all simulators but MuJoCo"),
-}
 HISTORY_FIRST = "MuJoCo begins with 0 in the history of delayed commands: call mj_initCtrlHistory"
 BESIDE = 0.01  # the same, for a module beside the file, and of all rows for friction at rest
 
@@ -107,7 +77,7 @@ class Bench:
         """The model with what is asked for, fitted to the runs to learn from."""
         if asked not in self.made:
             numbers = fit_numbers(self.study, asked)
-            if BRISTLES in asked.elements:
+            if Element.BRISTLES in asked.elements:
                 numbers = self.with_bristles(numbers)
             return self.made_of(asked, numbers)
         return self.made[asked]
@@ -115,7 +85,11 @@ class Bench:
     def made_of(self, asked: Asked, numbers: Numbers) -> Candidate:
         """The model with these numbers, and how far it misses."""
         opened = self.written(numbers)
-        text = self.module(opened, numbers) if asked.laws else ""
+        text = self.module(opened.chain, numbers) if asked.laws else ""
+        return self.judged(asked, opened, numbers, text)
+
+    def judged(self, asked: Asked, opened: Opened, numbers: Numbers, text: str) -> Candidate:
+        """A model, and how far it misses with a module."""
         with installed(text, opened.chain):
             missed = self.judge.torque(opened.chain, numbers)
         self.made[asked] = Candidate(asked, numbers, opened, missed, text)
@@ -131,23 +105,18 @@ class Bench:
             found, chain = plain.numbers, plain.opened.chain
             chain = chain.in_model(copy(chain.model))
             study = self.study.of_file(chain, found.gain)
-            own = Asked((plain.asked.elements & {DELAY}) | {FRICTION}, laws=laws,
+            own = Asked((plain.asked.elements & {Element.DELAY}) | {Element.FRICTION}, laws=laws,
                         late=plain.asked.late)  # fmt: skip
-            numbers = fit_numbers(study, own).put(
-                bristles=found.bristles, yields=found.yields, damped=found.damped
-            )
+            numbers = fit_numbers(study, own).put(**found.at_rest)
             text = module_text(chain, numbers, study.scene.arm.gain, self.judge.arm.ratio)
-            numbers = numbers.put(gain=found.gain)
-            with installed(text, chain):
-                missed = self.judge.torque(chain, numbers)
             opened = replace(plain.opened, chain=chain)
-            self.made[asked] = Candidate(asked, numbers, opened, missed, text)
+            return self.judged(asked, opened, numbers.put(gain=found.gain), text)
         return self.made[asked] if laws else plain
 
     def with_bristles(self, numbers: Numbers) -> Numbers:
         """Numbers with bristles too, by the same runs."""
         opened = self.written(numbers)
-        with installed(self.module(opened, numbers) if numbers.laws else "", opened.chain):
+        with installed(self.module(opened.chain, numbers) if numbers.laws else "", opened.chain):
             off = self.judge.off(opened.chain, self.judge.learning, numbers)
         return fit_bristles(self.study, numbers, off)
 
@@ -169,53 +138,56 @@ class Bench:
             stiffen(document.root, self.opened.chain, numbers)
         return self.opened.again(document)
 
-    def module(self, opened: Opened, numbers: Numbers) -> str:
+    def module(self, chain: Chain, numbers: Numbers) -> str:
         """The text of the module for laws that no element holds."""
-        arm = self.judge.arm
-        return module_text(opened.chain, numbers, arm.gain, arm.ratio)
+        return module_text(chain, numbers, self.judge.arm.gain, self.judge.arm.ratio)
 
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """plain: with elements of the file alone.  full: with a module too, or the same.
+    """A corrected model, and what is said of it.
 
-    rungs: after the first.  notices: on links that could not be written.
+    rungs: after the first.  fitted: numbers of its body and the logs that told them, None without
+    torques.  module: text beside it.  lost: what other simulators leave out.
     """
 
-    plain: Candidate
-    full: Candidate
+    opened: Opened
     rungs: tuple[MotionRung, ...]
     elements: tuple[WrittenElement, ...]
+    fitted: tuple[Candidate, Study] | None
+    module: str
     left_out: tuple[str, ...]
     notices: tuple[str, ...]
+    lost: tuple[str, ...]
 
 
 def asked_of(found: MotionDiagnosis, bench: Bench) -> tuple[Asked, tuple[Term, ...]]:
     """Everything that elements may hold, and the laws that none holds."""
-    terms, model = found.models[-1].terms, bench.opened.chain.model
+    terms, chain = found.models[-1].terms, bench.opened.chain
     link = next((int(e.place[1:]) - 1 for e in found.effects
                  if e.effect in ("payload", "link_inertia") and e.worth), -1)  # fmt: skip
     late = found.models[-1].delay
     late += sum(float(term.value[0]) for term in terms if term.effect == "delay")
     of_command = late < 0.0 and bench.judge.commanded  # which the commands themselves show
-    if abs(late) < SHORTEST * float(model.opt.timestep) or of_command:
+    if abs(late) < SHORTEST * chain.step or of_command:
         late = 0.0
-    chain = bench.opened.chain
-    motors = [is_driven(model, joint) and chain.servo(joint) < 0 for joint in chain.joints]
-    geared = tuple(j for j in held_at(terms, GAIN) if motors[j])
-    curved = held_at(terms, LEVELLED) if has_powers(model) else ()
-    elements = {FRICTION, MASSES, ARMATURE}
-    sprung = held_at(terms, SPRINGS)
-    some = {LEVELLED: curved, SPRINGS: sprung, GAIN: geared, DELAY: late}
-    elements |= {name for name, where in some.items() if where}
+    pairs = zip(chain.joints, chain.servos, strict=True)
+    motors = [is_driven(chain.model, joint) and servo < 0 for joint, servo in pairs]
+    geared = tuple(j for j in held_at(terms, Element.GAIN) if motors[j])
+    curved = held_at(terms, Element.LEVELLED) if has_powers(chain.model) else ()
+    sprung = held_at(terms, Element.SPRINGS)
+    there = {Element.FRICTION: True, Element.MASSES: True, Element.ARMATURE: True,
+             Element.LEVELLED: curved, Element.SPRINGS: sprung, Element.GAIN: geared,
+             Element.DELAY: late}  # fmt: skip
+    elements = {one for one, where in there.items() if where}
     if bench.plain:
-        elements -= {LEVELLED, DELAY}
+        elements -= {Element.LEVELLED, Element.DELAY}
     bent = 1 if bench.plain else POWERS - 1
     asked = Asked(frozenset(elements), link, curved, sprung, geared, late=late, bent=bent)
-    return asked, tuple(term for term in terms if MODULE in term.law.held)
+    return asked, tuple(term for term in terms if Element.MODULE in term.law.held)
 
 
-def held_at(terms: Sequence[Term], element: str) -> tuple[int, ...]:
+def held_at(terms: Sequence[Term], element: Element) -> tuple[int, ...]:
     """Joints at which an element may hold a law."""
     return tuple(sorted({term.joint for term in terms if element in term.law.held}))
 
@@ -237,13 +209,14 @@ def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Correct
                     'the compiler inertiafromgeom="auto"' for name in names)  # fmt: skip
     elements = (*worths(bench, plain), *law_worths(bench, plain, full))
     left = tuple(left_out(found, whole.geared))
-    return Corrected(plain, full, rungs, elements, left, notices)
+    return Corrected(plain.opened, rungs, elements, (plain, bench.study), full.module, left,
+                     notices, tuple(lost(plain, full)))  # fmt: skip
 
 
 def first_choice(bench: Bench, whole: Asked, laws: tuple[Term, ...]) -> Candidate:
     """All elements and laws: with the masses of all links or of the one that changed."""
     if any(term.law.family == CURVE for term in laws):
-        whole = replace(whole, elements=whole.elements - {LEVELLED})  # the laws say it better
+        whole = whole.without(Element.LEVELLED)  # the laws say it better
     whole = replace(whole, laws=laws)
     best = bench.candidate(replace(whole, link=-1))
     if whole.link >= 0:
@@ -256,7 +229,7 @@ def by_elements(bench: Bench, full: Candidate, whole: Asked) -> Candidate:
     """Elements alone, with the masses that belong to the laws that none holds."""
     if not full.asked.laws:
         return full
-    elements = full.asked.elements | (whole.elements & {LEVELLED, FRICTION})
+    elements = full.asked.elements | (whole.elements & {Element.LEVELLED, Element.FRICTION})
     asked = replace(full.asked, elements=elements, laws=(), behind=full.asked.laws)
     return bench.candidate(asked)
 
@@ -270,9 +243,9 @@ def without_idle(bench: Bench, best: Candidate) -> Candidate:
     fewer: list[Callable[[Asked], Asked]] = [
         partial(without_law, effect=effect) for effect in effects_of(best.asked.laws)
     ]
-    fewer += [partial(Asked.without, element=name) for name in reversed(ATTRIBUTES)
+    fewer += [partial(Asked.without, element=name) for name in reversed(IN_FILE)
               if name in best.asked.elements]  # fmt: skip
-    fewer.append(lambda asked: asked.without(ARMATURE).without(MASSES))
+    fewer.append(lambda asked: asked.without(Element.ARMATURE).without(Element.MASSES))
     for less in fewer:
         bare = bench.candidate(less(best.asked))
         idle = bare.score < best.score + STAYS
@@ -283,15 +256,15 @@ def without_idle(bench: Bench, best: Candidate) -> Candidate:
 
 def at_rest(bench: Bench, plain: Candidate, full: Candidate) -> tuple[Candidate, Candidate]:
     """Both with the same bristles, if all rows gain by them, and more than moving ones lose."""
-    more = bench.candidate(full.asked.adding(BRISTLES))
+    more = bench.candidate(full.asked.adding(Element.BRISTLES))
     gain = mean_log(full.missed.whole) - mean_log(more.missed.whole)
     helps = gain > BESIDE + max(0.0, more.score - full.score)
     if not helps or bench.tracking(more) > bench.tracking(full) + STAYS:
         return plain, full
     if full is plain:
         return more, more
-    held = {name: getattr(more.numbers, name) for name in ("bristles", "yields", "damped")}
-    return bench.made_of(plain.asked.adding(BRISTLES), plain.numbers.put(**held)), more
+    numbers = plain.numbers.put(**more.numbers.at_rest)
+    return bench.made_of(plain.asked.adding(Element.BRISTLES), numbers), more
 
 
 def without_law(asked: Asked, effect: str) -> Asked:
@@ -308,8 +281,8 @@ def ladder(
     bench: Bench, plain: Candidate, full: Candidate, progress: Progress
 ) -> Iterator[MotionRung]:
     """A rung for each element, fitted with those before it, and for each effect of the module."""
-    taken = set[str]()
-    for name in ATTRIBUTES:
+    taken = set[Element]()
+    for name in IN_FILE:
         if name in plain.asked.elements:
             taken.add(name)
             asked = replace(plain.asked, elements=frozenset(taken))
@@ -329,13 +302,13 @@ def rung(bench: Bench, one: Candidate, name: str, progress: Progress) -> MotionR
 
 def worths(bench: Bench, plain: Candidate) -> Iterator[WrittenElement]:
     """What each element of the file is worth."""
-    for name, attributes in ATTRIBUTES.items():
+    for name in IN_FILE:
         if name in plain.asked.elements:
             bare = bench.candidate(plain.asked.without(name))
-            rows = "whole" if name == BRISTLES else "moving"
+            rows = "whole" if name == Element.BRISTLES else "moving"
             ends = (getattr(one.missed, rows) for one in (bare, plain))
             worth = changed_joints(*ends)
-            yield WrittenElement(name, "file", attributes, worth)
+            yield WrittenElement(name.value, "file", name.attributes, worth)
 
 
 def law_worths(bench: Bench, plain: Candidate, full: Candidate) -> Iterator[WrittenElement]:
@@ -347,26 +320,21 @@ def law_worths(bench: Bench, plain: Candidate, full: Candidate) -> Iterator[Writ
         yield WrittenElement(WORDS[effect], "module", f"at {where}", worth)
 
 
-def lost(made: Corrected) -> Iterator[str]:
+def lost(plain: Candidate, full: Candidate) -> Iterator[str]:
     """What other simulators leave out of the file, for people."""
-    numbers, elements = made.plain.numbers, made.plain.asked.elements
+    numbers, elements = plain.numbers, plain.asked.elements
     held = {
-        LEVELLED: numbers.damping[:, 1:].any(),
-        SPRINGS: numbers.stiffness[:, 1:].any(),
-        DELAY: DELAY in elements,
-        BRISTLES: numbers.bristles.any(),
-        MODULE: made.full.module,
+        Element.LEVELLED: numbers.damping[:, 1:].any(),
+        Element.SPRINGS: numbers.stiffness[:, 1:].any(),
+        Element.DELAY: Element.DELAY in elements,
+        Element.BRISTLES: numbers.bristles.any(),
+        Element.MODULE: full.module,
     }
     for name, is_there in held.items():
         if is_there:
-            yield left_out_by(name)
-    if DELAY in elements and numbers.late < 0.0:
+            yield name.left_out
+    if Element.DELAY in elements and numbers.late < 0.0:
         yield HISTORY_FIRST
-
-
-def left_out_by(element: str) -> str:
-    """Which readers of a file leave out an element."""
-    return f"{LOST[element][1]} leave out {LOST[element][0]} ({element}); see plain="
 
 
 def left_out(found: MotionDiagnosis, geared: Sequence[int]) -> Iterator[str]:
@@ -376,9 +344,10 @@ def left_out(found: MotionDiagnosis, geared: Sequence[int]) -> Iterator[str]:
     """
     for one in found.effects:
         law = LAWS.get(one.effect)
-        held = law and law.held and (law.held != (GAIN,) or int(one.place[1:]) - 1 in geared)
+        alone = law and law.held == (Element.GAIN,)
+        held = law and law.held and (not alone or int(one.place[1:]) - 1 in geared)
         if law and not held and not is_body(one):
-            joint, (without, with_it) = best_worth(one)
+            joint, (without, with_it) = one.best
             cost = f"{joint} {without:.3g} in place of {with_it:.3g} {found.unit}"
             yield f"{one.words}: {law.why} (costs {cost})"
     yield from (one.sentence(found.unit) for one in found.unexplained if one.share > MATTERS)

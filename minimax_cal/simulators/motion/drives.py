@@ -6,41 +6,58 @@ import math
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from minimax_cal.dynamics.drives import (
     DELAY,
     FIELDS,
+    FITTED,
+    FRICTION,
     GAINS,
+    IN_A_RUN,
+    INERTIA,
     KINDS,
     SPEED_LIMIT,
     Body,
     Drive,
     DriveFit,
     Followed,
+    covariance_of,
     fit_drive,
     is_another,
 )
-from minimax_cal.dynamics.laws import DELAY as LATE_IN_FILE
-from minimax_cal.dynamics.laws import WORDS
+from minimax_cal.dynamics.laws import WORDS, Element
+from minimax_cal.dynamics.logs.table import NOTHING
 from minimax_cal.dynamics.regressor import Motion
 from minimax_cal.dynamics.result import MotionEffect, changed_joints
-from minimax_cal.dynamics.run import NOTHING
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import RobotError
+from minimax_cal.ground.errors import OptionError, RobotError
+from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.measuring.faults.fault import Amount
 from minimax_cal.robots.document import Document
-from minimax_cal.robots.mjcf import mujoco, numbers
+from minimax_cal.robots.mjcf import numbers
 from minimax_cal.simulators.chain import Chain, braked
-from minimax_cal.simulators.elements import known, parents_of, section, tune
-from minimax_cal.simulators.given import IMPLICIT, elements_of
-from minimax_cal.simulators.motion.correct import HISTORY_FIRST, left_out_by, mean_log
-from minimax_cal.simulators.motion.driven import ahead_of
-from minimax_cal.simulators.motion.judge import Judge
-from minimax_cal.simulators.motion.opened import Opened
-from minimax_cal.simulators.motion.written import SHORTEST, actuators_of, delayed
+from minimax_cal.simulators.elements import forget, known, parents_of, section, tune
+from minimax_cal.simulators.mjcf import IMPLICIT, elements_of, servos_of
+from minimax_cal.simulators.motion.correct import HISTORY_FIRST, Candidate, Corrected, mean_log
+from minimax_cal.simulators.motion.fit import Study, fit_numbers
+from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge, ahead_of
+from minimax_cal.simulators.motion.numbers import (
+    SHORTEST,
+    Bodies,
+    Numbers,
+    Opened,
+    actuators_of,
+    delayed,
+    given_numbers,
+    write_numbers,
+)
+from minimax_cal.simulators.result import WrittenElement
 
 WORTH = 0.01  # fall of the mean log joint error by which an effect of a drive is kept
 OTHER_SHARE = 0.4  # fall of what is left, as a mean log, by which drives carry gravity otherwise
@@ -91,19 +108,13 @@ class Served:
 def own_drives(chain: Chain) -> tuple[Drive, ...]:
     """(n) the position servos of a model."""
     model, out = chain.model, []
-    for joint, name in zip(chain.joints, chain.names, strict=True):
-        servo = chain.servo(joint)
-        gear = float(model.actuator_gear[servo, 0])
-        kp, kv = (-float(model.actuator_biasprm[servo, k]) * gear**2 for k in (1, 2))
+    late = getattr(model, "actuator_delay", np.zeros(model.nu))[chain.servos].tolist()
+    gain, damper, limits = servos_of(chain)
+    for j, name in enumerate(chain.names):
         ahead = sum(float(model.actuator_gainprm[k, 0]) for k in ahead_of(model, (name,)))
-        limits = [math.inf]
-        if model.actuator_forcelimited[servo]:
-            limits.append(float(np.abs(model.actuator_forcerange[servo]).min() * abs(gear)))
-        if model.jnt_actfrclimited[joint]:
-            limits.append(float(np.abs(model.jnt_actfrcrange[joint]).min()))
-        late = float(getattr(model, "actuator_delay", np.zeros(model.nu))[servo])
-        whole = kv + ahead
-        out.append(Drive(kp, whole, ahead / whole if ahead else 0.0, late, min(limits)))
+        whole = float(damper[j]) + ahead
+        out.append(Drive(float(gain[j]), whole, ahead / whole if ahead else 0.0, late[j],
+                         float(np.abs(limits[j]).min())))  # fmt: skip
     return tuple(out)
 
 
@@ -132,7 +143,7 @@ class Fits:
         each = tuple(fit_drive(learnt, held, j, drive) for j, drive in enumerate(given))
         for j, fit in enumerate(each):
             rows = held.joint(j)
-            rest = rows.rest(fit.drive, fit.beside) if fit else rows.torque
+            rest = fit.rest(rows) if fit else rows.torque
             left.append(float((rest**2).sum()))
         return Fits(share, each, held, 0.5 * mean_log(np.array(left)))
 
@@ -147,10 +158,10 @@ def serve(judge: Judge, opened: Opened, *, plain: bool = False) -> Served:
 
     plain: without delays, which other simulators do not read.
     """
-    chain, least = opened.chain, SHORTEST * float(opened.chain.model.opt.timestep)
+    chain, least = opened.chain, SHORTEST * opened.chain.step
     own, damping, first = own_drives(chain), np.zeros(len(chain.dofs)), share_of(chain)
     if judge.held.unit == NOTHING:
-        damping = np.array(chain.model.dof_damping[chain.dofs])
+        damping = chain.model.dof_damping[chain.dofs]
     given = [replace(one, damper=one.damper + by) for one, by in zip(own, damping, strict=True)]
     body = body_of(chain)
     seen = followed(judge, body)
@@ -183,16 +194,15 @@ def damped_by_joints(judge: Judge, opened: Opened) -> bool:
     body = body_of(chain)
     fits = Fits.of(followed(judge, body), own_drives(chain), share_of(chain), body).each
     parts = [fit.drive.damper / damping[j] for j, fit in enumerate(fits) if fit]
-    return bool(parts) and float(np.median(parts)) < NO_DAMPER
+    return bool(parts) and np.median(parts) < NO_DAMPER
 
 
 def body_of(chain: Chain) -> Body:
     """Torque that the masses of a model alone take for a motion, whatever carries them."""
-    mj, model = mujoco(), copy(chain.model)
+    mj, model, data, at, dofs = replace(chain, model=copy(chain.model)).fresh()
     model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONSTRAINT)
     for name in ("dof_armature", "dof_damping", "jnt_stiffness", "body_gravcomp"):
         getattr(model, name)[:] = 0.0
-    data, at, dofs = mj.MjData(model), chain.places, chain.dofs
 
     def body(motion: Motion) -> Array:
         out = np.empty(motion.q.shape)
@@ -249,7 +259,7 @@ def effects_of(served: Served, judge: Judge, opened: Opened) -> Iterator[MotionE
 def lost_late(effects: Sequence[MotionEffect]) -> Iterator[str]:
     """What is to be said where a file has late commands, for people."""
     if any(one.effect == DELAY for one in effects):
-        yield left_out_by(LATE_IN_FILE)
+        yield Element.DELAY.left_out
         yield HISTORY_FIRST
 
 
@@ -274,12 +284,12 @@ def with_drives(opened: Opened, served: Served, kinds: Sequence[str] = KINDS) ->
 def write_drives(document: Document, chain: Chain, drives: Sequence[Drive]) -> None:
     """Give the servos of a model the numbers of drives, where these are others than it has."""
     root, model = document.root, chain.model
-    step, floating = float(model.opt.timestep), bool(model.body_gravcomp[chain.bodies[0]])
+    step, floating = chain.step, bool(model.body_gravcomp[chain.bodies[0]])
     joints = elements_of(root, chain)
     for j, (drive, own) in enumerate(zip(drives, own_drives(chain), strict=True)):
         name, number = chain.names[j], chain.joints[j]
         servo = next(e for e in actuators_of(root, name) if e.tag in ("position", "general"))
-        gear = float(model.actuator_gear[chain.servo(number), 0])
+        gear = model.actuator_gear[chain.servo(number), 0]
         regulated = drive.taking(own, GAINS) != drive
         if regulated:
             tune(servo, drive.stiffness / gear**2, (1.0 - drive.ahead) * drive.damper / gear**2)
@@ -290,7 +300,7 @@ def write_drives(document: Document, chain: Chain, drives: Sequence[Drive]) -> N
         for actuator in actuators_of(root, name) if regulated or drive.delay != own.delay else ():
             write_late(actuator, drive.delay, step)
     shaken = np.array([d.damper for d in drives]) * step * model.dof_invweight0[chain.dofs]
-    if int(model.opt.integrator) not in IMPLICIT and shaken.max() > SHAKES:
+    if model.opt.integrator not in IMPLICIT and shaken.max() > SHAKES:
         section(root, "option").set("integrator", "implicitfast")
 
 
@@ -306,10 +316,7 @@ def write_ahead(root: ET.Element, joint: str, gain: float) -> None:
     if gain:
         known(section(root, "actuator"), "velocity", f"{joint}_ahead", joint=joint, kv=gain)
         return
-    for part in root.iter("actuator"):
-        for old in part.findall("velocity"):
-            if old.get("name") == f"{joint}_ahead":
-                part.remove(old)
+    forget(root, "actuator", "velocity", f"{joint}_ahead")
 
 
 def write_late(actuator: ET.Element, late: float, step: float) -> None:
@@ -331,7 +338,217 @@ def write_share(root: ET.Element, chain: Chain, share: float) -> None:
 def can_write(opened: Opened) -> bool:
     """Whether every joint has a servo of its own that can be given other numbers."""
     chain, root = opened.chain, opened.given.document.root
-    servos = [chain.servo(joint) for joint in chain.joints]
     tags = [{e.tag for e in actuators_of(root, name)} for name in chain.names]
     named = all({"position", "general"} & some for some in tags)
-    return named and not chain.model.actuator_dyntype[servos].any()
+    return named and not chain.model.actuator_dyntype[chain.servos].any()
+
+
+# ---- actuators and ranges ------------------------------------------------------------------------
+
+
+UNITS = {name: unit for fields in FIELDS.values() for name, unit in fields.items()}
+ELEMENTS = {  # of the body, their names and units, and how they stand in `Numbers`
+    Element.FRICTION: (("friction", "N m"), ("damping", "N m s/rad")),
+    Element.ARMATURE: (("armature", "kg m^2"),),
+}
+ISAAC = '''"""Actuators of {name} for Isaac Lab, whose physics steps are of {step} s.
+
+A drive whose feed_forward is s wants s times the commanded speed as its velocity target.
+feed_forward = {ahead}
+"""
+
+from isaaclab.actuators import DelayedPDActuatorCfg
+
+ACTUATORS = {{
+{entries}}}
+'''
+
+
+def as_actuators(chain: Chain, served: Served | None) -> list[dict[str, Any]]:
+    """Of a model as it is written, joint by joint, in SI, limits infinite where there are none.
+
+    served: what its logs say of speeds that no model holds.
+    """
+    dofs, step = chain.dofs, chain.step
+    fits = served.fits if served else (None,) * len(dofs)
+    held = ("dof_armature", "dof_frictionloss", "dof_damping")
+    body = np.array([getattr(chain.model, name)[dofs] for name in held]).T.tolist()
+    return [
+        {"joint": name, "stiffness": drive.stiffness, "damping": drive.damper,
+         "feed_forward": drive.ahead, "armature": own[0], "friction": own[1],
+         "viscous_friction": own[2], "effort_limit": drive.torque,
+         "velocity_limit": fit.drive.speed if fit else math.inf, "delay": drive.delay,
+         "delay_steps": round(drive.delay / step)}
+        for name, drive, own, fit in zip(chain.names, own_drives(chain), body, fits, strict=True)
+    ]  # fmt: skip
+
+
+def actuators_text(found: list[dict[str, Any]], step: float, name: str) -> dict[str, str]:
+    """The files that can be written, by their format."""
+    content = {"schema": 1, "kind": "actuators", "model": name, "timestep": step, "joints": found}
+    entries = ""
+    for late in sorted({one["delay_steps"] for one in found}):
+        some = [one for one in found if one["delay_steps"] == late]
+        fields: dict[str, Any] = {"joint_names_expr": [one["joint"] for one in some]}
+        for of in ("stiffness", "damping", "armature", "friction", "viscous_friction",
+                   "effort_limit", "velocity_limit"):  # fmt: skip
+            fields[of] = {o["joint"]: o[of] for o in some if math.isfinite(o[of])} or None
+        fields |= {"dynamic_friction": fields["friction"], "min_delay": late, "max_delay": late}
+        entries += f'    "delay_{late}": DelayedPDActuatorCfg(\n'
+        entries += "".join(f"        {key}={value!r},\n" for key, value in fields.items())
+        entries += "    ),\n"
+    ahead = {one["joint"]: one["feed_forward"] for one in found}
+    isaac = ISAAC.format(name=name, step=step, ahead=ahead, entries=entries)
+    return {"json": json_text(plain(content)), "isaac": isaac}
+
+
+def write_actuators(path: Path | str, form: str, chain: Chain, served: Served | None) -> None:
+    """Write the actuators of a model in a format that simulators take."""
+    step, found = chain.step, as_actuators(chain, served)
+    write_whole(Path(path), actuators_text(found, step, chain.robot.name)[form])
+
+
+# ---- ranges ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Ranged:
+    """Numbers of a kind, with their covariance (p, p) and their spread between runs (p,)."""
+
+    names: tuple[tuple[str, str, str], ...]
+    mean: Array
+    covariance: Array
+    between: Array
+
+
+def of_drives(served: Served, joints: tuple[str, ...], count: int) -> Ranged:
+    """Gains and delays, by stretches of the runs left out in turn.  count: of the runs."""
+    told = [(fit, k, (name, joint, UNITS[name]), getattr(drive, name))
+            for joint, fit, drive in zip(joints, served.fits, served.drives(), strict=True) if fit
+            for k, name in enumerate(FITTED) if (fit.change[:, k] != 0.0).any()]  # fmt: skip
+    every = sorted({stretch for fit, *_ in told for stretch in fit.stretch.tolist()})
+    changes = [dict(zip(fit.stretch.tolist(), fit.change[:, k], strict=True))
+               for fit, k, *_ in told]  # fmt: skip
+    change = np.array([[one.get(stretch, 0.0) for one in changes] for stretch in every])
+    change = change.reshape(len(every), len(changes))
+    run = np.array(every, dtype=int) // IN_A_RUN
+    by_run = np.array([change[run == number].sum(axis=0) for number in range(count)])
+    covariance = covariance_of(change) if every else np.zeros((0, 0))
+    names, mean = tuple(name for *_, name, _ in told), np.array([one[-1] for one in told])
+    return Ranged(names, mean, covariance, spread(by_run))
+
+
+def spread(change: Array) -> Array:
+    """(p,) between runs, of the changes (r, p) without each; NaN of a single run."""
+    if len(change) < 2:
+        return np.full(change.shape[1:], np.nan)
+    return np.asarray((len(change) - 1.0) * np.std(change, axis=0, ddof=1))
+
+
+def of_body(made: Candidate, study: Study, joints: tuple[str, ...]) -> Ranged:
+    """Friction, damping and armature that were fitted, each run left out in turn."""
+    kinds = [one for one in ELEMENTS if one in made.asked.elements]
+    names = tuple((name, joint, unit) for kind in kinds for name, unit in ELEMENTS[kind]
+                  for joint in joints)  # fmt: skip
+
+    def values(numbers: Numbers) -> Array:
+        each = (getattr(numbers, name) for kind in kinds for name, _ in ELEMENTS[kind])
+        return np.concatenate([[], *(one.reshape(len(joints), -1)[:, 0] for one in each)])
+
+    mean, runs = values(made.numbers), range(len(study.scene.logs.names))
+    if len(runs) < 2 or not names:
+        unknown = np.full(len(names), np.nan)
+        return Ranged(names, mean, np.diag(unknown), unknown)
+    studies = (study.only([run for run in runs if run != out]) for out in runs)
+    asked = replace(made.asked, behind=())
+    change = np.array([values(fit_numbers(one, asked)) - mean for one in studies])
+    whole = (len(runs) - 1.0) / len(runs) * change.T @ change
+    return Ranged(names, mean, whole, spread(change))
+
+
+def write_ranges(
+    path: Path | str,
+    fitted: tuple[Candidate, Study] | None,
+    served: Served | None,
+    joints: tuple[str, ...],
+    count: int,
+) -> None:
+    """Write mean, deviation and spread of what was fitted, and the covariance of all of it.
+
+    fitted: numbers of the body and the logs that told them.  count: of the runs to learn from.
+    """
+    parts = [of_drives(served, joints, count)] if served else []
+    parts += [of_body(*fitted, joints)] if fitted else []
+    whole = block_diag(*(part.covariance for part in parts))
+    sigma = iter(np.sqrt(np.diag(whole)).tolist())
+    parameters = [
+        {"name": name, "joint": joint, "mean": mean, "sigma": next(sigma),
+         "between_runs": float(between), "unit": unit}
+        for part in parts
+        for (name, joint, unit), mean, between in zip(part.names, part.mean, part.between,
+                                                      strict=True)
+    ]  # fmt: skip
+    content = {"schema": 1, "kind": "ranges", "parameters": parameters, "covariance": whole}
+    write_whole(Path(path), json_text(plain(content)))
+
+
+# ---- by commands and positions alone -------------------------------------------------------------
+
+
+HELD = {  # of the body, by their fields of `Numbers`: what was fitted beside drives, attributes
+    Element.FRICTION: (FRICTION, "frictionloss"),
+    Element.ARMATURE: (INERTIA, "armature"),
+}
+SCALE = (
+    "commands and positions without torques: gains, friction and rotors are those for the masses "
+    "of the model; were all masses k times as large, so would these be, and no position would "
+    "change; a torque, or a weighed arm, tells k; dampers of servo and joint stand as one"
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Answer(Corrected):
+    """A corrected model with its drives, and what each effect of these is worth."""
+
+    served: Served | None = None
+    effects: tuple[MotionEffect, ...] = ()
+
+
+def by_positions(judge: Judge, opened: Opened, *, plain: bool) -> Answer:
+    """What lowers the joint error under the logged commands, each step of it.
+
+    Raises OptionError without servos to correct.
+    """
+    if judge.drives != OWN_SERVOS or not can_write(opened):
+        raise OptionError(
+            f"{judge.runs[0].source}: no column of torque or current: then every run needs "
+            "commands of all joints (q1_cmd_rad, ...), and the model position servos"
+        )
+    served, names = serve(judge, opened, plain=plain), tuple(HELD)
+    served = kept(served, judge, with_body(opened, served, names))
+    for name in reversed(names):
+        less = tuple(one for one in names if one != name)
+        bare, whole = (joint_error(judge, with_body(opened, served, some), served)
+                       for some in (less, names))  # fmt: skip
+        names = less if bare < whole + WORTH else names
+    effects = tuple(effects_of(served, judge, with_body(opened, served, names)))
+    steps = list(steps_with(served, effects, opened))
+    driven = with_drives(opened, served)
+    steps += [(f"+ {name}", with_body(driven, served, names[: number + 1]))
+              for number, name in enumerate(names)]  # fmt: skip
+    rungs = tuple(judge.rung(name, one.chain) for name, one in steps)
+    elements = tuple(WrittenElement(name.value, "file", HELD[name][1], {}) for name in names)
+    return Answer(with_body(driven, served, names), rungs, elements, None, "", (), (SCALE,),
+                  tuple(lost_late(effects)), served=served, effects=effects)  # fmt: skip
+
+
+def with_body(opened: Opened, served: Served, names: Sequence[Element]) -> Opened:
+    """The model with friction and rotors that were fitted beside the drives."""
+    document = opened.given.document.copy()
+    new = given = given_numbers(opened.chain, Bodies.of(opened.chain))
+    for name in names:
+        values = [old if fit is None else max(fit.beside[HELD[name][0]], 0.0)
+                  for fit, old in zip(served.fits, getattr(given, name), strict=True)]  # fmt: skip
+        new = new.put(**{name: np.array(values)})
+    write_numbers(document, opened.chain, given, new)
+    return opened.again(document)

@@ -10,28 +10,25 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from minimax_cal.dynamics.laws import (
-    ARMATURE,
-    DELAY,
-    FRICTION,
-    GAIN,
-    LEVELLED,
-    MASSES,
-    SPRINGS,
-    Term,
-)
+from minimax_cal.dynamics.laws import Element, Term
+from minimax_cal.dynamics.model import Columns, held_friction, solve_scaled
 from minimax_cal.dynamics.regressor import PER_LINK
-from minimax_cal.dynamics.rows import Logs, Whitening, whitening
-from minimax_cal.dynamics.scene import Arm, Scene
-from minimax_cal.dynamics.search import Columns, generous, solve_scaled
+from minimax_cal.dynamics.rows import YIELD, Arm, Logs, Scene, Whitening
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.simulators.chain import Chain
-from minimax_cal.simulators.motion.bodies import Bodies, inertial, physical
-from minimax_cal.simulators.motion.numbers import POWERS, Numbers, given_numbers
+from minimax_cal.simulators.motion.numbers import (
+    POWERS,
+    Bodies,
+    Numbers,
+    given_numbers,
+    inertial,
+    physical,
+)
 
 PRIOR = 0.5  # standard deviation of a body's log-Cholesky coordinates about the model's
 PRIOR_ASSUMED = 1.5  # the same where the masses of the model are assumed
@@ -55,7 +52,7 @@ class Asked:
     gain is off.  laws: that no element holds.  bent: powers of the angle in a spring's torque.
     """
 
-    elements: frozenset[str]
+    elements: frozenset[Element]
     link: int = -1
     curved: tuple[int, ...] = ()
     sprung: tuple[int, ...] = ()
@@ -65,25 +62,28 @@ class Asked:
     late: float = 0.0
     bent: int = POWERS - 1
 
-    def adding(self, element: str) -> Asked:
+    def adding(self, element: Element) -> Asked:
         """With one element more."""
         return replace(self, elements=self.elements | {element})
 
-    def without(self, element: str) -> Asked:
+    def without(self, element: Element) -> Asked:
         """All but one element."""
         return replace(self, elements=self.elements - {element})
 
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """A number of one joint.  rows: (M,) torque of the log per unit.  low: its least value.
+    """A number of one joint.  rows: (M,) torque of the log per unit.
 
-    mean, sd: of its prior, sd infinite for none.
+    field, at, by: what it adds to of `Numbers`, there, per unit.  low: its least value.  mean, sd:
+    of its prior, sd infinite for none.
     """
 
-    kind: str
+    field: str
     joint: int
     rows: Array
+    at: Any
+    by: Array | float = 1.0
     low: float = 0.0
     mean: float = 0.0
     sd: float = np.inf
@@ -109,32 +109,30 @@ class Study:
 
     @staticmethod
     def of(chain: Chain, arm: Arm, logs: Logs, terms: tuple[Term, ...], inertia: Array,
-           *, assumed: bool) -> Study:  # fmt: skip
-        """Of the logs to learn from.  terms: the laws of a diagnosis."""
-        bodies, given, columns = begun(chain, arm, logs)
-        white = whitening(logs, generous(columns, terms))
+           prior: float, white: Whitening | None = None) -> Study:  # fmt: skip
+        """Of the logs to learn from.  white: by the laws, unless given."""
+        bodies, scene = Bodies.of(chain), Scene.of(arm, logs)
+        given = given_numbers(chain, bodies)
+        columns = Columns(scene.with_body(of_all(bodies.links(given.bodies)), scene.friction))
+        white = white or columns.whitening(terms)
         links = white.white(columns.links[white.kept])
-        prior = PRIOR_ASSUMED if assumed else PRIOR
         return Study(chain, bodies, given, columns.scene, white, links, inertia, prior, terms)
 
     def only(self, runs: Sequence[int]) -> Study:
         """Of some of the runs."""
-        logs, assumed = self.scene.logs.only(runs), self.prior == PRIOR_ASSUMED
-        return Study.of(self.chain, self.scene.arm, logs, self.terms, self.inertia, assumed=assumed)
+        arm, logs = self.scene.arm, self.scene.logs.only(runs)
+        return Study.of(self.chain, arm, logs, self.terms, self.inertia, self.prior)
 
     def of_file(self, chain: Chain, gain: Array) -> Study:
         """The same logs, for a written model.  gain: (n,) of its drives over those of the logs."""
-        arm = replace(self.scene.arm, gain=self.scene.arm.gain / gain)
-        bodies, given, columns = begun(chain, arm, self.scene.logs)
-        links = self.white.white(columns.links[self.white.kept])
-        return replace(self, chain=chain, bodies=bodies, given=given, scene=columns.scene,
-                       links=links)  # fmt: skip
+        arm, logs = replace(self.scene.arm, gain=self.scene.arm.gain / gain), self.scene.logs
+        return Study.of(chain, arm, logs, self.terms, self.inertia, self.prior, self.white)
 
     def error(self, late: float) -> Array:
         """(N,) whitened torques less those of a known payload; so much earlier [s]."""
         logs = self.scene.logs.earlier(late) if late else self.scene.logs
         known = logs.filtered(self.scene.known_torque)
-        return np.asarray(self.white.white((logs.y - known).T[self.white.kept]))
+        return self.white.white((logs.y - known).T[self.white.kept])
 
     def with_masses(self, found: Numbers) -> Study:
         """The same logs, for a model that has masses and armature already."""
@@ -143,14 +141,6 @@ class Study:
         given = self.given.put(bodies=own, armature=found.armature)
         scene = self.scene.with_body(of_all(bodies.links(own)), self.scene.friction)
         return replace(self, bodies=bodies, given=given, scene=scene)
-
-
-def begun(chain: Chain, arm: Arm, logs: Logs) -> tuple[Bodies, Numbers, Columns]:
-    """What a model has, and columns of logs of its arm with its masses."""
-    bodies = Bodies.of(chain)
-    given, scene = given_numbers(chain, bodies), Scene.of(arm, logs)
-    rigid = of_all(bodies.links(given.bodies))
-    return bodies, given, Columns(scene.with_body(rigid, scene.friction))
 
 
 def of_all(links: Array) -> Array:
@@ -163,9 +153,9 @@ def fit_numbers(study: Study, asked: Asked) -> Numbers:
     if asked.behind:
         whole = replace(asked, laws=asked.behind, behind=())
         study = study.with_masses(fit_numbers(study, whole))
-        asked = replace(asked, behind=(), elements=asked.elements - {MASSES, ARMATURE})
+        asked = replace(asked, behind=()).without(Element.MASSES).without(Element.ARMATURE)
     scene, numbers = study.scene, study.given.put(fastest=study.scene.arm.fastest)
-    late = asked.late if DELAY in asked.elements else 0.0
+    late = asked.late if Element.DELAY in asked.elements else 0.0
     error = study.error(late)
     for _ in range(ROUNDS):
         columns = list(columns_of(study, scene, asked))
@@ -179,27 +169,27 @@ def columns_of(study: Study, scene: Scene, asked: Asked) -> Iterator[Column]:
     motion, unit, given = scene.logs.motion, scene.divisor, study.given
     for j in range(given.joints):
         qd, qdd = motion.qd[:, j], motion.qdd[:, j]
-        if FRICTION in asked.elements:
-            yield Column("friction", j, scene.sense[:, j] / unit[j])
-            yield Column("damping", j, qd / unit[j])
-        if LEVELLED in asked.elements and j in asked.curved:
+        if Element.FRICTION in asked.elements:
+            yield Column("friction", j, scene.sense[:, j] / unit[j], j)
+            yield Column("damping", j, qd / unit[j], (j, 0))
+        if Element.LEVELLED in asked.elements and j in asked.curved:
             for share in LEVELS_OFF:
                 powers = levelling(share * scene.arm.fastest[j])
-                yield Column(f"curve {share}", j, speeds(qd) @ powers / unit[j])
-        if ARMATURE in asked.elements:
+                yield Column("damping", j, speeds(qd) @ powers / unit[j], j, powers)
+        if Element.ARMATURE in asked.elements:
             whole = unit[j] * np.abs(scene.logs.torque[:, j]).max() / np.abs(qdd).max()
             doubt = max(given.armature[j], ROTOR * study.inertia[j], ROTOR * whole)
-            yield Column("armature", j, qdd / unit[j], mean=given.armature[j], sd=doubt)
-        if SPRINGS in asked.elements and j in asked.sprung:
+            yield Column("armature", j, qdd / unit[j], j, mean=given.armature[j], sd=doubt)
+        if Element.SPRINGS in asked.elements and j in asked.sprung:
             for power in range(asked.bent + 1):
-                yield Column(f"spring {power}", j, motion.q[:, j] ** power / unit[j], -np.inf)
-        if GAIN in asked.elements and j in asked.geared:
-            yield Column("gain", j, scene.load[:, j], -np.inf)
+                rows = motion.q[:, j] ** power / unit[j]
+                yield Column("spring", j, rows, (j, power), low=-np.inf)
+        if Element.GAIN in asked.elements and j in asked.geared:
+            yield Column("gain", j, scene.load[:, j], j, low=-np.inf)
     for number, term in enumerate(asked.laws):
-        rows = term.columns(scene)
         low = 0.0 if term.law.nonnegative else -np.inf
-        for k in range(rows.shape[1]):
-            yield Column(f"law {number} {k}", term.joint, rows[:, k], low)
+        for rows in term.columns(scene).T:
+            yield Column("law", term.joint, rows, number, low=low)
 
 
 def speeds(qd: Array) -> Array:
@@ -212,21 +202,28 @@ def levelling(speed: float) -> Array:
     return np.array([1.0, -1.0 / speed, 1.0 / (3.0 * speed**2)])
 
 
+def kept_numbers(study: Study, asked: Asked) -> Numbers:
+    """The model's own numbers, 0 where they are fitted."""
+    given, fitted = study.given, asked.elements
+    own, free = Element.FRICTION not in fitted, asked.sprung if Element.SPRINGS in fitted else ()
+    stiffness = given.stiffness.copy()
+    stiffness[list(free)] = 0.0
+    return given.put(
+        friction=given.friction * own,
+        damping=given.damping * own,
+        bristles=given.bristles * own,
+        armature=given.armature * (Element.ARMATURE not in fitted),
+        stiffness=stiffness,
+    )
+
+
 def standing(study: Study, asked: Asked) -> Array:
     """(M, n) torque of what the model has and is not fitted [N m]."""
-    given, motion = study.given, study.scene.logs.motion
-    out = np.zeros_like(motion.q)
-    if FRICTION not in asked.elements:
-        out += given.friction * study.scene.sense
-        out += np.einsum("mjp,jp->mj", speeds(motion.qd), given.damping)
-    if ARMATURE not in asked.elements:
-        out += given.armature * motion.qdd
-    x = motion.q - given.rest
-    springs = sum(given.stiffness[:, p] * x ** (p + 1) for p in range(POWERS))
-    free = [j for j in range(given.joints) if SPRINGS in asked.elements and j in asked.sprung]
-    springs = np.array(springs)
-    springs[:, free] = 0.0
-    return np.asarray(out + springs)
+    own, motion = kept_numbers(study, asked), study.scene.logs.motion
+    out = own.friction * study.scene.sense + own.armature * motion.qdd
+    out += np.einsum("mjp,jp->mj", speeds(motion.qd), own.damping)
+    x = motion.q - own.rest
+    return np.asarray(sum((own.stiffness[:, p] * x ** (p + 1) for p in range(POWERS)), out))
 
 
 def solved(
@@ -262,7 +259,7 @@ def joint_fit(
     links, linear, right = rows
     n, k = study.bodies.count, len(columns)
     free = np.zeros((n, PER_LINK), dtype=bool)
-    if MASSES in asked.elements:
+    if Element.MASSES in asked.elements:
         free[:] = np.arange(n)[:, None] == asked.link if asked.link >= 0 else True
     mean, sd, low = (np.array([getattr(c, name) for c in columns]).reshape(k)
                      for name in ("mean", "sd", "low"))  # fmt: skip
@@ -315,14 +312,14 @@ def least_within(
             new = np.maximum(new, least)
             with np.errstate(over="ignore", invalid="ignore"):  # too far a step is refused
                 after = residual(new)
-                gained = float(left @ left - after @ after)
+                gained = left @ left - after @ after
             if gained >= 0.0:
                 break
             damping *= 10.0
         if not gained >= 0.0:
             return x
         x, left, damping = new, after, max(0.1 * damping, LEAST_DAMPING)
-        if gained <= CLOSE * float(left @ left):
+        if gained <= CLOSE * (left @ left):
             break
     return x
 
@@ -330,8 +327,7 @@ def least_within(
 def damped_step(gram: Array, pull: Array, damping: float, free: Array) -> Array:
     """(p,) step of the free ones; 0 of the others."""
     out = np.zeros(len(pull))
-    if free.any():
-        out[free] = -solve_scaled(gram[np.ix_(free, free)], pull[free], damping)
+    out[free] = -solve_scaled(gram[np.ix_(free, free)], pull[free], damping)
     return out
 
 
@@ -344,45 +340,26 @@ def numbers_of(
     before: Numbers,
 ) -> Numbers:
     """What was fitted, and the model's own for the rest; all at the joints."""
-    given, n = study.given, study.given.joints
-    friction, damping = given.friction.copy(), given.damping.copy()
-    armature, gain = given.armature.copy(), np.ones(n)
-    spring = np.zeros((n, POWERS))
-    if FRICTION in asked.elements:
-        friction[:], damping[:] = 0.0, 0.0
-    laws: list[list[float]] = [[] for _ in asked.laws]
+    own, n = kept_numbers(study, asked), study.given.joints
+    found = {name: getattr(own, name).copy() for name in ("friction", "damping", "armature")}
+    found |= {"gain": np.ones(n), "spring": np.zeros((n, POWERS))}
     for column, one in zip(columns, value, strict=True):
-        kind, j = column.kind, column.joint
-        match kind.split():
-            case ["friction"]:
-                friction[j] = one
-            case ["damping"]:
-                damping[j, 0] += one
-            case ["curve", share]:
-                damping[j] += one * levelling(float(share) * before.fastest[j])
-            case ["armature"]:
-                armature[j] = one
-            case ["spring", power]:
-                spring[j, int(power)] = one
-            case ["gain"]:
-                gain[j] += one
-            case ["law", number, _]:
-                laws[int(number)].append(float(one))
-    stiffness, rest = given.stiffness.copy(), given.rest.copy()
-    for j in asked.sprung if SPRINGS in asked.elements else ():
+        if column.field in found:
+            found[column.field][column.at] += one * column.by
+    gain, spring = found.pop("gain"), found.pop("spring")
+    stiffness, rest = own.stiffness, own.rest.copy()
+    for j in asked.sprung if Element.SPRINGS in asked.elements else ():
         stiffness[j], rest[j] = spring_of(spring[j] / gain[j])
-    per = gain[:, None]
+    law = np.array([column.at if column.field == "law" else -1 for column in columns])
     return before.put(
+        **{name: (one.T / gain).T for name, one in found.items()},
         bodies=bodies,
-        friction=friction / gain,
-        bristles=before.bristles * (FRICTION not in asked.elements),
-        damping=damping / per,
-        armature=armature / gain,
+        bristles=own.bristles,
         stiffness=stiffness,
         rest=rest,
         gain=gain,
         laws=asked.laws,
-        value=tuple(np.array(one) for one in laws),
+        value=tuple(value[law == number] for number in range(len(asked.laws))),
     )
 
 
@@ -432,9 +409,9 @@ def softness(chain: Chain, numbers: Numbers) -> tuple[Array, Array]:
     """(n,) D [kg m^2] and b [1/s] of the friction of each joint, as a model has it."""
     model = chain.model
     dofs = chain.dofs
-    reference, impedance = np.array(model.dof_solref[dofs]), np.array(model.dof_solimp[dofs])
+    reference, impedance = model.dof_solref[dofs], model.dof_solimp[dofs]
     start, end = np.clip(impedance[:, :2].T, *IMPEDANCES)
-    time = np.maximum(reference[:, 0], 2.0 * float(model.opt.timestep))
+    time = np.maximum(reference[:, 0], 2.0 * chain.step)
     rate = np.where(reference[:, 0] > 0.0, 2.0 / (end * time), -reference[:, 1] / end)
     return start / (1.0 - start) / weights(chain, numbers), rate
 
@@ -450,3 +427,38 @@ def weights(chain: Chain, numbers: Numbers) -> Array:
     model.dof_armature[dofs] = numbers.armature
     mj.mj_setConst(model, mj.MjData(model))
     return np.asarray(np.maximum(model.dof_invweight0[dofs], 1e-15))
+
+
+# ---- friction at rest ----------------------------------------------------------------------------
+
+
+STABLE = 0.3  # timestep times frequency of a joint on its bristles, at most
+DAMPED = 0.02  # of critical damping; 0.5 and more do worse than no bristle
+BRISTLE_ROUNDS = 2  # of fits, each with the ways of the one before
+
+
+def has_bristles() -> bool:
+    """Whether this MuJoCo has motors without input."""
+    return hasattr(mujoco(), "mjtCtrlInput")
+
+
+def fit_bristles(study: Study, numbers: Numbers, missed: Array) -> Numbers:
+    """Numbers with bristles, by what the model misses on the runs to learn from (R, n).
+
+    A bristle of friction F that yields after a way L [Dahl 1968] is MuJoCo's `dcmotor` without
+    input, whose friction is of LuGre, of stiffness F / L and the same at every speed.  MuJoCo takes
+    its force at the beginning of a step: L is longer where the inertia of the joint and the
+    timestep ask for it.  A damper keeps a joint from creeping, and brakes where it turns round:
+    DAMPED is a small share of the critical one.
+    """
+    scene = with_numbers(study, study.scene, numbers)
+    inertia = 1.0 / weights(study.chain, numbers)
+    yields = np.broadcast_to(YIELD, numbers.bristles.shape)
+    for _ in range(BRISTLE_ROUNDS):
+        held = held_friction(scene.stuck(yields), missed) * (scene.divisor / numbers.gain)[:, None]
+        whole = np.maximum(held.sum(axis=1), 1e-300)
+        held *= np.minimum(1.0, numbers.friction / whole)[:, None]
+        slow = (study.chain.step / STABLE) ** 2 / inertia
+        yields = np.maximum(YIELD, held.shape[1] * held * slow[:, None])
+    damping = 2.0 * DAMPED * np.sqrt(inertia / np.maximum((held / yields).sum(axis=1), 1e-300))
+    return numbers.put(bristles=held, yields=yields, damped=damping)

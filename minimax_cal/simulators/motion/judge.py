@@ -2,34 +2,270 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import pprint
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib import resources
+from types import ModuleType
+from typing import Any
 
 import numpy as np
+import scipy
 
 from minimax_cal.dynamics.diagnose import named_runs
 from minimax_cal.dynamics.drives import command_of
 from minimax_cal.dynamics.given import MotionKnown
-from minimax_cal.dynamics.rows import Logs, prepare, rms_by_joint
-from minimax_cal.dynamics.run import NOTHING, Run
-from minimax_cal.dynamics.scene import Arm, Scene
+from minimax_cal.dynamics.laws import Law
+from minimax_cal.dynamics.logs.table import NOTHING, Run
+from minimax_cal.dynamics.rows import (
+    EDGE_S,
+    Arm,
+    Logs,
+    Scene,
+    at_times,
+    bent_bristles,
+    prepare,
+    rms_by_joint,
+)
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.simulators.chain import Chain
-from minimax_cal.simulators.given import largest_inertia
-from minimax_cal.simulators.motion.driven import (
-    Gains,
-    follow_commands,
-    follow_gains,
-    follow_torques,
-    inverse_torque,
-    tracking,
+from minimax_cal.robots.mjcf import mujoco
+from minimax_cal.simulators.chain import Chain, fill_history, id_of
+from minimax_cal.simulators.drive import check_stable
+from minimax_cal.simulators.mjcf import largest_inertia
+from minimax_cal.simulators.motion.numbers import (
+    FRICTION,
+    Numbers,
+    Opened,
+    bristles_in,
+    given_bristles,
+    in_its_gravity,
 )
-from minimax_cal.simulators.motion.module import installed
-from minimax_cal.simulators.motion.numbers import Numbers
-from minimax_cal.simulators.motion.opened import Opened, in_its_gravity
-from minimax_cal.simulators.motion.result import COMMANDS, MotionRung
+from minimax_cal.simulators.result import COMMANDS, MotionRung
+
+NUMBERS = "NUMBERS: dict[str, dict[str, Any]] = {}"  # in callback.py, to be filled
+LAWS = "LAWS: dict[str, tuple[bool, Any]] = {}"
+ENDING = "_friction.py"
+
+
+def module_text(chain: Chain, numbers: Numbers, unit: Array, ratio: Array) -> str:
+    """The module.  unit: (n,) torque per unit of the log.  ratio: (n,) of the gears."""
+    told: dict[str, Any] = {}
+    laws = {term.effect: term.law for term in numbers.laws}
+    for j, name in enumerate(chain.names):
+        pairs = zip(numbers.laws, numbers.value, strict=True)
+        mine = [(t.effect, amounts_of(t.law, value, unit[j], numbers.gain[j]),
+                 dict(t.tuned)) for t, value in pairs if t.joint == j]  # fmt: skip
+        told[name] = {
+            "frictionloss": float(numbers.loss[j]),
+            "damping": numbers.damping[j].tolist(),
+            "fastest": float(numbers.fastest[j]),
+            "laws": mine,
+        }
+        if any("gear" in laws[law].reads for law, *_ in mine):
+            told[name]["gear"] = abs(float(ratio[j]))
+    source = (resources.files("minimax_cal.simulators.motion") / "callback.py").read_text("utf-8")
+    filled = pprint.pformat(told, width=96, sort_dicts=False)
+    source = source.replace(NUMBERS, f"{NUMBERS[:-2]}{filled}")
+    return source.replace(LAWS, f"{LAWS[:-1]}\n{laws_text(laws)}}}" if laws else LAWS)
+
+
+def amounts_of(law: Law, value: Array, unit: float, gain: float) -> list[float]:
+    """A law's parameters at the joint [N m, or its share of torque]."""
+    pairs = zip(value, law.units, strict=False)
+    return [float(v * (unit if of.startswith("t") else 1.0) / gain) for v, of in pairs]
+
+
+def laws_text(laws: Mapping[str, Law]) -> str:
+    """Laws as entries of the module: whether friction, and torque per unit of each parameter."""
+    out = ""
+    for name, law in laws.items():
+        known = ", ".join([*sorted(law.reads), *law.tuned, "**_"])
+        out += f"    # {law.words}\n"
+        out += f'    "{name}": ({law.dry}, lambda {known}: ({", ".join(law.torque)},)),\n'
+    return out
+
+
+def loaded(text: str) -> ModuleType:
+    """A module of a text."""
+    made = ModuleType("friction")
+    exec(compile(text, "friction", "exec"), vars(made))
+    return made
+
+
+@contextmanager
+def installed(text: str, chain: Chain) -> Iterator[None]:
+    """A model with its module, if the text is not empty; another callback comes back after it."""
+    before = mujoco().get_mjcb_passive()
+    try:
+        if text:
+            loaded(text).install(chain.model)
+        yield
+    finally:
+        mujoco().set_mjcb_passive(before)
+
+
+# ---- a simulated arm along a log -----------------------------------------------------------------
+
+
+Pull = Callable[[Array, Array, Array], Array]  # torque of joint values, and how far they are off
+BANDWIDTH = 2.0 * np.pi * 5.0  # of drives that hold an arm to a log, where none are given [1/s]
+
+
+@dataclass(frozen=True, eq=False)
+class Gains:
+    """Of proportional and derivative drives: (n,) stiffness [N m/rad] and damper [N m s/rad]."""
+
+    stiffness: Array
+    damper: Array
+
+    def __call__(self, q: Array, off: Array, slow: Array) -> Array:
+        """(n,) torque where joints and their speeds are off by so much."""
+        return np.asarray(self.stiffness * off + self.damper * slow)
+
+
+def inverse_torque(chain: Chain, logs: Logs) -> Array:
+    """(M, n) torque that a model takes for the motion of logs, as its drives feel it [N m]."""
+    mj, model, data, at, dofs = chain.fresh()
+    out = np.empty(logs.motion.q.shape)
+    joint, number, bristle = np.array(bristles_in(chain), dtype=int).reshape(-1, 3).T
+    yields = given_bristles(chain)["yields"]
+    bent = (bent_bristles(logs, yields) * yields)[:, joint, number]
+    floating = ~model.jnt_actgravcomp[list(chain.joints)].astype(bool)
+    motion = logs.motion
+    for k in range(len(out)):
+        data.qpos[at], data.qvel[dofs], data.qacc[dofs] = motion.q[k], motion.qd[k], motion.qdd[k]
+        data.time = float(logs.since[k])
+        mj.mj_inverse(model, data)
+        out[k] = data.qfrc_inverse[dofs] + floating * data.qfrc_gravcomp[dofs]
+        if len(bristle):
+            data.act[model.actuator_actadr[bristle]] = bent[k]
+            mj.mj_fwdActuation(model, data)
+            np.subtract.at(out[k], joint, data.actuator_force[bristle])
+    return out
+
+
+def follow_commands(chain: Chain, run: Run, commands: Array, source: str) -> Array:
+    """(m, n) joint values where a model's own position servos bring an arm.
+
+    commands: (m, n) at the times of the run [rad, m].  Raises RobotError for an unstable model.
+    """
+    servos = chain.servos
+    speeds = ahead_of(chain.model, chain.names)
+
+    def drive(data: Any, now: int) -> None:
+        data.ctrl[servos] = path[now]
+        data.ctrl[list(speeds)] = rates[now, list(speeds.values())]
+        if not now:
+            fill_history(chain.model, data)
+
+    path = at_times(steps_of(run.time, chain), run.time, commands)
+    rates = np.gradient(path, chain.step, axis=0)
+    return stepped(chain, run, drive, source)
+
+
+def ahead_of(model: Any, names: Sequence[str]) -> dict[int, int]:
+    """Ids of actuators that take the commanded speed of some joints, and of which (from 0)."""
+    ids = (id_of(model, "ACTUATOR", f"{name}_ahead") for name in names)
+    return {number: j for j, number in enumerate(ids) if number >= 0}
+
+
+def follow_torques(chain: Chain, run: Run, torque: Array, pull: Pull, source: str) -> Array:
+    """(m, n) joint values under measured torques and drives that hold the arm to the log.
+
+    torque: (m, n) at the times of the run [N m].  The drives make up for what the model gets wrong:
+    where it is right, the arm follows the log by the measured torques alone.
+    """
+    wanted, time = scipy.interpolate.CubicSpline(run.time, run.q), steps_of(run.time, chain)
+    path = wanted(time), wanted(time, 1), at_times(time, run.time, torque)
+    return held_to(chain, run, path, pull, source)
+
+
+def follow_gains(chain: Chain, run: Run, commands: Array, gains: Pull, source: str) -> Array:
+    """(m, n) joint values where proportional and derivative drives bring an arm by commands."""
+    wanted = at_times(steps_of(run.time, chain), run.time, commands)
+    return held_to(chain, run, (wanted, 0.0 * wanted, 0.0 * wanted), gains, source)
+
+
+def held_to(
+    chain: Chain, run: Run, path: tuple[Array, Array, Array], pull: Pull, source: str
+) -> Array:
+    """(m, n) joint values under drives that hold an arm to joint values and speeds (steps, n).
+
+    path: these, and torque beside that of the drives [N m].
+    """
+    at, dofs = chain.places, chain.dofs
+    q, qd, ahead = path
+
+    def drive(data: Any, now: int) -> None:
+        off, slow = q[now] - data.qpos[at], qd[now] - data.qvel[dofs]
+        data.qfrc_applied[dofs] = ahead[now] + pull(data.qpos[at], off, slow)
+
+    with own_drives_off(chain.model):
+        return stepped(chain, run, drive, source)
+
+
+def by_inertia(chain: Chain) -> Pull:
+    """Drives whose gains follow the inertia of an arm: critically damped."""
+    mj, model, data, at, dofs = chain.fresh()
+    wanted, torque = np.zeros(model.nv), np.zeros(model.nv)
+
+    def pull(q: Array, off: Array, slow: Array) -> Array:
+        data.qpos[at] = q
+        mj.mj_fwdPosition(model, data)
+        wanted[dofs] = BANDWIDTH**2 * off + 2.0 * BANDWIDTH * slow
+        mj.mj_mulM(model, data, torque, wanted)
+        return torque[dofs]
+
+    return pull
+
+
+@contextmanager
+def own_drives_off(model: Any) -> Iterator[None]:
+    """A model without its actuators' forces but for bristles, and with all its weight."""
+    fields = ("actuator_gainprm", "actuator_biasprm", "body_gravcomp")
+    kept = {name: getattr(model, name).copy() for name in fields}
+    drives = kept["actuator_biasprm"][:, FRICTION] == 0.0
+    try:
+        for name in fields:
+            getattr(model, name)[drives if name.startswith("actuator") else ...] = 0.0
+        yield
+    finally:
+        for name in fields:
+            getattr(model, name)[:] = kept[name]
+
+
+def steps_of(time: Array, chain: Chain) -> Array:
+    """Times of a model's steps along a log [s]."""
+    step = chain.step
+    return np.asarray(time[0] + step * np.arange(int((time[-1] - time[0]) / step) + 1))
+
+
+def stepped(chain: Chain, run: Run, drive: Callable[[Any, int], None], source: str) -> Array:
+    """(m, n) joint values at the times of a run.  drive: sets what acts at a step."""
+    mj, model, data, at, dofs = chain.fresh()
+    start = scipy.interpolate.CubicSpline(run.time, run.q)
+    data.qpos[at], data.qvel[dofs] = start(run.time[0]), start(run.time[0], 1)
+    time = steps_of(run.time, chain)
+    out = np.empty((len(time), run.joints))
+    for now in range(len(time)):
+        out[now] = data.qpos[at]
+        drive(data, now)
+        mj.mj_step(model, data)
+    check_stable(mj, data, source)
+    return at_times(run.time, time, out)
+
+
+def tracking(q: Array, run: Run) -> Array:
+    """(n,) RMS distance of joint values (m, n) from those of a run, its ends left out [rad, m]."""
+    inside = (run.time > run.time[0] + EDGE_S) & (run.time < run.time[-1] - EDGE_S)
+    return np.asarray(np.sqrt(((q - run.q)[inside] ** 2).mean(axis=0)))
+
+
+# ---- the judge -----------------------------------------------------------------------------------
+
 
 Pair = tuple[Sequence[float], Sequence[float]]  # stiffness and damper
 LEAST_HELD = 4.0  # of a single run: length of the end that is held out [s]
@@ -52,8 +288,8 @@ class Judge:
 
     arm: of the model as it is read, with gains and speeds.  inertia: (n,) largest about each joint
     of the model as given [kg m^2].  learning, held: on the even grid.  runs: that judge, as logged.
-    drives: in words, empty where nothing is driven.  hold: given gains, or the
-    model whose inertia those of usual drives follow.
+    drives: in words, empty where nothing is driven.  hold: given gains, or
+    those of usual drives.
     """
 
     arm: Arm
@@ -64,7 +300,7 @@ class Judge:
     runs: tuple[Run, ...]
     source: str
     drives: str = ""
-    hold: Gains | Chain | None = None
+    hold: Pull | None = None
 
     @staticmethod
     def of(opened: Opened, runs: Sequence[Run], known: MotionKnown, *, fast: bool = False) -> Judge:
@@ -73,7 +309,7 @@ class Judge:
         Raises CalibrationError.
         """
         if fast:
-            runs = sorted(runs, key=lambda run: float(speed_of(run)))
+            runs = sorted(runs, key=speed_of)
         robot = in_its_gravity(opened.chain)
         gains = known.torque_gains(robot, runs)
         learning, held = divided(known.loaded(runs), known.holdout, known.holdout_run)
@@ -89,8 +325,8 @@ class Judge:
         """
         chain = opened.chain
         commanded = all(run.command is not None for run in (*self.runs, *self.learning_runs))
-        own = all(chain.servo(joint) >= 0 for joint in chain.joints)
-        hold: Gains | Chain = chain
+        own = bool((chain.servos >= 0).all())
+        hold: Pull = by_inertia(chain)
         if gains is not None:
             try:
                 hold = Gains(*(np.broadcast_to(np.array(one, dtype=float), len(self.inertia))
@@ -109,14 +345,19 @@ class Judge:
         """The same runs and drives, for another model of the arm."""
         return replace(self, arm=replace(self.arm, robot=in_its_gravity(opened.chain)))
 
+    def read(self, numbers: Numbers | None) -> tuple[Array, float]:
+        """(n,) torque of the log per torque of the joint, and by how much it is late [s]."""
+        if numbers is None:
+            return np.ones(len(self.inertia)), 0.0
+        return numbers.gain, numbers.late
+
     def off(self, chain: Chain, logs: Logs, numbers: Numbers | None) -> Array:
         """(R, n) torque that a model gets wrong along some logs [unit of the log]."""
-        gain = np.ones(len(self.inertia)) if numbers is None else numbers.gain
-        late = 0.0 if numbers is None else numbers.late
+        gain, late = self.read(numbers)
         seen = logs.earlier(late) if late else logs
         said = inverse_torque(chain, logs) * gain / self.arm.gain
         known = self.known if logs is self.held else Scene.of(self.arm, logs).known_torque
-        return np.asarray(seen.y - logs.filtered(said + known))
+        return seen.y - logs.filtered(said + known)
 
     def torque(self, chain: Chain, numbers: Numbers | None = None) -> Missed:
         """What a model gets wrong on the runs that judge."""
@@ -130,28 +371,22 @@ class Judge:
 
     def tracking(self, chain: Chain, numbers: Numbers | None = None) -> Array:
         """(n,) RMS joint error under the drives over the runs that judge [rad, m]."""
-        squares, weight = np.zeros(len(self.inertia)), 0.0
-        for number, run in enumerate(self.runs):
-            q = self.follow(chain, run, number, numbers)
-            squares += tracking(q, run) ** 2 * run.duration
-            weight += run.duration
-        return np.asarray(np.sqrt(squares / weight))
+        off = [tracking(self.follow(chain, run, number, numbers), run)
+               for number, run in enumerate(self.runs)]  # fmt: skip
+        weights = [run.duration for run in self.runs]
+        return np.asarray(np.sqrt(np.average(np.square(off), axis=0, weights=weights)))
 
     def follow(self, chain: Chain, run: Run, number: int, numbers: Numbers | None) -> Array:
         """(m, n) where the drives bring the arm along a run that judges."""
         assert self.hold is not None
         if self.drives == OWN_SERVOS:
             return follow_commands(chain, run, command_of(run), self.source)
-        if self.drives == GIVEN_GAINS and isinstance(self.hold, Gains):
+        if self.drives == GIVEN_GAINS:
             return follow_gains(chain, run, command_of(run), self.hold, self.source)
-        gain = np.ones(len(self.inertia)) if numbers is None else numbers.gain
-        late = 0.0 if numbers is None else numbers.late
-        rows = slice(self.held.start[number], self.held.start[number + 1])
-        known, grid = self.known[rows], self.held.since[rows]
-        time = run.time - run.time[0]
-        carried = np.stack([np.interp(time, grid, column) for column in known.T], axis=1)
-        early = [np.interp(time + late, time, column) for column in (run.torque - carried).T]
-        torque = np.stack(early, axis=1) * self.arm.gain / gain
+        gain, late = self.read(numbers)
+        rows, time = self.held.spans[number], run.time - run.time[0]
+        carried = at_times(time, self.held.since[rows], self.known[rows])
+        torque = at_times(time + late, time, run.torque - carried) * self.arm.gain / gain
         return follow_torques(chain, run, torque, self.hold, self.source)
 
     def rung(self, name: str, chain: Chain, numbers: Numbers | None = None, module: str = "",

@@ -11,8 +11,8 @@ import numpy as np
 
 from minimax_cal.dynamics.diagnose import diagnose_motion
 from minimax_cal.dynamics.given import MotionKnown, Payload, read_logs, runs_of
+from minimax_cal.dynamics.logs.table import CURRENT, NOTHING, Run
 from minimax_cal.dynamics.result import MotionDiagnosis, MotionEffect, load_motion
-from minimax_cal.dynamics.run import CURRENT, NOTHING, Run
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
@@ -22,24 +22,13 @@ from minimax_cal.ground.threads import one_thread
 from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.robots.urdf import MODELS
-from minimax_cal.simulators.given import largest_inertia
+from minimax_cal.simulators.mjcf import largest_inertia
 from minimax_cal.simulators.motion import drives
-from minimax_cal.simulators.motion.actuators import check_files, write_actuators, write_ranges
-from minimax_cal.simulators.motion.bristles import has_bristles
-from minimax_cal.simulators.motion.correct import (
-    STAYS,
-    Bench,
-    asked_of,
-    correct,
-    lost,
-    mean_log,
-)
-from minimax_cal.simulators.motion.fit import Study
-from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge
-from minimax_cal.simulators.motion.module import ENDING
-from minimax_cal.simulators.motion.opened import Opened, calibrated, open_model
-from minimax_cal.simulators.motion.positions import Answer, by_positions
-from minimax_cal.simulators.motion.result import MotionGap, MotionRung
+from minimax_cal.simulators.motion.correct import STAYS, Bench, asked_of, correct, mean_log
+from minimax_cal.simulators.motion.fit import PRIOR, PRIOR_ASSUMED, Study, has_bristles
+from minimax_cal.simulators.motion.judge import ENDING, OWN_SERVOS, Judge
+from minimax_cal.simulators.motion.numbers import Opened, calibrated, open_model
+from minimax_cal.simulators.result import MotionGap, MotionRung
 
 MOTOR = "dcmotor"  # what holds friction beside a constraint
 
@@ -111,8 +100,7 @@ def motion_gap(
     >>> print(mc.motion_gap("arm.xml", ["run1.csv", "run2.csv"], write="corrected.xml").summary())
     """
     began = time.perf_counter()
-    check_request(write, friction, plain=plain)
-    check_files(actuators, randomize)
+    check_request(write, friction, actuators, randomize, plain=plain)
     progress("reading the model and the logs")
     runs = read_logs(model, logs)
     opened = open_model(model, runs[0].joints if runs else 0, tip)
@@ -132,7 +120,7 @@ def motion_gap(
             first.append(judge.rung("calibrated geometry", opened.chain))
         if judge.held.unit == NOTHING:
             progress("fitting the drives to their commands")
-            made = by_positions(judge, opened, plain=plain)
+            made = drives.by_positions(judge, opened, plain=plain)
         else:
             found = told_or_found(judge, opened, diagnosis, known.payload, progress)
             judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
@@ -145,10 +133,10 @@ def motion_gap(
     if path is not None:
         write_whole(path, made.opened.content(path))
     if actuators is not None and not nothing:
-        write_actuators(actuators[1], actuators[0], made.opened.chain, made.served)
+        drives.write_actuators(actuators[1], actuators[0], made.opened.chain, made.served)
     if randomize is not None and not nothing:
         count = len(judge.learning_runs)
-        write_ranges(randomize, made.fitted, made.served, opened.chain.names, count)
+        drives.write_ranges(randomize, made.fitted, made.served, opened.chain.names, count)
     if beside is not None:
         write_whole(beside, made.module)
     told = (text for run in runs for text in run.notices)
@@ -170,13 +158,12 @@ def motion_gap(
     )
 
 
-def by_torques(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Answer:
+def by_torques(bench: Bench, found: MotionDiagnosis, progress: Progress) -> drives.Answer:
     """By torques, and by commands where they were logged."""
     bench, served, rungs, effects = by_commands(bench, found, progress)
     made = correct(bench, found, progress)
-    return Answer(made.plain.opened, served, (*rungs, *made.rungs), effects, made.elements,
-                  (made.plain, bench.study), made.full.module, made.left_out, made.notices,
-                  (*lost(made), *drives.lost_late(effects)))  # fmt: skip
+    more = {"rungs": (*rungs, *made.rungs), "lost": (*made.lost, *drives.lost_late(effects))}
+    return drives.Answer(**vars(made) | more, served=served, effects=effects)
 
 
 def by_commands(
@@ -240,7 +227,14 @@ def told_or_found(
     return found
 
 
-def check_request(write: Path | str | None, friction: str | None, *, plain: bool) -> None:
+def check_request(
+    write: Path | str | None,
+    friction: str | None,
+    actuators: tuple[str, Path | str] | None,
+    ranges: Path | str | None,
+    *,
+    plain: bool,
+) -> None:
     """Raise CalibrationError for what cannot be written, what holds no friction, and no MuJoCo."""
     if write is not None:
         check_writable(write, MODELS)
@@ -251,6 +245,11 @@ def check_request(write: Path | str | None, friction: str | None, *, plain: bool
         raise OptionError(f"plain: other simulators leave out {MOTOR}; leave plain or friction")
     if friction == MOTOR and not has_bristles():
         raise OptionError(f"friction={MOTOR}: this MuJoCo has no motors without input; update it")
+    if actuators and actuators[0] not in ("isaac", "json"):
+        raise OptionError(f"actuators={actuators[0]!r}: give isaac or json, and a file")
+    for path in (actuators and actuators[1], ranges):
+        if path is not None:
+            check_writable(path)
 
 
 def bench_of(
@@ -259,5 +258,6 @@ def bench_of(
     """Where corrections of a model are fitted and judged.  asked: its `bristled` and `plain`."""
     assumed = opened.given.assumed or not weighed(opened.chain.robot).all()
     study = Study.of(opened.chain, judge.arm, judge.learning, found.models[-1].terms,
-                     largest_inertia(opened.chain), assumed=bool(assumed))  # fmt: skip
+                     largest_inertia(opened.chain),
+                     PRIOR_ASSUMED if assumed else PRIOR)  # fmt: skip
     return Bench(judge, opened, study, *asked)

@@ -1,18 +1,201 @@
-"""What a simulator's elements hold of an arm in motion: masses, friction, armature, springs."""
+"""What a simulator's elements hold of an arm in motion: masses, friction, armature, springs.
+
+Masses are pseudo-inertias, in coordinates in which all of them are physical.
+A pseudo-inertia (4, 4) of a body is [[S, m c], [m c', m]] with S = tr(I) / 2 - I; it is positive
+definite for every body that exists [Wensing, Kim, Slotine 2018].  With the drawn body's lower
+factor L, L U U' L' of any upper triangular U with a positive diagonal is one [log-Cholesky, Rucker
+and Wensing 2022], and U = 1 is the drawn body.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from minimax_cal.correcting.exporters.correct import laid
 from minimax_cal.dynamics.laws import Term
-from minimax_cal.dynamics.scene import YIELD
+from minimax_cal.dynamics.regressor import SQUARE, inertial_parameters
+from minimax_cal.dynamics.rows import YIELD
+from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.arrays import Array
-from minimax_cal.robots.mjcf import mujoco
-from minimax_cal.simulators.chain import Chain
-from minimax_cal.simulators.motion.bodies import Bodies
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.robots.document import Document
+from minimax_cal.robots.gravity import LEAST_MASS, G, masses_of, weighed
+from minimax_cal.robots.mjcf import Given, body_pose, mujoco, numbers, read_model
+from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.transforms import inverse, tail, transform
+from minimax_cal.robots.urdf import MODELS, is_urdf
+from minimax_cal.simulators.arm import arm_of, stiff
+from minimax_cal.simulators.chain import (
+    TURNS,
+    Chain,
+    at_zero,
+    braked,
+    chain_along,
+    chain_of,
+    holders,
+    id_of,
+)
+from minimax_cal.simulators.elements import STEPS, forget, known, parents_of, section, tune
+from minimax_cal.simulators.mjcf import (
+    content_for,
+    corrected,
+    counts_degrees,
+    elements_of,
+    new_tree,
+    own_masses,
+)
+
+ROWS, COLUMNS = np.triu_indices(4)  # places of the ten coordinates in U
+THINNEST = 1e-6  # of a body's largest second moment: no principal one is smaller
+LIGHTEST = 1e-4  # of a body without a mass, to begin with [kg]
+WIDTH = 0.05  # of a body without a size, to begin with [m]
+
+
+def pseudo_inertia(parameters: Array) -> Array:
+    """(..., 4, 4) of inertial parameters (..., 10) about the origin of a frame."""
+    about = parameters[..., 4 + SQUARE]
+    half = 0.5 * np.trace(about, axis1=-2, axis2=-1)
+    out = np.empty((*parameters.shape[:-1], 4, 4))
+    out[..., :3, :3] = half[..., None, None] * np.eye(3) - about
+    out[..., :3, 3] = out[..., 3, :3] = parameters[..., 1:4]
+    out[..., 3, 3] = parameters[..., 0]
+    return out
+
+
+def parameters_of(pseudo: Array) -> Array:
+    """(..., 10) inertial parameters of pseudo-inertias (..., 4, 4)."""
+    second = pseudo[..., :3, :3]
+    about = np.trace(second, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - second
+    rows, columns = np.triu_indices(3)
+    parts = [pseudo[..., 3, 3, None], pseudo[..., :3, 3], about[..., rows, columns]]
+    return np.concatenate(parts, axis=-1)
+
+
+def of_body(mass: float, centre: Array, about: Array) -> Array:
+    """(4, 4) of a body.  centre: (3,) [m].  about: (3, 3) about its centre of gravity [kg m^2]."""
+    return of_second(mass, centre, 0.5 * np.trace(about) * np.eye(3) - about)
+
+
+def of_second(mass: float, centre: Array, second: Array) -> Array:
+    """(4, 4) of a body.  second: (3, 3) second moments about its centre of gravity [kg m^2]."""
+    out = mass * np.outer([*centre, 1.0], [*centre, 1.0])
+    out[:3, :3] += second
+    return out
+
+
+def principal(pseudo: Array, mass: float) -> tuple[Array, Array, Array]:
+    """Centre of gravity (3,), principal second moments (3,) about it, and their axes (3, 3)."""
+    centre = pseudo[:3, 3] / mass
+    return centre, *np.linalg.eigh(pseudo[:3, :3] - mass * np.outer(centre, centre))
+
+
+def physical(pseudo: Array) -> Array:
+    """The nearest body that exists: no mass below LIGHTEST, none thinner than THINNEST."""
+    mass = max(float(pseudo[3, 3]), LIGHTEST)
+    centre, size, axes = principal(pseudo, mass)
+    least = max(THINNEST * float(size.max()), THINNEST * mass * WIDTH**2)
+    return of_second(mass, centre, (axes * np.maximum(size, least)) @ axes.T)
+
+
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """What each of n joints carries in a simulator's model.
+
+    drawn: (n, 4, 4) pseudo-inertia of the joint's body in its own frame.  beside: (n, 4, 4) of what
+    else the joint alone carries, in the same frame.  to_link: (n, 4, 4) pose of that frame in the
+    link's frame of the robot [m].
+    """
+
+    drawn: Array
+    beside: Array
+    to_link: Array
+
+    @staticmethod
+    def of(chain: Chain) -> Bodies:
+        """Of an arm in a compiled model."""
+        model, data = chain.model, at_zero(chain.model, chain.joints)
+        links = laid(chain.robot, chain.base)[1:]
+        holder, bodies = holders(model, chain.bodies), chain.bodies
+        drawn, beside, to_link = [], [], []
+        for i, body in enumerate(bodies):
+            here = body_pose(data, body)
+            others = [int(k) for k in np.flatnonzero(holder == i) if k != body]
+            drawn.append(physical(inside(model, data, [body], here)))
+            beside.append(inside(model, data, others, here))
+            to_link.append(inverse(links[i]) @ here)
+        return Bodies(np.array(drawn), np.array(beside), np.array(to_link))
+
+    @property
+    def count(self) -> int:
+        """Number of joints."""
+        return len(self.drawn)
+
+    def links(self, own: Array) -> Array:
+        """(n, 10) parameters of the links in the robot's frames, of bodies (n, 4, 4)."""
+        turn = self.to_link
+        return parameters_of(turn @ (own + self.beside) @ np.swapaxes(turn, -1, -2))
+
+    def at(self, coordinates: Array) -> Array:
+        """(n, 4, 4) bodies at coordinates (n, 10); 0 is as drawn."""
+        half = np.linalg.cholesky(self.drawn) @ upper(coordinates)
+        return half @ np.swapaxes(half, -1, -2)
+
+    def slopes(self, coordinates: Array) -> Array:
+        """(n, 10, 10) derivative of each link's parameters by its body's coordinates, one a row."""
+        lower = self.to_link @ np.linalg.cholesky(self.drawn)
+        factor = upper(coordinates)
+        whole = lower @ factor
+        size = np.where(ROWS == COLUMNS, factor[:, ROWS, COLUMNS], 1.0)
+        left = np.moveaxis(lower[:, :, ROWS] * size[:, None], 1, 2)  # (n, 10, 4)
+        right = np.moveaxis(whole[:, :, COLUMNS], 1, 2)
+        change = left[..., :, None] * right[..., None, :]
+        return parameters_of(change + np.swapaxes(change, -1, -2))
+
+
+def inside(model: Any, data: Any, bodies: Sequence[int], frame: Array) -> Array:
+    """(4, 4) of some bodies of a model together, in a frame of the world (4, 4)."""
+    out = np.zeros((4, 4))
+    for body in bodies:
+        turn = data.ximat[body].reshape(3, 3)
+        about = turn @ np.diag(model.body_inertia[body]) @ turn.T
+        out += of_body(float(model.body_mass[body]), data.xipos[body], about)
+    back = inverse(frame)
+    return back @ out @ back.T
+
+
+def upper(coordinates: Array) -> Array:
+    """(n, 4, 4) upper triangular matrices of coordinates (n, 10)."""
+    out, own = np.zeros((len(coordinates), 4, 4)), np.arange(4)
+    out[:, ROWS, COLUMNS] = coordinates
+    out[:, own, own] = np.exp(out[:, own, own])
+    return out
+
+
+def inertial(pseudo: Array) -> dict[str, Array]:
+    """Attributes of an <inertial>: pos, quat, mass, diaginertia, of a body in its frame."""
+    mass = float(pseudo[3, 3])
+    centre, size, axes = principal(pseudo, mass)
+    size = np.maximum(size, THINNEST * size.max())  # else rounding makes it thinner than nothing
+    axes = axes * np.linalg.det(axes)
+    turn = Rotation.from_matrix(transform(axes, np.zeros(3))[:3, :3])
+    return {
+        "pos": centre,
+        "quat": turn.as_quat(scalar_first=True),
+        "mass": np.array([mass]),
+        "diaginertia": size.sum() - size,
+    }
+
+
+# ---- what elements hold --------------------------------------------------------------------------
+
 
 FRICTION, STIFFNESS = 3, 5  # places in a dcmotor's biasprm and dynprm, then its damper
 POWERS = 3  # of the speed in MuJoCo's damping: v, v |v|, v^3; of the angle in its springs
@@ -58,6 +241,11 @@ class Numbers:
         """(n,) friction that no bristle holds."""
         return np.asarray(np.maximum(self.friction - self.bristles.sum(axis=1), 0.0))
 
+    @property
+    def at_rest(self) -> dict[str, Any]:
+        """The numbers of its bristles."""
+        return {name: getattr(self, name) for name in ("bristles", "yields", "damped")}
+
     def put(self, **changes: Any) -> Numbers:
         """With other fields."""
         return replace(self, **changes)
@@ -70,18 +258,16 @@ def given_numbers(chain: Chain, bodies: Bodies) -> Numbers:
     spring = np.column_stack(
         [model.jnt_stiffness[joints], of_powers(model, "jnt_stiffnesspoly", joints)]
     )
-    held, yields, damped = given_bristles(chain)
+    held = given_bristles(chain)
     return Numbers(
         bodies=bodies.drawn,
-        armature=np.array(model.dof_armature[dofs]),
-        friction=np.array(model.dof_frictionloss[dofs]) + held.sum(axis=1),
+        armature=model.dof_armature[dofs],
+        friction=model.dof_frictionloss[dofs] + held["bristles"].sum(axis=1),
         damping=damping,
         stiffness=spring,
-        rest=np.array(model.qpos_spring[chain.places]),
+        rest=model.qpos_spring[chain.places],
         gain=np.ones(len(dofs)),
-        bristles=held,
-        yields=yields,
-        damped=damped,
+        **held,
     )
 
 
@@ -92,13 +278,12 @@ def bristle(joint: str, number: int) -> str:
 
 def bristles_in(chain: Chain) -> list[tuple[int, int, int]]:
     """Joint, number and id of every bristle of a model."""
-    mj, model = mujoco(), chain.model
-    places = [(j, k, mj.mj_name2id(model, mj.mjtObj.mjOBJ_ACTUATOR, bristle(name, k)))
+    places = [(j, k, id_of(chain.model, "ACTUATOR", bristle(name, k)))
               for j, name in enumerate(chain.names) for k in range(len(YIELD))]  # fmt: skip
     return [place for place in places if place[2] >= 0]
 
 
-def given_bristles(chain: Chain) -> tuple[Array, Array, Array]:
+def given_bristles(chain: Chain) -> dict[str, Any]:
     """Friction (n, k), ways (n, k) and dampers (n,) of a model's bristles, as in `Numbers`."""
     damped = np.zeros(len(chain.joints))
     held, yields = np.zeros((len(damped), len(YIELD))), np.tile(YIELD, (len(damped), 1))
@@ -106,7 +291,7 @@ def given_bristles(chain: Chain) -> tuple[Array, Array, Array]:
         stiffness, damper = chain.model.actuator_dynprm[number, STIFFNESS : STIFFNESS + 2]
         held[j, k] = chain.model.actuator_biasprm[number, FRICTION]
         yields[j, k], damped[j] = held[j, k] / stiffness, damper / stiffness
-    return held, yields, damped
+    return {"bristles": held, "yields": yields, "damped": damped}
 
 
 def of_powers(model: Any, name: str, places: Array) -> Array:
@@ -118,3 +303,256 @@ def of_powers(model: Any, name: str, places: Array) -> Array:
 def has_powers(model: Any) -> bool:
     """Whether this MuJoCo has polynomials of the speed."""
     return hasattr(model, "dof_dampingpoly")
+
+
+# ---- written into a model ------------------------------------------------------------------------
+
+
+SAME = 1e-12  # relative change of a number that is none
+STOPS = 4e-6  # friction moves the tool of a new file, at each joint, by no more [m]
+OPEN = {"motorconst": "1", "resistance": "1e9", "input": "none"}  # a motor that drives nothing
+HISTORY = 2  # samples of a delayed signal beyond those of the delay
+SHORTEST = 0.5  # of a timestep: a shorter delay is none
+
+
+def write_numbers(document: Document, chain: Chain, given: Numbers, found: Numbers) -> None:
+    """Change a model's elements to what was found, where that differs from what it has.
+
+    Raises RobotError.
+    """
+    parents = parents_of(document.root)
+    for i, joint in enumerate(elements_of(document.root, chain)):
+        if differs(found.bodies[i], given.bodies[i]):
+            weigh(parents[joint], found.bodies[i])
+        put(joint, "armature", found.armature[i], given.armature[i])
+        put(joint, "frictionloss", found.loss[i], given.loss[i])
+        put(joint, "damping", powers(found.damping[i]), powers(given.damping[i]))
+        put(joint, "stiffness", powers(found.stiffness[i]), powers(given.stiffness[i]))
+        if differs(found.stiffness[i], given.stiffness[i]):
+            rest = found.rest[i]
+            turns = chain.model.jnt_type[chain.joints[i]] != 2 and counts_degrees(document.root)
+            joint.set("springref", numbers([np.degrees(rest) if turns else rest]))
+    write_gains(document.root, chain, found)
+    write_delay(document.root, chain, found)
+    write_bristles(document.root, chain, found)
+
+
+def differs(found: Array, given: Array) -> bool:
+    """Whether a number changes."""
+    return not np.allclose(found, given, rtol=SAME, atol=0.0)
+
+
+def powers(values: Array) -> Array:
+    """Numbers without zeros at their end, one at least."""
+    last = int(np.flatnonzero(values)[-1]) + 1 if values.any() else 1
+    return values[:last]
+
+
+def put(joint: ET.Element, name: str, found: Array | float, given: Array | float) -> None:
+    """Set an attribute, where its number changes."""
+    new, old = np.atleast_1d(found), np.atleast_1d(given)
+    if new.shape != old.shape or differs(new, old):
+        joint.set(name, numbers(new))
+
+
+def weigh(body: ET.Element, pseudo: Array) -> None:
+    """Give a body its mass and inertia."""
+    values = inertial(pseudo)
+    element = known(body, "inertial")
+    for name in (*TURNS, "fullinertia"):
+        element.attrib.pop(name, None)
+    for name, value in values.items():
+        element.set(name, numbers(value))
+    if list(body).index(element) and body.find("joint") is not None:
+        body.remove(element)
+        body.insert(0, element)
+
+
+def write_gains(root: ET.Element, chain: Chain, found: Numbers) -> None:
+    """Let motors of a joint put out what its drive does, of what is commanded."""
+    for name, gain in zip(chain.names, found.gain, strict=True):
+        if gain == 1.0:
+            continue
+        for actuator in actuators_of(root, name):
+            old = [float(v) for v in actuator.get("gear", "1").split()]
+            actuator.set("gear", numbers([old[0] / gain, *old[1:]]))
+
+
+def actuators_of(root: ET.Element, joint: str) -> list[ET.Element]:
+    """The actuators that drive a joint."""
+    every = [e for part in root.iter("actuator") for e in part]
+    return [e for e in every if e.get("joint") == joint and e.get("input") != OPEN["input"]]
+
+
+def write_bristles(root: ET.Element, chain: Chain, found: Numbers) -> None:
+    """Give joints their bristles, and take away those that they have no more."""
+    for j, name in enumerate(chain.names):
+        for k, friction in enumerate(found.bristles[j]):
+            if friction > 0.0:
+                stiffness = friction / found.yields[j, k]
+                level = [stiffness, stiffness * found.damped[j], friction, friction, 1.0]
+                known(section(root, "actuator"), "dcmotor", bristle(name, k), joint=name,
+                      lugre=level, **OPEN)  # fmt: skip
+            else:
+                forget(root, "actuator", "dcmotor", bristle(name, k))
+
+
+def write_delay(root: ET.Element, chain: Chain, found: Numbers) -> None:
+    """A command that acts late, or a torque that is read late."""
+    late = delayed(abs(found.late), chain.step)
+    for name in chain.names if late else ():
+        if found.late > 0.0:
+            sensors = section(root, "sensor")
+            known(sensors, "jointactuatorfrc", f"{name}_torque", joint=name, **late)
+            continue
+        for actuator in actuators_of(root, name):
+            actuator.attrib |= late
+
+
+def delayed(late: float, step: float) -> dict[str, str]:
+    """Attributes of what is so late [s]; none where that is no delay.  step: of time [s]."""
+    if late < SHORTEST * step:
+        return {}
+    count = math.ceil(late / step) + HISTORY
+    return {"delay": numbers([late]), "nsample": str(count), "interp": "linear"}
+
+
+def stiffen(root: ET.Element, chain: Chain, found: Numbers) -> None:
+    """Let position servos of a new file hold the arm where it is commanded, for all its friction.
+
+    A servo of gain k stops within friction / k of its command.
+    """
+    arm = stiff(chain.robot, masses_of(chain.robot, LEAST_MASS))
+    needed = found.friction * np.where(chain.robot.prismatic, 1.0, arm.reach) / STOPS
+    for i, name in enumerate(chain.names):
+        for servo in actuators_of(root, name):
+            if servo.tag != "position" or needed[i] <= float(servo.get("kp", "0")):
+                continue
+            inertia = float(servo.get("kv", "0")) ** 2 / (4.0 * float(servo.get("kp", "1")))
+            damper = 2.0 * np.sqrt(needed[i] * inertia)
+            step = chain.step
+            tune(servo, needed[i], max(damper, STEPS * step * needed[i]))
+
+
+def free_joints(root: ET.Element, chain: Chain) -> None:
+    """Give servos the dampers that joints of a new file hold for them.
+
+    Along logs the damping of a joint is friction, and a servo's damper is part of its torque.
+    """
+    for number, joint in zip(chain.joints, elements_of(root, chain), strict=True):
+        if braked(chain.model)[number]:
+            servo = chain.model.actuator(chain.servo(number))
+            damper = float(joint.attrib.pop("damping")) / float(servo.gear[0]) ** 2
+            known(section(root, "actuator"), "position", str(servo.name), kv=damper)
+
+
+def new_model(robot: Robot) -> Document:
+    """A new file of a robot: its masses as drawn, position servos that hold it."""
+    root = new_tree(stiff(robot, masses_of(robot, LEAST_MASS)), ())
+    weigh_drawn(root, robot)
+    return Document(root)
+
+
+def weigh_drawn(root: ET.Element, robot: Robot) -> None:
+    """Give the links of a new file the inertias of a robot, where it tells them."""
+    bodies = {str(body.get("name")): body for body in root.iter("body")}
+    drawn = inertial_parameters(robot)
+    for i in np.flatnonzero(weighed(robot)):
+        place = tail(robot.mdh[i])  # of the link's frame in that of its joint, the body's
+        moved = place @ pseudo_inertia(drawn[i]) @ place.T
+        if drawn[i, 0] > LEAST_MASS and np.linalg.eigvalsh(moved)[0] > 0.0:
+            weigh(bodies[f"link{i + 1}"], moved)
+
+
+def unwritten(chain: Chain, wanted: Array, names: Sequence[str]) -> list[str]:
+    """Links whose masses MuJoCo did not take from the file.  wanted: (n, 4, 4)."""
+    got = Bodies.of(chain).drawn
+    off = np.abs(parameters_of(got) - parameters_of(wanted)).max(axis=1)
+    size = np.abs(parameters_of(wanted)).max(axis=1)
+    return [names[int(i)] for i in np.flatnonzero(off > 1e-6 * size)]
+
+
+# ---- a model to be corrected ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """A model and its arm.  given: its file.  new: whether it is made of a robot file or URDF."""
+
+    given: Given
+    chain: Chain
+    new: bool
+
+    def again(self, document: Document) -> Opened:
+        """The same arm in a changed tree."""
+        given = replace(self.given, document=document)
+        return replace(self, given=given, chain=self.chain.in_model(given.compiled()))
+
+    def rebuilt(self, given: Given) -> Opened:
+        """The arm of the same joints, whose bodies may stand elsewhere."""
+        model = given.compiled()
+        joints = self.chain.ids_in(model)
+        chain = chain_along(model, joints, given.source, unknown=given.assumed)
+        return replace(self, given=given, chain=chain)
+
+    def with_free_joints(self) -> Opened:
+        """The same with the dampers of servos in the servos."""
+        free_joints(self.given.document.root, self.chain)
+        return self.again(self.given.document)
+
+    def content(self, path: Path | None) -> bytes:
+        """The file, to be written at a path."""
+        return content_for(self.given.document, self.given.folder, path)
+
+
+def is_mjcf(model: Path | str) -> bool:
+    """Whether a model is a simulator's own."""
+    path = Path(model)
+    return path.suffix.lower() in MODELS and not is_urdf(path)
+
+
+def open_model(model: Path | str, joints: int, tip: str = "", *, freed: bool = True) -> Opened:
+    """The arm of so many joints in a model's file; of a robot file or URDF a new model.
+
+    freed: whether servos get the dampers that joints hold for them.  Raises CalibrationError.
+    """
+    mujoco()
+    if is_mjcf(model):
+        given = read_model(model)
+        chain = chain_of(given.compiled(), joints, given.source, tip, unknown=given.assumed)
+        opened = Opened(given, chain, new=False)
+        return opened.with_free_joints() if freed else opened
+    robot = load_robot(model)
+    if robot.joints != joints:
+        raise OptionError(f"{model}: has {robot.joints} joints, the logs have {joints}")
+    given = Given(str(model), new_model(robot), Path())
+    chain = chain_of(given.compiled(), joints, given.source)
+    opened = Opened(given, chain, new=True)
+    return opened.with_free_joints() if freed else opened
+
+
+def calibrated(opened: Opened, fit: Fit) -> tuple[Opened, tuple[str, ...]]:
+    """The model with the arm of a static calibration in it, and notices."""
+    names = fit.cell.target_names
+    if opened.new:
+        arm = arm_of(fit.cell, fit.train.q, masses_of(fit.cell.robot, LEAST_MASS))
+        document = Document(new_tree(arm, names, springs=True))
+        weigh_drawn(document.root, fit.cell.robot)
+        given = replace(opened.given, document=document)
+        return opened.rebuilt(given).with_free_joints(), ()
+    nominal = fit.nominal.robot
+    arm = arm_of(fit.cell, fit.train.q, own_masses(opened.chain, nominal))
+    driven = bool((opened.chain.servos >= 0).any())
+    document, notices = corrected(opened.given, opened.chain, nominal, arm, names, driven=driven)
+    if not driven and (arm.gain.any() or arm.coupled):
+        notices += (
+            "not in the model: encoder gains and couplings, which only position servos hold",
+        )
+    return opened.rebuilt(replace(opened.given, document=document)), notices
+
+
+def in_its_gravity(chain: Chain) -> Robot:
+    """The robot of a model, its vertical as long as the model's gravity over that of the earth."""
+    if chain.gravity == 0.0:
+        raise OptionError("the model has no gravity; give it <option gravity=...>, as the arm has")
+    return replace(chain.robot, up=chain.robot.up * chain.gravity / G)
