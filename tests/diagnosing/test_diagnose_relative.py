@@ -17,6 +17,7 @@ from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.fitting.several import relative
 from minimax_cal.ground.arrays import Array
+from tests.contradictions import contradictions
 
 
 def measured(job: Job, arm: Imperfect | None = None) -> tuple[Imperfect, list]:
@@ -34,6 +35,7 @@ def diagnosed(title: str, cause: str) -> RelativeDiagnosis:
 @pytest.mark.parametrize("title", SETS)
 def test_the_cause_is_named_and_no_other(title: str, cause: str) -> None:
     found = diagnosed(title, cause)
+    assert contradictions(found) == []
     names = {f.term.effect for f in found.effects if f.established}
     if cause in ("sound", "outside"):
         assert found.verdict == {"sound": "none", "outside": "unknown"}[cause]
@@ -77,11 +79,11 @@ def test_what_no_law_finds_is_above_the_noise_that_is_given(title: str) -> None:
     job = Job("irb2600", SETS[title], "sound", 3, 100)
     sound = arm_of(job)
     tossed = Tossed(sound.robot, sound.real, 0.0)
+    plain = diagnosed(title, "sound")
+    assert plain.meets_floor is None
+    names = [one.name for one in plain.calibration.instruments] or [plain.calibration.kind]
     for arm, verdict, meets in ((sound, "none", True), (tossed, "unknown", False)):
         _, data = measured(job, arm)
-        plain = diagnose_relative(arm.robot, data)
-        assert plain.meets_floor is None
-        names = [one.name for one in plain.calibration.instruments] or [plain.calibration.kind]
         found = diagnose_relative(arm.robot, data, noises=dict.fromkeys(names, NOISE))
         assert (found.verdict, found.meets_floor) == (verdict, meets)
         assert not [f for f in found.effects if f.established]

@@ -45,10 +45,6 @@ def test_the_sines_are_a_matern_process(length: float) -> None:
     assert_allclose(part.T @ part, (1.0 + s) * np.exp(-s), atol=2e-3)  # 0.1 lengths to the ends
 
 
-def test_a_curve_is_nothing_where_nothing_was_measured() -> None:
-    assert_allclose(sines(np.array([-1.0, 0.0, 2.0, 9.0]), 0.0, 2.0, 7), 0.0, atol=1e-14)
-
-
 def test_curves_of_two_joints_are_found_and_hold_at_new_poses(robot: Robot) -> None:
     sim = rigid(robot, 260, 2, 3)
     turn = np.zeros_like(sim.data.q)

@@ -8,17 +8,13 @@ from problems_fit import study_of
 
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
-from minimax_cal.diagnosing.causes import causes_of
 from minimax_cal.diagnosing.established import as_alternative, asked, judged, often, stands_for
 from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.evidence.limits import CONFIRMED, FREQUENT, PARTS, ROUNDS
 from minimax_cal.evidence.selection import Choice, select
 from minimax_cal.evidence.stability import Repeats
-from minimax_cal.fitting.options import silent
 from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.table import Term
-
-Names = tuple[frozenset[tuple[str, str]], ...]
 
 
 def found(effect: str, place: str, size: float = 100.0) -> Finding:
@@ -95,11 +91,3 @@ def test_poses_too_few_to_ask_leave_an_effect_possible_below_the_budget() -> Non
     assert told.to_dict()["effects"][0]["frequency"] is None
     assert told.ladder[-1].name == "geometric"
     assert told.possible.holdout.rms_mm < 0.2 * told.ladder[-1].holdout.rms_mm
-
-
-def test_a_plain_cause_is_found_in_every_subsample() -> None:
-    study = study_of(make(Case("irb2600", "single", (Cause("backlash", "J2", 300.0),), seed=4)))
-    _, causes = causes_of(study, (), (), silent)
-    (one,) = causes.effects
-    assert one.term.key == ("backlash", "J2")
-    assert one.again == 1.0

@@ -26,7 +26,7 @@ def test_it_ends_with_one_and_writes_no_robot(
     robot: mc.Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data, out = tmp_path / "d.csv", tmp_path / "gap.json"
-    mc.write_measurements(data, mirrored(mc.simulate(robot, 60, 2, seed=5).data))
+    mc.write_measurements(data, mirrored(mc.simulate(robot, 40, 2, seed=5).data))
     assert run("diagnose", "irb2600", data, "--quick", "--json", "-o", out) == 1
     said = capsys.readouterr()
     assert said.err.splitlines()[-1].startswith("error: failed: ")

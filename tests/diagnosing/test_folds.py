@@ -119,19 +119,6 @@ def test_a_session_left_out_has_no_frame(monkeypatch: pytest.MonkeyPatch) -> Non
     assert not grouped.folds
 
 
-def test_groups_that_are_named_are_the_parts(
-    play: Study, judges: Judges, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fold(*given: Any) -> Any:
-        return SimpleNamespace(fits=[SimpleNamespace(cell=play.geometric)])
-
-    monkeypatch.setattr(folds, "fold_of", fold)
-    found = beyond_of(play, ALONE, replace(judges, by="region"), silent)  # type: ignore[arg-type]
-    known = [part.name for part in parts(judges.everyone, "region")]
-    assert [one.where for one in found.folds] == known
-    assert all(name.startswith("the region of ") for name in known)
-
-
 def test_a_fold_is_sought_and_fitted_on_its_rows_alone(play: Study) -> None:
     _, causes = causes_of(play, (), (), silent)
     assert isinstance(causes, Causes)

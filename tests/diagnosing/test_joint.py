@@ -1,4 +1,3 @@
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +19,7 @@ from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.scene import mask_of
-from minimax_cal.modelling.effects.table import Term, at_bounds, bounds
+from minimax_cal.modelling.effects.table import Term, bounds
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.robot import Robot
 
@@ -72,11 +71,6 @@ def test_compliances_are_not_negative() -> None:
     assert (high > 0.0).all()
 
 
-def test_what_rounding_leaves_of_a_bound_is_at_it() -> None:
-    allowed = np.array([[0.0, 2.0], [0.0, 2.0], [-3.0, 3.0], [-np.inf, np.inf]])
-    assert at_bounds(np.array([4e-18, 1e-6, 3.0, 0.0]), allowed).tolist() == [1, 0, 1, 0]
-
-
 def test_a_fit_is_worse_beyond_a_part_in_a_thousand(play: Study) -> None:
     fit = Trials(play, ()).trial(())
     for factor, no_worse in ((0.9995, True), (0.998, False), (2.0, True)):
@@ -119,42 +113,16 @@ def test_an_effect_that_is_not_there_is_no_rung(play: Study) -> None:
     assert (np.diff(errors) < 0.0).all()
 
 
-def test_what_is_told_is_what_is_saved() -> None:
-    made = make(Case("irb2600", "pair", (Cause("joint_compliance", "all", 2000.0),
-                                         Cause("backlash", "J3", 2000.0)), seed=2))  # fmt: skip
-    found = mc.diagnose(made.robot, made.data, quick=True)
-    assert len(found.effects) >= 2
-    kept = {(t.effect, t.place): values for t, values in zip(
-        found.cells[-1].effects.terms, found.cells[-1].effects.values, strict=True)}  # fmt: skip
-    content = json.loads(found.json())
-    for told in content["effects"]:
-        values = [p["value"] * (1e-3 if p["unit"] == "mm" else 1.0) for p in told["parameters"]]
-        assert_allclose(values, kept[told["effect"], told["place"]], rtol=1e-12)
-    saved = {(e["effect"], e["place"]): e["values"] for e in content["cells"][-1]["effects"]}
-    for key, values in kept.items():
-        assert_allclose(saved[key], values, rtol=1e-12)
-
-
 def test_heavy_tails_are_not_named() -> None:
     made = make(Case("irb2600", "none", (), seed=4))
     rng = np.random.default_rng(0)
     verdicts = []
-    for _ in range(4):
+    for _ in range(2):
         noise = 3e-5 * rng.standard_t(3, size=made.data.y.shape)
         found = mc.diagnose(made.robot, made.data.with_y(made.data.y + noise), quick=True)
         verdicts.append((found.verdict, [f.term.effect for f in found.effects]))
     assert all(verdict != "named" for verdict, _ in verdicts), verdicts
     assert not any("outliers" in names for _, names in verdicts), verdicts
-
-
-def test_held_out_poses_stay_where_they_were_put() -> None:
-    made = make(Case("irb2600", "single", (Cause("outliers", "all", 1.0),), seed=7))
-    sound = make(Case("irb2600", "none", (), seed=7))
-    spoilt, clean = (mc.diagnose(m.robot, m.data, quick=True) for m in (made, sound))
-    lines = [set(d.data.line[d.held].tolist()) for d in (spoilt, clean)]
-    assert lines[0] <= lines[1]  # a row without a sound point is not in the data
-    assert spoilt.ladder[-1].holdout.poses == clean.ladder[-1].holdout.poses
-    assert spoilt.ladder[-1].trusted.rms_mm < 0.5 * spoilt.ladder[-1].holdout.rms_mm
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -193,11 +161,6 @@ def test_a_gear_is_fitted_in_all_its_orders(seed: int) -> None:
     assert told.names == ("cos 2/turn", "sin 2/turn", "cos 3/turn", "sin 3/turn")
     elsewhere = Term("gear_error", "all", {"turns": 1.0, "joints": mask_of([3, 4])})
     assert [t.choice for t in entire(twice, (*twice, elsewhere))] == [{"orders": 2.0}]
-
-
-def test_other_laws_are_already_whole(play: Study) -> None:
-    found = Finding((PLAY,), ("b2",), ("rad",), (1e-4,), (1e-5,), 9.0, 0.0)
-    assert whole(found, (PLAY,), play.scene) is found
 
 
 @pytest.mark.parametrize(("targets", "jitter"), [(1, 0.0), (3, 6e-5)])

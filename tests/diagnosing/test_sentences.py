@@ -136,12 +136,6 @@ def test_minor_effects_take_one_line(found: Diagnosis) -> None:
     assert line == "6 minor effects together take 0.060 mm off the RMS error."
 
 
-def test_a_single_cause_is_one(found: Diagnosis) -> None:
-    alone = replace(found, effects=found.effects[:1], ladder=found.ladder[:3])
-    assert alone.headline().startswith("Main cause: joint compliance at joint 2 (")
-    assert "minor" not in alone.headline()
-
-
 def test_alternatives_stand_at_their_own_place(found: Diagnosis) -> None:
     """Of two causes of a kind only the second has one; the measurement is for the larger share."""
     others = [Alternative("link_bending", f"L{n}", 0.9, 3.0, 1.0, f"measure {n}") for n in (1, 2)]

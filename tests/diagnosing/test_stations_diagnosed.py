@@ -51,23 +51,20 @@ def test_two_stations_are_diagnosed_as_one(plain: mc.Diagnosis) -> None:
     assert np.nanmax(np.linalg.norm(left.points, axis=-1)) < 1.5 * reach  # all about one base
 
 
-def foot(move: float) -> dict[str, np.ndarray]:
-    """Columns of three reflectors on the foot that move, or not, when the targets do."""
+def foot() -> dict[str, np.ndarray]:
+    """Columns of three reflectors on the foot that move when the targets do."""
     base, rng = MADE.cell.base, np.random.default_rng(1)
     out = {}
     for number, spot in enumerate(FOOT):
-        seen = base[:3, :3] @ spot + base[:3, 3] + move * LATE[:, None] * SHIFT
+        seen = base[:3, :3] @ spot + base[:3, 3] + LATE[:, None] * SHIFT
         seen = seen + FOOT_NOISE * rng.normal(size=seen.shape)
         out |= {f"base{number + 1}_{axis}": seen[:, i] for i, axis in enumerate("xyz")}
     return out
 
 
-@pytest.mark.parametrize("move", [1.0, 0.0])
-def test_a_jump_is_named_with_its_size_and_the_foot_judges_it(
-    plain: mc.Diagnosis, move: float
-) -> None:
+def test_a_jump_is_named_with_its_size_and_the_foot_judges_it(plain: mc.Diagnosis) -> None:
     data = ONE.with_y(ONE.y + LATE[:, None, None] * SHIFT)
-    found = diagnosed(replace(data, columns={**data.columns, **foot(move)}))
+    found = diagnosed(replace(data, columns={**data.columns, **foot()}))
     (jump,) = (f for f in found.effects if f.term.effect == "session_jump")
     assert jump.term.place == "frame"
     assert_allclose(jump.term.choice["since"], 70 / 119, rtol=1e-12)
@@ -79,9 +76,4 @@ def test_a_jump_is_named_with_its_size_and_the_foot_judges_it(
     }
     assert_allclose(found.ladder[-1].holdout.rms_mm, plain.ladder[-1].holdout.rms_mm, rtol=SAMPLING)
     (told,) = (text for text in found.notices if "on the foot" in text)
-    assert told.endswith("they agree with it") == bool(move)
-    assert ("they contradict it" in told) != bool(move)
-
-
-def test_no_foot_says_nothing(plain: mc.Diagnosis) -> None:
-    assert not any("on the foot" in text for text in plain.notices)
+    assert told.endswith("they agree with it")

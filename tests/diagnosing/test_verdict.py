@@ -99,11 +99,6 @@ def test_an_old_file_holds_established_effects(two_orders: mc.Diagnosis) -> None
     assert again.remaining is None
 
 
-def test_a_name_that_is_not_found_again_is_tentative() -> None:
-    assert finding("backlash", "J1", again=1.0).established
-    assert not replace(finding("backlash", "J1"), again=0.8).established
-
-
 def test_what_could_not_be_tested_stands_among_the_alternatives_of_its_relatives() -> None:
     """Without masses a joint that yields to its own load may yield to its neighbour's."""
     robot = mc.load_robot("irb2600")

@@ -96,7 +96,7 @@ def clear(made: Study, rows: Array) -> Array:
     return np.asarray(rows - made.rows.basis @ (made.rows.basis.T @ rows))
 
 
-@pytest.mark.parametrize("kind", ["shakes", "J5", "J3"])
+@pytest.mark.parametrize("kind", ["shakes", "J3"])
 def test_scatter_from_visit_to_visit_does_not_remain(kind: str) -> None:
     """However it moves the targets: four drawings, of which one at most is called a remainder.
 
