@@ -278,7 +278,6 @@ class Some:
         ((), 60),
         ((Cause("joint_compliance", "J3", 300.0),), 100),
         ((Cause("gear_error", "J2", 100.0), Cause("frame_drift", "frame", 300.0)), 100),
-        ((Cause("backlash", "J1", 300.0), Cause("thermal_growth", "all", 1000.0)), 60),
     ],
 )
 def test_a_part_names_what_its_rows_alone_name(causes, poses):
