@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 import minimax_cal as mc
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.modelling.simulate import Truth, simulate
-from qp_backends import Solution
 
 # ---- calibrate -----------------------------------------------------------------------------------
 
@@ -331,18 +330,6 @@ def test_result_file_and_headline_say_who_answered(robot, noisy, monkeypatch):
     count = fit.answered["daqp"]
     assert f"QPs: {count} by daqp ({count - 1} warm-started)" in fit.summary()
     assert "QPs" not in mc.calibrate(robot, noisy.data, "sum").headline()
-
-
-def test_a_function_of_the_user_is_named(robot, noisy):
-    from qp_backends import Problem
-    from qp_backends import solve as solve_qp
-
-    def mine(problem: Problem) -> Solution:
-        return dataclasses.replace(solve_qp(problem, "daqp"), backend="")
-
-    fit = mc.calibrate(robot, noisy.data, qp=mine)
-    assert list(fit.answered) == ["function mine"]
-    assert fit.work.warm_starts == 0
 
 
 @pytest.mark.parametrize(("method", "least"), [("eliminated", 1e-5), ("raw", 1e-3)])

@@ -20,7 +20,7 @@ from minimax_cal.fitting.pixels.data import read_board
 from minimax_cal.ground.files import json_of
 from minimax_cal.instruments import read_relative
 from minimax_cal.measuring.checks import check_joints
-from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.modelling.simulate import simulate
 from minimax_cal.reporting.plots.figures import new_figure, save
 from minimax_cal.robots.ranges import near_zero
 from qp_backends import Problem, child
@@ -261,15 +261,6 @@ def test_fifty_notices_are_enough(capsys):
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "notice: 0"
     assert lines[50:] == ["notice: and 19950 more, in the JSON"]
-
-
-def test_exact_measurements_are_a_success():
-    """Steps below rounding were called stalled."""
-    for objective in ("sum", "minimax", "point"):
-        made = simulate("irb120", 24, 3, 1, Truth(noise=0.0, noise_per_metre=0.0, compliance=0.0))
-        fit = mc.calibrate("irb120", made.data, objective, holdout=0.0)
-        assert fit.status == "converged", objective
-        assert fit.accuracy["train"].max_mm < 1e-6
 
 
 def test_a_backends_process_imports_nothing_from_the_current_folder(tmp_path, monkeypatch):
