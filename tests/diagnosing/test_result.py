@@ -35,7 +35,7 @@ from minimax_cal.diagnosing.result import (
     Untestable,
     of_curve,
 )
-from minimax_cal.diagnosing.sentences import NOT_VISITED, OPENINGS, closed_words
+from minimax_cal.diagnosing.sentences import NOT_VISITED, OPENINGS, closed_words, together
 from minimax_cal.fitting.accuracy import Accuracy
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
@@ -428,6 +428,11 @@ def test_alternatives_stand_at_their_own_place(found: Diagnosis) -> None:
     text = next(text for text in both.reasons if text.startswith("Recommended: "))
     assert large.share > second.share > 0.0
     assert text.startswith("Recommended: measure 2, to know whether it is")
+
+
+def test_places_of_one_kind_are_told_in_one() -> None:
+    assert together(("at joint 2", "at joint 1", "at joint 3")) == "at joint 2, 1 and 3"
+    assert together(("at joint 2", "in the base")) == "at joint 2, in the base"
 
 
 def test_possible_effects_stand_together_below(found: Diagnosis) -> None:
