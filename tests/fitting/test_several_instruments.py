@@ -43,7 +43,7 @@ from minimax_cal.robots.sampling import random_poses
 
 
 TOOL = np.array([[0.1, 0.0, 0.1], [0.0, 0.1, 0.1], [-0.1, -0.1, 0.2]])
-SEEDS = range(4)
+SEEDS = range(6)
 
 
 def tracker(arm: Arm, rng: np.random.Generator, poses: int, noise: float) -> mc.Measurements:
