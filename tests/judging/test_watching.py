@@ -92,14 +92,14 @@ def test_as_many_poses_as_named_decide_every_second_session(seen, poses):
         return health.verdict(Limit("rms", seen * rms), error, data, 0.0, 0)
 
     named = []
-    while len(named) < 15:
+    while len(named) < 25:
         error, data = session(poses)
         error *= 1e-3 * rms / np.sqrt((error**2).sum(axis=-1).mean())
         if (found := judged(error, data)).valid is None:
             said = re.search(r": (?:about|more than) (\d+) poses like these decide$", found.why)
             named.append(int(said[1]))
     few, many = (
-        np.mean([judged(*session(round(count))).valid is not None for _ in range(50)])
+        np.mean([judged(*session(round(count))).valid is not None for _ in range(80)])
         for count in np.median(named) * np.array([1.0 / 1.5, 1.5])
     )
     assert few < 0.5 < many
