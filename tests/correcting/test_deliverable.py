@@ -301,6 +301,7 @@ def with_torques(robot: mc.Robot, own: str) -> Measurements:
         torque
         + {
             "bias": 0.5 * size,
+            "friction": 0.5 * size * rng.choice([-1.0, 1.0], q.shape),
             "noise": 1.5 * size * rng.normal(size=q.shape),
         }[own]
     )
@@ -310,7 +311,7 @@ def with_torques(robot: mc.Robot, own: str) -> Measurements:
     return replace(made.data.with_y(y), columns={**made.data.columns, **columns})
 
 
-@pytest.mark.parametrize("own", ["bias", "noise"])
+@pytest.mark.parametrize("own", ["bias", "friction", "noise"])
 def test_what_was_fitted_to_measured_torques_is_fitted_to_those_of_gravity(own):
     """No torque is measured where a file is used: its figure is what it reaches without."""
     robot = mc.load_robot("irb2600")

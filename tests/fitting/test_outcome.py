@@ -45,7 +45,7 @@ def whole_degrees(data: Measurements) -> Measurements:
 def test_the_file_of_another_arm_has_failed_and_names_links(tmp_path):
     """Nobody sees it in the errors: enough free parameters make the one arm of the other."""
     data, out = tmp_path / "d.csv", tmp_path / "fit.json"
-    mc.write_measurements(data, simulate("irb120", 60, 3, seed=1).data)
+    mc.write_measurements(data, simulate("irb120", 105, 3, seed=1).data)
     fit = mc.calibrate("ur10", data, "sum")
     assert fit.status == "failed"
     assert fit.within.after.rms_mm < 1.0
