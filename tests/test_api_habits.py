@@ -1,5 +1,7 @@
 """Habits of people who know SciPy: pairs, texts, functions and arrays where these are natural."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -39,12 +41,14 @@ def test_a_qp_solver_may_be_a_function(robot, noisy):
 
     def counting(problem: Problem) -> Solution:
         asked.append(problem)
-        return solve(problem, "quadprog")
+        return replace(solve(problem, "quadprog"), backend="")
 
     fit = mc.calibrate(robot, noisy.data, qp=counting)
     named = mc.calibrate(robot, noisy.data, qp="quadprog")
     assert asked
     assert fit.qp == "function counting"
+    assert list(fit.answered) == ["function counting"]
+    assert fit.work.warm_starts == 0
     assert_allclose(fit.parameters.value, named.parameters.value, rtol=0, atol=1e-9)
     again = mc.Fit.from_dict(fit.to_dict())
     assert again.options.qp == "function counting"

@@ -265,24 +265,6 @@ def test_results_are_written_before_pictures(csv, tmp_path, monkeypatch):
     assert mc.load_fit(out).status == "converged"
 
 
-def test_calibrate_starts_without_what_it_does_not_use():
-    """And what is put off is there when it is asked for."""
-    unused = (
-        "numba", "numpy.f2py.crackfortran", "unittest", "yaml", "minimax_cal.evidence.selection",
-        "minimax_cal.judging.bootstrap", "minimax_cal.robots.urdf",
-    )  # fmt: skip
-    code = (
-        "import sys\n"
-        "from minimax_cal.cli.commands import quickly\n"
-        "quickly('minimax_cal.cli.calibrate')\n"
-        f"print([name for name in {unused} if name in sys.modules])\n"
-        "from numpy import testing\n"
-        "testing.assert_allclose(1.0, 1.0)\n"
-    )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ended.stdout == "[]\n"
-
-
 @pytest.mark.parametrize("module", ["minimax_cal", "minimax_cal.cli"])
 def test_the_package_itself_is_the_command(module, csv):
     command = [sys.executable, "-m", module, "calibrate", "nothing", str(csv)]
@@ -512,7 +494,7 @@ def test_what_is_wrong_ends_with_2(tmp_path, refuses):
 # ---- printed commands ----------------------------------------------------------------------------
 
 
-ARMS = ("irb120", "irb2600", "ur10", "scara_600", "meca500")
+ARMS = ("irb120", "ur10", "scara_600")
 
 
 def printed(out: str) -> list[list[str]]:

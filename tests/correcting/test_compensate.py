@@ -85,11 +85,8 @@ def apart(one: Array, other: Array) -> tuple[Array, Array]:
     return np.linalg.norm(one[:, :3, 3] - other[:, :3, 3], axis=1), turn.magnitude()
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_true_robot_comes_to_the_nominal_targets(robot, seed):
-    sim = simulate(robot, 100, 3, seed=seed)
-    fit = mc.calibrate(robot, sim.data, effects=["joint_compliance:all"])
-    q = regular(robot, random_poses(robot, 400, np.random.default_rng(seed + 10)))
+def test_the_true_robot_comes_to_the_nominal_targets(robot, sim, fit):
+    q = regular(robot, random_poses(robot, 400, np.random.default_rng(10)))
     found = compensate(fit, q)
     assert not found.failed.any()
     goal = fit.nominal.predict(q)

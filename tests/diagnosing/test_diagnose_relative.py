@@ -10,13 +10,18 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
+from experiments import blind_gap, motion_blind
+from experiments.gap_cases import make
 from experiments.relative import NOISE
 from experiments.relative_gap import CAUSES, SETS, Imperfect, Job, arm_of, seen
 from minimax_cal.diagnosing.instruments import diagnose_relative
 from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
+from minimax_cal.diagnosing.verdict import ABOVE_NOISE
+from minimax_cal.dynamics.laws import USUAL
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.fitting.several import relative
 from minimax_cal.ground.arrays import Array
+from tests.contradictions import contradictions
 
 
 def measured(job: Job, arm: Imperfect | None = None) -> tuple[Imperfect, list]:
@@ -34,6 +39,7 @@ def diagnosed(title: str, cause: str) -> RelativeDiagnosis:
 @pytest.mark.parametrize("title", SETS)
 def test_the_cause_is_named_and_no_other(title: str, cause: str) -> None:
     found = diagnosed(title, cause)
+    assert contradictions(found) == []
     names = {f.term.effect for f in found.effects if f.established}
     if cause in ("sound", "outside"):
         assert found.verdict == {"sound": "none", "outside": "unknown"}[cause]
@@ -77,11 +83,11 @@ def test_what_no_law_finds_is_above_the_noise_that_is_given(title: str) -> None:
     job = Job("irb2600", SETS[title], "sound", 3, 100)
     sound = arm_of(job)
     tossed = Tossed(sound.robot, sound.real, 0.0)
+    plain = diagnosed(title, "sound")
+    assert plain.meets_floor is None
+    names = [one.name for one in plain.calibration.instruments] or [plain.calibration.kind]
     for arm, verdict, meets in ((sound, "none", True), (tossed, "unknown", False)):
         _, data = measured(job, arm)
-        plain = diagnose_relative(arm.robot, data)
-        assert plain.meets_floor is None
-        names = [one.name for one in plain.calibration.instruments] or [plain.calibration.kind]
         found = diagnose_relative(arm.robot, data, noises=dict.fromkeys(names, NOISE))
         assert (found.verdict, found.meets_floor) == (verdict, meets)
         assert not [f for f in found.effects if f.established]
@@ -147,3 +153,71 @@ def test_mistakes_are_one_line(options: dict, words: str) -> None:
     arm, data = measured(Job("irb2600", ("wires_3",), "sound", 1, 60))
     with pytest.raises(mc.CalibrationError, match=words):
         mc.diagnose_relative(arm.robot, data, **options)
+
+
+# ---- contradictions ------------------------------------------------------------------------------
+
+
+CASES = blind_gap.plan(7001, blind_gap.QUICK)
+FEW = range(0, len(CASES), 10)
+TORQUES = motion_blind.plan(7003, 1, 3)
+
+
+@cache
+def found_of(i: int) -> mc.Diagnosis:
+    made = make(CASES[i])
+    return mc.diagnose(made.robot, made.data, quick=True)
+
+
+@cache
+def found_by(i: int) -> mc.MotionDiagnosis:
+    made = motion_blind.make(TORQUES[i])
+    return mc.diagnose_motion(made.robot, made.runs, ratio=motion_blind.RATIO, payload=made.payload)
+
+
+def check(i: int) -> None:
+    """The answer agrees with itself, and with what the command that it prints reaches."""
+    found, made = found_of(i), make(CASES[i])
+    assert contradictions(found) == []
+    if found.main and not found.main[0].rows:
+        fit = mc.calibrate(made.robot, made.data, objective="sum", effects=found)
+        reached = fit.accuracy["holdout"].rms_mm
+        assert reached == pytest.approx(found.budget[-1]["rms_mm"], rel=0.01)
+
+
+@pytest.mark.parametrize("i", FEW)
+def test_an_answer_does_not_contradict_itself(i):
+    check(i)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("i", sorted({*range(len(CASES))} - {*FEW}))
+def test_no_answer_contradicts_itself(i):
+    check(i)
+
+
+@pytest.mark.parametrize("i", range(len(TORQUES)))
+def test_no_answer_by_torques_contradicts_itself(i):
+    assert contradictions(found_by(i)) == []
+
+
+def test_a_contradiction_is_seen():
+    named = next(one for one in map(found_of, FEW) if one.main and len(one.ladder) > 2)
+    first, *others = named.effects
+    rest = replace(named.remaining, unexplained_mm=2.0 * named.remaining.unexplained_mm + 1.0)
+    for words, change in {
+        "an effect stands twice": {"effects": (first,) * 2},
+        "a step that is not confirmed": {"effects": (replace(first, again=0.5), *others)},
+        "parts that do not add up": {"remaining": rest},
+        "above noise that is as large": {
+            "verdict": "unknown", "tested": (0.1372, 0.1373), "structure_in": ABOVE_NOISE,
+        },
+    }.items():  # fmt: skip
+        assert words in contradictions(replace(named, **change)), words
+
+
+def test_a_contradiction_of_torques_is_seen():
+    every = map(found_by, range(len(TORQUES)))
+    named = next(one for one in every if {e.effect for e in one.main} - {*USUAL})
+    none = replace(named, verdict="none", effects=(*named.effects, named.effects[0]))
+    assert {"an effect stands twice", "none, and a cause"} <= {*contradictions(none)}

@@ -1,10 +1,11 @@
+"""Curves of joints that no law has, and fits without a part of the poses."""
+
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from test_left_out import geometric, rigid
 
 import minimax_cal as mc
 from minimax_cal.diagnosing import diagnose, gap
@@ -12,15 +13,17 @@ from minimax_cal.diagnosing.causes import Causes, beside_curves, causes_of
 from minimax_cal.diagnosing.diagnose import in_rungs, no_worse, with_maps
 from minimax_cal.diagnosing.error_maps import error_maps, strongest_wave
 from minimax_cal.diagnosing.gap import climbed
-from minimax_cal.diagnosing.joint import joint
+from minimax_cal.diagnosing.joint import Joint, joint
+from minimax_cal.diagnosing.left_out import Beside, Block, Left, begun
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.options import silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.maps import sines, spread
 from minimax_cal.modelling.effects.table import EFFECTS, Term, terms
-from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 from minimax_cal.robots.robot import Robot
 
 NODES = np.arange(-2.0, 3.0, 0.15)
@@ -43,10 +46,6 @@ def test_the_sines_are_a_matern_process(length: float) -> None:
     part = sines(x, 0.0, span, 2000) * spread(length, span, 2000)[:, None]
     s = np.sqrt(3.0) * np.abs(x[:, None] - x) / length
     assert_allclose(part.T @ part, (1.0 + s) * np.exp(-s), atol=2e-3)  # 0.1 lengths to the ends
-
-
-def test_a_curve_is_nothing_where_nothing_was_measured() -> None:
-    assert_allclose(sines(np.array([-1.0, 0.0, 2.0, 9.0]), 0.0, 2.0, 7), 0.0, atol=1e-14)
 
 
 def test_curves_of_two_joints_are_found_and_hold_at_new_poses(robot: Robot) -> None:
@@ -247,3 +246,69 @@ def test_a_ladder_keeps_a_map_whatever_its_place_among_the_effects(
         study, effects, [True] * len(effects)
     )  # the curve by itself is refused, and tried again
     assert again.taken == ladder.taken
+
+
+# ---- left out ------------------------------------------------------------------------------------
+
+
+def rigid(robot: Robot, poses: int, targets: int, seed: int) -> Simulation:
+    return simulate(robot, poses, targets, seed=seed, truth=Truth(compliance=0.0))
+
+
+def geometric(robot: Robot, sim: Simulation, turn: Array | float) -> Joint:
+    """The geometric fit of an arm whose joints turn by so much more: (m, n) [rad]."""
+    data = with_history(sim.data)
+    moved = sim.cell.predict(data.q + turn) - sim.cell.predict(data.q)
+    data = data.with_y(data.y + moved)
+    return joint(studied(robot, data, fit_cell(robot, data, SUM, silent)), ())
+
+
+def test_a_fit_without_a_part_is_that_of_the_others(rng: np.random.Generator) -> None:
+    y, columns = rng.normal(size=(20, 3)), rng.normal(size=(20, 3, 4))
+    block = Block("J1", rng.normal(size=(20, 3, 5)), np.array([[0.3] * 5]))
+    parts = np.arange(20) % 4 == np.arange(4)[:, None]
+    after = Beside.of(parts, y, columns, np.zeros(columns.shape[-1])).with_block(block)
+    penalty = np.diag(np.sqrt(after.ridge))
+    for part in parts:
+        rows = np.concatenate([after.columns[~part].reshape(-1, 9), penalty])
+        told = np.concatenate([y[~part].reshape(-1), np.zeros(9)])
+        value = np.linalg.lstsq(rows, told, rcond=None)[0]
+        assert_allclose(after.error[part], y[part] - after.columns[part] @ value, atol=1e-9)
+
+
+def test_the_prior_that_meets_the_parts_best_is_taken(rng: np.random.Generator) -> None:
+    columns = rng.normal(size=(30, 3, 2))
+    y = columns @ np.array([1.0, -2.0]) + 0.01 * rng.normal(size=(30, 3))
+    parts = np.arange(30) % 5 == np.arange(5)[:, None]
+    at = Beside.of(parts, y, rng.normal(size=(30, 3, 1)), np.zeros(1))
+    sizes = [at.with_block(Block("J1", columns, np.full((1, 2), s))).square for s in (1e-3, 2.0)]
+    both = at.with_block(Block("J1", columns, np.array([[1e-3, 1e-3], [2.0, 2.0]])))
+    assert_allclose(both.square, min(sizes), rtol=1e-12)
+    assert sizes[1] < 0.01 * sizes[0]
+
+
+def test_what_holds_a_fit_holds_it_without_a_part(robot: Robot) -> None:
+    """Left out, each part is met as the fit with its priors meets it: a map has many columns."""
+    sim = rigid(robot, 60, 2, 3)
+    turn = np.zeros_like(sim.data.q)
+    turn[:, 1] = 3e-4 * np.sin(9.0 * sim.data.q[:, 1])
+    bare = geometric(robot, sim, turn)
+    choice = {"low": -1.6, "high": 2.4, "length": 0.35, "size": 3e-4}
+    fit = joint(bare.study, [Term("joint_error_map", "J2", choice)])
+    left = Left.of(fit)
+    at = begun(left)
+    assert_allclose(at.square, fit.cross_validated(list(left.parts)), rtol=1e-6)
+    free = Beside.of(left.parts, left.y, left.columns, np.zeros(left.columns.shape[-1]))
+    assert free.square > 1.5 * at.square  # as it would be without
+
+
+def test_what_no_pose_shows_is_nothing(rng: np.random.Generator) -> None:
+    """As a session's frame, once its poses stand out."""
+    y, columns = rng.normal(size=(20, 3)), rng.normal(size=(20, 3, 4))
+    columns[..., 2] = 0.0
+    parts = np.arange(20) % 4 == np.arange(4)[:, None]
+    some, whole = (
+        Beside.of(parts, y, columns[..., kept], np.zeros(np.count_nonzero(kept)))
+        for kept in (np.arange(4) != 2, np.ones(4, dtype=bool))
+    )
+    assert_allclose(whole.error, some.error, atol=1e-12)

@@ -244,16 +244,6 @@ def test_what_a_gap_hid_is_marked_once_it_is_closed() -> None:
     assert not (mine.far & ~marked.far).any()
 
 
-def test_what_only_the_last_fit_misses_is_its_own() -> None:
-    made = study_of(make(Case("irb2600", "single", (Cause("backlash", "J2", 300.0),), seed=1)))
-    first = joint(made, ()).cell
-    bent = replace(first, target_positions=first.target_positions + 5e-3)
-    data = made.data
-    judges = Judges(data.take(np.arange(1, data.poses)), data.take(np.arange(1)),
-                    np.zeros((len(data.target_names), 1), dtype=bool))  # fmt: skip
-    assert judges.marked(first, bent)[1] == ()
-
-
 @pytest.mark.parametrize("column", ["order", "time"])
 def test_a_nest_that_moved_makes_no_points_stand_out(column: str) -> None:
     """Whichever poses are held out: rows are looked at as they were visited."""

@@ -1,10 +1,13 @@
-import json
+"""Joint fits of geometry and effects: bounds, trials, whole laws, and how large effects are."""
+
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from problems_fit import study_of
+from scipy.optimize import minimize_scalar
+from scipy.stats import multivariate_normal
 
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
@@ -13,14 +16,17 @@ from minimax_cal.diagnosing.gap import climbed, folds
 from minimax_cal.diagnosing.joint import joint
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import SUM, Study, studied
-from minimax_cal.diagnosing.trial import Trials
+from minimax_cal.diagnosing.trial import Trials, unsized, weights_of
 from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.floor import noise_at_most
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.fitting.uncertainty import Estimator, Poses
+from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.scene import mask_of
-from minimax_cal.modelling.effects.table import Term, at_bounds, bounds
+from minimax_cal.modelling.effects.table import Term, bounds
+from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.robot import Robot
 
@@ -72,11 +78,6 @@ def test_compliances_are_not_negative() -> None:
     assert (high > 0.0).all()
 
 
-def test_what_rounding_leaves_of_a_bound_is_at_it() -> None:
-    allowed = np.array([[0.0, 2.0], [0.0, 2.0], [-3.0, 3.0], [-np.inf, np.inf]])
-    assert at_bounds(np.array([4e-18, 1e-6, 3.0, 0.0]), allowed).tolist() == [1, 0, 1, 0]
-
-
 def test_a_fit_is_worse_beyond_a_part_in_a_thousand(play: Study) -> None:
     fit = Trials(play, ()).trial(())
     for factor, no_worse in ((0.9995, True), (0.998, False), (2.0, True)):
@@ -119,42 +120,16 @@ def test_an_effect_that_is_not_there_is_no_rung(play: Study) -> None:
     assert (np.diff(errors) < 0.0).all()
 
 
-def test_what_is_told_is_what_is_saved() -> None:
-    made = make(Case("irb2600", "pair", (Cause("joint_compliance", "all", 2000.0),
-                                         Cause("backlash", "J3", 2000.0)), seed=2))  # fmt: skip
-    found = mc.diagnose(made.robot, made.data, quick=True)
-    assert len(found.effects) >= 2
-    kept = {(t.effect, t.place): values for t, values in zip(
-        found.cells[-1].effects.terms, found.cells[-1].effects.values, strict=True)}  # fmt: skip
-    content = json.loads(found.json())
-    for told in content["effects"]:
-        values = [p["value"] * (1e-3 if p["unit"] == "mm" else 1.0) for p in told["parameters"]]
-        assert_allclose(values, kept[told["effect"], told["place"]], rtol=1e-12)
-    saved = {(e["effect"], e["place"]): e["values"] for e in content["cells"][-1]["effects"]}
-    for key, values in kept.items():
-        assert_allclose(saved[key], values, rtol=1e-12)
-
-
 def test_heavy_tails_are_not_named() -> None:
     made = make(Case("irb2600", "none", (), seed=4))
     rng = np.random.default_rng(0)
     verdicts = []
-    for _ in range(4):
+    for _ in range(2):
         noise = 3e-5 * rng.standard_t(3, size=made.data.y.shape)
         found = mc.diagnose(made.robot, made.data.with_y(made.data.y + noise), quick=True)
         verdicts.append((found.verdict, [f.term.effect for f in found.effects]))
     assert all(verdict != "named" for verdict, _ in verdicts), verdicts
     assert not any("outliers" in names for _, names in verdicts), verdicts
-
-
-def test_held_out_poses_stay_where_they_were_put() -> None:
-    made = make(Case("irb2600", "single", (Cause("outliers", "all", 1.0),), seed=7))
-    sound = make(Case("irb2600", "none", (), seed=7))
-    spoilt, clean = (mc.diagnose(m.robot, m.data, quick=True) for m in (made, sound))
-    lines = [set(d.data.line[d.held].tolist()) for d in (spoilt, clean)]
-    assert lines[0] <= lines[1]  # a row without a sound point is not in the data
-    assert spoilt.ladder[-1].holdout.poses == clean.ladder[-1].holdout.poses
-    assert spoilt.ladder[-1].trusted.rms_mm < 0.5 * spoilt.ladder[-1].holdout.rms_mm
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -195,11 +170,6 @@ def test_a_gear_is_fitted_in_all_its_orders(seed: int) -> None:
     assert [t.choice for t in entire(twice, (*twice, elsewhere))] == [{"orders": 2.0}]
 
 
-def test_other_laws_are_already_whole(play: Study) -> None:
-    found = Finding((PLAY,), ("b2",), ("rad",), (1e-4,), (1e-5,), 9.0, 0.0)
-    assert whole(found, (PLAY,), play.scene) is found
-
-
 @pytest.mark.parametrize(("targets", "jitter"), [(1, 0.0), (3, 6e-5)])
 def test_noise_is_at_most_what_is_said(robot: Robot, targets: int, jitter: float) -> None:
     """In 97.5 of 100: the error of a fit is less than the noise, of which the fit took a part.
@@ -220,3 +190,93 @@ def test_noise_is_at_most_what_is_said(robot: Robot, targets: int, jitter: float
     assert np.mean(np.array(left) < true) > 0.9
     assert np.count_nonzero(np.array(said) < true) <= 3  # of 24; more by chance once in 300
     assert 1.0 < np.median(np.array(said) / true) < 1.4
+
+
+# ---- sizes ---------------------------------------------------------------------------------------
+
+
+TOLERANCE = 2e-2
+GEAR = Term("gear_error", "J2", {"turns": 1.0})
+
+
+@pytest.fixture(scope="module")
+def geared() -> Study:
+    return study_of(make(Case("irb2600", "single", (Cause("gear_error", "J2", 300.0),), seed=4)))
+
+
+def linear(study: Study, *terms: Term, at: float = 0.0) -> tuple[Poses, Array]:
+    """The poses at a state whose effects are all of one value, and those values."""
+    base, state = study.model.only(study.fit.identification.active), study.fit.state
+    model, state = extended(base, study.robot, study.data, state, terms)
+    state = replace(state, effects=state.effects + at)
+    model, state = extended(base, study.robot, study.data, state, terms)
+    return Poses.of(Estimator(model, np.ones(len(model.y))), state), state.effects
+
+
+@pytest.mark.parametrize("at", [0.0, 4e-5])
+@pytest.mark.parametrize("power", [300.0, 12.0])
+def test_the_size_is_the_likeliest(power: float, at: float) -> None:
+    """Against the marginal likelihood of the same linear model, maximised by SciPy."""
+    study = study_of(make(Case("irb2600", "single", (Cause("gear_error", "J2", power),), seed=4)))
+    poses, values = linear(study, GEAR, at=at)
+    weight = weights_of(poses, values, [slice(0, 2)])
+    poses, _ = linear(study, GEAR)  # a linear model is the same everywhere
+    columns, e = poses.jacobian.reshape(-1, poses.jacobian.shape[2]), poses.error.reshape(-1)
+    size = np.linalg.norm(columns[:, -2:], axis=0)
+    u, s, _ = np.linalg.svd(columns[:, :-2], full_matrices=True)
+    rest = u[:, int(np.count_nonzero(s > 1e-9 * s[0])) :]  # what geometry cannot do
+    across, f = np.linalg.qr(rest.T @ (columns[:, -2:] / size))
+    y = across.T @ (rest.T @ e)  # all that tells the size: the rest is noise whatever it is
+    least = np.sum((rest.T @ e) ** 2) - y @ y
+    variance = float(least) / (len(e) - columns.shape[1])
+
+    def unlikely(log: float) -> float:
+        covariance = variance * np.eye(2) + np.exp(log) * f @ f.T
+        return -float(multivariate_normal.logpdf(y, np.zeros(2), covariance))
+
+    best = minimize_scalar(unlikely, bounds=np.log([1e-6 * variance, 1e6 * variance]))
+    # 20 rounds of expectation and maximisation come within two per cent
+    assert_allclose(weight, variance / np.exp(best.x) * size**2, rtol=TOLERANCE)
+
+
+def test_what_the_data_tell_is_left_alone(geared: Study) -> None:
+    found = joint(geared, (GEAR,))
+    poses, _ = linear(geared, GEAR)
+    gram = poses.normal_matrix
+    free = np.linalg.lstsq(gram, poses.gradient + poses.prior * poses.off, rcond=None)[0][-2:]
+    sigma = np.sqrt(np.diag(np.linalg.pinv(gram, hermitian=True))[-2:])
+    sigma *= np.sqrt((poses.error**2).mean())
+    assert (np.abs(found.state.effects - free) < 0.3 * sigma).all()
+
+
+def test_what_the_data_do_not_tell_stays_small(geared: Study) -> None:
+    """An effect that is not there: its square falls well below that of least squares."""
+    other = Term("gear_error", "J5", {"turns": 1.0})
+    poses, values = linear(geared, GEAR, other)
+    weight = weights_of(poses, values, [slice(0, 2), slice(2, 4)])
+    gram, pull = poses.normal_matrix, poses.gradient + poses.prior * poses.off
+    prior = np.concatenate([np.zeros(len(gram) - 4), weight])
+    free, held = (np.linalg.solve(gram + np.diag(w), pull)[-2:] for w in (0.0 * prior, prior))
+    assert np.linalg.norm(held) < 0.7 * np.linalg.norm(free)
+
+
+def test_single_parameters_and_maps_have_none(geared: Study) -> None:
+    terms = (Term("backlash", "J2"), GEAR, Term("joint_compliance", "J2", {"parts": 128.0}))
+    assert unsized(terms, geared.scene) == [slice(1, 3)]
+    poses, values = linear(geared, terms[0])
+    assert not weights_of(poses, values, []).any()
+
+
+def test_the_sigma_of_a_held_effect_is_no_more_than_its_size() -> None:
+    """A joint that turned by a radian: its gear's two waves are nearly geometry there."""
+    made = make(Case("irb2600", "single", (Cause("gear_error", "J2", 300.0),), seed=4))
+    study = study_of(made)
+    rows = np.abs(study.data.q[:, 4] - np.median(study.data.q[:, 4])) < 0.5
+    data = study.data.take(rows)
+    few = studied(study.robot, data, study.fit)
+    held = joint(few, (Term("gear_error", "J5", {"turns": 1.0}),))
+    weight = held.model.prior.weight[-2:]
+    assert (weight > 0.0).all()
+    size = np.sqrt(held.poses.mean_square / weight)  # of the prior
+    assert (held.uncertainty.sigma[-2:] < 1.5 * size).all()
+    assert not held.model.prior.beside[-2:].any()

@@ -1,7 +1,6 @@
 """Proposals for further measurements, against measuring them."""
 
 import dataclasses
-import time
 
 import numpy as np
 import pytest
@@ -320,19 +319,3 @@ def test_payload_is_one_that_the_arm_carries(wide: Site) -> None:
     assert 1.0 <= payload(wide.scene) <= 20.0
     digits = f"{payload(wide.scene):e}"
     assert digits[0] in "125"
-
-
-def test_joined_data_are_one_after_another(sim: Simulation) -> None:
-    a, b = sim.data.take(np.arange(3)), sim.data.take(np.arange(3, 7))
-    assert_allclose(a.followed_by(b).q, sim.data.q[:7], rtol=0, atol=0)
-
-
-def test_a_call_is_short(robot: mc.Robot) -> None:
-    here = site(robot, simulate(robot, 115, 3, seed=9).data, QUIET)
-    taken = []
-    for _ in range(3):
-        fresh = dataclasses.replace(here)
-        began = time.process_time()  # of this process: others may be busy
-        separate_with(fresh, Pair(J2, np.array([1e-7]), BASE, [(GEAR, np.array([1e-4, 1e-4]))]))
-        taken.append(time.process_time() - began)
-    assert min(taken) < 0.3  # about 0.03 s on a free core

@@ -11,23 +11,46 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+import minimax_cal as mc
+from minimax_cal.diagnosing.curves import (
+    Curve,
+    Leftover,
+    guilty,
+    joint_equivalent,
+    order_curve,
+    residual_curve,
+    turns,
+    without,
+)
+from minimax_cal.diagnosing.proposals import REVISIT
 from minimax_cal.diagnosing.result import (
     SHOWN_LINES,
+    VERDICTS,
     Alternative,
+    Dependence,
     Diagnosis,
     Finding,
+    Remaining,
     Step,
     Untestable,
     of_curve,
 )
-from minimax_cal.diagnosing.sentences import closed_words
+from minimax_cal.diagnosing.sentences import NOT_VISITED, OPENINGS, closed_words, together
 from minimax_cal.fitting.accuracy import Accuracy
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.fitting.floor import DECLARED, Floor
-from minimax_cal.modelling.effects.table import Fitted, Term
-from minimax_cal.modelling.effects.words import name_place
+from minimax_cal.fitting.floor import AT_MOST, DECLARED, DISTANCES, REPEATS, Floor
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.effects import drivers
+from minimax_cal.modelling.effects.drivers import own_value
+from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
+from minimax_cal.modelling.effects.words import name_place, name_step
 from minimax_cal.modelling.simulate import simulate
+from minimax_cal.reporting.tables import remaining_table
+from minimax_cal.robots.gravity import masses_of
+from minimax_cal.robots.kinematics import rotation
+from minimax_cal.robots.sampling import random_poses
 from minimax_cal.solvers.status import Status
 
 PLAY, SOFT = Term("backlash", "J2"), Term("joint_compliance", "J3", {"parts": 128.0})
@@ -278,3 +301,441 @@ def test_rivals_are_told_with_what_tells_them_apart(made: Diagnosis) -> None:
     titles = [table.title for table in found.tables()]
     assert len(titles) == len(made.tables()) + 1
     assert all(table.rows for table in found.tables())
+
+
+# ---- sentences -----------------------------------------------------------------------------------
+
+
+FOUND = (  # effect, place, share, held-out RMS before and after [mm]; by share, as in the file
+    ("joint_compliance", "J2", 0.60, 0.5, 0.3),
+    ("gear_error", "J3", 0.20, 0.8, 0.5),
+    ("gear_ripple", "J1", 0.12, 0.3, 0.25),
+    ("gear_error", "J5", 0.02, 0.25, 0.24),
+    ("backlash", "J4", 0.01, 0.24, 0.23),
+)
+LADDER = ("gear_error J3", "joint_compliance J2", "gear_ripple J1", "gear_error J5", "backlash J4")
+IN_WORDS = [name_step(f"+ {name}").removeprefix("+ ") for name in LADDER]
+WIDER = "measure 20 more poses all over the workspace"
+
+
+def step(name: str, rms: float) -> Step:
+    return Step(name, scores(rms), scores(rms), scores(rms))
+
+
+def cause(effect: str, place: str, share: float, before: float, after: float) -> Finding:
+    unit = "rad/(N m)" if effect == "joint_compliance" else "rad"
+    return Finding((Term(effect, place),), ("c",), (unit,), (2e-6,), (1.23456e-7,), 100.0, 1e-9,
+                   share=share, before=before, after=after, minor=share < 0.05)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bare() -> Diagnosis:
+    robot = mc.load_robot("irb2600")
+    return mc.diagnose(robot, simulate(robot, 60, 1, seed=1).data, quick=True)
+
+
+@pytest.fixture
+def found(bare: Diagnosis) -> Diagnosis:
+    after = {f"{effect} {place}": rms for effect, place, _, _, rms in FOUND}
+    rungs = [step(f"+ {name}", after[name]) for name in LADDER]
+    return replace(
+        bare, verdict="named", effects=tuple(cause(*row) for row in FOUND), closed=0.95,
+        closed_ci=(0.9, 0.97), ladder=(step("nominal", 2.0), step("geometric", 0.8), *rungs),
+        floor=Floor(0.03, 0.0, 0.03, AT_MOST), beyond=Beyond(), floor_known=True,
+    )  # fmt: skip
+
+
+def marked(found: Diagnosis, **more: Any) -> Diagnosis:
+    """With what the evidence says besides: whether effects are established, what remains."""
+    for name, value in more.pop("established", {}).items():
+        one = next(f for f in found.effects if f.term.effect == name)
+        object.__setattr__(one, "again", float(value))
+    for name, value in more.items():
+        object.__setattr__(found, name, value)
+    return found
+
+
+def test_every_verdict_opens_the_words(found: Diagnosis) -> None:
+    assert set(OPENINGS) == set(VERDICTS)
+    alternative = Alternative("link_bending", "L2", 0.9, 3.0, 1.0)
+    first = replace(found.effects[0], alternatives=(alternative,))
+    for verdict in VERDICTS:
+        changed = replace(found, verdict=verdict)
+        if verdict == "one_of":
+            changed = replace(changed, effects=(first, *found.effects[1:]))
+            assert "at joint 2 as one of several" in changed.headline()  # not the one that is named
+            assert changed.main[0].evidence.startswith("one of these")
+        first_words = "Main causes" if verdict == "unknown" else OPENINGS[verdict]
+        if verdict in ("none", "not_repeatable"):
+            changed = replace(changed, effects=())
+        assert changed.headline().startswith(first_words), verdict
+        assert OPENINGS[verdict] in changed.headline()
+        assert changed.summary().startswith(changed.headline())
+    minor = replace(found.effects[-1], alternatives=(alternative,))
+    main = replace(found, verdict="one_of", effects=(*found.effects[:-1], minor))
+    assert main.headline().startswith(OPENINGS["named"])  # a minor one alone is ambiguous
+
+
+def test_causes_stand_by_their_share_and_tables_in_the_order_of_the_ladder(
+    found: Diagnosis,
+) -> None:
+    causes = found.reasons[0]
+    assert causes.startswith("Main causes: joint compliance at joint 2 (")
+    places = [causes.index(f", {share} %") for share in (60, 20, 12)]
+    assert places == sorted(places)
+    assert causes.endswith("12 % of the squared error that geometry leaves.")
+    assert [row[0] for row in found.effects_table().rows] == IN_WORDS
+    assert [row[0] for row in found.parameter_table().rows] == IN_WORDS
+    assert [step.name for step in found.ladder[2:]] == [f"+ {name}" for name in LADDER]
+    assert [e["effect"] for e in found.to_dict()["effects"]] == [row[0] for row in FOUND]
+
+
+def test_the_words_are_short_and_have_no_loose_pronoun(found: Diagnosis) -> None:
+    assert len(found.reasons) <= 8
+    assert all(len(text.split()) < 60 for text in found.reasons)
+    for text in found.reasons:
+        assert text.split()[0] not in ("It", "They", "Together", "There", "This", "These", "That")
+        assert "tell it " not in text
+
+
+def test_minor_effects_take_one_line(found: Diagnosis) -> None:
+    (line,) = [text for text in found.reasons if "minor" in text]
+    assert line.startswith("2 minor effects (gear error at joint 5; backlash at joint 4) together")
+    assert line.endswith(" take 0.020 mm off the RMS error.")
+    many = tuple(replace(found.effects[-1], terms=(Term("backlash", f"J{n}"),))
+                 for n in range(1, 7))  # fmt: skip
+    (line,) = [
+        text for text in replace(found, effects=(*found.effects[:3], *many)).reasons
+        if "minor" in text
+    ]  # fmt: skip
+    assert line == "6 minor effects together take 0.060 mm off the RMS error."
+
+
+def test_alternatives_stand_at_their_own_place(found: Diagnosis) -> None:
+    """Of two causes of a kind only the second has one; the measurement is for the larger share."""
+    others = [Alternative("link_bending", f"L{n}", 0.9, 3.0, 1.0, f"measure {n}") for n in (1, 2)]
+    large, small = found.effects[:2]
+    second = replace(small, terms=(replace(small.term, effect=large.term.effect),),
+                     alternatives=(others[0], replace(others[0], place="L3")))  # fmt: skip
+    both = replace(found, effects=(large, second), ladder=found.ladder[:4])
+    causes = both.reasons[0]
+    assert "joint compliance at joint 2 and 3" in causes
+    assert (
+        ", or link bending at link 1 (for joint 3) or link bending at link 3 (for joint" in causes
+    )
+    assert "(for joint 2)" not in causes
+    both = replace(both, effects=(replace(large, alternatives=(others[1],)), second))
+    text = next(text for text in both.reasons if text.startswith("Recommended: "))
+    assert large.share > second.share > 0.0
+    assert text.startswith("Recommended: measure 2, to know whether it is")
+
+
+def test_places_of_one_kind_are_told_in_one() -> None:
+    assert together(("at joint 2", "at joint 1", "at joint 3")) == "at joint 2, 1 and 3"
+    assert together(("at joint 2", "in the base")) == "at joint 2, in the base"
+
+
+def test_possible_effects_stand_together_below(found: Diagnosis) -> None:
+    unsure = marked(found, established={"gear_ripple": False})
+    assert "gear ripple" not in unsure.reasons[0]
+    assert unsure.reasons[-1] == (
+        "Possible causes, not confirmed: gear ripple at joint 1; 0.050 mm off the RMS error."
+    )
+    table = unsure.effects_table()
+    assert table.header[-1] == "evidence"
+    assert [(row[0], row[-1]) for row in table.rows][-1] == (
+        "gear ripple at joint 1", "possible, 0.00")  # fmt: skip
+
+
+def test_the_remaining_error_is_given_in_its_parts(found):
+    assert not remaining_table(replace(found, remaining=None)).rows  # of a file without it
+    left = Remaining((Dependence("J3", "its load", 0.2, 0.002),), 0.1, 0.05, REPEATS)
+    parts = replace(found, remaining=left)
+    text = next(text for text in parts.reasons if text.startswith("Remaining error"))
+    assert "0.050 mm is measurement noise (repeated poses), 0.200 mm is a motion of" in text
+    assert text.endswith("joint 3 that depends on its load (p < 0.005), 0.100 mm is unexplained.")
+    assert [row[1] for row in remaining_table(parts).rows] == [0.05, 0.2, 0.1]
+    unsure = replace(parts, remaining=replace(parts.remaining, noise_mm=float("nan")))
+    assert remaining_table(unsure).rows[0][0] == "noise, not known"
+    none = replace(left, depends=(), noise_mm=0.02, noise_from=DISTANCES)
+    (text,) = [text for text in replace(found, remaining=none, floor_known=False).reasons
+               if text.startswith("Remaining error")]  # fmt: skip
+    assert "0.020 mm is the instrument's noise (distances between the targets)" in text
+    assert text.endswith("no dependence was found, 0.100 mm may be the arm's repeatability.")
+
+
+def test_what_nobody_measured_is_asked_for_first(found):
+    """For every verdict, in the first sentence too."""
+    for verdict in VERDICTS:
+        opened = replace(found, verdict=verdict, floor_known=False)
+        assert opened.next == REVISIT
+        assert opened.reasons[0].endswith(f"; {NOT_VISITED}.")
+        known = replace(opened, floor_known=True)
+        assert NOT_VISITED not in known.headline()
+        assert known.next != REVISIT
+        assert known.next or verdict not in ("unknown", "not_repeatable")
+
+
+@pytest.mark.parametrize(
+    ("driver", "kind"),
+    [
+        ("its last move and load", "approach"),
+        ("its load and angle", "payload"),
+        ("time, to and fro", "late"),
+        ("temperature", "warm"),
+        ("where it is", "instrument"),
+        ("two angles together", "more"),
+    ],
+)
+def test_each_kind_of_unknown_has_its_measurement(found, driver, kind):
+    sure = replace(found, effects=(), verdict="unknown", structure=0.002)
+    told = replace(sure, structure_in=f"J2 following {driver}").next
+    assert told.kind == kind
+    assert "joint 2" in told.settles
+    assert replace(sure, structure_in="anything else").next.kind == "more"
+
+
+def test_outliers_are_left_out_beside(found: Diagnosis) -> None:
+    *before, last = found.ladder
+    assert "without" not in found.headline()
+    for count, words in ((19, "1 outlier"), (17, "3 outliers")):
+        sound = replace(scores(0.11), counts=(count,))
+        changed = replace(found, ladder=(*before, replace(last, trusted=sound)))
+        assert f"(largest 0.460 mm; 0.110 mm without {words})" in changed.headline()
+
+
+def test_what_does_not_help_is_not_proposed(found: Diagnosis) -> None:
+    others = (Alternative("link_bending", "L2", 0.9, 3.0, 1.0, WIDER),
+              Alternative("base_flex", "frame", 0.9, 3.0, 1.0, "no measurement considered is "
+                          "enough: the best raises the power to 2 of the 25 needed"))  # fmt: skip
+    first = replace(found.effects[0], alternatives=others)
+    changed = replace(found, verdict="one_of", effects=(first, *found.effects[1:]))
+    (text,) = [text for text in changed.reasons if text.startswith("Recommended: ")]
+    assert text == (
+        f"Recommended: {WIDER}, to know whether it is joint compliance at joint 2 or link bending "
+        "at link 2."
+    )
+    assert "or base flex or link bending at link 2" in changed.reasons[0]
+    nothing = replace(changed, effects=(replace(first, alternatives=others[1:]),))
+    said = [text for text in nothing.reasons if text.startswith("Recommended: ")]
+    assert not said
+
+
+def test_every_chance_and_power_says_what_is_enough(found: Diagnosis) -> None:
+    place = "J3 following its own angle"
+    told = replace(found, verdict="unknown", structure=1e-7, structure_in=place)
+    assert "p < 0.005" in told.headline()
+    assert "Unexplained: the error after all effects is not random" in told.headline()
+    assert replace(told, effects=()).headline().startswith("Unexplained: the error after geometry")
+    assert "below 0.005 are significant" in told.effects_table().title
+    assert "the power is below 25" in told.rival_table().title
+    assert "lambda" not in told.summary()
+
+
+def test_people_read_millimetres_and_milliradians_with_two_digits_of_sigma(
+    found: Diagnosis,
+) -> None:
+    table = found.parameter_table()
+    cells = {row[0]: row[2:] for row in table.cells()}
+    assert cells["joint compliance at joint 2"] == ["0.002", "0.00012", "mrad/(N m)"]
+    assert cells["gear error at joint 3"] == ["0.002", "0.00012", "mrad"]
+    assert found.to_dict()["effects"][1]["parameters"][0]["unit"] == "rad"  # SI in the file
+
+
+# ---- curves --------------------------------------------------------------------------------------
+
+
+M = 60
+SPOTS = np.array([[0.1, 0.0, 0.03], [-0.05, 0.09, 0.03], [-0.05, -0.09, 0.03]])
+NAMES = ("smr1", "smr2", "smr3")
+
+
+def fitted(name: str, place: str, value: list[float], **choice: float) -> Fitted:
+    return Fitted((Term(name, place, choice),), (np.array(value),))
+
+
+def cell_of(robot: mc.Robot, effects: Fitted = NOTHING) -> mc.Cell:
+    base = np.eye(4)
+    base[:3, :3], base[:3, 3] = rotation(np.array([0.2, -0.1, 1.0])), [3.0, -1.0, 0.5]
+    return mc.Cell(robot, base, NAMES, SPOTS, effects)
+
+
+def left_by(
+    effects: Fitted, name: str = "irb2600", told: bool = True, **columns: Array
+) -> Leftover:
+    """What is left of exact measurements of an arm with effects, without them and with."""
+    robot, rng = mc.load_robot(name), np.random.default_rng(1)
+    order = {"order": np.arange(M)[::-1] + 1.0} if told else {}
+    q = random_poses(robot, M, rng)
+    data = mc.measurements(q, rng.normal(size=(M, 3, 3)), **order, **columns)
+    data = with_history(replace(data, target_names=NAMES, sliding=robot.prismatic))
+    first, last = cell_of(robot), cell_of(robot, effects)
+    data = data.with_y(last.follow(data))
+    return Leftover.of(data, np.arange(M) % 5 == 0, 1e-5, (first, last), effects.terms)
+
+
+LOOSE = fitted("backlash", "J5", [1e-3])
+
+
+def test_views_are_geometry_effects_and_all_but_the_first() -> None:
+    left = left_by(LOOSE)
+    plain, whole, bare = left.views
+    measured = left.data.y - cell_of(left.scene.robot).predict(left.data.q)
+    axes = cell_of(left.scene.robot).base[:3, :3]
+    assert_allclose(plain, np.moveaxis(measured, 1, 0) @ axes, rtol=0, atol=1e-12)
+    assert_allclose(whole, 0.0, atol=1e-12)
+    assert_allclose(bare, plain, rtol=0, atol=1e-12)
+    assert_allclose(left.distances()[0], 1e3 * np.linalg.norm(measured, axis=-1).T, atol=1e-9)
+    there = left.scene.robot.pose(left.data.q) @ np.append(SPOTS[1], 1.0)
+    assert_allclose(left.points[1] - left.views[0][1], there[:, :3], rtol=0, atol=1e-12)
+    alone = left_by(NOTHING)
+    assert len(alone.views) == 1
+    assert alone.law is None
+    assert alone.term is None
+
+
+def test_an_effect_is_taken_out_with_all_its_lines() -> None:
+    ripple = [Term("gear_ripple", "J3", {"turns": t}) for t in (121.0, 242.0)]
+    both = Fitted((*ripple, *LOOSE.terms), (np.ones(2), 2.0 * np.ones(2), np.ones(1)))
+    assert without(both, ripple[1]).terms == LOOSE.terms
+    assert without(both, LOOSE.terms[0]).terms == tuple(ripple)
+    assert [v.tolist() for v in without(both, LOOSE.terms[0]).values] == [[1, 1], [2, 2]]
+
+
+def test_play_is_a_turn_of_its_joint_by_the_side_it_came_from() -> None:
+    left = left_by(LOOSE)
+    curve = residual_curve(left)
+    came = np.zeros(M)
+    came[:-1] = left.data.q[:-1, 4] - left.data.q[1:, 4]  # the last row is visited first
+    assert_allclose(curve.x, np.degrees(came), rtol=0, atol=1e-9)
+    assert curve.xlabel == "last move of joint 5 (deg)"
+    assert curve.ylabel == "equivalent turn of joint 5 (mrad)"
+    assert curve.title == "errors as a turn of joint 5, for backlash at joint 5"
+    plain, whole, bare = curve.y
+    assert_array_equal(np.sign(plain[:-1]), np.sign(came[:-1]))
+    assert 0.2 < np.abs(plain[:-1]).max() < 0.6  # half of a milliradian, less the ridge
+    assert_allclose(whole, 0.0, atol=1e-9)
+    assert_allclose(bare, plain, rtol=1e-9)
+
+
+def static_torque(left: Leftover, joint: int) -> Array:
+    return np.asarray(left.scene.gravity[joint])
+
+
+def test_torques_of_masses_that_were_told_do_not_say_that_they_are_assumed() -> None:
+    scene = left_by(NOTHING).scene
+    mass, com = masses_of(scene.robot)
+    told = replace(scene, robot=replace(scene.robot, mass=mass, com=com))
+    measured = {f"tau{j + 1}": np.arange(M) for j in range(scene.joints)}
+    felt = replace(scene, data=replace(scene.data, columns={**scene.data.columns, **measured}))
+    for one in (told, felt):
+        assert drivers.torque(one, 1, {})[0] == "static torque of joint 2 (N m)"
+
+
+def wave(left: Leftover, joint: int) -> Array:
+    return np.asarray(np.degrees(left.data.q[:, joint]) % (360.0 / 121.0))
+
+
+def degrees(left: Leftover, joint: int) -> Array:
+    return np.degrees(left.data.q[:, joint])
+
+
+@pytest.mark.parametrize(
+    ("effects", "law", "joint", "label"),
+    [
+        (fitted("link_bending", "L2", [1e-6]), static_torque, 1,
+         "static torque of joint 2, masses assumed (N m)"),
+        (fitted("base_flex", "frame", [5e-7]), static_torque, 1,
+         "static torque of joint 2, masses assumed (N m)"),
+        (fitted("gear_ripple", "J3", [2e-4, 1e-4], turns=121.0), wave, 2,
+         "joint 3 within a wave of 2.98° (deg)"),
+        (fitted("encoder_gain", "J4", [1e-3]), degrees, 3, "joint 4 (deg)"),
+        (fitted("joint_coupling", "J5", [1e-3], source=4.0), degrees, 3, "joint 4 (deg)"),
+        (NOTHING, degrees, 0, "joint 1 (deg)"),
+    ],
+    ids=lambda part: part.terms[0].effect if isinstance(part, Fitted) and part.terms else "",
+)  # fmt: skip
+def test_a_curve_is_drawn_against_what_its_law_looks_at(
+    effects: Fitted, law: object, joint: int, label: str
+) -> None:
+    left = left_by(effects)
+    curve = residual_curve(left)
+    assert curve.xlabel == label
+    wanted = law(left, joint)  # type: ignore[operator]
+    assert_allclose(np.abs(curve.x), np.abs(wanted), rtol=1e-9, atol=1e-9)
+    assert len(curve.y) == (3 if effects.terms else 1)
+    if effects.terms and effects.terms[0].effect in ("encoder_gain", "joint_coupling"):
+        shown = turns(left)[-1][:, guilty(left, turns(left))]
+        assert_allclose(curve.y[-1], 1e3 * (shown - shown.mean()), rtol=0, atol=1e-12)
+        assert abs(curve.y[0].mean()) > 1e-3  # a constant turn, which geometry takes
+
+
+def test_time_and_heat_are_drawn_along_their_motion() -> None:
+    heat = np.linspace(20.0, 30.0, M)
+    warm = left_by(fitted("thermal_growth", "all", [3e-4], temperature=1.0, apart=0.0),
+                   temperature=heat)  # fmt: skip
+    curve = residual_curve(warm)
+    assert curve.xlabel == "temperature (°C)"
+    assert_array_equal(curve.x, np.broadcast_to(heat, (3, M)))
+    assert curve.ylabel == "error along its growth (mm)"
+    assert_allclose(np.abs(curve.y[0]), warm.distances()[0], rtol=0, atol=1e-6)
+    jump = left_by(fitted("session_jump", "frame", [1e-3, 0, 0, 0, 0, 0], since=0.5))
+    curve = residual_curve(jump)
+    assert curve.title == "error of all targets, for session jump"
+    assert_allclose(curve.x[0], np.linspace(1.0, 0.0, M), rtol=0, atol=1e-12)
+    assert_allclose(curve.y[0], 1.0 * (curve.x >= 0.5), rtol=0, atol=1e-9)
+    shift = left_by(fitted("target_shift", "smr2", [0.0, 2e-3, 0.0], since=0.5))
+    curve = residual_curve(shift)
+    assert curve.title == "error of smr2, for target shift at smr2"
+    assert curve.y[0].shape == curve.x.shape == (1, M)
+    assert_allclose(curve.y[0], 2.0 * (curve.x >= 0.5), rtol=0, atol=1e-9)
+
+
+def test_an_offset_is_drawn_along_the_line_of_sight() -> None:
+    left = left_by(fitted("target_offset", "all", [1e-3]))
+    curve = residual_curve(left)
+    away = np.linalg.norm(left.data.y, axis=-1).T  # the instrument is the origin
+    assert_allclose(curve.x, away, rtol=1e-12)
+    assert_allclose(curve.y[0], 1.0, rtol=0, atol=1e-9)
+    assert curve.xlabel == "distance from the instrument (m)"
+
+
+def test_a_slide_is_shown_in_millimetres() -> None:
+    left = left_by(NOTHING, "scara_600")
+    label, x = own_value(left.scene, 2, {})
+    assert label == "joint 3 (mm)"
+    assert_allclose(x, 1e3 * left.data.q[:, 2], rtol=1e-14)
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_errors_in_the_order_of_the_visits(told: bool) -> None:
+    left = left_by(LOOSE, told=told)
+    curve = order_curve(left)
+    rms = np.sqrt(np.mean(left.distances()[0] ** 2, axis=0))
+    assert_allclose(curve.y[0], rms, rtol=1e-12)
+    if told:
+        assert_array_equal(curve.x, np.arange(M)[::-1] + 1.0)
+    assert (curve.xlabel == "visit (first to last)") == told
+    some = replace(left, errors=tuple(np.where(np.arange(3)[:, None, None] == 1, np.nan, e)
+                                      for e in left.errors))  # fmt: skip
+    rms = np.sqrt(np.mean(left.distances()[0][[0, 2]] ** 2, axis=0))
+    assert_allclose(order_curve(some).y[0], rms, rtol=1e-12)
+
+
+def test_a_curve_names_its_views() -> None:
+    curve = Curve("t", "x (m)", "y (mm)", np.arange(2.0), (np.ones(2), np.array([np.nan, 2.0])))
+    told = curve.to_dict()
+    assert told["x"] == {"label": "x (m)", "values": [0.0, 1.0]}
+    assert told["views"] == [
+        {"name": "geometry alone", "values": [1.0, 1.0]},
+        {"name": "with effects", "values": [None, 2.0]},
+    ]
+
+
+def test_joint_equivalent_is_the_turn():
+    scene = left_by(NOTHING).scene
+    turn = 1e-3 * np.random.default_rng(0).normal(size=(scene.poses, scene.joints))
+    error = np.einsum("nkcm,mn->kmc", scene.jacobian, turn)
+    off = np.abs(joint_equivalent(error, scene.jacobian, 1e-7) - turn)
+    assert np.median(off) < 1e-5  # large only where the wrist or the arm is stretched
+    assert np.quantile(off[:, :3], 0.9) < 1e-4

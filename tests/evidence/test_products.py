@@ -273,26 +273,24 @@ class Some:
 
 
 @pytest.mark.parametrize(
-    ("causes", "poses"),
+    ("third", "causes", "poses"),
     [
-        ((), 60),
-        ((Cause("joint_compliance", "J3", 300.0),), 100),
-        ((Cause("gear_error", "J2", 100.0), Cause("frame_drift", "frame", 300.0)), 100),
-        ((Cause("backlash", "J1", 300.0), Cause("thermal_growth", "all", 1000.0)), 60),
+        (0, (), 60),
+        (1, (Cause("joint_compliance", "J3", 300.0),), 100),
+        (2, (Cause("gear_error", "J2", 100.0), Cause("frame_drift", "frame", 300.0)), 100),
     ],
 )
-def test_a_part_names_what_its_rows_alone_name(causes, poses):
+def test_a_part_names_what_its_rows_alone_name(third, causes, poses):
     """From the same candidates, at the likeliest ratio of all and not of few."""
     made = study_of(make(Case("irb2600", "single", causes, seed=5, poses=poses)))
     choice = select(arm_library(made.scene, made.rows))
-    for third in range(3):
-        kept = made.rows.at(np.arange(made.data.poses) % 3 != third)
-        found = select(choice.part(kept))
-        terms = [c.term for c in choice.part(kept).candidates]
-        alone = Library.of(Some(choice.library.dictionary, kept), terms, ())
-        expected = select(alone)
-        assert {c.key for c in found.chosen} == {c.key for c in expected.chosen}
-        assert len(found.chosen) >= len(causes)
+    kept = made.rows.at(np.arange(made.data.poses) % 3 != third)
+    part = choice.part(kept)
+    found = select(part)
+    terms = [c.term for c in part.candidates]
+    alone = select(Library.of(Some(choice.library.dictionary, kept), terms, ()))
+    assert {c.key for c in found.chosen} == {c.key for c in alone.chosen}
+    assert len(found.chosen) >= len(causes)
 
 
 def test_a_part_tunes_again_what_it_ends_with():

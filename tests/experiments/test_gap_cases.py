@@ -2,18 +2,16 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from experiments import blind_gap, gap_cases, machine_gap, machines, scoring
+from experiments import blind_gap, gap_cases, machines
 from experiments.gap_cases import ARMS, FAULTS, LAWS, Case, Cause, Truth, World
 from experiments.machines import LAWS as SHOP_LAWS
 from experiments.machines import MAKES, Asked
-from experiments.record import interval
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import plain
 
@@ -282,97 +280,6 @@ def test_score_of_several_effects():
     assert blind_gap.score(case, small, answer("named", J2, GAIN, J3))["strange"] == 1
 
 
-def test_criteria_and_tables_of_made_up_rows():
-    def row(condition: str, said: dict, *names: tuple[str, str], **more: object) -> dict:
-        causes = tuple(Cause(effect, place, 100.0) for effect, place in names)
-        made = blind_gap.score(Case("irb2600", condition, causes), truth_of(*names), said)
-        return made | {"seconds": 0.1, "telling": 90.0, "rho2": 0.1} | more
-
-    rows = [
-        row("none", answer("none")),
-        row("none", answer("named", J2)),
-        row("single", answer("named", J2), J2, oracle_mm=0.04, known_mm=0.04),
-        row("single", answer("one_of", GAIN, also=(J2,)), J2, oracle_mm=0.01, known_mm=0.04),
-        row("single", answer("unknown"), GAIN, telling=3.0, rho2=0.97),
-        row("deleted", answer("named", GAIN), J2),
-        row("deleted", answer("named", ("joint_error_map", "J2")), J2),  # which is true
-        row("deleted", answer("named", ("joint_error_map", "J3")), J2),
-        row("deleted", answer("unknown"), J2),
-        row("outside", answer("unknown"), ("outside_sum", "J2")),
-        row("pair", answer("named", J2, GAIN), GAIN, J2),
-    ]
-    criteria = blind_gap.criteria(rows)
-    table = scoring.headline(criteria, *blind_gap.no_shares(rows))
-    found = {str(line[0]).strip(): line for line in table.rows}
-    assert found["no effect: something named"][1:3] == (2, 50.0)
-    assert found["no effect: something named"][6] == "MISSED"
-    assert_allclose(found["one effect, lambda >= 50: truth in the set of the first"][2], 200 / 3)
-    assert found["first name right where lambda (1 - rho^2) >= 25"][1:3] == (2, 50.0)
-    assert found["true effect deleted: named for sure"][2] == 75.0
-    assert found["named for sure, and falsely"][2] == 50.0
-    assert found["outside the library, lambda (1 - rho^2) >= 50: unknown"][6] == "met"
-    assert found["two effects exactly right, each lambda (1 - rho^2) >= 25"][2] == 100.0
-    assert found["one effect, lambda >= 50: mean size of the set"][2] == 1.5
-    assert found["median seconds of a quick diagnosis"][6] == "met"
-    missed = scoring.misses(criteria, lambda row: row["robot"], "oracle_mm")
-    reasons = {line[0] for line in missed.rows}
-    assert {"false alarm", "wrong name", "not close", "sure without the truth"} <= reasons
-    for made in (scoring.verdicts, blind_gap.per_effect, blind_gap.detectability,
-                 blind_gap.shrink, scoring.troubles):  # fmt: skip
-        assert made(rows).text()
-    said = {row[0]: row[2] for row in blind_gap.confusion(rows).rows}
-    assert said == {"gear_error": "gear_error 1, encoder_gain 1", "encoder_gain": "unknown 1"}
-
-
-def test_a_run_shows_the_diagnosis_files_only(monkeypatch):
-    """Robot and data by path, in a folder that says nothing; then the seal is opened."""
-    given = []
-
-    class Answer:
-        def to_dict(self) -> dict:
-            return answer("named", GAIN)
-
-    def diagnose(robot: Path, data: Path, **options: object) -> Answer:
-        given.append((robot.name, data.name, options))
-        text = robot.read_text() + data.read_text().partition("\n")[0]
-        assert not any(word in text for word in ("encoder", "gain", "lambda", "truth"))
-        return Answer()
-
-    def resemblance(robot: mc.Robot, data: mc.Measurements, motion: Array) -> dict:
-        assert motion.shape == (3, data.poses, 3)
-        return {GAIN: 1.0, J2: 0.7}
-
-    monkeypatch.setattr(mc, "diagnose", diagnose, raising=False)
-    monkeypatch.setattr(blind_gap, "resemblance", resemblance)
-    case = Case("irb2600", "single", (Cause(*GAIN, 1000.0),), poses=60, seed=8)
-    row = blind_gap.run(case)
-    assert given == [("robot.json", "data.csv", {"seed": 8, "exclude": (), "quick": True})]
-    assert row["trouble"] == ""
-    assert (row["match"], row["rho2"], row["rival"]) == ("exact", 0.7, list(J2))
-    assert_allclose(row["telling"], 300.0, rtol=1e-6)
-    assert_allclose(row["oracle_mm"], row["known_mm"], rtol=0.02)
-    assert_allclose(row["known_mm"], row["floor_mm"], rtol=0.2)
-
-
-def test_intervals_are_clopper_and_pearsons():
-    assert_allclose(interval(0, 100), [0.0, 1 - 0.025 ** (1 / 100)], atol=1e-12)
-    assert_allclose(interval(100, 100), [0.025 ** (1 / 100), 1.0], atol=1e-12)
-
-
-@pytest.mark.parametrize("size", [blind_gap.Size(), blind_gap.QUICK])
-def test_plan_covers_every_condition(size):
-    cases = blind_gap.plan(1, size)
-    assert len({case.seed for case in cases}) == len(cases)
-    conditions = {case.condition for case in cases}
-    assert {"none", "single", "pair", "triple", "background"} <= conditions
-    assert {"outside", "deleted", "wrong_law", "fault"} <= conditions
-    single = {case.causes[0].law for case in cases if case.condition == "single"}
-    assert single == set(blind_gap.LIBRARY)
-    for case in cases:
-        for cause in case.causes:
-            assert cause.place in gap_cases.places(cause.law, case.robot)
-
-
 def test_laws_of_joints_are_differences_of_forward_kinematics():
     place = world(jitter=0.0)
     last = np.concatenate([place.q[:1], place.q[:-1]])
@@ -409,20 +316,3 @@ def test_lambda_is_what_was_asked_for_in_shops(law):
         made = machines.make(Asked(robot, "test", (Cause(law, place, 70.0, 1),), poses=60))
         assert_allclose(made.powers, [70.0], rtol=1e-5)
         assert made.parts.shape == (1, 3, made.data.poses, 3)
-
-
-def test_a_separable_cause_is_told_from_one_that_is_not():
-    row = {"verdict": "named", "all_right": True, "lambda": 60.0, "telling": 30.0}
-    assert machine_gap.separable(row)
-    assert machine_gap.right(row)
-    assert not machine_gap.separable(row | {"telling": 20.0})
-    assert not machine_gap.right(row | {"verdict": "unknown"})
-    assert not machine_gap.right(row | {"all_right": False})
-
-
-def test_every_case_can_be_made_and_has_a_seed_of_its_own():
-    cases = machine_gap.plan(5, machine_gap.QUICK)
-    assert len({case.seed for case in cases}) == len(cases)
-    for case in cases:
-        for cause in case.causes:
-            assert cause.place in machines.places(cause.law, case.robot, case.targets)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from conftest import SHARED, shared
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
@@ -10,37 +9,15 @@ from scipy.spatial.transform import Rotation
 import minimax_cal as mc
 from experiments import methods
 from experiments.hand_eye import closed_form, mdh_pose, place
-from experiments.methods import (
-    FIGURES,
-    MINIMAX,
-    PARTS,
-    SINGLE,
-    Job,
-    Studies,
-    figure_of,
-)
+from experiments.methods import Job, figure_of
 from experiments.poe import Screws, fit_poses, fit_positions, screws_of
-from experiments.poses import (
-    euler_deviation,
-    exp,
-    lever,
-    orientation_error,
-    points,
-    poses_of,
-    triangle,
-)
+from experiments.poses import exp, lever, orientation_error, points, poses_of, triangle
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.sampling import random_poses
 from minimax_cal.robots.transforms import inverse, transform
 
 # ---- methods -------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def alone(tmp_path_factory: pytest.TempPathFactory) -> Studies:
-    """The study without real data."""
-    return methods.run(quick=True, seed=1, folder=tmp_path_factory.mktemp("none"))
 
 
 def moved_triangle(rng: np.random.Generator) -> tuple[Array, Array, Array]:
@@ -66,44 +43,6 @@ def test_errors_of_known_poses(rng):
     assert_allclose(orientation_error(measured, other), np.linalg.norm(turn, axis=1), atol=1e-12)
 
 
-def test_euler_angles_exaggerate_near_gimbal_lock():
-    def turned(a: float, b: float, c: float) -> Array:
-        turn = Rotation.from_euler("xyz", [a, b, c], degrees=True).as_matrix()
-        return transform(turn, np.zeros(3))[None]
-
-    assert_allclose(euler_deviation(turned(170, 5, 0), turned(-170, 2, 1)),
-                    np.radians([[20, 3, 1]]), atol=1e-12)  # fmt: skip
-    near = turned(40, 89.9, 0), turned(0, 89.9, -40)
-    assert orientation_error(*near)[0] < np.radians(0.1)
-    assert_allclose(euler_deviation(*near), np.radians([[40, 0, 40]]), atol=1e-9)
-
-
-def test_sum_and_minimax_are_the_best_at_what_they_minimise(alone):
-    # all methods but the nominal one fit the same family of arms
-    _, results = alone[0]
-    best = figure_of(results["sum"], "AP RMSE", "training")
-    worst = figure_of(results[MINIMAX], "worst SMR", "training")
-    for name, outcomes in results.items():
-        assert all(outcome.status == "converged" for outcome in outcomes), name
-        assert figure_of(outcomes, "AP RMSE", "training") >= best * (1 - 1e-9), name
-        assert figure_of(outcomes, "worst SMR", "training") >= worst * (1 - 1e-3), name
-
-
-def test_poe_and_mdh_fit_one_smr_alike(alone):
-    _, results = alone[0]
-    for i, name in enumerate(SINGLE, start=1):
-        mdh, poe = results[name][0], results[f"POE SMR {i}"][0]
-        for part in PARTS:
-            assert_allclose(mdh.errors[part].distance, poe.errors[part].distance, rtol=0, atol=1e-8)
-
-
-def test_every_method_beats_the_nominal_one_held_out(alone):
-    _, results = alone[0]
-    for key in FIGURES:
-        values = {name: figure_of(each, key, "held out") for name, each in results.items()}
-        assert max(values, key=lambda name: values[name]) == "nominal"
-
-
 def test_real_robots_improve_held_out():
     shared("irb120")
     case = methods.cases(quick=True)[1]
@@ -115,18 +54,6 @@ def test_real_robots_improve_held_out():
     assert 0.7 < error["nominal"] < 1.1  # [mm]
     assert error["POE pose"] == pytest.approx(error["MDH pose"], rel=1e-6)
     assert max(error["MDH pose"], error["sum"]) < 0.4
-
-
-def test_command(alone, tmp_path, monkeypatch):
-    monkeypatch.setattr(methods, "run", lambda *_: alone)
-    out, figures = tmp_path / "out", tmp_path / "figures.json"
-    options = ["--quick", "--data", str(tmp_path), "--out", str(out), "--json", str(figures)]
-    done = CliRunner().invoke(methods.main, options)
-    assert done.exit_code == 0, done.output
-    text = (out / "methods.md").read_text(encoding="utf-8")
-    assert text.count("data absent") == 2 * 2  # title and row, for each real robot
-    assert (out / "methods_1.csv").exists()
-    assert '"schema": 1' in figures.read_text()
 
 
 # ---- poe -----------------------------------------------------------------------------------------
@@ -197,7 +124,7 @@ def cell(robot: mc.Robot, count: int, seed: int) -> tuple[Array, Array, Array, A
 
 
 @pytest.mark.parametrize("name", ["irb2600", "ur10", "meca500"])
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(4))
 def test_closed_form_recovers_both_frames(name, seed):
     robot = mc.load_robot(name)
     _, A, B, X, Z = cell(robot, 20, seed)
@@ -206,7 +133,7 @@ def test_closed_form_recovers_both_frames(name, seed):
     assert_allclose(found_z, Z, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_refinement_finds_what_rotations_about_one_axis_leave_open(seed):
     robot = mc.load_robot("scara_600")
     q, _, B, _, _ = cell(robot, 20, seed)
@@ -221,16 +148,3 @@ def test_mdh_pose_fit_finds_the_true_robot(robot, clean):
     assert found.status == "converged"
     q = random_poses(robot, 50, np.random.default_rng(9))
     assert_allclose(found.predict(q), clean.cell.predict(q), rtol=0, atol=1e-9)
-
-
-def test_splits_part_the_poses():
-    shared("fanuc_r2000")
-    for case in methods.cases(quick=False):
-        joints = [methods.divided(case, split, 3, SHARED)[1:] for split in range(case.splits)]
-        for train, held in joints:
-            assert train.poses == case.train
-            both = np.concatenate([train.q, held.q])
-            assert len(np.unique(both, axis=0)) == len(both)
-        if case.folds:
-            every = np.concatenate([held.q for _, held in joints])
-            assert len(np.unique(every, axis=0)) == len(every) == train.poses + held.poses

@@ -7,23 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from experiments.driven_arms import drawn_arm
-from experiments.motion_blind import (
-    BEYOND,
-    PAIR,
-    SINGLE,
-    SOUND,
-    Told,
-    oracle,
-    place_of,
-    plan,
-    questions_table,
-    run,
-)
+from experiments.motion_blind import BEYOND, SINGLE, SOUND, Told, oracle, questions_table, run
 from experiments.motion_cases import (
     CAUSES,
     LIBRARY,
-    MUJOCO,
-    OUTSIDE,
     OWN,
     Case,
     by_integration,
@@ -34,20 +21,9 @@ from experiments.motion_cases import (
     some_arm,
     sound,
 )
-from experiments.motion_gap import Case as GapCase
-from experiments.motion_gap import Closed, Judged, closed_table, real_table
-from experiments.motion_real import (
-    SIMULATED,
-    Left,
-    names_table,
-    steps_table,
-)
-from experiments.motion_real import (
-    Told as RealTold,
-)
-from experiments.motion_real import (
-    run as run_left,
-)
+from experiments.motion_real import SIMULATED, Left
+from experiments.motion_real import Told as RealTold
+from experiments.motion_real import run as run_left
 from minimax_cal.dynamics.laws import LAWS
 
 # ---- motion blind --------------------------------------------------------------------------------
@@ -162,34 +138,12 @@ def test_answers_are_judged_by_the_truth():
     assert counts["outside: sure and wrong"] == (2, 1)
 
 
-def test_a_payload_is_judged_by_its_mass_and_interval():
-    near = told(SINGLE, "payload L3", "named", "payload L3", mass=(1.02, 0.005, 1.0))
-    far = told(SINGLE, "payload L3", "named", "payload L3", mass=(1.05, 0.05, 1.0))
-    counts = {row[0]: row[1:3] for row in questions_table([near, far]).rows}
-    assert counts["payload: the link named, its mass within 3 %"] == (2, 1)
-    assert counts["payload: the true mass within its 95 % interval"] == (2, 1)
-
-
 def test_a_payload_that_nobody_told_is_named_with_its_mass():
     answer = run(Case(SINGLE, OWN, (("payload", 0),), 3))
     value, sigma, true = answer.mass
     assert answer.right
     assert value == pytest.approx(true, rel=0.03)
     assert abs(value - true) < 3.0 * sigma
-
-
-def test_the_plan_holds_every_cause_by_both_generators():
-    cases = plan(3, 6, 2 * len(LIBRARY))
-    assert len({case.seed for case in cases}) == len(cases)
-    single = {(c.causes[0][0], c.generator) for c in cases if c.condition == SINGLE}
-    assert single == {(name, generator) for name in LIBRARY for generator in (MUJOCO, OWN)}
-    outside = {(c.causes[0][0], c.generator) for c in cases if c.condition == BEYOND}
-    assert outside == {(name, generator) for name in OUTSIDE for generator in (MUJOCO, OWN)}
-    assert all(len({n for n, _ in c.causes}) == 2 for c in cases if c.condition == PAIR)
-    assert place_of("payload", 0, 4) == ("payload", "L4")
-    assert place_of("link_inertia", 1, 3) == ("link_inertia", "L2")
-    assert place_of("delay", 2, 3) == ("delay", "all")
-    assert place_of("cable", 5, 4) == ("cable", "J2")
 
 
 # ---- motion real ---------------------------------------------------------------------------------
@@ -207,16 +161,6 @@ def test_withheld_effects_are_named_and_help_on_a_run_that_no_fit_saw(left_out):
     assert np.all(left_out.reached[-1] <= left_out.whole[-1])  # rows at rest only add
 
 
-def test_tables_count_runs_and_compare_with_the_claim(left_out):
-    table = steps_table(SIMULATED, [left_out, left_out])
-    last = dict(zip((row[0] for row in table.rows), table.rows, strict=True))
-    assert last["all effects"][1:] == pytest.approx(left_out.reached[-1])
-    assert last["claimed over reached"][1:] == pytest.approx(
-        left_out.claimed[-1] / left_out.reached[-1]
-    )
-    assert all(row[1:] == (2, 2) for row in names_table(SIMULATED, [left_out, left_out]).rows)
-
-
 # ---- motion gap ----------------------------------------------------------------------------------
 
 
@@ -231,20 +175,21 @@ def test_an_arm_lacks_what_is_asked_for_and_repeats_by_its_seed():
     assert real.body_mass[-1] == pytest.approx(arm.known.body_mass[-1] + arm.withheld.payload)
 
 
-def test_tables_count_what_remains():
-    one = Closed(10.0, 1.0, 0.1, np.array([0.1, 0.2]), np.array([0.01, 0.02]))
-    case = GapCase("ur10", ("friction",), 1)
-    *_, last = closed_table([case, case], [one, one]).rows
-    assert last == ("median", 10.0, pytest.approx(10.0), pytest.approx(20.0),
-                    pytest.approx(1.0), pytest.approx(2.0))  # fmt: skip
-    low = np.array([0.05, 0.06])
-    run = Judged(
-        "a", np.array([2.0, 2.0]), np.array([0.3, 0.4]), np.array([0.1, 0.2]), low, 0.5 * low
-    )
-    assert [row[1:] for row in real_table([run, run]).rows] == [
-        (pytest.approx(2.0), pytest.approx(2.0)),
-        (pytest.approx(0.3), pytest.approx(0.4)),
-        (pytest.approx(0.1), pytest.approx(0.2)),
-        (pytest.approx(0.05), pytest.approx(0.06)),
-        (pytest.approx(0.025), pytest.approx(0.03)),
-    ]
+# ---- servos --------------------------------------------------------------------------------------
+
+
+def test_half_of_the_arms_have_elastic_joints_and_each_repeats_by_its_seed():
+    pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
+    from experiments.servos import drawn, drawn_cases
+
+    cases = drawn_cases(20, 5)
+    assert sum(case.elastic for case in cases) == 10
+    assert len({case.arm for case in cases}) == 4
+    one, again = (drawn("scara_600", 7, elastic=True) for _ in range(2))
+    assert one.delay == again.delay
+    assert one.real.njnt == 2 * one.arm.robot.joints
+    assert ((one.gain >= 0.5) & (one.gain <= 2.0)).all()
+    sound = drawn("scara_600", 7, elastic=False, sound=True)
+    assert (sound.gain == 1.0).all()
+    assert sound.delay == 0.0
+    assert np.allclose(sound.real.actuator_gainprm[:, 0], sound.stiffness)

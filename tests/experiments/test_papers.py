@@ -12,28 +12,10 @@ from click.testing import CliRunner
 from conftest import ROOT, shared
 from numpy.testing import assert_allclose
 
-from experiments import errata, splits
+from experiments import errata
 from experiments.__main__ import STUDIES
-from experiments.conditions import PAPER, Errors, arm_of
-from experiments.convergence import Row, grid, moved_of
-from experiments.courses import Course, rises
-from experiments.splits import Held
-from experiments.verdicts import (
-    HEADER,
-    HOLDS,
-    MISSING,
-    NO,
-    PARTLY,
-    TOO_FEW,
-    VERDICTS,
-    YES,
-    Verdict,
-    near,
-    of_quick,
-    table_of,
-    told,
-)
-from experiments.verdicts_m import FIVE, best_of
+from experiments.conditions import PAPER
+from experiments.verdicts import HEADER, MISSING, TOO_FEW, VERDICTS
 
 PAGE = ROOT / "docs" / "papers.md"
 LIST = ROOT / "docs" / "errata.md"
@@ -66,77 +48,6 @@ def test_no_entries_of_table_3_give_the_percentages_of_the_text():
 
 def test_the_list_on_the_page_is_what_the_command_writes():
     assert errata.page() in LIST.read_text(encoding="utf-8")
-
-
-# ---- verdicts ----------------------------------------------------------------------------------
-
-
-def test_verdicts_follow_from_their_parts():
-    assert [told(True, True), told(True, False), told(False)] == [YES, PARTLY, NO]
-
-
-def test_a_quick_run_says_nothing_on_few_cases():
-    made = {n: Verdict("x", "splits", "1", "1", YES, cases=n) for n in (0, 2, 19, 20)}
-    assert [of_quick(v).verdict for v in made.values()] == [YES, TOO_FEW, TOO_FEW, YES]
-
-
-def test_rules_are_two_sided_and_printed():
-    assert [near(x, 67.34) for x in (-15.7, 50.0, 51.0, 84.0, 85.0)] == [
-        False, False, True, True, False,
-    ]  # fmt: skip
-    rule = "within 25 %"
-    rows = table_of([Verdict("x", "splits", "1", "1", YES, rule=rule)]).rows
-    assert rows[0][-1] == f"rule: {rule}"
-    bare = table_of([Verdict("x", "y", "1", "1", v) for v in (YES, HOLDS)]).rows
-    assert all(str(row[-1]).startswith("rule: ") for row in bare)
-
-
-def errors(*sums: float) -> Errors:
-    return Errors(sums, np.ones(12), np.ones(4), np.ones(4))
-
-
-def test_a_condition_is_judged_by_what_it_makes_small():
-    made = {name: errors(3.0, 3.0, 4.0) for name in FIVE}
-    made |= {"nominal": errors(9, 9, 9), "smr:1": errors(1, 5, 5), "smr:2": errors(5, 1, 5)}
-    made |= {"smr:3": errors(5, 5, 1), "sum": errors(2, 2, 3.5), "minimax": errors(3, 3, 3)}
-    assert all(best_of(name, made) for name in PAPER)
-    worse = made | {"minimax": errors(3, 3, 5), "smr:1": errors(6, 6, 6), "sum": errors(9, 9, 9)}
-    assert [best_of(name, worse) for name in ("minimax", "smr:1", "sum", "nominal")] == [False] * 4
-
-
-def test_rises_are_counted():
-    course = Course(np.array([4.0, 2.0, 3.0, 3.0, 1.0, 1.5]), 6, True, 1.0)
-    assert rises(course) == 2
-
-
-def test_starts_moved_by_rounding_stand_beside_the_same_starts():
-    def row(every: int, lost: int) -> Row:
-        theta, alpha = grid(every)
-        least = theta + alpha > 0.0
-        converged = theta > -1.0
-        converged[lost] ^= True
-        size = len(theta)
-        return Row("nllm", "all, mm", every, np.ones(size), np.ones(size), converged, least, 1.0)
-
-    few = len(grid(3)[0])
-    m = moved_of(row(1, 0), row(3, 7))  # the first start of all is not among the few
-    assert m.starts == few
-    assert_allclose(m.otherwise, 100.0 / few)
-    assert_allclose(abs(np.diff(m.converged)), 100.0 / few)
-    assert m.minimum[0] == m.minimum[1]
-
-
-def test_splits_hold_every_region_out_once_and_tell_their_spread():
-    _, data = arm_of("irb2600", 0)
-    jobs = [splits.Job("irb2600", "by groups", region, 100, 0) for region in range(splits.REGIONS)]
-    held = np.array([splits.held_rows(data, job) for job in jobs])
-    assert (held.sum(axis=0) == 1).all()
-    random = splits.held_rows(data, splits.Job("irb2600", "random", 1, 100, 0))
-    assert (~random).sum() == 100
-    found = {job: Held((1.0, 2.0), (0.9 + 0.1 * i, 2.0)) for i, job in enumerate(jobs)}
-    s = splits.spread_of(found, "irb2600", "by groups", 0)
-    assert_allclose([s.median, s.low, s.high], [1.15, 1.025, 1.275])
-    assert (s.wins, s.splits) == (1, 6)
 
 
 # ---- the page ----------------------------------------------------------------------------------

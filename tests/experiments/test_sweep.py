@@ -162,31 +162,6 @@ def test_a_process_that_dies_ends_the_sweep_in_a_word(tmp_path):
         sweep(kill_worker, [0, 1, 2], name="dead", jobs_in_parallel=2, folder=tmp_path)
 
 
-def test_a_key_names_all_that_a_result_depends_on():
-    keys = {
-        module.key(name, function, job, code)
-        for name in ("a", "b")
-        for function in (work, kill_worker)
-        for job in (Job(0), Job(1))
-        for code in ("x", "y")
-    }
-    assert len(keys) == 16
-    assert module.key("a", work, Job(0), "x") == module.key("a", work, Job(0), "x")
-
-
-def test_code_of_a_study_is_its_file_and_what_it_imports(tmp_path):
-    for name, text in {
-        "study": "from pkg.helper import f\nimport numpy.linalg",
-        "helper": "def f():\n    from pkg import deeper",
-        "deeper": "",
-        "other": "",
-        "record": "",
-    }.items():
-        (tmp_path / f"{name}.py").write_text(text)
-    found = [path.stem for path in module.study_files(tmp_path / "study.py")]
-    assert found == ["deeper", "helper", "study"]
-
-
 def wait_for(ready: Any, seconds: float = 120.0) -> None:
     until = time.monotonic() + seconds
     while not ready():
@@ -280,16 +255,6 @@ def test_a_missing_package_is_named(package, extra, options, tmp_path, monkeypat
 
 
 # ---- all studies -----------------------------------------------------------------------------
-
-
-def test_options_of_a_study(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    result = run_toy("--quick", "--seed", "3", "--jobs", "1", "--json", "x.json", "--more", "2")
-    assert result.exit_code == 0, result.stderr
-    path = Path("x.json")
-    study = Study("toy", True, path, Path("results/toy"), 3, 1, "", False)
-    assert result.stdout.strip() == f"{study} 2"
-    assert len(list(tmp_path.glob("results/cache/toy/*.part"))) == 2
 
 
 HOSTILE = "<script>alert('x')</script> & \"quoted\" | bar"
@@ -500,12 +465,3 @@ def test_a_deserted_cluster_is_not_waited_for(dead, tmp_path, monkeypatch):
                 sweep(work, jobs, name="deserted", cluster=address, folder=tmp_path)
         ending.result()
     assert len(list(tmp_path.glob("deserted/*.part"))) >= 1  # what arrived is kept
-
-
-def test_a_study_starts_under_its_own_name(monkeypatch):
-    made = ModuleType("experiments.fake_study")
-    seen: list[str] = []
-    made.main = lambda prog_name: seen.append(prog_name)
-    monkeypatch.setitem(sys.modules, made.__name__, made)
-    module.start("/somewhere/experiments/fake_study.py")
-    assert seen == ["python -m experiments.fake_study"]

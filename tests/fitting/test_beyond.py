@@ -1,3 +1,6 @@
+"""Parts left out, folds, intervals, spans and floors: what is claimed of poses not measured."""
+
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -20,14 +23,24 @@ from minimax_cal.fitting.accuracy import (
     told,
     top_of_normal,
 )
-from minimax_cal.fitting.beyond import (
-    needed,
-    one_step,
-    step_without,
-    unidentified,
-    without,
-)
+from minimax_cal.fitting.beyond import needed, one_step, step_without, unidentified, without
 from minimax_cal.fitting.crossed import MIN_HELD_POSES
+from minimax_cal.fitting.floor import (
+    AT_MOST,
+    DECLARED,
+    DISTANCES,
+    REPEATS,
+    RMS_OF_REPEATABILITY,
+    Floor,
+    by_distances,
+    declared,
+    floor_of,
+    instrument_noise,
+    instrument_of,
+    of_coordinate,
+    with_instrument,
+)
+from minimax_cal.fitting.spans import inner_size, least_span, narrow, outside, spans_of
 from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import plain
@@ -203,15 +216,6 @@ def test_what_joints_spanned_survives_the_file(robot):
     assert bare.spans == fit.spans
 
 
-def test_a_diagnosis_claims_nothing_outside_either(robot):
-    found = mc.diagnose(robot, with_spans(robot, (0, 1, 2), 0.0).data)
-    gap = found.to_dict()["gap"]["beyond"]
-    assert gap["worst_mm"] is None
-    assert gap["narrow"] == ["J1", "J2", "J3"]
-    assert "Outside the measured region nothing is claimed: joint 1 spans" in found.headline()
-    assert mc.Diagnosis.from_dict(found.to_dict()).beyond == found.beyond
-
-
 @pytest.mark.slow
 def test_the_plan_that_is_offered_mends_it(robot):
     made = with_spans(robot, (0, 1, 2), 0.0)
@@ -289,7 +293,7 @@ def test_too_few_poses_are_a_loud_warning(robot):
 # ---- intervals -----------------------------------------------------------------------------------
 
 
-RUNS = 300
+RUNS = 200
 CHANCE = 3.3 * np.sqrt(0.95 * 0.05 / RUNS)  # one test in a thousand fails by chance
 
 
@@ -477,3 +481,213 @@ def test_the_largest_of_normal_samples_follow_their_law():
     every = top_of_normal(6, 6, rng_of(4)).reshape(-1)
     assert abs(every.mean()) < 4.0 / np.sqrt(len(every))
     assert abs(every.var() - 1.0) < 4.0 * np.sqrt(2.0 / len(every))
+
+
+# ---- accuracy ------------------------------------------------------------------------------------
+
+
+# Two targets at three poses [m]; distances 5, 0, - and 1, 2, 2 mm.
+ERROR = 1e-3 * np.array(
+    [
+        [[3.0, 0.0, 4.0], [0.0, 0.0, 0.0], [np.nan] * 3],
+        [[0.0, 1.0, 0.0], [0.0, 0.0, -2.0], [2.0, 0.0, 0.0]],
+    ]
+)
+
+
+def test_all_points_and_each_target():
+    found = accuracy(ERROR)
+    assert found.rms_mm == pytest.approx(math.sqrt(34.0 / 5.0), rel=1e-14)
+    assert (found.max_mm, found.mean_mm) == pytest.approx((5.0, 2.0), rel=1e-14)
+    assert (found.poses, found.counts, found.worst) == (3, (2, 3), (0, 0))
+    assert found.sse_mm2 == pytest.approx((25.0, 9.0), rel=1e-14)
+    assert found.by_target() == pytest.approx((math.sqrt(12.5), math.sqrt(3.0)), rel=1e-14)
+    one, other, every = found.table("title", ("smr1", "smr2")).rows
+    assert one[:3] == ("smr1", 2, pytest.approx(math.sqrt(12.5)))
+    assert other[:3] == ("smr2", 3, pytest.approx(math.sqrt(3.0)))
+    assert one[3:5] == pytest.approx((2.5, 5.0), rel=1e-14)
+    assert other[3:5] == pytest.approx((5.0 / 3.0, 2.0), rel=1e-14)
+    assert every == ("all", 5, found.rms_mm, found.mean_mm, found.max_mm, pytest.approx(34.0))
+
+
+def test_no_point_is_no_number():
+    found = accuracy(np.full((2, 0, 3), np.nan))
+    assert (found.poses, found.counts, found.worst) == (0, (0, 0), (-1, -1))
+    assert all(map(math.isnan, (found.rms_mm, found.max_mm, *found.by_target())))
+
+
+# ---- spans ---------------------------------------------------------------------------------------
+
+
+def data_of(q: np.ndarray) -> Measurements:
+    return measurements(q, np.arange(3.0 * len(q)).reshape(-1, 1, 3) / 1e3)
+
+
+@pytest.fixture
+def free(robot: mc.Robot) -> mc.Robot:
+    """Without limits."""
+    return replace(robot, lower=np.full(6, -np.inf), upper=np.full(6, np.inf))
+
+
+@pytest.mark.parametrize(("size", "count"), [(9.0, 6), (11.0, 0), (0.0, 6)])
+def test_a_joint_that_spans_less_than_ten_degrees_is_narrow(free, size, count):
+    q = np.radians(size) * np.linspace(0.0, 1.0, 400)[:, None] + np.zeros(6)
+    assert len(narrow(spans_of(free, data_of(q)))) == count
+
+
+def test_a_slide_needs_twenty_millimetres(free):
+    slides = replace(free, prismatic=np.arange(6) == 0)
+    q = np.linspace(0.0, 1.0, 400)[:, None] * [0.019, 1.0, 1.0, 1.0, 1.0, 1.0]
+    (few,) = narrow(spans_of(slides, data_of(q)))
+    assert (few.joint, few.unit, few.least) == ("J1", "mm", 20.0)
+    assert few.high == pytest.approx(19.0)
+    assert not narrow(spans_of(slides, data_of(1.2 * q)))
+
+
+@pytest.mark.parametrize(
+    ("size", "least"),
+    [
+        (np.inf, 10.0),
+        (180.0, 10.0),
+        (360.0, 18.0),
+        (12.0, 6.0),
+    ],  # 5 %, or half of a short one
+)
+def test_the_range_of_a_joint_counts(free, size, least):
+    half = np.full(6, np.radians(size) / 2.0)
+    limited = replace(free, lower=-half, upper=half)
+    assert np.degrees(least_span(limited, 0)) == pytest.approx(least)
+
+
+def test_one_or_two_poses_elsewhere_make_no_span():
+    assert inner_size(np.array([0.0, 0.0, 0.0, 0.0, 2.0, 3.0])) == 0.0
+    assert inner_size(np.array([0.0, 0.0, 0.0, 3.0, 3.0, 3.0])) == 3.0
+    assert inner_size(np.zeros(2)) == inner_size(np.zeros(0)) == 0.0
+
+
+def test_poses_that_nothing_measured_do_not_count(free):
+    q = np.zeros((40, 6))
+    q[:20, 0] = np.linspace(0.0, 2.0, 20)
+    whole = data_of(q)
+    y = whole.y.copy()
+    y[:20] = np.nan
+    assert "J1" not in [span.joint for span in narrow(spans_of(free, whole))]
+    assert "J1" in [span.joint for span in narrow(spans_of(free, whole.with_y(y)))]
+
+
+def test_outside_is_where_a_narrow_joint_was_not(free, rng):
+    q = rng.uniform(-1.0, 1.0, (50, 6))
+    q[:, 2] = 0.3
+    spans = spans_of(free, data_of(q))
+    asked = np.array([q[0], q[0], q[0], q[0]])
+    asked[1, 2], asked[2, 0], asked[3, 2] = 0.35, 3.0, 0.305  # 5 mrad are no move
+    assert outside(spans, asked).tolist() == [False, True, False, False]
+    assert not outside((), asked).any()
+
+
+# ---- floor ---------------------------------------------------------------------------------------
+
+
+SIGMA = 1e-5
+
+
+def visited(
+    rng: np.random.Generator, times: int, poses: int = 200
+) -> tuple[Measurements, np.ndarray]:
+    """Poses visited several times, and errors of three targets."""
+    q = np.repeat(rng.uniform(-2.0, 2.0, (poses, 6)), times, axis=0)
+    q += 1e-5 * rng.normal(size=q.shape)
+    error = SIGMA * rng.normal(size=(3, len(q), 3))
+    error += 1e-3 * np.repeat(rng.normal(size=(3, poses, 3)), times, axis=1)  # of the model
+    return mc.measurements(q, np.moveaxis(error, 0, 1)), error
+
+
+@pytest.mark.parametrize("times", [2, 3, 5])
+def test_visits_tell_the_noise_whatever_the_model(rng, times):
+    data, error = visited(rng, times)
+    found = floor_of(data, error, np.nan, 10.0)
+    assert found.source == REPEATS
+    # 600 to 3000 squares of three coordinates; a median is a little less sure than a mean
+    assert_allclose(found.value, 1e3 * np.sqrt(3.0) * SIGMA, rtol=0.06)
+    assert found.low < 1e3 * np.sqrt(3.0) * SIGMA < found.high
+
+
+def test_a_few_wrong_visits_do_not_set_the_floor(rng):
+    data, error = visited(rng, 2)
+    error[:, :20] += 2e-3 * rng.normal(size=(3, 20, 3))
+    found = floor_of(data, error, np.nan, 10.0)
+    assert found.source == REPEATS
+    assert_allclose(found.value, 1e3 * np.sqrt(3.0) * SIGMA, rtol=0.12)
+
+
+def test_without_visits_or_promises_the_fit_tells_at_most(rng):
+    q = rng.uniform(-2.0, 2.0, (30, 6))
+    data = mc.measurements(q, rng.normal(size=(30, 1, 3)))
+    error = SIGMA * rng.normal(size=(1, 30, 3))
+    assert floor_of(data, error, np.nan, 0.3) == Floor(0.3, 0.0, 0.3, AT_MOST)
+    assert floor_of(data, error, 1e-4, 0.3) == Floor(0.3, 0.0, 0.3, AT_MOST)
+    assert floor_of(data, error, 1e-3, 0.3) == Floor(0.3, 0.0, 0.3, AT_MOST)
+    told = floor_of(with_instrument(data, "0.0392mm"), error, 1e-4, 0.3)
+    assert told.source == DECLARED
+    both = np.hypot(np.sqrt(3.0) * 0.0392 / 1.959964, 0.1 * RMS_OF_REPEATABILITY)
+    assert_allclose(told.value, both, rtol=1e-6)
+    assert told.low < told.value
+
+
+def test_no_floor_is_above_what_a_model_leaves():
+    assert Floor(1.79, 0.0, 1.79, AT_MOST).beneath(0.273) == Floor(0.273, 0.0, 0.273, AT_MOST)
+    assert Floor(0.1, 0.05, 0.4, REPEATS).beneath(0.3) == Floor(0.1, 0.05, 0.3, REPEATS)
+
+
+def test_repeatability_is_mean_and_three_deviations(rng):
+    distance = np.linalg.norm(rng.normal(size=(400_000, 3)), axis=1)
+    promise = distance.mean() + 3.0 * distance.std()
+    assert_allclose(np.sqrt((distance**2).mean()) / promise, RMS_OF_REPEATABILITY, rtol=3e-3)
+
+
+def test_a_floor_is_drawn_between_its_ends(rng):
+    known = Floor(0.02, 0.018, 0.023, REPEATS).drawn(20_000, rng)
+    assert_allclose(np.quantile(known, [0.025, 0.5, 0.975]), [0.018, 0.02, 0.023], rtol=0.01)
+    loose = Floor(0.1, 0.0, 0.1, AT_MOST)
+    assert loose.least == 0.0
+    assert_allclose(loose.drawn(20_000, rng).mean(), 0.05, rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("text", "base", "more"),
+    [("10um+2.5um/m", 1e-5, 2.5e-6), ("0.05mm", 5e-5, 0.0), (" 15 um + 6 um/m", 1.5e-5, 6e-6)],
+)
+def test_an_instrument_in_words(text, base, more):
+    told = instrument_of(text)
+    assert_allclose([told.base, told.per_metre], [base, more], rtol=1e-12)
+
+
+@pytest.mark.parametrize("text", ["", "10", "10 parsec", "1.2.3um", "0um", "5um+3um", "2 m"])
+def test_an_instrument_that_is_none(text):
+    with pytest.raises(mc.OptionError, match=r"10um\+2.5um/m"):
+        instrument_of(text)
+
+
+def test_a_column_counts_more_than_the_option(rng):
+    y = rng.normal(size=(5, 2, 3))
+    bare = mc.measurements(rng.normal(size=(5, 6)), y)
+    filled = with_instrument(bare, "10um+2um/m")
+    far = np.linalg.norm(y, axis=-1).mean(axis=1)
+    assert_allclose(filled.columns["u95"], 1e-5 + 2e-6 * far, rtol=1e-12)
+    kept = with_instrument(mc.measurements(bare.q, y, u95=np.full(5, 3e-5)), "10um+2um/m")
+    assert_allclose(kept.columns["u95"], 3e-5)
+    assert "column u95_mm is used" in kept.notices[-1]
+    assert declared(bare, np.nan) is None
+    assert np.isnan(instrument_noise(bare))
+    assert_allclose(instrument_noise(kept), 3e-5 / 1.959964, rtol=1e-6)  # of a coordinate
+
+
+def test_a_fit_that_leaves_a_little_less_contradicts_no_distance():
+    """What distances tell has an interval; what a fit leaves at most may be inside of it."""
+    sigma, sure = 17e-6, 0.05
+    told = of_coordinate(sigma)
+    for most, source in ((1.2 * told, DISTANCES), (0.97 * told, DISTANCES), (0.8 * told, AT_MOST)):
+        floor = by_distances((sigma, sure), np.nan, np.nan, most)
+        assert floor.source == source
+        assert floor.low <= floor.value <= floor.high <= most
+        assert floor.value == min(told, most)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ from scipy.spatial.transform import Rotation
 import minimax_cal as mc
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.modelling.simulate import Truth, simulate
-from qp_backends import Solution
 
 # ---- calibrate -----------------------------------------------------------------------------------
 
@@ -109,23 +109,6 @@ def test_targets_measured_at_different_poses(robot):
     assert_allclose(ratio / ratio.max(), optimum.f / optimum.f.max(), rtol=1e-9)
     assert len(fit.distances.mean) == 0
     assert fit.accuracy["holdout"].rms_mm < 0.6 * fit.accuracy["nominal"].rms_mm
-
-
-def test_sigma_is_the_scatter_over_repeated_measurements(robot):
-    """Pooled z-scores over 30 x 33 parameters: their mean square is one within 5 sigma."""
-    truth = Truth(compliance=0)
-    scores = []
-    for seed in range(30):
-        made = simulate(robot, 40, 3, seed, truth)
-        fit = mc.calibrate(robot, made.data, "sum", holdout=0.0)
-        # a noise-free run of the same cell gives the values that the noise disturbs
-        perfect = made.data.with_y(made.cell.predict(made.data.q))
-        exact = mc.calibrate(robot, perfect, "sum", holdout=0.0)
-        for noisy, true in zip(fit.parameters, exact.parameters, strict=True):
-            if noisy.identifiable and not noisy.name.startswith("base_r"):
-                scores.append((noisy.value - true.value) / noisy.sigma)
-    square = np.mean(np.square(scores))
-    assert abs(square - 1.0) < 5 * np.sqrt(2 / len(scores)) * 2  # parameters correlate: twice
 
 
 def test_fixed_parameters_stay_and_freed_ones_are_kept(robot, noisy):
@@ -349,20 +332,8 @@ def test_result_file_and_headline_say_who_answered(robot, noisy, monkeypatch):
     assert "QPs" not in mc.calibrate(robot, noisy.data, "sum").headline()
 
 
-def test_a_function_of_the_user_is_named(robot, noisy):
-    from qp_backends import Problem
-    from qp_backends import solve as solve_qp
-
-    def mine(problem: Problem) -> Solution:
-        return dataclasses.replace(solve_qp(problem, "daqp"), backend="")
-
-    fit = mc.calibrate(robot, noisy.data, qp=mine)
-    assert list(fit.answered) == ["function mine"]
-    assert fit.work.warm_starts == 0
-
-
 @pytest.mark.parametrize(("method", "least"), [("eliminated", 1e-5), ("raw", 1e-3)])
-@pytest.mark.parametrize("arm", ["irb2600", "irb120", "ur5e"])
+@pytest.mark.parametrize("arm", ["irb2600", "ur5e"])
 def test_the_papers_subgradient_answers_by_itself(arm, method, least):
     """RMSE(phi) over the optimum; it is no success unless it is one, and says how far it came."""
     drawn = mc.load_robot(arm)
@@ -405,7 +376,7 @@ def test_small_matrices_get_one_thread(robot):
 # ---- real data -----------------------------------------------------------------------------------
 
 
-SEEDS = range(10)
+SEEDS = range(5)
 ARMS = ("simulated", "irb120")  # what must hold of both is tested where real data are absent, too
 
 
@@ -456,15 +427,18 @@ def test_fanuc_leave_one_pose_out():
     assert np.sqrt(np.mean(np.square(after))) <= 0.52
 
 
+@cache
+def worst_by(backend: str, name: str) -> float:
+    """The largest sum of squares of a target at the minimax that a backend finds [mm^2]."""
+    robot, data = arm_of(name)
+    fit = mc.calibrate(robot, data, qp=backend, holdout=0.3)
+    return max(fit.accuracy["train"].sse_mm2)
+
+
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("backend", ["quadprog", "clarabel", "osqp", "proxqp"])
 def test_backends_agree(backend, name):
-    robot, data = arm_of(name)
-    best = [
-        max(mc.calibrate(robot, data, qp=qp, holdout=0.3).accuracy["train"].sse_mm2)
-        for qp in ("daqp", backend)
-    ]
-    assert best[1] == pytest.approx(best[0], rel=1e-6)
+    assert worst_by(backend, name) == pytest.approx(worst_by("daqp", name), rel=1e-6)
 
 
 @pytest.mark.parametrize(

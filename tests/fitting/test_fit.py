@@ -95,6 +95,7 @@ def test_the_robot_is_of_geometry_alone(fit, saved, robot, noisy):
         assert fit.robot is fit.cell.robot
 
 
+@pytest.mark.parametrize("fit", ["point", "effects", "robust"], indirect=True)
 def test_the_report_is_the_same(fit, saved):
     one, other = (
         render(compose(read_sources([each]), Wording("2026-01-31", appendix=True)))
@@ -104,6 +105,7 @@ def test_the_report_is_the_same(fit, saved):
     assert strip(one) == strip(other)
 
 
+@pytest.mark.parametrize("fit", ["minimax", "effects", "prior"], indirect=True)
 def test_every_fact_is_in_the_file_and_shown_everywhere(fit, tmp_path):
     """What `Fit` declares, by its key; in words in the summary, the report and the page."""
     content = fit.to_dict()

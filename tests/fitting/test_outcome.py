@@ -62,7 +62,7 @@ def test_another_arm_is_not_polished():
     """Its minimax took a minute: links of a kilometre, and QPs that no backend answers."""
     other = simulate("ur10", 24, 3, 1, Truth(compliance=0.0)).data
     with pytest.warns(mc.CalibrationWarning, match="implausibly large changes"):
-        fit = mc.calibrate("irb2600", other)
+        fit = mc.calibrate("irb2600", other, holdout=0.0)
     assert fit.status == "failed"
     assert fit.minimax
     assert fit.minimax.iterations <= 20
@@ -288,9 +288,6 @@ def test_a_point_that_only_the_calibrated_arm_misses_counts(robot):
     assert not found.wrong
 
 
-# ---- limits --------------------------------------------------------------------------------------
-
-
 # ---- what is made of it --------------------------------------------------------------------------
 
 
@@ -358,7 +355,7 @@ def sound_arm(seed: int) -> tuple[str, float, str]:
 
 
 @pytest.mark.filterwarnings("ignore::minimax_cal.CalibrationWarning")
-@pytest.mark.parametrize("count", [pytest.param(25), pytest.param(500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [pytest.param(12), pytest.param(500, marks=pytest.mark.slow)])
 def test_sound_arms_are_calibrated(count):
     """None has failed.  Those that are no better by what was seen are truly better in 2 of 500:
     of 21 and 34 poses, where what no geometry explains is most of the error.

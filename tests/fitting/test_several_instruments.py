@@ -322,14 +322,14 @@ PULLED = (("wires_3",), ("closures_known",), ("poses",), ("tracker", "closures_k
 @pytest.mark.parametrize("kinds", PULLED)
 def test_the_compliance_is_found_to_its_sigma(kinds):
     pulls = []
-    for seed in range(8):
+    for seed in range(5):
         arm, data, known = measured(seed, kinds)
         fit = relative(arm.robot, list(data), known_distances=known, effects=ASKED)
         found = [p for p in fit.parameters if p.of_effect]
         assert [p.name for p in found] == ["joint_compliance:J2.c2", "joint_compliance:J3.c3"]
         assert all(p.sigma < 0.3 * COMPLIANCE for p in found)
         pulls += [(p.value - COMPLIANCE) / p.sigma for p in found]
-    assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.5  # sixteen: 0.65 to 1.4 in 95 %
+    assert 0.5 < np.sqrt(np.mean(np.square(pulls))) < 1.6  # ten: 0.57 to 1.43 in 95 %
     assert np.abs(pulls).max() < 3.5
 
 
@@ -503,7 +503,7 @@ def off(seed: int, robot: mc.Robot, ball: np.ndarray) -> float:
     return float(np.sqrt(((both[0] - both[1] @ turn) ** 2).sum(axis=1).mean()))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_weak_prior_brings_a_panda_home_from_a_plate_of_sockets(seed):
     with_prior, plain = with_priors(seed, PRIOR), with_priors(seed, None)
     assert str(with_prior.status) == "converged"
@@ -582,7 +582,7 @@ def test_the_command_takes_priors(tmp_path, says):
 # ---- priors of links that points tell together alone -------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("seen", ["tracker", "poses"])
 def test_of_links_that_move_alike_priors_tell_each(seen, seed):
     """d2 and d3 of parallel axes: their sum is measured, their difference is what priors say.

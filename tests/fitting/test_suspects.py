@@ -182,7 +182,7 @@ def test_lists_are_those_of_benjamini_and_hochberg(chances, level):
 @pytest.mark.parametrize("loss", ["square", "tukey"])
 def test_wrong_points_are_listed_and_few_others(robot, loss):
     hits, misses, others = 0, 0, 0
-    for seed in range(6):
+    for seed in range(4):
         case = shifted(robot, 0.05, 1e-3, poses=40, seed=seed)
         listed = case.listed(case.robust(loss))
         hits += int((listed & case.bad).sum())
@@ -340,7 +340,7 @@ def stuck(robot: mc.Robot, data: Measurements) -> tuple[Measurements, np.ndarray
 
 def test_a_fit_that_contradicts_its_data_has_failed_and_writes_no_robot(robot, tmp_path, says):
     data, out = tmp_path / "d.csv", tmp_path / "fit.json"
-    mc.write_measurements(data, mirrored(simulate(robot, 110, 2, seed=5).data))
+    mc.write_measurements(data, mirrored(simulate(robot, 40, 2, seed=5).data))
     fit = mc.Fit.from_dict(
         json.loads(
             says("calibrate irb2600", data, "--objective", "sum", "--json", "-o", out, code=1).out

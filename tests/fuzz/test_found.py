@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import shlex
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from minimax_cal.ground.files import json_of
 from minimax_cal.instruments import read_relative
 from minimax_cal.instruments.pixels import read_board
 from minimax_cal.measuring.checks import check_joints
-from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.modelling.simulate import simulate
 from minimax_cal.reporting.plots.figures import new_figure, save
 from minimax_cal.robots.ranges import near_zero
 from qp_backends import Problem, child
@@ -45,36 +46,87 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return line
 
 
-def test_cells_of_a_diagnosis_are_of_one_arm(tmp_path, capsys):
-    """The page drew the last one at the joints of the first."""
+@pytest.mark.parametrize(
+    ("files", "arguments", "says"),
+    [
+        ("fit.json targets.csv", "compensate fit.json targets.csv --lever 1e9", "positive and fin"),
+        ("fit.json targets.csv", "compensate fit.json targets.csv --lever 1e308", "at most 1e+12"),
+        ("fit.json targets.csv", "compensate fit.json targets.csv --tolerance 1e308", "at most 1e"),
+        ("", "plan irb120 --poses 9 --noise -1e300", "cannot be"),
+        ("", "plan irb120 --motion --payload null", "payload"),
+        ("", "fleet cells.toml --jobs 0", "give their number"),
+        ("", "fleet cells.toml --jobs -2", "give their number"),
+        ("", f"fleet cells.toml --jobs {'9' * 20}", "give their number"),
+        ("data.csv fit.json", "check fit.json data.csv --tolerance 'rms 1' --seed -1", "seed -1"),
+        ("cells.toml robot.json data.csv fit.json", "fleet cells.toml --out a -o a", "two results"),
+        ("data.csv", f"calibrate irb120 data.csv --bootstrap {10**20}", "give 2 to 100000"),
+        ("links.json run1.csv", "torques links.json run1.csv --payload 1e308", "payload"),
+        ("links.json run1.csv", "torques links.json run1.csv --ratio 1e308", "ratio"),
+        (
+            "arm.xml data.csv fit.json",
+            "gap arm.xml data.csv --fit fit.json --holdout nan",
+            "holdou",
+        ),
+        ("arm.xml data.csv fit.json", "gap arm.xml data.csv --fit fit.json --holdout 7", "holdout"),
+        ("arm.xml data.csv fit.json", "gap arm.xml data.csv --fit fit.json --seed -1", "seed"),
+    ],
+)
+def test_what_cannot_be_is_refused_and_leaves_nothing(
+    files, arguments, says, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    if "arm.xml" in files:
+        pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
+    for name in files.split():
+        Path(name).write_bytes(material()[name])
+    assert says in refused(capsys, *shlex.split(arguments))
+    assert {path.name for path in tmp_path.iterdir()} == {*files.split()}
 
-    def shorter(content: Any) -> None:
-        del content["rungs"][-1]["robot"]["joints"][2]
 
-    path = broken(tmp_path, "diagnosis.json", shorter)
-    assert "its cells are not of one arm" in refused(capsys, "report", path)
+def settings_of(name: str, value: Any) -> Any:
+    return lambda content: content["provenance"]["settings"].update({name: value})
+
+
+OPTIONS = (("objective", 1), ("distance_tolerance", [0.1]), ("seed", -1))
+POSES = (("split", None), ("line", [None]), ("q", [[1.0], [1.0, 2.0]]), ("measured_mm", "x"))
+ARRAYS = (("prior", [0.0] * 5, "prior is not of"), ("prior", [[1.0], [1.0, 2.0]], "something else"),
+          ("singular", 3.0, "singular is not a row"), ("singular", [], "is not a row"))  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("part", "value"),
-    [("split", None), ("line", [None]), ("q", [[1.0], [1.0, 2.0]]), ("measured_mm", "x")],
-)
-def test_a_broken_list_of_poses_is_told_in_our_words(part, value, tmp_path, capsys):
-    path = broken(tmp_path, "fit.json", lambda content: content["poses"].update({part: value}))
-    line = refused(capsys, "iso9283", path)
-    assert "its list of poses cannot be read" in line
+    ("name", "change", "arguments", "says"),
+    [
+        ("diagnosis.json", lambda c: c["rungs"][-1]["robot"]["joints"].pop(2), "report",
+         "its cells are not of one arm"),
+        ("diagnosis.json", lambda c: [v.update(views=[]) for v in c["curves"].values()], "report",
+         "has no values"),
+        ("truth.json", lambda c: c.update(targets_mm=[7]), "evaluate", "is not a saved calibrat"),
+        *(("fit.json", lambda c, k=k, v=v: c["poses"].update({k: v}), "iso9283",
+           "its list of poses cannot be read") for k, v in POSES),
+        *(("fit.json", lambda c, k=k, v=v: c["arrays"].update({k: v}), "iso9283", says)
+          for k, v, says in ARRAYS),
+        *((name, settings_of(k, v), "export", f"provenance.settings.{k}")
+          for name in ("fit.json", "effects.json") for k, v in OPTIONS),
+        *(("motion.json", change, "report", "motion.json") for change in (
+            lambda c: c["curves"][0].update(sigma="x"),
+            lambda c: c["curves"][0]["torque"].pop(),
+            lambda c: c["held_run"]["measured"][0].pop(),
+            lambda c: c["not_testable"].append({"effect": "x", "place": "J1", "needs": ""}),
+            lambda c: c["budget"][0]["holdout_rms"].append(1.0),
+            lambda c: c["effects"][0].update(parameters=[]),
+        )),
+    ],
+)  # fmt: skip
+def test_a_result_of_other_parts_is_told_in_our_words(
+    name, change, arguments, says, tmp_path, capsys
+):
+    data = tmp_path / "data.csv"
+    data.write_bytes(material()["data.csv"])
+    more = {"report": ["-o", tmp_path / "page.html"], "export": ["--to", "ur-yaml"],
+            "evaluate": [data]}.get(arguments, [])  # fmt: skip
+    line = refused(capsys, arguments, broken(tmp_path, name, change), *more)
+    assert says in line
     assert not any(word in line for word in ("NoneType", "shape", "inhomogeneous", "convert"))
-
-
-def test_arrays_of_another_size_are_told_in_our_words(tmp_path, capsys):
-    for name, values, says in (
-        ("prior", [0.0] * 5, "prior is not of"),
-        ("prior", [[1.0], [1.0, 2.0]], "something else"),
-        ("singular", 3.0, "singular is not a row"),
-        ("singular", [], "singular is not a row"),
-    ):
-        path = broken(tmp_path, "fit.json", lambda c, n=name, v=values: c["arrays"].update({n: v}))
-        assert says in refused(capsys, "iso9283", path)
 
 
 @pytest.mark.parametrize("cell", ["1e308", "-1e300", "100001"])
@@ -117,19 +169,6 @@ def test_the_name_of_an_output_moves_no_cursor(tmp_path, monkeypatch, capsys):
     out, err = capsys.readouterr()
     assert err.count("written: ") == 4
     assert "\x1b" not in out + err
-
-
-def test_a_lever_that_cannot_be_is_refused(tmp_path, monkeypatch, capsys):
-    """Its square overflowed."""
-    monkeypatch.chdir(tmp_path)
-    for name in ("fit.json", "targets.csv"):
-        Path(name).write_bytes(material()[name])
-    line = refused(capsys, "compensate", "fit.json", "targets.csv", "--lever", "1e9")
-    assert "must be positive and finite" in line
-    for option in ("--lever", "--tolerance"):
-        line = refused(capsys, "compensate", "fit.json", "targets.csv", option, "1e308")
-        assert "cannot be; give a finite number, at most 1e+12" in line
-    assert "cannot be" in refused(capsys, "plan", "irb120", "--poses", 9, "--noise", "-1e300")
 
 
 def test_targets_on_a_terminal_move_no_cursor():
@@ -186,11 +225,6 @@ def test_a_file_whose_link_is_named_is_an_input(tmp_path, monkeypatch, capsys):
     assert Path("robot.urdf").read_bytes() == material()["robot.urdf"]
 
 
-def test_a_fleet_has_no_more_processes_than_cells_can_use(capsys):
-    for jobs in ("0", "-2", "9" * 20):
-        assert "give their number" in refused(capsys, "fleet", "cells.toml", "--jobs", jobs)
-
-
 @pytest.mark.slow
 def test_a_joint_zero_off_by_a_quarter_turn_is_found_by_whole_poses(tmp_path):
     """Several starts are compared there; two that end alike were a batch of two."""
@@ -227,15 +261,6 @@ def test_fifty_notices_are_enough(capsys):
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "notice: 0"
     assert lines[50:] == ["notice: and 19950 more, in the JSON"]
-
-
-def test_exact_measurements_are_a_success():
-    """Steps below rounding were called stalled."""
-    for objective in ("sum", "minimax", "point"):
-        made = simulate("irb120", 24, 3, 1, Truth(noise=0.0, noise_per_metre=0.0, compliance=0.0))
-        fit = mc.calibrate("irb120", made.data, objective, holdout=0.0)
-        assert fit.status == "converged", objective
-        assert fit.accuracy["train"].max_mm < 1e-6
 
 
 def test_a_backends_process_imports_nothing_from_the_current_folder(tmp_path, monkeypatch):
@@ -302,43 +327,6 @@ def test_what_is_no_scheduler_is_told_in_our_words(tmp_path, capsys, monkeypatch
     assert not (tmp_path / "made").exists()  # an empty folder was left
 
 
-def test_targets_without_names_are_told_in_our_words(tmp_path, capsys):
-    """A list of a number was looked up at that number."""
-    path = broken(tmp_path, "truth.json", lambda content: content.update(targets_mm=[7]))
-    (tmp_path / "data.csv").write_bytes(material()["data.csv"])
-    assert "is not a saved calibration" in refused(capsys, "evaluate", path, tmp_path / "data.csv")
-
-
-def test_a_seed_below_zero_is_refused(tmp_path, capsys):
-    """NumPy's generator said so in the middle of a check."""
-    for name in ("data.csv", "fit.json"):
-        (tmp_path / name).write_bytes(material()[name])
-    more = ("--tolerance", "rms 0.5", "--seed", -1)
-    assert "seed -1" in refused(
-        capsys, "check", tmp_path / "fit.json", tmp_path / "data.csv", *more
-    )
-
-
-def test_a_folder_of_results_is_no_file_of_them(tmp_path, capsys):
-    """The folder was made, the cells were done, and their rows could not be written."""
-    for name in ("cells.toml", "robot.json", "data.csv", "fit.json"):
-        (tmp_path / name).write_bytes(material()[name])
-    told = ("--out", tmp_path / "a", "-o", tmp_path / "a")
-    assert "two results" in refused(capsys, "fleet", tmp_path / "cells.toml", *told)
-    assert not (tmp_path / "a").exists()
-
-
-def test_a_chart_of_nothing_is_told_in_our_words(tmp_path, capsys):
-    """A curve without a view was NumPy's empty maximum."""
-
-    def empty(content: Any) -> None:
-        for curve in content["curves"].values():
-            curve["views"] = []
-
-    path = broken(tmp_path, "diagnosis.json", empty)
-    assert "has no values" in refused(capsys, "report", path, "-o", tmp_path / "page.html")
-
-
 def test_a_joint_that_never_comes_to_zero_is_no_trouble():
     """Limits of 3.5 to 7 rad, or of 1 to 3 m, left nothing to draw from."""
     for lower, upper in ((3.5, 7.0), (-20.0, -15.0), (4.0, np.inf), (-np.inf, -4.0), (-1.0, 9.0)):
@@ -391,24 +379,6 @@ def test_import_writes_nothing_that_cannot_be_read(tmp_path, capsys):
     assert not out.exists()
 
 
-@pytest.mark.parametrize("options", [("--holdout", "nan"), ("--holdout", 7), ("--seed", -1)])
-def test_a_share_that_cannot_be_is_refused_where_it_is_not_needed(options, tmp_path, capsys):
-    """A given fit has its split; the odd share went into the answer."""
-    pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
-    for name in ("arm.xml", "data.csv", "fit.json"):
-        (tmp_path / name).write_bytes(material()[name])
-    files = [tmp_path / name for name in ("arm.xml", "data.csv")]
-    told = refused(capsys, "gap", *files, "--fit", tmp_path / "fit.json", *options, "--json")
-    assert str(options[0]).strip("-") in told
-
-
-def test_more_replicates_than_memory_holds_are_refused(tmp_path, capsys):
-    (tmp_path / "data.csv").write_bytes(material()["data.csv"])
-    line = refused(capsys, "calibrate", "irb120", tmp_path / "data.csv", "--objective", "sum",
-                   "--bootstrap", 10**20)  # fmt: skip
-    assert "give 2 to 100000" in line
-
-
 def test_a_part_of_held_out_poses_alone_judges_a_diagnosis(tmp_path):
     """Of the 12 training poses it left out none, and products of no rows were a traceback."""
     path = tmp_path / "data.csv"
@@ -424,51 +394,6 @@ def test_a_joint_limit_beyond_all_numbers_is_no_warning():
     robot = mc.load_robot("irb120")
     upper = np.where(np.arange(6) == 0, 1e308, robot.upper)
     check_joints(replace(robot, upper=upper), simulate(robot, poses=9).data)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("objective", 1), ("distance_tolerance", [0.1]), ("seed", -1)]
-)
-@pytest.mark.parametrize("file", ["fit.json", "effects.json"])
-def test_an_option_of_another_kind_in_a_result_is_refused(file, name, value, tmp_path, capsys):
-    path = broken(
-        tmp_path, file, lambda content: content["provenance"]["settings"].update({name: value})
-    )
-    assert f"provenance.settings.{name}" in refused(capsys, "export", path, "--to", "ur-yaml")
-
-
-def lengthen_a_step(content: Any) -> None:
-    content["budget"][0]["holdout_rms"].append(1.0)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda content: content["curves"][0].update(sigma="x"),
-        lambda content: content["curves"][0]["torque"].pop(),
-        lambda content: content["held_run"]["measured"][0].pop(),
-        lambda content: content["not_testable"].append({"effect": "x", "place": "J1", "needs": ""}),
-        lengthen_a_step,
-        lambda content: content["effects"][0].update(parameters=[]),
-    ],
-)
-def test_a_motion_diagnosis_of_other_parts_is_refused(change, tmp_path, capsys):
-    path = broken(tmp_path, "motion.json", change)
-    assert "motion.json" in refused(capsys, "report", path)
-
-
-@pytest.mark.parametrize("option", ["payload", "ratio"])
-def test_numbers_beyond_all_arms_are_refused(option, tmp_path, capsys):
-    for name in ("links.json", "run1.csv"):
-        (tmp_path / name).write_bytes(material()[name])
-    line = refused(
-        capsys, "torques", tmp_path / "links.json", tmp_path / "run1.csv", f"--{option}", "1e308"
-    )
-    assert option in line
-
-
-def test_a_payload_that_is_no_number_is_refused(capsys):
-    assert "payload" in refused(capsys, "plan", "irb120", "--motion", "--payload", "null")
 
 
 def test_a_board_larger_than_a_hall_is_refused(tmp_path):

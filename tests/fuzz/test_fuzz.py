@@ -30,7 +30,7 @@ from .known import FATAL, HARMLESS, disagreement, with_known
 from .material import material
 from .running import GOOD, Outcome, judged, outcomes
 
-CASES, SEED = 40, 20260101
+CASES, SEED = 20, 20260101
 MANY, FRESH = 10_000, 20260707
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="limits are those of POSIX")
@@ -187,7 +187,7 @@ def test_every_option_of_every_command_is_among_the_cases():
             if isinstance(part, click.Option) and "--pdf" not in part.opts:
                 assert (name, max(part.opts, key=len)) in given
     assert len(set(lines)) == len(lines)
-    some = range(0, len(lines), len(lines) // 10)
+    some = range(0, len(lines), len(lines) // 5)
     assert bad(list(outcomes(EACH, some))) == []
 
 

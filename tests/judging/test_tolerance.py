@@ -344,12 +344,6 @@ def test_table_and_json(found):
     assert first["interval"][0] < 1e3 * found.value[0] < first["interval"][1]
 
 
-def test_progress_is_told(fit):
-    said: list[str] = []
-    bootstrap(fit, 30, progress=said.append)
-    assert said == ["replicate 1 of 30", "replicate 26 of 30"]
-
-
 @pytest.mark.parametrize(
     ("objective", "options", "say"),
     [

@@ -554,14 +554,6 @@ def test_what_is_no_table(write):
         import_files([])
 
 
-def test_utf16_and_byte_order_marks(truth, write):
-    header = "q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,smr1_x_m,smr1_y_m,smr1_z_m"
-    text = table(np.column_stack([truth.q, truth.y[:, 0]]), header)
-    same(import_files([write("a.csv", text.encode("utf-16"))]), truth, targets=1)
-    same(import_files([write("a.csv", text.encode("utf-8-sig"))]), truth, targets=1)
-    same(import_files([write("a.csv", text.replace("\n", "\r\n"))]), truth, targets=1)
-
-
 # --- command -----------------------------------------------------------------------------------
 
 
@@ -612,16 +604,6 @@ def test_a_clock_runs_on_over_midnight(truth, write, stamps, seconds):
 def test_a_clock_of_twelve_hours_is_asked_about(truth, write):
     path = clocked(truth, write, ["12:59:59", "01:00:00", "01:00:01"])
     refused(f"{path}:3: column time: 01:00:00 follows 12:59:59: a clock of twelve hours?", path)
-
-
-def test_joint_names_are_put_along_the_arm(truth, write):
-    ways = [2, 1, 0, 3, 4, 5]
-    for front in ("", "left_"):
-        names = [f"{front}{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow",
-                 "wrist_1", "wrist_2", "wrist_3")]  # fmt: skip
-        joints = write("ros.csv", table(truth.q[:, ways], ",".join(names[i] for i in ways)))
-        points = write("points.csv", table(truth.y[:, 0] * 1e3, "x,y,z"))
-        same(import_files([points], joints, units="q=rad"), truth, targets=1)
 
 
 def test_rapid_comments_are_no_poses(truth, write):

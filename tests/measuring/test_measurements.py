@@ -1,11 +1,28 @@
+"""Files of measurements, several as sessions, points set aside, tools; texts in one pass."""
+
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import run
 from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
+from minimax_cal.measuring.campaigns import campaigns, session_names
 from minimax_cal.measuring.grouping import groups, split
+from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.importers import cmm, programs
+from minimax_cal.measuring.measurements import FILE, TOOL, USER, Measurements
+from minimax_cal.measuring.set_aside import NO_REASON, counted, entries, left_out, set_aside, whole
+from minimax_cal.measuring.tools import by_tool, side_by_side
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.simulate import Simulation, simulate
+from minimax_cal.reading import words
+from minimax_cal.robots.gravity import G
+from minimax_cal.robots.robot import robot_from_dict
 
 HEAD = "q1_rad,q2_rad,smr1_x_mm,smr1_y_mm,smr1_z_mm"
 GOOD = HEAD + "\n0.1,0.2,1,2,3\n0.3,0.4,4,5,6\n"
@@ -255,3 +272,380 @@ def test_a_cell_of_very_many_digits_is_refused_at_once(tmp_path):
     (tmp_path / "m.csv").write_text(f"q1_rad,smr1_x_mm\n0.1,{'1' * 200_000}x\n")
     with pytest.raises(mc.DataError):
         mc.read_measurements(tmp_path / "m.csv")
+
+
+# ---- campaigns -----------------------------------------------------------------------------------
+
+
+DIGITS = 1e-9  # of a millimetre's in a file [m]
+
+
+def made(seed: int = 0, poses: int = 20, targets: int = 2, **columns: object) -> mc.Measurements:
+    rng = np.random.default_rng(seed)
+    q, y = rng.uniform(-1.0, 1.0, (poses, 6)), rng.normal(size=(poses, targets, 3))
+    return mc.measurements(q, y, **columns)  # type: ignore[arg-type]
+
+
+def test_files_are_sessions_with_lines_that_count_on(tmp_path):
+    parts = [made(seed, poses) for seed, poses in ((0, 20), (1, 15), (2, 12))]
+    paths = [tmp_path / f"{name}.csv" for name in ("march", "june", "may")]
+    for part, path in zip(parts, paths, strict=True):
+        mc.write_measurements(path, part)
+    data = mc.read_campaigns(paths)
+    assert list(dict.fromkeys(data.columns["session"])) == ["march", "june", "may"]
+    assert_allclose(data.q, np.concatenate([part.q for part in parts]), rtol=0, atol=DIGITS)
+    assert len(set(data.line)) == data.poses == 47
+    own = [mc.read_measurements(path).line for path in paths]
+    assert_array_equal(data.line, np.concatenate([own[0], own[1] + 1000, own[2] + 2000]))
+    assert any("june.csv from line 1001" in said for said in data.notices)
+    assert "march.csv" in data.source
+    assert "may.csv" in data.source
+
+
+def test_one_file_is_read_as_ever(tmp_path):
+    path = tmp_path / "march.csv"
+    mc.write_measurements(path, made())
+    data = mc.read_campaigns([path])
+    assert "session" not in data.columns
+    assert data.digest == mc.read_measurements(path).digest
+
+
+def test_targets_go_by_name_and_columns_are_empty_where_a_file_lacks_them():
+    one = replace(made(0), target_names=("smr1", "smr3"))
+    two = replace(made(1, temperature=np.full(20, 21.0)), target_names=("smr3", "smr2"))
+    data = campaigns([one, two], ["a", "b"])
+    assert data.target_names == ("smr1", "smr3", "smr2")
+    assert_array_equal(data.y[:20, 1], one.y[:, 1])
+    assert_array_equal(data.y[20:, 1], two.y[:, 0])
+    assert_array_equal(data.seen, np.repeat([[1, 1, 0], [0, 1, 1]], 20, axis=0) > 0)
+    assert_array_equal(data.columns["temperature"], np.repeat([np.nan, 21.0], 20))
+
+
+def test_labels_of_poses_mean_something_in_their_own_file_only():
+    labels = np.arange(20).astype(str)
+    data = campaigns([made(0, pose=labels), made(1, pose=labels)], ["a", "b"])
+    assert len(set(data.columns["pose"])) == 40
+
+
+def test_sessions_of_a_file_come_after_its_name():
+    two = made(1, session=np.repeat(["am", "pm"], 10))
+    data = campaigns([made(0), two], ["march", "june"])
+    assert list(dict.fromkeys(data.columns["session"])) == ["march", "june/am", "june/pm"]
+
+
+def test_a_split_of_one_file_leaves_the_others_for_training():
+    held = np.where(np.arange(20) < 5, "holdout", "train")
+    data = campaigns([made(0), made(1, split=held)], ["a", "b"])
+    assert_array_equal(data.columns["split"] == "holdout", np.isin(np.arange(40), range(20, 25)))
+
+
+def test_clocks_that_start_again_follow_each_other():
+    time = np.arange(20) * 60.0
+    data = with_history(campaigns([made(0, time=time), made(1, time=time)], ["a", "b"]))
+    assert np.all(np.diff(data.columns["clock"]) > 0.0)
+    later = campaigns([made(0, time=time), made(1, time=time + 1e6)], ["a", "b"])
+    assert_array_equal(later.columns["time"][20:], time + 1e6)
+
+
+def test_points_set_aside_stay_so():
+    points = np.zeros((20, 2), dtype=bool)
+    points[3, 1] = True
+    two = set_aside(made(1), points, "nest knocked", "user")
+    data = campaigns([made(0), two], ["a", "b"])
+    (point,) = data.set_aside
+    assert data.aside is not None
+    assert point.row == data.aside.line[0] == two.set_aside[0].row + 1000
+    assert data.aside.columns["session"][0] == "b"
+
+
+def test_arms_of_other_joints_are_refused():
+    other = mc.measurements(np.zeros((4, 7)), np.random.default_rng(0).normal(size=(4, 3)))
+    with pytest.raises(mc.DataError, match=r"has 7 joints.* has 6"):
+        campaigns([made(), other], ["a", "b"])
+    slide = replace(made(), sliding=np.arange(6) == 2)
+    with pytest.raises(mc.DataError, match="joint 3 is a length there"):
+        campaigns([made(), slide], ["a", "b"])
+
+
+def test_names_of_sessions_tell_the_files_apart(tmp_path):
+    assert session_names(["x/march.csv", "x/june.csv"]) == ["march", "june"]
+    assert session_names(["x/data.csv", "y/data.csv"]) == ["x/data", "y/data"]
+    with pytest.raises(mc.DataError, match="is given twice"):
+        session_names(["x/data.csv", "x/../x/data.csv"])
+
+
+# ---- set aside -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def measured(noisy: Simulation) -> Measurements:
+    """Measurements whose file begins with its header."""
+    return replace(noisy.data, simulated=False, line=np.arange(noisy.data.poses) + 2)
+
+
+def test_only_the_named_points_are_gone(measured):
+    data, line = measured, measured.line
+    found = left_out(data, [f"{line[0]}:smr2=knocked", str(line[3])])
+    assert [(p.row, p.pose, p.target, p.why, p.by) for p in found.set_aside] == [
+        (line[0], 1, "smr2", "knocked", USER),
+        *((line[3], 4, name, NO_REASON, USER) for name in data.target_names),
+    ]
+    assert_array_equal(found.line, np.delete(line, 3))  # a pose without a point
+    gone = np.zeros(data.seen.shape, dtype=bool)
+    gone[0, 1], gone[3] = True, True
+    assert_array_equal(found.y, np.where(gone[..., None], np.nan, data.y)[found.line - 2])
+    assert found.aside is not None
+    assert_array_equal(found.aside.line, line[[0, 3]])
+    assert_array_equal(found.aside.y, np.where(gone[..., None], data.y, np.nan)[[0, 3]])
+    assert found.notices[-1].startswith("4 points set aside")
+    assert_array_equal(whole(found).y, data.y)
+
+
+def test_nothing_named_changes_nothing(measured):
+    assert left_out(measured, []) is measured
+    assert whole(measured) is measured
+
+
+def test_what_is_set_aside_twice_comes_once(measured):
+    data = left_out(measured, ["2:smr1", "2:smr1=twice", "3"])
+    assert [(p.row, p.target) for p in data.set_aside] == [
+        (2, "smr1"), (3, "smr1"), (3, "smr2"), (3, "smr3")]  # fmt: skip
+    mask = np.zeros(data.seen.shape, dtype=bool)
+    mask[0] = True
+    more = set_aside(data, mask, "trimmed", TOOL)
+    assert [(p.row, p.pose, p.target) for p in more.set_aside[4:]] == [
+        (2, 1, "smr2"), (2, 1, "smr3")]  # fmt: skip
+    assert_array_equal(whole(more).y, measured.y)
+
+
+def test_a_file_keeps_them_with_the_reason_and_who_it_was(measured, tmp_path):
+    first, second = tmp_path / "poses.csv", tmp_path / "used.csv"
+    mc.write_measurements(first, measured)
+    assert run("import", first, "--leave-out", "2:smr1,5=nest, knocked; twice", "-o", second) == 0
+    data = mc.read_measurements(second)
+    assert 5 not in data.line
+    assert np.isnan(data.y[data.line == 2, 0]).all()
+    assert {(p.row, p.target) for p in data.set_aside} == {
+        (2, "smr1"), (5, "smr1"), (5, "smr2"), (5, "smr3")}  # fmt: skip
+    assert {(p.why, p.by) for p in data.set_aside} == {("nest, knocked, twice", USER)}
+    assert_allclose(whole(data).y, measured.y, rtol=0, atol=1e-9)
+    mask = np.zeros(data.seen.shape, dtype=bool)
+    mask[7, 2] = True
+    mc.write_measurements(second, set_aside(data, mask, "marked deleted", FILE))
+    again = mc.read_measurements(second)
+    assert again.set_aside[-1].by == FILE or again.set_aside[0].by == FILE
+    assert len(again.set_aside) == 5
+
+
+@pytest.mark.parametrize(
+    ("cell", "said"),
+    [
+        ("nest knocked", [("", "nest knocked", USER)]),
+        ("smr2: too far [file]", [("smr2", "too far", FILE)]),
+        ("smr1: a; smr3", [("smr1", "a", USER), ("", "smr3", USER)]),
+        ("smr1:", [("smr1", NO_REASON, USER)]),
+        ("a: b [x]", [("", "a: b [x]", USER)]),
+    ],
+)
+def test_cells_of_the_column(cell, said):
+    assert entries(cell) == said
+
+
+def test_the_column_names_targets_that_are_there(measured, tmp_path):
+    path = tmp_path / "poses.csv"
+    cells = np.array(["", "smr9: x", *[""] * (measured.poses - 2)])
+    mc.write_measurements(path, replace(measured, columns={"set_aside": cells}))
+    with pytest.raises(mc.DataError, match=r"poses.csv:3: column set_aside: no target smr9"):
+        mc.read_measurements(path)
+    cells[:] = "smr3: all bad"
+    mc.write_measurements(path, replace(measured, columns={"set_aside": cells}))
+    with pytest.raises(mc.DataError, match="smr3 is measured at no pose, but for points"):
+        mc.read_measurements(path)
+    cells[:] = "all bad"
+    mc.write_measurements(path, replace(measured, columns={"set_aside": cells}))
+    with pytest.raises(mc.DataError, match="every measured point is set aside"):
+        mc.read_measurements(path)
+
+
+def test_poses_set_aside_were_visited(measured):
+    """The moves of the other poses, and the clock, are those of the whole file."""
+    every = with_history(measured)
+    found = with_history(left_out(measured, ["9", "10:smr1", "20"]))
+    kept = np.isin(every.line, found.line)
+    for name, column in found.columns.items():
+        assert_array_equal(column, every.columns[name][kept])
+    assert found.aside is not None
+    for name, column in found.aside.columns.items():
+        assert_array_equal(column, every.columns[name][np.isin(every.line, [9, 10, 20])])
+
+
+def test_how_many_in_words(measured):
+    data = left_out(measured, ["3:smr1"])
+    assert counted(data.set_aside) == "1 point set aside by the user"
+    mask = np.zeros(data.seen.shape, dtype=bool)
+    mask[:2, 2] = True
+    data = set_aside(data, mask, "trimmed", TOOL)
+    assert counted(data.set_aside) == "3 points set aside (1 by the user, 2 by the program)"
+
+
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [("x", "write LINE:TARGET"), ("900000", "no pose stands in line"), ("2:smr9", "smr1, smr2")],
+)
+def test_a_point_that_is_not_there(points, said, measured, tmp_path, capsys):
+    path = tmp_path / "poses.csv"
+    mc.write_measurements(path, measured)
+    assert run("import", path, "--leave-out", points, "-o", tmp_path / "out.csv") == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out.csv").exists()
+
+
+# ---- tools ---------------------------------------------------------------------------------------
+
+
+NOISE = 20e-6
+APART = np.array([0.03, -0.05, 0.2])  # of the reflectors on one tool and the other [m]
+TOOLS = ("gripper", "long probe")
+
+
+def two_tools(robot: mc.Robot, tmp_path: Path) -> tuple[Path, mc.Measurements]:
+    """A file of an arm whose tool was changed, rows of both by turns."""
+    made = simulate(robot, 80, 2, seed=4)
+    other = replace(made.cell, target_positions=made.cell.target_positions + APART)
+    rng = np.random.default_rng(0)
+    label = np.array([TOOLS[i] for i in rng.integers(0, 2, 80)])
+    q = made.data.q
+    y = np.where((label == TOOLS[0])[:, None, None], made.cell.predict(q), other.predict(q))
+    y[3, 1] = np.nan
+    data = mc.measurements(q, y + NOISE * rng.normal(size=y.shape), tool=label)
+    path = tmp_path / "tools.csv"
+    mc.write_measurements(path, data)
+    return path, data
+
+
+def test_each_tool_has_reflectors_of_its_own(robot, tmp_path):
+    path, _ = two_tools(robot, tmp_path)
+    assert "tool" in path.read_text().splitlines()[0].split(",")
+    data = mc.read_measurements(path)
+    assert set(data.target_names) == {
+        f"smr{i}@{tool}" for i in (1, 2) for tool in ("gripper", "long-probe")
+    }
+    assert not data.notices
+    fit = mc.calibrate(robot, data, "sum", holdout=0.25)
+    assert fit.accuracy["holdout"].rms_mm < 1.4e3 * NOISE * np.sqrt(3)
+    offset = dict(zip(fit.cell.target_names, fit.cell.target_positions, strict=True))
+    apart = offset["smr1@long-probe"] - offset["smr1@gripper"]
+    assert_allclose(apart, APART, atol=1e-3)  # turned by what the last link is off
+    # written and read again it is the same file, and a new file of one tool is predicted
+    again = tmp_path / "again.csv"
+    mc.write_measurements(again, data)
+    assert again.read_text() == path.read_text()
+    assert_allclose(by_tool(side_by_side(data)).y, data.y)
+    one = tmp_path / "one.csv"
+    lines = path.read_text().splitlines()
+    kept = [lines[0], *(line for line in lines[1:] if line.endswith("gripper"))]
+    one.write_text("\n".join(kept))
+    assert mc.read_measurements(one).target_names == ("smr1", "smr2")
+
+
+def test_a_point_of_a_tool_is_set_aside_by_its_reflector(robot, tmp_path):
+    path, _ = two_tools(robot, tmp_path)
+    out = tmp_path / "out.csv"
+    assert run("import", path, "--leave-out", "12:smr1=knocked", "-o", out, "--quiet") == 0
+    data = mc.read_measurements(out)
+    (point,) = data.set_aside
+    assert point.target.startswith("smr1@")
+    assert (point.row, point.why) == (12, "knocked")
+
+
+def test_a_pose_without_its_tool_is_refused(robot, tmp_path):
+    path, _ = two_tools(robot, tmp_path)
+    path.write_text(path.read_text().replace("gripper", "", 1))
+    with pytest.raises(mc.DataError, match="column tool is empty; name the tool of each pose"):
+        mc.read_measurements(path)
+
+
+def test_torque_of_a_payload_is_that_of_a_mass_at_its_centre():
+    robot = robot_from_dict({
+        "name": "bar", "units": {"length": "m", "angle": "rad"}, "up": [0, 1, 0],
+        "joints": [dict(a=0.5, d=0, theta=0, alpha=0), dict(a=0.4, d=0, theta=0, alpha=0)],
+    })  # fmt: skip
+    q = np.array([[0.3, 0.4], [1.0, -0.2], [0.0, 0.0]])
+    centre = np.array([[0.1, 0.02, 0.0], [0.0, -0.1, 0.3], [np.nan, np.nan, np.nan]])
+    mass = np.array([2.0, 5.0, 3.0])
+    columns = {f"payload_{a}": centre[:, i] for i, a in enumerate("xyz")}
+    data = mc.measurements(q, np.ones((3, 3)) * q.sum(1)[:, None], payload=mass, **columns)
+    spot = np.array([[0.05, 0.0, 0.0]])
+    cell = Cell(robot, np.eye(4), data.target_names, spot)
+    scene: Scene = cell.scene(data)
+    at = np.where(np.isfinite(centre), centre, spot)
+    pose = robot.pose(q)
+    place = np.einsum("mij,mj->mi", pose[:, :3, :3], at) + pose[:, :3, 3]
+    elbow = 0.5 * np.stack([np.cos(q[:, 0]), np.sin(q[:, 0])], axis=1)
+    expected = -G * mass * np.stack([place[:, 0], place[:, 0] - elbow[:, 0]])
+    assert_allclose(scene.payload, expected, rtol=0, atol=1e-9)
+    assert_allclose(scene.payload_place.T, place, rtol=0, atol=1e-12)
+
+
+def test_a_centre_without_its_mass_is_told(tmp_path, robot):
+    path = tmp_path / "data.csv"
+    data = simulate(robot, 20, 1, seed=1).data
+    columns = {**data.columns, **{f"payload_{a}": np.full(20, 0.1) for a in "xyz"}}
+    mc.write_measurements(path, replace(data, columns=columns))
+    assert "payload_x_mm" in path.read_text()
+    notices = mc.read_measurements(path).notices
+    assert any("payload_x_mm is not used: the file has no column payload_kg" in n for n in notices)
+
+
+def test_compliance_counts_where_the_payload_hangs(robot):
+    """A heavy load that hangs now here, now there: told where, the fit reaches the noise."""
+    made = simulate(robot, 90, 3, seed=8)
+    rng = np.random.default_rng(1)
+    mass = rng.choice([0.0, 40.0], 90)
+    centre = rng.uniform(-0.4, 0.4, (90, 3))
+    columns = {f"payload_{a}": centre[:, i] for i, a in enumerate("xyz")}
+    whole = mc.measurements(made.data.q, made.data.y, payload=mass, **columns)
+    scene = made.cell.scene(whole)
+    bend = 2e-6 * scene.gravity.T * robot.sign * [0, 1, 1, 1, 1, 0]
+    y = made.cell.predict(made.data.q + bend) + NOISE * rng.normal(size=made.data.y.shape)
+    effects = [f"joint_compliance:J{i}" for i in range(2, 6)]
+    told = mc.calibrate(robot, whole.with_y(y), "sum", effects=effects, holdout=0.2)
+    plain = mc.measurements(made.data.q, y, payload=mass)
+    untold = mc.calibrate(robot, plain, "sum", effects=effects, holdout=0.2)
+    assert told.accuracy["holdout"].rms_mm < 1.5e3 * NOISE * np.sqrt(3)
+    assert untold.accuracy["holdout"].rms_mm > 1.5 * told.accuracy["holdout"].rms_mm
+
+
+# ---- one pass ------------------------------------------------------------------------------------
+
+
+TEXTS = (
+    "9" * 200_000,
+    "P[1]{ " * 40_000,
+    "x = {X 1 " * 30_000,
+    "{ " * 100_000,
+    "[" + " " * 200_000,
+    "x = [" + "1, " * 60_000,
+)
+
+
+WORDS = {found for found in vars(words).values() if isinstance(found, re.Pattern)}
+PATTERNS = [found for module in (cmm, programs) for found in vars(module).values()
+            if isinstance(found, re.Pattern) and found not in WORDS]  # fmt: skip
+PATTERNS += [language.cartesian for language in programs.LANGUAGES]
+
+
+@pytest.mark.parametrize(
+    "text", TEXTS, ids=["digits", "positions", "poses", "braces", "blanks", "numbers"]
+)
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_no_text_takes_more_than_one_pass(pattern, text):
+    """Each would take minutes, were its time to grow with the square of its length."""
+    assert sum(1 for _ in pattern.finditer(text)) <= len(text)
+
+
+@pytest.mark.parametrize("cell", ["x_" * 20_000, "pos_x" * 10_000, "x_pos_" * 10_000, "9" * 40_000])
+@pytest.mark.parametrize("pattern", sorted(WORDS, key=lambda found: found.pattern))
+def test_no_name_takes_more_than_one_pass(pattern, cell):
+    """Words are compared with whole cells."""
+    assert pattern.fullmatch(cell + "!") is None

@@ -14,9 +14,8 @@ from scipy.spatial.transform import Rotation
 import minimax_cal as mc
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.history import with_history
-from minimax_cal.modelling.effects import EFFECTS, Effect, Term, register
+from minimax_cal.modelling.effects import EFFECTS, Term
 from minimax_cal.modelling.effects.maps import spread, waves_over
-from minimax_cal.modelling.effects.scene import Columns, one_joint
 from minimax_cal.modelling.effects.table import Fitted, terms
 from minimax_cal.modelling.joint_fit import extended, fitted, scene_of
 from minimax_cal.modelling.model import Model, model_of
@@ -447,32 +446,6 @@ def library() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("library")
-def test_an_own_effect_is_fitted_saved_and_loaded(tmp_path):
-    register(
-        Effect(
-            "squint",
-            "joint 4 leans with the square of joint 2",
-            "dq_4 = s q_2^2",
-            lambda scene: ("J4",),
-            lambda scene, place, choice: Columns(
-                ("s",), ("1/rad",), turn=one_joint(scene, 3, scene.q[1][None] ** 2)
-            ),
-        )
-    )
-    put = {"squint:J4": [3e-4]}
-    data = visited()
-    data = measured(with_effects(true_cell(), data, put), data)
-    fit = mc.calibrate(ROBOT, data, effects=["squint"])
-    check_found(fit, put)
-    fit.save(tmp_path / "fit.json")
-    cell = mc.load_cell(tmp_path / "fit.json")
-    assert_allclose(cell.predict(data.q), fit.predict(data.q), rtol=0, atol=1e-12)
-    del EFFECTS["squint"]
-    with pytest.raises(mc.CalibrationError, match="effect 'squint' is not known here"):
-        mc.load_cell(tmp_path / "fit.json")
-
-
-@pytest.mark.usefixtures("library")
 def test_the_example_finds_its_effect(capsys):
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     first, second = capsys.readouterr().out.splitlines()
@@ -480,9 +453,3 @@ def test_the_example_finds_its_effect(capsys):
     assert abs(value - 5e-5) < 4.0 * sigma
     before, after = (float(second.split()[i]) for i in (3, 6))
     assert after < 0.5 * before
-
-
-def test_effects_are_taken_from_one_text():
-    data = measured(true_cell(), visited(60))
-    fit = mc.calibrate(ROBOT, data, objective="sum", effects="encoder_gain:J1, base_flex:frame")
-    assert [term.label for term in fit.cell.effects.terms] == ["encoder_gain:J1", "base_flex:frame"]

@@ -34,12 +34,13 @@ from minimax_cal.planning.result import Plan
 from minimax_cal.robots.transforms import inverse
 
 ROOT = Path(__file__).parents[2]
-POSES, DISTANCE, INCIDENCE = 20, (0.35, 0.75), np.radians(45.0)
+POSES, DISTANCE, INCIDENCE = 16, (0.35, 0.75), np.radians(45.0)
 TWO = (
     View(np.eye(4)),
     View(np.array([[1.0, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])),
 )
 
+ONE = pytest.mark.parametrize("cell", [True], ids=["eye in hand"], indirect=True)
 
 pytestmark = pytest.mark.usefixtures("few_candidates")
 
@@ -51,7 +52,7 @@ def planned(cell: Cell, folder: Path, **more: object) -> Plan:
         "camera_on": "flange" if cell.on_flange else "ground",
         "camera_at": tuple(view.pose for view in cell.views), "board_at": cell.place,
         "print_looks": "z", "distance": DISTANCE, "incidence": INCIDENCE, "jitter": 0.0,
-        "pixel_noise": NOISE, "candidates": 200,
+        "pixel_noise": NOISE, "candidates": 100,
     }  # fmt: skip
     cameras = {f"cam{i}": folder / f"cam{i}.yaml" for i in range(len(cell.views))}
     return mc.plan_cameras(cell.drawn, POSES, cameras, folder / "board.csv", **given | more)
@@ -94,18 +95,19 @@ def check_seen(cell: Cell, plan: Plan, share: float = 0.8) -> None:
 def test_planned_poses_see_the_board(cell, plan):
     check_seen(cell, plan)
     assert (plan.q >= np.maximum(cell.drawn.lower, -np.pi)).all()
-    assert plan.efficiency > 0.8
+    assert plan.efficiency > 0.6  # a few whole poses cost
     assert plan.cameras == ("cam0",)
     assert plan.to_dict()["instrument"]["noise_px"] == NOISE
     assert plan.still == ("board" if cell.on_flange else "camera")
 
 
+@ONE
 def test_planned_poses_reach_the_predicted_sigma_and_beat_random_ones(cell, plan):
     rng, here = np.random.default_rng(5), plan.here
     assert here.mean[0] < 0.75 * here.mean[1]
     random = plan.candidates.q[: plan.candidates.drawn]
     errors = []
-    for _ in range(8):
+    for _ in range(6):
         some = random[rng.choice(len(random), POSES, replace=False)]
         for q in (plan.q, some):
             made = taken(cell, q, rng)
@@ -130,6 +132,7 @@ def test_information_is_that_of_the_fit(cell, tmp_path):
     assert_allclose(own, theirs, rtol=0.1)  # `taken` has no corners at the edge of an image
 
 
+@ONE
 def test_jitter_tells_less(cell, plan, tmp_path):
     shaken = planned(cell, tmp_path, jitter=1e-4)
     assert shaken.here.mean[0] > 1.5 * plan.here.mean[0]
@@ -138,7 +141,7 @@ def test_jitter_tells_less(cell, plan, tmp_path):
 def test_two_cameras_are_planned_together(tmp_path):
     points = board_points((4, 3), 0.06)
     cell = make_cell(np.random.default_rng(3), points=points, poses=4, views=TWO)
-    both = planned(cell, tmp_path, criterion="D")
+    both = planned(cell, tmp_path, criterion="D", candidates=60)
     check_seen(cell, both)
     assert both.seen.shape == (POSES, 2)
     assert both.seen.all(axis=0).any() or both.seen.any(axis=0).all()
@@ -157,7 +160,7 @@ def test_the_command_of_the_page_runs(tmp_path, says, monkeypatch):
     assert line is not None
     picture = tmp_path / "plan.svg"
     command = shlex.split(line[1])
-    said, told = says(*command, "--candidates", 100, "--figure", picture)
+    said, told = says(*command, "--candidates", 50, "--figure", picture)
     assert "Predicted sigma of a position" in said
     assert "noise of a pixel 0.1 px" in told
     written = Path(command[command.index("-o") + 1]).read_text()
@@ -170,7 +173,7 @@ def test_a_calibration_places_cameras_and_board(cell, plan, tmp_path, answered, 
     fit = tmp_path / "fit.json"
     files = write_cell(taken(cell, plan.q, np.random.default_rng(1)), tmp_path)
     see = ["--camera", f"cam0={tmp_path / 'cam0.yaml'}", "--board", tmp_path / "board.csv",
-           "--print-looks", "z", "--candidates", 80, "--fit", fit]  # fmt: skip
+           "--print-looks", "z", "--candidates", 50, "--fit", fit]  # fmt: skip
     assert run("calibrate ur5", *files, "-o", fit) == 0
     content = answered("plan ur5 --poses 12", *see)
     assert content["cameras"] == ["cam0"]
@@ -210,6 +213,7 @@ def test_wrong_input_is_one_line(given, said, says):
     assert len(err.strip().splitlines()) == 1
 
 
+@ONE
 def test_a_board_that_nothing_sees_is_said(cell, tmp_path):
     far = cell.place.copy()
     far[:3, 3] += 10.0

@@ -129,9 +129,9 @@ def test_a_backend_says_nothing(name, capfd):
     rng = np.random.default_rng(6)
     impossible = Problem(np.eye(1), [0.0], [[1.0], [1.0]], [-INF, 1.0], [0.0, INF])
     endless = Problem(np.zeros((1, 1)), [-1.0], [[1.0]], [0.0], [INF])
-    for problem in (epigraph(rng), random_problem(rng), impossible, endless):
+    for problem in (epigraph(rng), impossible, endless):
         solve(problem, name)
-        solve(problem, name, tolerance=1e-300)  # nobody is good enough: all are asked
+    solve(random_problem(rng), name, tolerance=1e-300)  # nobody is good enough: all are asked
     if sys.platform != "win32":
         ctypes.CDLL(None).fflush(None)  # what is printed from C waits in a buffer of its own
     assert capfd.readouterr() == ("", "")

@@ -73,7 +73,7 @@ def test_classics_reach_their_published_optimum(name):
     assert found.multipliers.min() >= 0.0
 
 
-@pytest.mark.parametrize("unit", [1e-6, 1e6, "mixed"])
+@pytest.mark.parametrize("unit", [1e-6, "mixed"])
 @pytest.mark.parametrize("name", CLASSICS)
 def test_the_unit_of_the_variables_does_not_matter(name, unit):
     classic = CLASSICS[name]
@@ -104,7 +104,7 @@ def least_polynomial(powers: np.ndarray, f: np.ndarray) -> float:
 @pytest.mark.parametrize("unit", [1.0, 1e3, 1e6], ids=["km", "m", "mm"])
 @pytest.mark.parametrize(
     ("degree", "jac"),
-    [*((degree, "given") for degree in range(2, 10)), (3, "2-point"), (6, "2-point")],
+    [(2, "given"), (4, "given"), (6, "given"), (9, "given"), (6, "2-point")],
 )
 def test_polynomials_are_fitted_in_any_unit(degree, unit, jac):
     """Columns from 1 to 1e65; the value is linprog's, or it is no success."""
