@@ -130,6 +130,6 @@ def asked_foot(
     findings: Iterable[Finding], told: Iterable[tuple[Term, str, str]]
 ) -> Iterator[Finding]:
     """The findings, with what the reflectors on the foot contradict."""
-    odd = {term.key: f"in {axes} by the reflectors on the foot" for term, _, axes in told if axes}
+    odd = {term.key: f"in {axes} by the foot" for term, _, axes in told if axes}
     for found in findings:
         yield replace(found, contradicted=odd.get(found.term.key, ""))

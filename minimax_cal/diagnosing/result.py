@@ -119,7 +119,7 @@ class Finding(Record):
     whether it is below 5 % of the squared held-out error that geometry leaves.  extends: False
     where the effects together make regions that are left out worse than geometry alone.
     curve: (3, g) of an error map: joint value, turn, sigma [rad].
-    contradicted: by what that was measured besides; empty where nothing does.
+    contradicted: where by what was measured besides, as in x by the foot; empty where nowhere.
     shown: the terms that the data ask for, where `terms` are the whole law that these belong to.
     """
 

@@ -33,7 +33,9 @@ from minimax_cal.reporting.tables import remaining_table, where_tables
 
 SHEET_ROWS = 50  # of tables on a printed page; the appendix has what is longer
 SHOWN_LEFT = 4  # rows of what the remaining error follows
-SHEET_NOTICES = 5  # as many fit on the page of the budget; the appendix has all
+SHEET_HEIGHT = 66.0  # rows of tables on a printed page: what is beyond stands in the appendix
+TALL, LETTERS = 1.35, 105  # of a line of text: its height in rows, its letters
+WIDE, LEAST = 5, 36  # columns from which on a cell of so many letters wraps
 BELOW = 9  # rows that the sentences below the parameters need
 LINE = 90  # letters of a line of a table's sentence
 BEFORE_EFFECTS = (
@@ -89,8 +91,23 @@ def budget(sources: Sources) -> Blocks:
     arms = (sources.simulator, sources.motion)
     blocks += [text(f"In the simulator: {arm.headline()}") for arm in arms if arm]
     every = dict.fromkeys(one for _, result in named(sources) for one in result.notices)
-    blocks += [Note(capitalise(f"{one}."), "notice") for one in list(every)[:SHEET_NOTICES]]
+    for one in every:
+        note = Note(capitalise(f"{one}."), "notice")
+        if sum(map(height, [*blocks, note])) > SHEET_HEIGHT:
+            break
+        blocks.append(note)
     return blocks
+
+
+def height(block: Block) -> float:
+    """How much of a printed page a block takes, in rows of a table."""
+    if isinstance(block, Note):
+        return TALL * math.ceil(len(block.text) / LETTERS)
+    if not isinstance(block, Table):
+        return 0.0
+    wide = len(block.header) > WIDE
+    cells = (max(len(cell) / (LEAST if wide else LINE) for cell in row) for row in block.cells())
+    return 3.0 + sum(map(math.ceil, cells))
 
 
 # ---- where ---------------------------------------------------------------------------------------
