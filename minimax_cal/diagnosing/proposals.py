@@ -79,4 +79,4 @@ def separating(causes: Sequence[Finding]) -> Proposal | None:
     text, pairs = max(by_text.items(), key=lambda entry: settled(entry[1]))
     named = names_of(list({f.name: f for f, _ in pairs}.values()), " and ")
     others = names_of(list({a.name: a for _, a in pairs}.values()), " and ")
-    return Proposal("separate", text, f"whether it is {named} or {others}")
+    return Proposal("separate", text, f"whether {named} is rather {others}")

@@ -363,7 +363,9 @@ def test_every_verdict_opens_the_words(found: Diagnosis) -> None:
         changed = replace(found, verdict=verdict)
         if verdict == "one_of":
             changed = replace(changed, effects=(first, *found.effects[1:]))
-            assert "at joint 2 as one of several" in changed.headline()  # not the one that is named
+            assert (
+                "at joint 2 is not distinguished from" in changed.headline()
+            )  # not the one that is named
             assert changed.main[0].evidence.startswith("one of these")
         first_words = "Main causes" if verdict == "unknown" else OPENINGS[verdict]
         if verdict in ("none", "not_repeatable"):
@@ -427,7 +429,8 @@ def test_alternatives_stand_at_their_own_place(found: Diagnosis) -> None:
     both = replace(both, effects=(replace(large, alternatives=(others[1],)), second))
     text = next(text for text in both.reasons if text.startswith("Recommended: "))
     assert large.share > second.share > 0.0
-    assert text.startswith("Recommended: measure 2, to know whether it is")
+    assert text.startswith("Recommended: measure 2, to know whether ")
+    assert " is rather " in text
 
 
 def test_places_of_one_kind_are_told_in_one() -> None:
@@ -512,8 +515,8 @@ def test_what_does_not_help_is_not_proposed(found: Diagnosis) -> None:
     changed = replace(found, verdict="one_of", effects=(first, *found.effects[1:]))
     (text,) = [text for text in changed.reasons if text.startswith("Recommended: ")]
     assert text == (
-        f"Recommended: {WIDER}, to know whether it is joint compliance at joint 2 or link bending "
-        "at link 2."
+        f"Recommended: {WIDER}, to know whether joint compliance at joint 2 is rather link "
+        "bending at link 2."
     )
     assert "or base flex or link bending at link 2" in changed.reasons[0]
     nothing = replace(changed, effects=(replace(first, alternatives=others[1:]),))

@@ -56,7 +56,7 @@ class Row:
         own, name = self.delivered, capitalise(self.short)
         if own.reason:
             return f"{own.sentence()}."
-        return f"{name}: {f'cannot hold {own.lacks}' if own.lacks else 'the whole model'}."
+        return f"{name}: {f'cannot hold {own.lacks}' if own.lacks else 'all of the model'}."
 
     @property
     def verdict(self) -> str:

@@ -390,7 +390,10 @@ def kept(sources: Sources) -> Iterator[str]:
         names = [f"{fit.data.called(s.line)} {s.target} {1e3 * s.distance:.2f} mm" for s in most]
         many = "1 outlier was" if len(names) == 1 else f"{len(names)} outliers were"
         where = name_first(names, MAX_NAMED)
-        yield f"{many} kept, and new poses may have such: {where}."
+        counts = "count in the result" if any(one.held for one in most) else (
+            "the limits are of poses without such"
+        )  # fmt: skip
+        yield f"{many} kept, and {counts}: {where}."
 
 
 def picture(sources: Sources, found: Signed) -> Figure:
@@ -440,7 +443,8 @@ def result_table(found: Signed) -> Table:
 
 def ends(before: float, bound: Bound) -> tuple[float, float, str]:
     """Cells of a row: before, result, its interval."""
-    low, high = ("" if math.isnan(end) else f"{end:.3f}" for end in (bound.low, bound.high))
+    most = bound.high if bound.high > bound.value else math.nan  # what was seen is no limit
+    low, high = ("" if math.isnan(end) else f"{end:.3f}" for end in (bound.low, most))
     return before, bound.value, f"{low or 'up'} to {high}" if high else f"from {low}" if low else ""
 
 

@@ -21,9 +21,10 @@ from minimax_cal.fitting.several import RelativeCalibration
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.records import reading
 from minimax_cal.ground.tables import Table, filled
-from minimax_cal.ground.words import capitalise
+from minimax_cal.ground.words import capitalise, name_first
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.effects.words import name_parameter
 from minimax_cal.modelling.frames import tables_of
 from minimax_cal.reporting.html.content import Block, Blocks, Note, missing, text
 from minimax_cal.reporting.html.error_charts import Names, against_joints
@@ -32,6 +33,7 @@ from minimax_cal.reporting.html.sources import Sources, named
 from minimax_cal.reporting.tables import remaining_table, where_tables
 
 SHEET_ROWS = 50  # of tables on a printed page; the appendix has what is longer
+SHOWN_LOST = 4  # parameters of effects that are named where they were kept
 SHOWN_LEFT = 4  # rows of what the remaining error follows
 SHEET_HEIGHT = 66.0  # rows of tables on a printed page: what is beyond stands in the appendix
 TALL, LETTERS = 1.35, 105  # of a line of text: its height in rows, its letters
@@ -39,7 +41,8 @@ WIDE, LEAST = 5, 36  # columns from which on a cell of so many letters wraps
 BELOW = 9  # rows that the sentences below the parameters need
 LINE = 90  # letters of a line of a table's sentence
 BEFORE_EFFECTS = (
-    "The tables are of what geometry leaves, before any effect. Geometry is fitted beside the "
+    "The tables are of what geometry leaves, before any effect; what it follows is no cause by "
+    "itself, for angles, loads and previous poses go together. Geometry is fitted beside the "
     "effects, so that base, tool and links may take a part of a joint's turn back."
 )
 NO_POSES = "The file holds no poses, so that nothing can be drawn; write it again with its poses."
@@ -237,8 +240,9 @@ def identified(fit: Fit) -> Blocks:
         if not (one.identifiable or one.of_effect):
             alike.setdefault(one.why_not, []).append(one.title)
     said = "; ".join(f"{', '.join(names)} ({why})" for why, names in alike.items())
-    lost = sum(p.of_effect and not p.identifiable for p in fit.parameters)
-    said += f"{'; ' * bool(said)}{lost} of effects" if lost else ""
+    lost = [name_parameter(p.name) for p in fit.parameters if p.of_effect and not p.identifiable]
+    if lost:
+        said += f"{'; ' * bool(said)}of effects {name_first(lost, SHOWN_LOST, '; ')}"
     rest = f" Kept nominal: {said}." if said else ""
     given = {p.because for p in fit.parameters if not p.identifiable}
     return [
