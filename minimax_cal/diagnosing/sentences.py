@@ -147,7 +147,7 @@ def subsampled(findings: Sequence[Finding]) -> str:
     loose = [f for f in findings if f.alternatives]
     sure = "one of them is confirmed" if loose == list(findings) else "confirmed"
     if loose and loose != list(findings):
-        sure = f"confirmed, but {names_of(loose, ' and ')} is not distinguished from what stands beside"
+        sure = f"confirmed, but {names_of(loose, ' and ')} is not distinguished from others"
     return f"{each} again in {least}{100.0 * often:.0f} % of the subsamples of the poses: {sure}."
 
 
