@@ -146,6 +146,10 @@ def test_pages_say_how_far_effects_turn_a_joint_and_by_which_parameters(whole, r
     effects = next(rows for title, rows in seen.tables.items() if "beyond geometry" in title)
     known = [p for p in fit.parameters if p.of_effect and p.identifiable]
     assert all(f"{p.value:.4g}" in str(effects) for p in known)
+    kept = [p for p in fit.parameters if not p.identifiable]
+    whys = [p.why_in_words if p.of_effect else p.why_not for p in kept]
+    assert kept
+    assert all(why in seen.text["parameters"] for why in whys)
 
 
 def test_rungs_of_a_diagnosis(results, tmp_path):

@@ -391,7 +391,7 @@ def kept(sources: Sources) -> Iterator[str]:
         many = "1 outlier was" if len(names) == 1 else f"{len(names)} outliers were"
         where = name_first(names, MAX_NAMED)
         counts = "count in the result" if any(one.held for one in most) else (
-            "the limits are of poses without such"
+            "the limits inside are of poses without such"
         )  # fmt: skip
         yield f"{many} kept, and {counts}: {where}."
 
@@ -458,8 +458,8 @@ def basis(found: Signed) -> str:
     elif away:
         out += f"Outside them nothing is claimed: {away.reason}. "
     out += (
-        "With 95 % confidence RMS, and largest error of as many new poses, stay below the upper "
-        "ends, which are compared with the requirement."
+        "With 95 % confidence as many new poses stay below the upper ends, which are compared with "
+        "what is required."
     )
     told = [claim for claim in found.claims if not claim.reason]
     if any(math.isnan(claim.bound(kind).high) for claim in told for kind in KINDS):

@@ -33,7 +33,7 @@ from minimax_cal.reporting.html.sources import Sources, named
 from minimax_cal.reporting.tables import remaining_table, where_tables
 
 SHEET_ROWS = 50  # of tables on a printed page; the appendix has what is longer
-SHOWN_LOST = 4  # parameters of effects that are named where they were kept
+SHOWN_KEPT = 14  # reasons why parameters were kept
 SHOWN_LEFT = 4  # rows of what the remaining error follows
 SHEET_HEIGHT = 66.0  # rows of tables on a printed page: what is beyond stands in the appendix
 TALL, LETTERS = 1.35, 105  # of a line of text: its height in rows, its letters
@@ -237,12 +237,13 @@ def identified(fit: Fit) -> Blocks:
     known, count = sum(p.identifiable for p in fit.parameters), len(fit.parameters)
     alike = dict[str, list[str]]()
     for one in fit.parameters:
-        if not (one.identifiable or one.of_effect):
-            alike.setdefault(one.why_not, []).append(one.title)
-    said = "; ".join(f"{', '.join(names)} ({why})" for why, names in alike.items())
-    lost = [name_parameter(p.name) for p in fit.parameters if p.of_effect and not p.identifiable]
-    if lost:
-        said += f"{'; ' * bool(said)}of effects {name_first(lost, SHOWN_LOST, '; ')}"
+        if not one.identifiable:
+            name, why = one.title, one.why_not
+            if one.of_effect:
+                name, why = name_parameter(one.name), one.why_in_words
+            alike.setdefault(why, []).append(name)
+    every = [f"{', '.join(names)} ({why})" for why, names in alike.items()]
+    said = name_first(every, SHOWN_KEPT, "; ")
     rest = f" Kept nominal: {said}." if said else ""
     given = {p.because for p in fit.parameters if not p.identifiable}
     return [
