@@ -50,7 +50,7 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements, SetAside
 from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.scene import joint_of
-from minimax_cal.modelling.effects.table import EFFECTS, Fitted, Term
+from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.frames import WHOLE, frames_of, in_words, tables_of, with_effects
 from minimax_cal.modelling.joint_fit import extended
@@ -512,12 +512,9 @@ class Fit(Result):
                 first = len(self.covariance) - sum(map(len, effects.values[at:]))
                 part = slice(first, first + len(own))
 
-                def turn(values: Array, term: Term = term) -> Array:
-                    return Fitted((term,), (values,)).turn(scene)[:, joint_of(term.place)]
-
-                each = np.array([turn(one) for one in np.eye(len(own))])
+                each = term.columns(scene).turn[:, joint_of(term.place)]
                 sigma = ((np.nan_to_num(self.covariance[part, part]) @ each) * each).sum(axis=0)
-                sizes = rms(turn(own)), float(np.sqrt(sigma.mean()))
+                sizes = rms(own @ each), float(np.sqrt(sigma.mean()))
                 rows.append((f"{name_effect(*term.key)}, RMS", "rad", *sizes, ""))
         plain = table_of_effects(p for p in self.parameters if not p.name.startswith(labels))
         return plain.plus(*rows)

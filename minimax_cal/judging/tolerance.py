@@ -48,7 +48,7 @@ class Claim:
     name: inside or outside.  before: of the nominal arm [mm], by kind.  poses: that count by
     themselves.  where: in words.  reason: why there is no claim, if there is none.  open: what
     could not be judged, so that nothing is passed by the rest; empty where all was.  sets: how many
-    poses RMS and largest are of; regions: where these are; kept: that effects were given, a clause.
+    poses RMS and largest are of; regions: where these are.
     refused: why nothing is passed, whatever the numbers; empty where it may be.
     """
 
@@ -62,7 +62,6 @@ class Claim:
     open: str = ""
     sets: tuple[int, int] = (0, 0)
     regions: tuple[str, str] = ("", "")
-    kept: str = ""
     refused: str = ""
 
     def bound(self, kind: str) -> Bound:
@@ -154,12 +153,11 @@ def beyond(found: Beyond) -> Claim:
         Bound(worst.rms_mm, found.rms_high_mm),
         Bound(far.max_mm, found.max_high_mm),
         worst.poses,
-        f"outside the measured region, in the worst part that was held out ({worst.where}, "
-        f"{worst.poses} poses{of}{found.kept.replace(',', ';')})",
+        f"the worst of whole parts held out in turn{found.kept} "
+        f"({worst.where}, {worst.poses} poses{of})",
         open=open_of(found),
         sets=(worst.poses, far.poses),
         regions=(worst.where, far.where),
-        kept=found.kept,
     )
 
 

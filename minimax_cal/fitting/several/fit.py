@@ -174,15 +174,12 @@ def of_worst(fit: InstrumentFit, options: RelativeOptions) -> InstrumentFit:
             np.sqrt(np.bincount(of[of >= 0], square[of >= 0]) / np.bincount(of[of >= 0]))
         )
 
-    labels = zip(stack.labels, stack.instruments, strict=True)
-    several = len(stack.blocks) > 1
-    names = [f"{label} {part}" if several else part for label, one in labels for part in one.parts]
     return replace(
         fit,
         state=best.x,
         found=replace(fit.found, status=(best.status,), iterations=np.array([best.iterations])),
         covariance=covariance_of(problem, best.x, np.square(fit.noise), share),
-        worst=Worst.of([names[i] for i in seen], sizes(fit.state), sizes(best.x), best),
+        worst=Worst.of([stack.parts[i] for i in seen], sizes(fit.state), sizes(best.x), best),
         notices=notes,
     )
 

@@ -185,7 +185,7 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
         for i, (data, (held, _)) in enumerate(zip(every, splits, strict=True))
     ]
     single = len(every) == 1
-    whole = measured[0] if single else together(found.stack.labels, measured)
+    whole = measured[0] if single else together(found.stack.parts, measured)
     notices = [
         said
         for data, (_, notes) in zip(every, splits, strict=True)
@@ -286,19 +286,18 @@ def by_key(nominal: Array, calibrated: Array, held: Array) -> dict[str, Array]:
     }
 
 
-def together(labels: Sequence[str], measured: Sequence[Measured]) -> Measured:
+def together(parts: tuple[str, ...], measured: Sequence[Measured]) -> Measured:
     """The errors of all files, one beside the other."""
     errors = {}
     for key in HELD:
-        parts = [each.errors[key] for each in measured]
-        ends = np.cumsum([[0, 0], *(part.shape[:2] for part in parts)], axis=0)
+        every = [each.errors[key] for each in measured]
+        ends = np.cumsum([[0, 0], *(part.shape[:2] for part in every)], axis=0)
         errors[key] = np.full((*ends[-1], 3), np.nan)
-        for part, (row, pose) in zip(parts, ends, strict=False):
+        for part, (row, pose) in zip(every, ends, strict=False):
             errors[key][row : row + part.shape[0], pose : pose + part.shape[1]] = part
-    stems = zip(labels, measured, strict=True)
     return Measured(
         kind=SEVERAL,
-        parts=tuple(f"{label} {part}" for label, each in stems for part in each.parts),
+        parts=parts,
         errors=errors,
         numbers={key: sum(each.numbers[key] for each in measured) for key in HELD},
         turns={},

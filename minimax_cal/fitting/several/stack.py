@@ -250,6 +250,17 @@ class Stack:
         )
         return errors, jacobians
 
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Every part by name, as wire1; of several files with what the file is called."""
+        every = [
+            (label, part)
+            for label, one in zip(self.labels, self.instruments, strict=True)
+            for part in one.parts
+        ]
+        several = len(self.blocks) > 1
+        return tuple(f"{label} {part}" if several else part for label, part in every)
+
     def part_of_rows(self, x: State) -> Array:
         """(rows,) which of all parts each is of, block by block; -2 of rows that are of several."""
         out, first = [], 0

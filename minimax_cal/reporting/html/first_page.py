@@ -46,7 +46,7 @@ from minimax_cal.reporting.html.content import Block, Figure, Note, caveat, text
 from minimax_cal.reporting.html.delivered import Row, governing, rows_of, whole
 from minimax_cal.reporting.html.error_charts import cumulative
 from minimax_cal.reporting.html.more_charts import budget_chart, waterfall
-from minimax_cal.reporting.html.pages import names_of, split_reasons, turned
+from minimax_cal.reporting.html.pages import names_of, split_reasons
 from minimax_cal.reporting.html.sources import Sources, named
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.status import Status
@@ -368,7 +368,8 @@ def because(sources: Sources) -> Iterator[Note]:
 
 def worst_joint(sources: Sources) -> Iterator[str]:
     """The joint that effects turn most, in degrees, and the pose; nothing where none turns one."""
-    for data, turn in turned(sources):
+    if sources.turned:
+        data, turn = sources.turned
         pose, joint = np.unravel_index(np.argmax(turn), turn.shape)
         at = ", ".join(
             f"{1e3 * q:.0f} mm" if slides else f"{np.degrees(q):.0f}"
@@ -454,13 +455,10 @@ def basis(found: Signed) -> str:
     out = f"Inside: {inside.where}. "
     away = found.claims[1] if len(found.claims) > 1 else None
     if away and not away.reason:
-        out += f"Outside: whole parts held out in turn{away.kept}, the worst. "
+        out += f"Outside: {away.where}. "
     elif away:
         out += f"Outside them nothing is claimed: {away.reason}. "
-    out += (
-        "With 95 % confidence as many new poses stay below the upper ends, which are compared with "
-        "what is required."
-    )
+    out += "With 95 % confidence as many new poses stay below the upper ends."
     told = [claim for claim in found.claims if not claim.reason]
     if any(math.isnan(claim.bound(kind).high) for claim in told for kind in KINDS):
         out += " A dash: the poses are too few, or too unlike each other, to tell a limit."

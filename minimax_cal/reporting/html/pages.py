@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
@@ -16,14 +16,10 @@ from minimax_cal.diagnosing.sentences import away, causes_first
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.found import parameter_table
 from minimax_cal.fitting.identify import Because
-from minimax_cal.fitting.pose_rows import comes_back
 from minimax_cal.fitting.several import RelativeCalibration
-from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.records import reading
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import capitalise, name_first
-from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.words import name_parameter
 from minimax_cal.modelling.frames import tables_of
 from minimax_cal.reporting.html.content import Block, Blocks, Note, missing, text
@@ -94,12 +90,9 @@ def budget(sources: Sources) -> Blocks:
     arms = (sources.simulator, sources.motion)
     blocks += [text(f"In the simulator: {arm.headline()}") for arm in arms if arm]
     every = dict.fromkeys(one for _, result in named(sources) for one in result.notices)
-    for one in every:
-        note = Note(capitalise(f"{one}."), "notice")
-        if sum(map(height, [*blocks, note])) > SHEET_HEIGHT:
-            break
-        blocks.append(note)
-    return blocks
+    notes = [Note(capitalise(f"{one}."), "notice") for one in every]
+    tall = np.cumsum([sum(map(height, blocks)), *map(height, notes)])[1:]
+    return [*blocks, *notes[: int(np.count_nonzero(tall <= SHEET_HEIGHT))]]
 
 
 def height(block: Block) -> float:
@@ -135,30 +128,13 @@ def where(sources: Sources) -> Blocks:
     return drawn
 
 
-def turned(sources: Sources) -> Iterator[tuple[Measurements, Array]]:
-    """The poses, and how far all effects turn each joint there: (m, n), 0 of one that slides [rad].
-
-    Nothing where none turns one, or the file does not tell.
-    """
-    fit, gap = sources.fit, sources.gap
-    if fit:
-        cell, data, error = fit.cell, fit.data, fit.error
-    elif gap and gap.cells:
-        cell, data, error = gap.cells[-1], gap.data, gap.errors[1]
-    else:
-        return
-    if cell.effects.terms and data.poses and comes_back(cell.error(data), error):
-        turn = np.abs(cell.effects.turn(cell.scene(with_history(data))))
-        turn[:, data.sliding] = 0.0
-        if turn.any():
-            yield data, turn
-
-
 def turns_of(sources: Sources) -> dict[str, tuple[float, str]]:
     """How far effects turn each joint at most [mrad], and at which pose."""
+    if not sources.turned:
+        return {}
+    data, turn = sources.turned
     return {
         f"J{i + 1}": (1e3 * float(turn[pose, i]), data.row_called(int(pose)))
-        for data, turn in turned(sources)
         for i, pose in enumerate(turn.argmax(axis=0))
     }
 
@@ -221,7 +197,7 @@ def by_effect(table: Table, room: int) -> Table:
             break
         rows.append((effect, said))
     more = len({row[0] for row in table.cells()}) - len(rows)
-    rest = f"; {more} smaller ones are in the appendix" if more else ""
+    rest = f"; {more} more are in the appendix" if more else ""
     return Table.made(f"{table.title}: value (sigma){rest}", rows, "effect | parameters")
 
 

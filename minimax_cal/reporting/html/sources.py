@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.dynamics.result import MotionDiagnosis
 from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.opened import RELATIVE
+from minimax_cal.fitting.pose_rows import comes_back
 from minimax_cal.fitting.several import RelativeCalibration
 from minimax_cal.fitting.several.pixel_result import PIXELS, PixelCalibration
 from minimax_cal.ground.arrays import Array
@@ -23,7 +25,7 @@ from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import json_of, read_raw
 from minimax_cal.ground.records import AGAIN
 from minimax_cal.ground.words import visible
-from minimax_cal.measuring.history import numbered, visits
+from minimax_cal.measuring.history import numbered, visits, with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.simulators.result import MotionGap, SimulatorGap
@@ -122,6 +124,21 @@ class Sources:
             before, after = gap.errors
             return Poses(gap.data, gap.held, 1e3 * before, 1e3 * after)
         return None
+
+    @cached_property
+    def turned(self) -> tuple[Measurements, Array] | None:
+        """The poses, and how far all effects turn each joint there: (m, n), 0 of a slide [rad].
+
+        None where none turns one, or the file does not tell.
+        """
+        cell, poses = self.cell, self.poses
+        if not (cell and poses and cell.effects.terms):
+            return None
+        if not comes_back(cell.error(poses.data), 1e-3 * poses.after):
+            return None
+        turn = np.abs(cell.effects.turn(cell.scene(with_history(poses.data))))
+        turn[:, poses.data.sliding] = 0.0
+        return (poses.data, turn) if turn.any() else None
 
     @property
     def cell(self) -> Cell | None:
