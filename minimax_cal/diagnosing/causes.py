@@ -29,8 +29,9 @@ from minimax_cal.measuring.faults.joints import looks_read_back
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.scene import Scene, joint_of, unmasked
-from minimax_cal.modelling.effects.table import EFFECTS, Term
+from minimax_cal.modelling.effects.table import EFFECTS, Term, by_waves, names_of
 from minimax_cal.modelling.effects.time import SESSION_JUMP
+from minimax_cal.modelling.effects.words import own_name
 
 ADVISED = 3  # rivals of an effect for which a further measurement is worked out
 
@@ -302,13 +303,8 @@ def whole(finding: Finding, every: Sequence[Term], scene: Scene) -> Finding:
     terms = entire(finding.terms, every)
     if terms == finding.terms:
         return finding
-    columns = [term.columns(scene) for term in terms]
-    named = [
-        by_waves(one.names, term.choice["turns"]) if len(terms) > 1 else one.names
-        for term, one in zip(terms, columns, strict=True)
-    ]
-    names = tuple(name for part in named for name in part)
-    units = tuple(unit for one in columns for unit in one.units)
+    named, units = names_of(terms, scene)
+    names = tuple(own_name(name) for name in named)
     none = (0.0,) * len(names)
     new = replace(finding, terms=terms, names=names, units=units, values=none, sigmas=none)
     return replace(new, shown=finding.terms)
@@ -321,7 +317,7 @@ def merged(findings: Sequence[Finding]) -> list[Finding]:
     for key, found in zip(keys, findings, strict=True):
         turns = found.fixed.get("waves_per_turn")
         if turns and (EFFECTS[key[0]].follows == "wave" or keys.count(key) > 1):
-            names = by_waves(found.names, turns)
+            names = by_waves(found.names, found.term)
             found = replace(found, names=names, fixed={f"waves_per_turn {turns:.4g}": turns})
         if key not in out:
             out[key] = found
@@ -341,11 +337,6 @@ def merged(findings: Sequence[Finding]) -> list[Finding]:
             fixed={**first.fixed, **found.fixed},
         )
     return list(out.values())
-
-
-def by_waves(names: Sequence[str], turns: float) -> tuple[str, ...]:
-    """Parameters of one of several lines, called by its waves a turn."""
-    return tuple(f"{name} {turns:.4g}/turn" for name in names)
 
 
 def fault_findings(faults: Sequence[Fault]) -> list[Finding]:

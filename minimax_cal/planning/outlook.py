@@ -100,7 +100,7 @@ def separated(asked: Question, contest: Contest, stops: Visits, seen: Array) -> 
 def remarks(task: Task, found: Poses) -> list[str]:
     """What the reader should know about how the poses were found."""
     out = ["the arm's body is a crude one and the cell is not known: check every move yourself"]
-    told = {name.rpartition(".")[0] for name in task.ahead.names}
+    told = {name.partition(".")[0] for name in task.ahead.names}
     terms = [term for term in task.ahead.cell.effects.terms if not term.frees_frames]
     silent_ones = [name_effect(*term.key) for term in terms if term.label not in told]
     if silent_ones:

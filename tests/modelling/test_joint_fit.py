@@ -4,6 +4,7 @@ import json
 import runpy
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -183,6 +184,25 @@ def test_priors_are_weighed_against_the_noise_that_effects_leave():
     fit = mc.calibrate(ROBOT, data, objective="sum", effects=list(put), priors=priors)
     check_found(fit, put)
     assert fit.accuracy["holdout"].rms_mm < 1.15 * FLOOR_MM
+
+
+def test_each_of_several_lines_of_a_gear_has_a_name(tmp_path: Path):
+    """The waves a turn tell one from another; a lone line goes without."""
+    lines = {"gear_ripple:J3:turns=17": [2e-4, 1e-4], "gear_ripple:J3:turns=31.5": [-1e-4, 3e-4]}
+    data = visited()
+    data = measured(with_effects(true_cell(), data, lines), data)
+    fit = mc.calibrate(ROBOT, data, objective="sum", effects=[*lines, "backlash:J2"])
+    names = [p.name for p in fit.parameters if p.of_effect]
+    assert names == [
+        "gear_ripple:J3.cos 17/turn", "gear_ripple:J3.sin 17/turn",
+        "gear_ripple:J3.cos 31.5/turn", "gear_ripple:J3.sin 31.5/turn", "backlash:J2.b2",
+    ]  # fmt: skip
+    fit.save(tmp_path / "fit.json")
+    again = mc.load_fit(tmp_path / "fit.json")
+    for name, value in zip(names, np.concatenate([*lines.values()]), strict=False):
+        found = again.parameters[name]
+        assert abs(found.value - value) < 4.0 * found.sigma
+        assert found.sigma < 5e-5
 
 
 # ---------------------------------------------------------------- what cannot be told

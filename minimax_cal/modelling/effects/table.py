@@ -362,14 +362,24 @@ def fitted_from_list(content: Sequence[Mapping[str, Any]]) -> Fitted:
 
 
 def names_of(terms: Sequence[Term], scene: Scene) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names, as joint_compliance:J2.c2, and units of all parameters."""
+    """Names, as joint_compliance:J2.c2 or of one of several lines gear_ripple:J4.cos 17/turn, and
+    units of all parameters.
+    """
     names: list[str] = []
     units: list[str] = []
+    labels = [term.label for term in terms]
     for term in terms:
         columns = term.columns(scene)
-        names += [f"{term.label}.{name}" for name in columns.names]
+        own = by_waves(columns.names, term) if labels.count(term.label) > 1 else columns.names
+        names += [f"{term.label}.{name}" for name in own]
         units += columns.units
     return tuple(names), tuple(units)
+
+
+def by_waves(names: Sequence[str], term: Term) -> tuple[str, ...]:
+    """Parameters of one of several lines of a gear, called by its waves a turn."""
+    turns = f" {term.choice['turns']:.4g}/turn" if "turns" in term.choice else ""
+    return tuple(f"{name}{turns}" for name in names)
 
 
 def fields_of(terms: Sequence[Term], scene: Scene) -> Array:

@@ -52,8 +52,13 @@ def name_label(label: str) -> str:
 
 def name_parameter(code: str) -> str:
     """A parameter of an effect, as joint_compliance:J2.c2; one of geometry stays."""
-    label, _, parameter = code.rpartition(".")
+    label, _, parameter = code.partition(".")
     return f"{name_label(label)}, {parameter}" if ":" in label else code
+
+
+def own_name(code: str) -> str:
+    """A parameter by its name alone, as c2 of joint_compliance:J2.c2; one of geometry stays."""
+    return code.partition(".")[2] or code
 
 
 def name_structure(text: str) -> str:

@@ -13,6 +13,7 @@ from minimax_cal.diagnosing.result import IF_REAL, Diagnosis
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import capitalise
+from minimax_cal.modelling.effects.words import own_name
 from minimax_cal.reporting.html.charts import (
     LOOKS,
     axis,
@@ -53,7 +54,7 @@ def correlation_map(known: Uncertainty) -> Figure:
     }  # fmt: skip
     # more labels than these hide each other; all are told where one points
     every = int(np.ceil(len(names) / MOST_LABELS))
-    short = [name.rpartition(".")[2] for name in names]  # of an effect its parameter
+    short = [own_name(name) for name in names]
     short = short if len(set(short)) == len(short) else names
     tick = {"type": "category", "tickfont": {"size": 10}, "showgrid": False,
             "tickvals": names[::every], "ticktext": short[::every]}  # fmt: skip
