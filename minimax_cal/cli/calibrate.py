@@ -7,20 +7,18 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
 from minimax_cal.cli.options import (
     ROBOT,
     ROWS,
     SOME_CAMPAIGNS,
     Output,
+    among,
     command,
     flag,
     of_any,
     on_command_line,
     options_from,
     plain_option,
-    record_of,
     refuse,
     result_options,
     together,
@@ -32,7 +30,6 @@ from minimax_cal.fitting.pixels.options import PixelFiles, PixelOptions
 from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.ground.files import json_text, plain
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.reading.rows import read_rows
 from minimax_cal.reporting.plots.figures import save_errors
 from minimax_cal.robots.kernels.choice import work
 from minimax_cal.solvers.status import Status
@@ -41,7 +38,6 @@ if TYPE_CHECKING:
     from minimax_cal.judging.bootstrap import Bootstrap
 
 OPTIONS = {f.name for kind in (Options, RelativeOptions) for f in fields(kind)}
-CAMERAS = {f.name for f in fields(PixelOptions)} - {f.name for f in fields(Options)}
 BRIEF = 1000  # poses that one fit needs no compiled kernels for
 
 
@@ -88,21 +84,14 @@ def calibrate_command(
     Files of several instruments are one fit: all share the arm, each counts by its own noise.  What
     cameras saw is given with --pixels, --joints and --camera, alone or beside DATA.
     """
-    files = record_of(PixelFiles, chosen)
-    if not (data or files.given):
-        raise click.UsageError(
-            "Missing argument 'DATA...', or --pixels with --joints and --camera."
-        )
-    if not files.given:
-        refuse(CAMERAS, "is about what cameras see, with pixels=, joints= and camera=")
-    files, rest = files.among([read_rows(path) for path in data])
-    if files.given and not rest:
+    files, rest = among(data, chosen)
+    if not rest and "effects" not in on_command_line():
         return by_cameras(robot, files, to, chosen)
     asked = {name: chosen[name] for name in chosen if name in OPTIONS}
-    given = of_any(rest, in_rows, to)
+    given = of_any(rest, in_rows, to) if rest else []
     if files.given or not isinstance(given, Measurements):
         refuse(("replicates", "in_rows", "without"), "is for points of a tracker")
-        refuse(CAMERAS - OPTIONS, "is for pixels alone")
+        refuse({"drawn_prior"}, "is for pixels alone, without effects")
         if asked["objective"] != "sum":
             what = "is for points of a tracker, or pixels alone; minimax-cal relative has one, too"
             refuse(("objective",), what)

@@ -11,12 +11,13 @@ from typing import Any
 import click
 
 from minimax_cal.cli.options import (
-    CAMPAIGNS,
     JSON,
     ROBOT,
     ROWS,
+    SOME_CAMPAIGNS,
     SOME_DATA,
     Output,
+    among,
     command,
     looked_up,
     measured,
@@ -25,6 +26,7 @@ from minimax_cal.cli.options import (
     options_from,
     refuse,
     result_options,
+    together,
     workers,
 )
 from minimax_cal.diagnosing.diagnose import DiagnosisOptions, diagnose
@@ -32,9 +34,11 @@ from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.dynamics.logs import are_logs
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.pixels.options import PixelFiles, PixelOptions
 from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Table, filled
+from minimax_cal.instruments.images import Images
 from minimax_cal.measuring.history import with_history
 from minimax_cal.reporting.plots.diagnosis import save_diagnosis
 from minimax_cal.reporting.tables import effects_list, effects_table, remaining_table, where_tables
@@ -43,10 +47,12 @@ from minimax_cal.solvers.status import Status
 
 @command
 @ROBOT
-@CAMPAIGNS
+@SOME_CAMPAIGNS
 @options_from(Options, "holdout", "seed", "holdout_by", "instrument")
 @options_from(DiagnosisOptions)
 @options_from(RelativeOptions, "offset", "known_distances", "lever", "noises")
+@options_from(PixelFiles)
+@options_from(PixelOptions, *Images.options)
 @workers(1, "1")
 @ROWS
 @result_options("the diagnosis (JSON)", keep="diagnosis.json", figure="the gap and where it lies")
@@ -57,15 +63,15 @@ def diagnose_command(
 
     DATA is as `calibrate` takes it; of logs, `torques` says why their torques are not ROBOT's.
     """
-    if are_logs(data):
+    if data and are_logs(data):
         return by_torques(robot, data, to, chosen)
-    given = of_any(data, in_rows, to)
-    if isinstance(given, list):
+    files, rest = among(data, chosen)
+    given = of_any(rest, in_rows, to) if rest else []
+    if files.given or isinstance(given, list):
         refuse(("in_rows", "jobs", "cluster"), "is for points of a tracker")
-        to.undrawn()
+        every = given if isinstance(given, list) else [given]
+        return together(diagnose, robot, every, files, to, chosen)
     found = to.work(diagnose, robot, given, **chosen)
-    if isinstance(given, list):
-        return to.finish(found, status=found.status)
     return to.finish(
         found,
         status=found.status,

@@ -501,6 +501,26 @@ def of_any(
     return visited(data, in_rows)
 
 
+def among(data: Sequence[Path], chosen: dict[str, Any]) -> tuple[PixelFiles, list[Rows]]:
+    """What is given of cameras, by options or among the files of data, and the other files.
+
+    chosen: options of a command, which `PixelFiles` are taken from.  Raises OptionError.
+    """
+    from minimax_cal.fitting.pixels.options import PixelFiles
+    from minimax_cal.instruments.images import Images
+    from minimax_cal.reading.rows import read_rows
+
+    files = record_of(PixelFiles, chosen)
+    if not (data or files.given):
+        raise click.UsageError(
+            "Missing argument 'DATA...', or --pixels with --joints and --camera."
+        )
+    if not files.given:
+        what = "is about what cameras see, with pixels=, joints= and camera="
+        refuse((*Images.options, "drawn_prior"), what)
+    return files.among([read_rows(path) for path in data])
+
+
 def together(
     verb: Callable[..., Any],
     robot: str,

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from minimax_cal.cli.options import (
-    CAMPAIGNS,
     ROBOT,
+    SOME_CAMPAIGNS,
     Output,
+    among,
     command,
     options_from,
     plain_option,
-    record_of,
-    refuse,
     result_options,
     together,
 )
@@ -24,17 +23,16 @@ from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.pixels.options import PixelFiles, PixelOptions
 from minimax_cal.fitting.several import RelativeOptions, relative
 from minimax_cal.ground.errors import OptionError
-
-CAMERAS = ("camera_on", "fix_camera", "camera_prior")
+from minimax_cal.instruments.images import Images
 
 
 @command
 @ROBOT
-@CAMPAIGNS
+@SOME_CAMPAIGNS
 @options_from(Options, "holdout", "seed", "fix", "free", "priors", "effects")
 @options_from(RelativeOptions)
 @options_from(PixelFiles)
-@options_from(PixelOptions, *CAMERAS)
+@options_from(PixelOptions, *Images.options)
 @options_from(Options, "qp", "method")
 @plain_option(
     "What is sought",
@@ -69,7 +67,5 @@ def relative_command(
         if chosen["objective"] != "sum":
             raise OptionError("a diagnosis is by objective=sum: leave --objective out")
         verb = partial(diagnose_relative, exclude=exclude)
-    files = record_of(PixelFiles, chosen)
-    if not files.given:
-        refuse(CAMERAS, "is about what cameras see, with pixels=, joints= and camera=")
-    return together(verb, robot, [*data], files, to, chosen)
+    files, rest = among(data, chosen)
+    return together(verb, robot, rest, files, to, chosen)

@@ -67,6 +67,7 @@ from minimax_cal.ground.stages import name_rung, number_step
 from minimax_cal.ground.threads import one_thread
 from minimax_cal.ground.words import name_first
 from minimax_cal.instruments.file import Given, taken
+from minimax_cal.instruments.images import Images
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.faults import find_faults, in_lines, mended, standing_out
 from minimax_cal.measuring.faults.fault import Fault
@@ -124,7 +125,7 @@ class DiagnosisOptions:
         return number_step(progress, steps.index(name) + 1, len(steps), name)
 
 
-OF_OTHERS = ("offset", "known_distances", "lever", "noises")
+OF_OTHERS = ("offset", "known_distances", "lever", "noises", *Images.options)
 
 
 @takes(

@@ -96,10 +96,7 @@ def diagnosed(
     check_left_out(exclude, EFFECTS)
     if chosen.effects:
         raise OptionError("effects: a diagnosis looks for them; leave them out")
-    asked = asked_of(robot, data, chosen)
-    for each in asked.every:
-        if each.kind == "pixels":
-            raise OptionError("a diagnosis is not for pixels yet: leave them out")
+    asked = asked_of(robot, data, chosen, sought=True)
     if not all(held.any() for held, _ in asked.splits):
         raise DataError(
             "a diagnosis needs held-out rows in every file: measure more, or hold out more "
@@ -233,7 +230,7 @@ def missed(result: RelativeCalibration, fit: InstrumentFit, noise: Array) -> flo
 
 def with_shares(scene: Scene, ladder: Budget) -> list[Finding]:
     """The findings with their values in the last fit and what each takes off, largest first."""
-    last = ladder.fits[-1]
+    last, scenes = ladder.fits[-1], ladder.fits[0].stack.scenes(scene.robot, ladder.fits[0].state)
     first = last.stack.lawless
     values = last.stack.values(last.state)
     sigma = np.sqrt(np.maximum(np.diag(last.covariance)[first:], 0.0))
@@ -248,7 +245,9 @@ def with_shares(scene: Scene, ladder: Budget) -> list[Finding]:
                 found,
                 values=tuple(values[own].tolist()),
                 sigmas=tuple(sigma[own].tolist()),
-                motion=motions_of(scene, found),
+                motion=tuple(
+                    map(max, zip(*(motions_of(one, found) for one in scenes), strict=False))
+                ),
                 before=before,
                 after=after,
                 share=share,
@@ -270,7 +269,7 @@ def known_noise(scene: Scene, fit: InstrumentFit) -> tuple[Known, str]:
     for i, (one, look) in enumerate(zip(stack.instruments, looks, strict=True)):
         if not np.isfinite(stack.given[i]):
             continue
-        arm = look.of(scene.jacobian[:, : look.targets, :, look.poses])
+        arm = look.of(scene.jacobian[..., look.poses])
         own = (arm**2).sum(axis=0).mean() / (fit.stiff or fit).stack.precision[i]
         unit = 1e3 / one.row_noise
         low = float(np.sqrt(cost[i] / chdtri(spare[i], 0.05)))

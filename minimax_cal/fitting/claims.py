@@ -37,6 +37,7 @@ from minimax_cal.robots.robot import Robot
 if TYPE_CHECKING:
     from minimax_cal.fitting.several.laws import Laws
 
+TOOL = np.array([0.0, 0.0, 0.1])  # a point beside the last axes, in the flange [m]
 OPEN = 1e-4  # of the largest column: positions that a parameter moves by less depend on it no more
 NO_VALUES: Array = np.zeros(0)
 
@@ -84,10 +85,11 @@ def positions_by(
     """(3 m, p) motion of the targets' centroid at random poses per unit of each parameter.
 
     But for the best rigid motion of all positions: a base is fitted wherever an arm is put to work.
-    mdh: (n, 5).  spots: (k, 3) targets on the flange [m].  The parameters are links, a base, the
-    targets and the laws, with values (d,).
+    mdh: (n, 5).  spots: (k, 3) targets on the flange, none where a tool is fitted there too [m].
+    The parameters are links, a base, the targets and the laws, with values (d,).
     """
-    at, spot = still(anywhere(robot, PLENTY).q, (), robot), spots.mean(axis=0)
+    at = still(anywhere(robot, PLENTY).q, (), robot)
+    spot = spots.mean(axis=0) if len(spots) else TOOL
     arm, frame = Arm.of(robot, at.q), (np.eye(3), np.zeros(3))
     if laws and laws.terms:
         scene = Scene.of(robot.with_mdh(mdh), at, frame, corners(spot), arm.q)
@@ -96,13 +98,13 @@ def positions_by(
     point, pose = np.repeat(flange.place(spot), 3, axis=0), np.repeat(np.arange(PLENTY), 3)
     axes, none = np.tile(np.eye(3), (PLENTY, 1)), np.zeros((len(pose), 3))
     by = by_arm(flange, ResidualRows(none[:, 0], pose, point, axes, none, none[:, :0])).T
-    target = flange.rotation.reshape(-1, 3) / len(spots)
+    target = flange.rotation.reshape(-1, 3) / max(len(spots), 1)
     links, bends = np.split(by, [5 * len(mdh)], axis=1)
     jacobian = np.hstack([links, np.zeros((len(by), 6)), *[target] * len(spots), bends])
     stiff = arm.at(mdh).place(spot)
     stiff = stiff - stiff.mean(axis=0)
     rigid = np.concatenate([np.tile(np.eye(3), (len(stiff), 1, 1)), -hat(stiff)], axis=2)
-    basis, _ = np.linalg.qr(rigid.reshape(-1, 6))
+    basis = orthonormal(np.hstack([rigid.reshape(-1, 6), *[target] * (not len(spots))]))
     return np.asarray(jacobian - basis @ (basis.T @ jacobian))
 
 

@@ -83,6 +83,7 @@ class Images(Instrument):
         quantity="pixel at the target",
         caution="A pixel is no position: what moves along the line of sight does not show in it. ",
         whole="cameras and targets moved together",
+        fitted="base and tool are",
     )
     chosen: ClassVar[tuple[str, ...]] = (
         "on_flange",
@@ -98,6 +99,7 @@ class Images(Instrument):
     alone = (
         "it holds pixels alone: give it to calibrate as pixels=, or add files of other instruments"
     )
+    alone_bends = True
     on_arm = False
     noise_given = False
     unmoved = "turns no direction"

@@ -60,7 +60,8 @@ class Words:
     quantity: what the errors are of.  part: what each row of them is.  caution: what they do not
     say.  counted: its numbers.  check: what to check where they contradict the arm.  more: what
     helps where they tell positions weakly, empty where they are positions.  of_position: whether
-    the errors are.  whole: what several of its places are together, for reasons.
+    the errors are.  whole: what several of its places are together, for reasons.  fitted: what is
+    fitted wherever positions are told.
     """
 
     quantity: str
@@ -71,6 +72,7 @@ class Words:
     more: str = ""
     of_position: bool = False
     whole: str = ""
+    fitted: str = "a base is"
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +111,7 @@ class Instrument:
     on_arm: ClassVar[bool] = True
     noise_given: ClassVar[bool] = True
     alone: ClassVar[str] = ""
+    alone_bends: ClassVar[bool] = False
     unmoved: ClassVar[str] = FRAMELESS
     scale: ClassVar[tuple[str, ...]] = ()
     drawn_scale: ClassVar[bool] = False

@@ -726,20 +726,23 @@ class Level(mc_instruments.Instrument):
 
 
 def test_an_instrument_may_read_the_flange_itself(robot):
-    """Beside a tracker it is fitted; what the evidence cannot know of it is refused in words."""
-    arm, rng = Arm.of("irb2600", 1, 0.0), np.random.default_rng(0)
+    """Beside a tracker it is fitted, and effects of the arm are sought in it: they turn it, too."""
+    arm, rng = Arm.of("irb2600", 1, 3e-6), np.random.default_rng(0)
     mc.register_instrument(Level)
     q, seen = random_poses(arm.robot, 80, rng), random_poses(arm.robot, 40, rng)
-    lean = arm.real.pose(q)[:, 0, 2] + 0.01 + 1e-6 * rng.normal(size=80)
-    level, points = Level(bare(q, {}), lean), mc.measurements(seen, arm.place(seen)[:, None])
+    lean = arm.real.pose(arm.bent(q))[:, 0, 2] + 0.01 + 1e-6 * rng.normal(size=80)
+    points = mc.measurements(seen, arm.place(seen)[:, None] + 1e-5 * rng.normal(size=(40, 1, 3)))
+    level = Level(bare(q, {}), lean)
     mc_instruments.check_instrument(level, arm.robot)
-    fit = mc.relative(arm.robot, [points, level])
+    fit = mc.relative(arm.robot, [points, level], effects="joint_compliance:all")
     zero = next(p for p in fit.parameters if p.name == "level.lean_zero_rx")
     assert zero.unit == "rad"
     assert zero.value == pytest.approx(0.01, abs=5e-6)
     assert mc.relative(arm.robot, level, holdout=0.0).positions_open
-    with pytest.raises(mc.OptionError, match="level: reads more than points of its own"):
-        mc.diagnose_relative(arm.robot, [points, level])
+    found = mc.diagnose_relative(arm.robot, [points, level])
+    assert {one.term.effect for one in found.effects} == {"joint_compliance"}
+    told = found.calibration.instruments[1].accuracy
+    assert 1e-3 * told["holdout"].rms_mm < 3e-6 < 1e-5 < 1e-3 * told["nominal"].rms_mm
 
 
 # ---- open positions ------------------------------------------------------------------------------

@@ -29,6 +29,8 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments.camera import read_camera
 from minimax_cal.instruments.pixels import read_pixels
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.gravity import masses_of, torques
 from minimax_cal.robots.kinematics import rotation
 from minimax_cal.robots.sampling import random_joints
 from minimax_cal.solvers.status import Status
@@ -55,7 +57,7 @@ def tracked(
     rng = np.random.default_rng([seed, 9])
     q = random_joints(cell.true, (poses,), rng)
     q[:, 3:] = q[:, 3:] if wrist is None else wrist
-    pose = cell.true.pose(q)
+    pose = cell.true.pose(cell.law(q))
     point = np.einsum("mij,kj->mki", pose[:, :3, :3], SPOTS) + pose[:, None, :3, 3]
     point = point @ rotation(np.array([0.1, 0.0, 0.7])).T + [2.0, 1.0, 0.3]
     return mc.measurements(q, point + noise * rng.normal(size=point.shape))
@@ -136,6 +138,43 @@ def test_pixels_alone_have_a_command_of_their_own():
     cell = cell_of(2)
     with pytest.raises(mc.DataError, match="pixels alone: give it to calibrate"):
         mc.relative(cell.drawn, [as_instrument(data_of(cell))])
+
+
+# ---- effects of the arm --------------------------------------------------------------------------
+
+
+SPRING, SPRUNG = 3e-5, "joint_compliance:J2"  # [rad/(N m)]
+
+
+def spring(q: Array) -> Array:
+    """Where the joints truly are of an arm whose second one winds up under gravity."""
+    robot = mc.load_robot("ur5")
+    links = kinematics.chain(robot.mdh, robot.turned(q), robot.prismatic)
+    return np.asarray(q + SPRING * np.eye(6)[1] * torques(links, *masses_of(robot), robot.up).T)
+
+
+@pytest.mark.parametrize("on_flange", [True, False], ids=["eye in hand", "eye to hand, a tracker"])
+def test_an_effect_of_the_arm_is_found_by_cameras(on_flange):
+    """Its sigmas hold the spring, whatever masses it bears, and the claim the arm's error."""
+    points = board_points((4, 3), 0.08)
+    cell = cell_of(1, on_flange=on_flange, law=spring, poses=40, points=points)
+    images = as_instrument(data_of(cell))
+    gap = mc.diagnose_relative(
+        cell.drawn, images if on_flange else [tracked(cell, 1, 30, 3e-5), images]
+    )
+    assert gap.verdict == "named"
+    assert [(one.term.label, one.established) for one in gap.effects] == [(SPRUNG, True)]
+    fit = gap.calibration
+    found = [p for p in fit.parameters if p.of_effect]
+    assert max(abs(p.value - SPRING) / p.sigma for p in found) < 3.5
+    assert fit.accuracy["holdout"].rms_mm < 0.1 * gap.steps[1].holdout.rms_mm
+    assert not fit.positions_open
+    assert fit.cell is not None
+    straight = replace(cell, law=np.asarray)  # its joints where they are told to be
+    assert arm_error(straight, fit.cell.robot) < 2.5e3 * fit.position_sigma
+    again = mc.relative(cell.drawn, images, effects=SPRUNG)
+    assert again.instruments[0].kind == "pixels"
+    assert {p.name.partition(".")[0] for p in again.parameters if p.of_effect} == {SPRUNG}
 
 
 def test_from_files_to_a_report(tmp_path, answered, refuses):

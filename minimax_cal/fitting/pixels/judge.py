@@ -16,6 +16,7 @@ from typing import Annotated
 import numpy as np
 
 from minimax_cal.evidence.noise import fit_components
+from minimax_cal.fitting.claims import TOOL
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.several.identify import lengths_of
 from minimax_cal.ground.arrays import Array
@@ -158,7 +159,6 @@ def unfitted(robot: Robot, fit: PixelFit) -> Array:
 POSES = 300  # over the joints' whole range
 MARGIN = 2.0 / 3.0  # of the drawing's sigma: an arm less sure may be worse than drawn
 SAME = 1e-9  # arms so far apart are one and the same [m]
-TOOL = np.array([0.0, 0.0, 0.1])  # a point beside the last axes, in the flange [m]
 
 
 def missed(robot: Robot, q: Array, point: Array) -> float:

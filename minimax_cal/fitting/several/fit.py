@@ -28,7 +28,7 @@ from minimax_cal.fitting.several.stack import Known, Squares, Stack, started
 from minimax_cal.fitting.several.worst import Worst, least_worst
 from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS, without_resting
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.modelling.effects.table import Term, at_bounds
 from minimax_cal.modelling.near import between, is_kept
@@ -243,10 +243,6 @@ def laws_of(robot: Robot, fit: InstrumentFit, texts: Sequence[str | Term]) -> La
     from minimax_cal.fitting.several.linear import rows_of_all, scene_of_all
     from minimax_cal.modelling.dictionary import ArmLaws
 
-    if any(one.kind == "pixels" for one in fit.stack.instruments):
-        raise OptionError(
-            "effects= is not for pixels yet: leave them out, or fit the effects from the others"
-        )
     scene = scene_of_all(robot, fit)
 
     def pick(chosen: Sequence[Term], several: Sequence[Term]) -> Term:

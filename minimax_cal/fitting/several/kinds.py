@@ -147,13 +147,17 @@ class Asked:
 
 
 def asked_of(
-    robot: Robot | str | Path, data: Given | Sequence[Given], options: RelativeOptions
+    robot: Robot | str | Path,
+    data: Given | Sequence[Given],
+    options: RelativeOptions,
+    *,
+    sought: bool = False,
 ) -> Asked:
-    """Data loaded and checked, and split.  Raises CalibrationError."""
+    """Data loaded and checked, and split; sought: whether effects are.  Raises CalibrationError."""
     robot = load_robot(robot)
     given = [data] if isinstance(data, Given) else list(data)
     every = sorted(map(as_instrument, given), key=lambda data: not data.on_arm)
-    check_given(every)
+    check_given(every, bends=sought or bool(options.effects))
     check_options(every, options)
     every = [replace(each, at=with_history(check_joints(robot, each.at))) for each in every]
     check_noises(labels_of(every), every, options)
@@ -346,9 +350,10 @@ def sigma_of_positions(robot: Robot, found: InstrumentFit) -> float:
 
 
 def targets_of(found: InstrumentFit, x: State) -> Array:
-    """(k, 3) targets of the first file on the flange [m]."""
+    """(k, 3) targets of the first file on the flange, none where it has none there [m]."""
     block = found.stack.blocks[0]
-    return block.instrument.targets(block.own(found.stack.part(x, 0)))
+    spots = block.instrument.targets(block.own(found.stack.part(x, 0)))
+    return spots if block.instrument.on_arm else spots[:0]
 
 
 def places_of(found: InstrumentFit) -> tuple[Array, Array]:

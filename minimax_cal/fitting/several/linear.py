@@ -2,7 +2,8 @@
 
 Each row is weighed by its instrument's noise.  The rows of a pose are rotated so that the noise of
 the joints is diagonal, as `modelling.rows` does it.  Geometry, what each instrument has of its own,
-and the places of sockets are projected out.
+and the places of sockets are projected out.  By how much a law turns and moves the flange is told
+by the motions of four corners about what each instrument looks at, as in its fit.
 """
 
 from __future__ import annotations
@@ -14,9 +15,7 @@ import numpy as np
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.fitting.several.fit import InstrumentFit
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.instruments.instrument import Instrument
-from minimax_cal.instruments.protocol import ResidualRows
+from minimax_cal.instruments.protocol import FlangePoses, Given, ResidualRows, by_arm
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.scene import Scene
@@ -31,43 +30,40 @@ APART = 2.0  # times the largest spread of joints: eigenvalues of rows that hold
 class Look:
     """An instrument where a fit ended.
 
-    rows: as it reads there.  targets: how many it has.  root: (rows,) what each is multiplied by.
-    poses: which of all poses are its own.  cell: (rows,) place of each among all, pose by pose.
-    shapeless: (m, r, r) see `Instrument.shapeless`.
+    rows: as it reads there.  flange: at its m poses.  middle: (3,) of the corners, on it [m].
+    root: (rows,) what each is multiplied by.  poses: which of all poses are its own.  cell: (rows,)
+    place of each among all, pose by pose.  shapeless: (m, r, r) see `Instrument.shapeless`.
     """
 
     rows: ResidualRows
-    targets: int
+    flange: FlangePoses
+    middle: Array
     root: Array
     poses: slice
     cell: Array
     shapeless: Array
 
     def of(self, fields: Array) -> Array:
-        """(d, rows) motions (d, k, 3, m) of its targets, m its own poses, as its rows."""
-        rows = self.rows
-        target = rows.part if self.targets > 1 else np.zeros_like(rows.pose)
-        slopes = np.einsum(
-            "rc,drc->dr", rows.by_point, fields[:, target, :, rows.pose].swapaxes(0, 1)
-        )
-        return np.asarray(rows.settled(slopes, loose=True)[1] * self.root)
+        """(d, rows) motions (d, 4, 3, m) of its corners as its rows."""
+        none = np.zeros(len(fields))
+        given = Given.of(self.flange, self.middle, fields, 0.0 * fields.sum(axis=0), none)
+        moved = self.flange._replace(angular=given.angular, linear=given.linear)
+        slopes = by_arm(moved, self.rows)
+        return np.asarray(self.rows.settled(slopes, loose=True)[1] * self.root)
 
 
 @dataclass(frozen=True, eq=False)
 class StackRows(Posed):
-    """Rows of several instruments; looks: at each, targets: the most of any."""
+    """Rows of several instruments; looks: at each."""
 
     looks: tuple[Look, ...]
 
     def of(self, fields: Array) -> Array:
-        """(N, D) displacement fields (D, k, 3, m) at the poses of all instruments, as rows.
-
-        Of an instrument with fewer targets than k the first count.
-        """
+        """(N, D) motions (D, 4, 3, m) of the corners at the poses of all instruments, as rows."""
         d, (m, r) = len(fields), self.weight.shape
         out = np.zeros((d, m * r))
         for look in self.looks:
-            out[:, look.cell] = look.of(fields[:, : look.targets, :, look.poses])
+            out[:, look.cell] = look.of(fields[..., look.poses])
         return self.turned(out)
 
     def turned(self, rows: Array) -> Array:
@@ -78,19 +74,15 @@ class StackRows(Posed):
 
 
 def scene_of_all(robot: Robot, fit: InstrumentFit) -> Scene:
-    """All poses that any instrument saw, each with its targets, in the frame of the base."""
+    """All poses that any instrument saw, each with its corners, in the frame of the base."""
     stack, x = fit.stack, fit.state
-    every = stack.scenes(robot, x)
-    most = max(scene.targets for scene in every)
-    points = [
-        np.concatenate([one.points, np.repeat(one.points[:1], most - one.targets, axis=0)])
-        for one in every
-    ]
+    every = stack.scenes(robot, x, about=True)
+    points = np.concatenate([one.points for one in every], axis=-1)
     q = np.concatenate([block.arm.q for block in stack.blocks])
     links = kinematics.chain(x.mdh, q, robot.prismatic)
     return Scene(
         robot.with_mdh(x.mdh), joined([one.data for one in every]), links,
-        every[0].target_positions, np.concatenate(points, axis=-1), np.eye(3), np.zeros(3),
+        every[0].target_positions, points, np.eye(3), np.zeros(3),
     )  # fmt: skip
 
 
@@ -131,14 +123,13 @@ def rows_of_all(scene: Scene, fit: InstrumentFit) -> StackRows:
         x, columns = stack.part(fit.state, i), stack.columns(i)
         root = precise / np.sqrt(rows.weights)
         one, own = block.instrument, block.own(x)
-        flange = block.flange(x)
-        check_point_reader(one, rows, flange.place(one.targets(own)))
+        flange, middle = block.flange(x), one.targets(own).mean(axis=0)
         shapeless = one.shapeless(flange, own)
         at, poses = (
             (start + rows.pose_of_row) * width + slot,
             slice(start, start + len(block.arm.q)),
         )
-        looks.append(Look(rows, len(one.targets(own)), root, poses, at, shapeless))
+        looks.append(Look(rows, flange, middle, root, poses, at, shapeless))
         error, slope = block.rows(x, active[columns], loose=True)
         whole = np.zeros((len(active), len(root)))
         whole[columns[active[columns]]] = slope * root
@@ -146,20 +137,6 @@ def rows_of_all(scene: Scene, fit: InstrumentFit) -> StackRows:
         slopes.append(whole)
         places.append(rows.places * root)
     return assembled(scene, fit, looks, errors, slopes, places, width)
-
-
-def check_point_reader(one: Instrument, rows: ResidualRows, place: Array) -> None:
-    """Raise OptionError for what reads more than its targets.  place: (m, k, 3) of these [m].
-
-    Evidence knows by how much a law moves a target, and neither turns nor other points.
-    """
-    part = rows.part if place.shape[1] > 1 else np.zeros_like(rows.pose)
-    off = (rows.point - place[rows.pose, part]) * rows.by_point.any(axis=1, keepdims=True)
-    if rows.by_rotation.any() or np.abs(off).max() > 1e-9:
-        raise OptionError(
-            f"{one.kind}: reads more than points of its own on the flange, which a diagnosis and "
-            "the choice among variants of an effect do not know yet; leave it out"
-        )
 
 
 def assembled(
@@ -189,7 +166,7 @@ def assembled(
         dead[look.poses, : shape.shape[1], : shape.shape[1]] = shape
     arms = np.zeros((scene.joints, total))
     for look in looks:
-        arms[:, look.cell] = look.of(scene.jacobian[:, : look.targets, :, look.poses])
+        arms[:, look.cell] = look.of(scene.jacobian[..., look.poses])
     by_pose = np.moveaxis(arms.reshape(scene.joints, scene.poses, width), 0, -1)
     spread = by_pose @ np.swapaxes(by_pose, 1, 2)
     far = APART * max(float(np.trace(spread, axis1=1, axis2=2).max()), 1.0)

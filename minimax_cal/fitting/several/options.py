@@ -106,12 +106,16 @@ def sigmas_of(names: Names, options: RelativeOptions) -> Array:
 # ---- checks --------------------------------------------------------------------------------------
 
 
-def check_given(every: Sequence[Instrument]) -> None:
-    """Raise DataError where there is nothing, or nothing but what another command takes."""
+def check_given(every: Sequence[Instrument], *, bends: bool) -> None:
+    """Raise DataError where there is nothing, or nothing but what another command takes.
+
+    bends: whether effects of the arm are fitted, or sought.
+    """
     if not every:
         raise DataError("no file of measurements is given")
     first = every[0]
-    if first.alone and all(data.kind == first.kind for data in every):
+    taken = not first.alone or (bends and first.alone_bends)
+    if not taken and all(data.kind == first.kind for data in every):
         raise DataError(f"{first.at.source}: {first.alone}")
 
 

@@ -328,7 +328,7 @@ class RelativeCalibration(Measured, Result):
         return (
             "By the parameters' sigmas alone, which hold neither effects that the model lacks nor "
             "errors of what is fixed, a position over the joints' range is good to "
-            f"{1e3 * self.position_sigma:.3f} mm RMS once a base is fitted."
+            f"{1e3 * self.position_sigma:.3f} mm RMS once {self.words.fitted} fitted."
         )
 
     def headline(self) -> str:

@@ -206,11 +206,15 @@ class Stack:
         own = [b.instrument.read_out(b.own(at)) for b, at in zip(self.blocks, parts, strict=True)]
         return replace(x, effects=np.concatenate([*own, self.values(x)]))
 
-    def scenes(self, robot: Robot, x: State) -> list[Scene]:
-        """What laws look at, block by block, with the geometry of a state and the targets."""
+    def scenes(self, robot: Robot, x: State, *, about: bool = False) -> list[Scene]:
+        """What laws look at, block by block, with the geometry of a state and the targets.
+
+        about: corners about their middle instead.
+        """
         parts = [(block, self.part(x, i)) for i, block in enumerate(self.blocks)]
-        return [block.scene(robot, at, block.instrument.targets(block.own(at)))
-                for block, at in parts]  # fmt: skip
+        spots = [block.instrument.targets(block.own(at)) for block, at in parts]
+        spots = [corners(each.mean(axis=0)) for each in spots] if about else spots
+        return [one.scene(robot, at, k) for (one, at), k in zip(parts, spots, strict=True)]
 
     def bent(self, robot: Robot, laws: Laws, x: State) -> tuple[Stack, State]:
         """The same instruments looking at an arm that gives way, linear at a state; that state.

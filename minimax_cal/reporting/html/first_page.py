@@ -437,7 +437,8 @@ def result_table(found: Signed) -> Table:
     title = f"{'Result by deliverable' if found.rows else f'Model: {found.model}'} [mm]"
     limits = [f"{KINDS[one.limit.kind]} at most {one.limit.size_mm:g}" for one in found.judged]
     title += f"; required: {', '.join(limits)}" if limits else ""
-    every = Table.made(title, rows, f"of | error of position | poses d | {columns}")
+    what = "error" if found.claims[0].reason else "error of position"
+    every = Table.made(title, rows, f"of | {what} | poses d | {columns}")
     first, last = (0 if found.rows else 1), (7 if found.judged else 6)
     return every.only(*range(first, last))
 
