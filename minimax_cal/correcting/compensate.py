@@ -29,7 +29,7 @@ from minimax_cal.ground.options import grouped, takes
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table, records_of
 from minimax_cal.ground.words import name_first
-from minimax_cal.measuring.checks import check_joints, limit_notices
+from minimax_cal.measuring.checks import arm_notices, check_joints
 from minimax_cal.measuring.history import ordered
 from minimax_cal.measuring.measurements import FARTHEST, Measurements, check_columns
 from minimax_cal.modelling.cell import Cell, still
@@ -333,7 +333,7 @@ def path_of(
 
 def remarks(arm: Cell, data: Measurements) -> list[str]:
     """What the reader should know about effects and limits."""
-    out = limit_notices(arm.robot, data)
+    out = arm_notices(arm.robot, data)
     terms = arm.effects.terms
     timed = [
         name_effect(*term.key)

@@ -16,6 +16,7 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.ground.options import grouped, takes
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.urdf import ends_of
 from minimax_cal.robots.urdf_file import read_urdf
 
 
@@ -145,12 +146,13 @@ def exported(
         found = kept(source, to, options.keep_anyway)
         q = source.train.q if source.data.poses else None
         job = job_of(source.source, found.cell, found.nominal, q)
+    urdf, mjcf = (ends_of(given or "") for given in (options.urdf, options.mjcf))
     job = replace(
         job,
-        originals=() if options.urdf is None else (read_urdf(options.urdf),),
-        model=None if options.mjcf is None else Path(options.mjcf),
+        originals=(read_urdf(urdf[0]),) if urdf[0] else (),
+        model=Path(mjcf[0]) if mjcf[0] else None,
         path=path,
-        tip=options.tip,
+        tip=options.tip or urdf[1] or mjcf[1],
         experimental=options.experimental,
     )
     file = table.export(job, to)

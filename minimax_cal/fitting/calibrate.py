@@ -179,7 +179,7 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     said = (*said, *unplaced(data, kept))
     data = stationed(robot, data, kept)
     train, held = seen_from(train, data.frames), seen_from(held, data.frames)
-    doubts = (*checks.limit_notices(robot, data), *time_notices(data), mislabelled(data))
+    doubts = (*checks.arm_notices(robot, data), *time_notices(data), mislabelled(data))
     off = (*distance_faults(data), *noise(data))
     doubts = (*doubts, *(fault.text for fault in off))
     notices = (*data.notices, *filter(None, doubts), *said)

@@ -97,15 +97,18 @@ def check_count(data: Measurements, poses: int, unknowns: int, known: int) -> No
         )
 
 
-def limit_notices(robot: Robot, data: Measurements) -> list[str]:
-    """Notices about joint values outside the robot's limits (1 % of slack)."""
+def arm_notices(robot: Robot, data: Measurements) -> list[str]:
+    """Notices about the robot's frames, and joint values outside its limits (1 % of slack)."""
     slack = 0.01 * (robot.upper - robot.lower)
     slack = np.where(np.isfinite(slack), slack, 0.0)
     outside = (data.q < robot.lower - slack) | (data.q > robot.upper + slack)
     return [
-        f"{data.source}: joint {i + 1} is outside the limits of {robot.name} at "
-        f"{int(outside[:, i].sum())} poses"
-        for i in np.flatnonzero(outside.any(axis=0))
+        *robot.notices,
+        *(
+            f"{data.source}: joint {i + 1} is outside the limits of {robot.name} at "
+            f"{int(outside[:, i].sum())} poses"
+            for i in np.flatnonzero(outside.any(axis=0))
+        ),
     ]
 
 

@@ -162,7 +162,8 @@ class Robot:
     drive_gain: (n,) torque for one ampere, NaN where unknown; may be empty [N m/A, N/A].
     drawn_within: how well its lengths and its angles are known as drawn, as sigmas [m, rad].
     coupling: (n, n) how far each joint goes per unit of each joint value; (0, 0) for each its own.
-    notation: how the robot's file writes its links.
+    notation: how the robot's file writes its links.  notices: how its frames are not those of the
+    links of a URDF or MJCF, which no file of it tells.
     """
 
     name: str
@@ -182,6 +183,7 @@ class Robot:
     drawn_within: tuple[float, float] = DRAWN_WITHIN
     coupling: Array = field(default_factory=lambda: np.zeros((0, 0)))
     notation: Notation = PLAIN
+    notices: tuple[str, ...] = ()
 
     @property
     def joints(self) -> int:
@@ -578,7 +580,8 @@ def load_robot(source: Robot | Path | str) -> Robot:
     from minimax_cal.robots.urdf import has_links, load_urdf  # not for a built-in robot
 
     if has_links(source):
-        return robot_from_dict(load_urdf(source).content, str(source))
+        found = load_urdf(source)
+        return replace(robot_from_dict(found.content, str(source)), notices=found.remaining)
     if path.suffix.lower() in (".csv", *SUFFIXES):
         from minimax_cal.robots.data_sheet import content_of  # few robots come as one
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,6 @@ class UrdfRobot:
 
     content: the robot in the file schema, metres and radians.  chain: joints from root to tip.
     base: (4, 4) frame 0 of the robot in the root link; tool: (4, 4) the tip in the last frame [m].
-    notices: what is not in the robot.
     """
 
     content: dict[str, Any]
@@ -45,7 +44,35 @@ class UrdfRobot:
     chain: tuple[Joint, ...]
     base: Array
     tool: Array
-    notices: tuple[str, ...]
+
+    @property
+    def remaining(self) -> tuple[str, ...]:
+        """What lies between its links and the frames of the robot, for people."""
+        every = (
+            ("root link is not the robot's base, which stands in it", self.base),
+            ("tip is not the robot's last frame, in which it stands", self.tool),
+        )
+        return tuple(
+            f"{self.urdf.source}: the {what} at "
+            f"({', '.join(f'{1e3 * v:.6g}' for v in pose[:3, 3])}) mm"
+            for what, pose in every
+            if difference(pose, np.eye(4)) > SAME
+        )
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What is not in the robot, for people."""
+        out, source = [*self.urdf.notices], self.urdf.source
+        if self.chain[0].parent != self.urdf.root:
+            out.append(f"{source}: the chain begins at {self.chain[0].parent!r}")
+        out += self.remaining
+        aside = [j.name for j in self.urdf.joints if j.moves and j not in self.chain]
+        if aside:
+            out.append(
+                f"{source}: joints outside the chain, and masses beyond them, are not in the "
+                f"robot: {', '.join(aside[:8])}"
+            )
+        return tuple(out)
 
 
 def chain_to(urdf: Urdf, tip: str = "") -> tuple[Joint, ...]:
@@ -55,7 +82,7 @@ def chain_to(urdf: Urdf, tip: str = "") -> tuple[Joint, ...]:
     Raises RobotError.
     """
     links = {urdf.root, *(joint.child for joint in urdf.joints)}
-    root, _, last = ("", "", tip) if tip in links else tip.rpartition(":")
+    root, last = both_ends(tip, links)
     for name in (root, last):
         if name and name not in links:
             leaves = sorted(name for name in links if not urdf.from_link(name))
@@ -238,7 +265,7 @@ def to_robot(urdf: Urdf, tip: str = "") -> UrdfRobot:
         "joints": joints,
         **({"coupling": follow.ratio.tolist()} if any(j.mimic for j in moving) else {}),
     }
-    return UrdfRobot(content, urdf, chain, base, tool, left_out(urdf, chain, base, tool))
+    return UrdfRobot(content, urdf, chain, base, tool)
 
 
 def centres(
@@ -287,24 +314,6 @@ def joint_content(
     return out
 
 
-def left_out(urdf: Urdf, chain: tuple[Joint, ...], base: Array, tool: Array) -> tuple[str, ...]:
-    """What the robot does not hold, for people."""
-    out = [*urdf.notices]
-    if chain[0].parent != urdf.root:
-        out.append(f"{urdf.source}: the chain begins at {chain[0].parent!r}")
-    for what, pose in (("base, in the root link", base), ("tip, in the last frame", tool)):
-        if difference(pose, np.eye(4)) > SAME:
-            at = ", ".join(f"{1e3 * v:.6g}" for v in pose[:3, 3])
-            out.append(f"{urdf.source}: a constant transform remains: {what}, at ({at}) mm")
-    aside = [j.name for j in urdf.joints if j.moves and j not in chain]
-    if aside:
-        out.append(
-            f"{urdf.source}: joints outside the chain, and masses beyond them, are not in the "
-            f"robot: {', '.join(aside[:8])}"
-        )
-    return tuple(out)
-
-
 def load_urdf(source: Path | str) -> UrdfRobot:
     """A robot of a URDF or MJCF; ``FILE#tip`` names the last link, ``FILE#root:tip`` both ends.
 
@@ -317,6 +326,14 @@ def load_urdf(source: Path | str) -> UrdfRobot:
 
         return to_robot(read_mjcf(name), tip)
     return to_robot(read_urdf(name), tip)
+
+
+def both_ends(tip: str, known: Iterable[str]) -> tuple[str, str]:
+    """The root, empty where none is named, and the tip of ``root:tip``; names may hold colons."""
+    names = {*known}
+    ways = [(tip[:at], tip[at + 1 :]) for at, mark in enumerate(tip) if mark == ":"]
+    whole = [("", tip)] if tip in names or not ways else []
+    return next(iter([*whole, *(way for way in ways if {*way} <= names), *ways[::-1]]))
 
 
 def ends_of(source: Path | str) -> tuple[str, str]:

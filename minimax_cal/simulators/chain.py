@@ -17,7 +17,7 @@ from minimax_cal.ground.files import json_of
 from minimax_cal.robots.mjcf import body_name, drives, is_driven, mujoco, tree_of, way_to
 from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.robots.transforms import transform
-from minimax_cal.robots.urdf import UrdfRobot, to_robot
+from minimax_cal.robots.urdf import UrdfRobot, both_ends, to_robot
 
 ROBOT = "minimax_cal_robot"  # the text under which a file of ours holds its robot whole
 SAME_ROBOT = 1e-6  # a file's own robot may differ from its bodies by no more [m, rad]
@@ -161,8 +161,8 @@ def joints_of(model: Any, count: int, source: str, tip: str) -> tuple[int, ...]:
     Where more lie on the way, those that an actuator drives; of several the driven arm.
     """
     found: dict[tuple[int, ...], list[str]] = {}
-    tip = tip.rpartition(":")[2]
     sites = {model.site(i).name: int(model.site_bodyid[i]) for i in range(model.nsite)}
+    tip = both_ends(tip, [*sites, *(model.body(i).name for i in range(model.nbody))])[1]
     tip = model.body(sites[tip]).name if tip in sites else tip
     for body in range(1, model.nbody):
         name = model.body(body).name

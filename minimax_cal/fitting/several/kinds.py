@@ -42,7 +42,7 @@ from minimax_cal.instruments.file import Given, as_instrument
 from minimax_cal.instruments.instrument import Instrument, checked
 from minimax_cal.instruments.table import is_registered
 from minimax_cal.measuring.campaigns import session_names
-from minimax_cal.measuring.checks import check_joints, limit_notices
+from minimax_cal.measuring.checks import arm_notices, check_joints
 from minimax_cal.measuring.history import Clock, with_history
 from minimax_cal.measuring.stations import Sessions
 from minimax_cal.modelling.cell import Cell
@@ -193,7 +193,7 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
     notices = [
         said
         for data, (_, notes) in zip(every, splits, strict=True)
-        for said in (*data.at.notices, *limit_notices(robot, data.at), *notes)
+        for said in (*data.at.notices, *arm_notices(robot, data.at), *notes)
     ] + [*found.notices]
     sources = ", ".join(data.at.source for data in every)
     source = replace(every[0].at, source=sources, digest=" ".join(d.at.digest for d in every))

@@ -36,7 +36,7 @@ from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.ground.threads import one_thread
 from minimax_cal.instruments.camera import FLANGE, read_camera
 from minimax_cal.instruments.pixels import PixelData, read_pixels
-from minimax_cal.measuring.checks import check_joints, limit_notices
+from minimax_cal.measuring.checks import arm_notices, check_joints
 from minimax_cal.measuring.measurements import TOOL, SetAside
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.status import Status
@@ -150,7 +150,7 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
         position_sigma=claim.sigma,
         beyond=(),
         notices=(
-            *data.notices, *limit_notices(robot, data.at), *one.notices, *notices_of(fit, held),
+            *data.notices, *arm_notices(robot, data.at), *one.notices, *notices_of(fit, held),
             *told, *outlier_notices(data, aside),
         ),
         provenance=Provenance.of(robot, at, options.settings()),

@@ -49,11 +49,15 @@ def parts_of(name: str) -> Parts:
 
 
 def match_names(points: Sequence[str], poses: Sequence[str]) -> Match | None:
-    """How names of points tell their poses; None where no pattern finds half of them.
+    """How names of points tell their poses; None where no pattern finds half of either.
 
     poses: names without repeats.
     """
-    found = [match for match in patterns(points, poses) if share_of(match) >= ENOUGH]
+    found = [
+        match
+        for match in patterns(points, poses)
+        if max(share_of(match), len({*match.pose} - {-1}) / max(len(poses), 1)) >= ENOUGH
+    ]
     return max(found, key=share_of, default=None)
 
 
@@ -63,14 +67,17 @@ def share_of(match: Match) -> float:
 
 
 def patterns(points: Sequence[str], poses: Sequence[str]) -> Iterator[Match]:
-    """Every pattern tried, the plainest first."""
+    """Every pattern tried, the plainest first; numbers alone only where no name has a pose."""
     rows = {parts_of(name): i for i, name in enumerate(poses)}
     names = [parts_of(name) for name in points]
     if len(rows) == len(poses):
-        yield matched(points, poses, [(rows.get(parts, -1), "") for parts in names], "name")
+        every = [matched(points, poses, [(rows.get(parts, -1), "") for parts in names], "name")]
         for way, last in (("pose, target", True), ("target, pose", False)):
             found = [beside(parts, rows, last) for parts in names]
-            yield matched(points, poses, found, f"name: {way}")
+            every.append(matched(points, poses, found, f"name: {way}"))
+        yield from every
+        if any(map(share_of, every)):
+            return
     numbers = {n: i for i, name in enumerate(poses) if (n := number_of(parts_of(name))) >= 0}
     if len(numbers) == len(poses):
         yield matched(points, poses, by_number(names, numbers), "number in the name")

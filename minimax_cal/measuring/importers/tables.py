@@ -210,6 +210,13 @@ def of_figaroh(stems: Stems) -> Meanings:
     return {s: f"smr{m[2]}_{m[1]}" for s in stems if (m := MARKER.fullmatch(s))} | joints
 
 
+def of_own(stems: Stems) -> Meanings:
+    """Every name as it is; joints without points have names of poses under any word for these."""
+    known = {stem: stem if kind_of(stem) or stem in WORDS else "" for stem in stems}
+    lone = not {"pose", "smr1_x"} & {*stems}
+    return known | {stem: "pose" for stem in stems if lone and plain(stem) == "pose"}
+
+
 TRACKER6D = Format(
     "6D tracker log",
     lambda stems, joints: (
@@ -235,7 +242,7 @@ FORMATS = (  # the first that fits is taken
         lambda stems, joints: (
             "q0" not in stems and ("smr1_x" in stems or ("q1" in stems and not points_of(stems)))
         ),
-        lambda stems: {stem: stem if kind_of(stem) or stem in WORDS else "" for stem in stems},
+        of_own,
         remark=lambda stem: KEPT,  # whatever it means elsewhere
     ),
     Format(
