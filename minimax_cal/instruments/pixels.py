@@ -120,11 +120,18 @@ def read_pixels(
         cameras=tuple(cameras),
         targets=targets,
         board=np.array(list(places.values())).reshape(-1, 3),
-        pose=numbered(file, "pose", labels, f"has no joint values in {joints}"),
+        pose=numbered(
+            file,
+            "pose",
+            labels,
+            f"has no joint values in {joints}; add them, or leave its rows out",
+        ),
         camera=numbered(
             file, "camera", tuple(known), "has no file; name it with camera='NAME=camera.yaml'"
         ),
-        target=numbered(file, "target", targets, f"has no place in {board}"),
+        target=numbered(
+            file, "target", targets, f"has no place in {board}; add it, or leave its rows out"
+        ),
         pixel=pixel,
         line=file.line,
         notices=(*file.notices, *at.notices),

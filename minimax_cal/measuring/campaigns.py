@@ -96,6 +96,12 @@ def campaigns(parts: Sequence[Measurements], names: Sequence[str]) -> Measuremen
     their names.  Raises DataError for parts of different joints.
     """
     check_alike(parts)
+    first_of = {part.digest: part for part in reversed(parts) if part.digest}
+    for part in parts:
+        if (same := first_of.get(part.digest, part)) is not part:
+            raise DataError(
+                f"{part.source}: holds the same as {same.source}; a campaign counts once"
+            )
     last = max(int(part.line.max(initial=1)) for part in parts)
     step = int(10 ** max(3, len(str(last))))  # a round number above all lines
     targets = tuple(dict.fromkeys(name for part in parts for name in part.target_names))

@@ -102,7 +102,8 @@ def chain_to(urdf: Urdf, tip: str = "") -> tuple[Joint, ...]:
                 "supported"
             )
     if not any(joint.moves for joint in chain):
-        raise RobotError(f"{urdf.source}: no moving joint leads to {last!r}")
+        why = [f"{urdf.source}: no moving joint leads to {last!r}", *urdf.notices]
+        raise RobotError("; ".join(why))
     return chain
 
 

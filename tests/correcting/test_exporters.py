@@ -416,6 +416,9 @@ def test_command_on_a_robot_and_its_errors(original, tmp_path):
     assert result.exception is None
     assert "not the robot's base" not in result.stderr  # a turn about axis 1
     assert run(f"{original}#wrist_1_link", "--to", "dh-csv").stdout.count("revolute") == 4
+    tips = (f"{original}#wrist_1_link",), (original, "--tip", "wrist_1_link")
+    both = [run(f"{original}#wrist_1_link", "--to", "urdf", "--urdf", *tip).stdout for tip in tips]
+    assert both[0] == both[1] != ""
     for arguments, words in (
         (("irb120", "--to", "step"), "no such format; choose one of urdf, ur-yaml"),
         (("irb120", "--to", "moc"), "agree (experimental)"),

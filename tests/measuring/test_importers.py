@@ -126,6 +126,22 @@ def test_leica_one_reflector_in_turns_is_told_by_the_rigid_body(truth, write):
     refused("add layout='pose' if", shuffled, joints=joints)
 
 
+def test_the_points_of_another_arm_in_the_same_file_are_left_out(truth, write):
+    """Numbers alone do not tell a pose where names do, under whatever word joints have them."""
+    mine = [[f"L{j + 1}", *row] for j in range(POSES) for row in leica_rows(truth)[3 * j :][:3]]
+    others = [[f"R{row[0][1:]}", *row[1:]] for row in mine]
+    order = np.random.default_rng(3).permutation(POSES)
+    for head in ("pose", "name", "Punkt"):
+        keyed = [[f"L{j + 1}", *truth.q[j]] for j in order]
+        rads = ",".join(f"q{i}_rad" for i in range(1, 7))
+        joints = write("joints.csv", table(keyed, f"{head},{rads}"))
+        points = write("both.csv", table([*others, *mine], f"{head},{LEICA}"))
+        found = import_files([points], joints)
+        assert_allclose(found.data.q, truth.q[order], rtol=0, atol=1e-9)
+        assert_allclose(found.data.y, truth.y[order], rtol=0, atol=1e-9)
+        assert any("have no pose of their name" in told for told in found.understood().notices)
+
+
 def test_leica_matched_by_key(truth, write):
     rows = [[f"p{i // 3}", *row] for i, row in enumerate(leica_rows(truth))]
     order = np.random.default_rng(2).permutation(len(rows))

@@ -367,6 +367,12 @@ def test_arms_of_other_joints_are_refused():
         campaigns([made(), slide], ["a", "b"])
 
 
+def test_a_campaign_under_two_names_is_refused():
+    one, other = (replace(made(), source=name, digest="alike") for name in ("a.csv", "b.csv"))
+    with pytest.raises(mc.DataError, match=r"b\.csv: holds the same as a\.csv; a campaign counts"):
+        campaigns([one, other], ["a", "b"])
+
+
 def test_names_of_sessions_tell_the_files_apart(tmp_path):
     assert session_names(["x/march.csv", "x/june.csv"]) == ["march", "june"]
     assert session_names(["x/data.csv", "y/data.csv"]) == ["x/data", "y/data"]
