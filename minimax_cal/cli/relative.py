@@ -35,7 +35,7 @@ CAMERAS = ("camera_on", "fix_camera", "camera_prior")
 @options_from(RelativeOptions)
 @options_from(PixelFiles)
 @options_from(PixelOptions, *CAMERAS)
-@options_from(Options, "qp", "method")
+@options_from(Options, "qp", "method", "loss")
 @plain_option(
     "What is sought",
     "--diagnose",

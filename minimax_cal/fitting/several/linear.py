@@ -13,6 +13,7 @@ import numpy as np
 
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.fitting.several.fit import InstrumentFit
+from minimax_cal.fitting.several.stack import place_in
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.instruments.instrument import Instrument
@@ -212,16 +213,6 @@ def assembled(
     rest = bare.turned(error)[:, 0] * measured
     basis = orthonormal(bare.turned(np.concatenate([nuisance, *beside])) * measured[:, None])
     return replace(bare, error=rest, basis=basis)
-
-
-def place_in(pose: Array) -> Array:
-    """(rows,) which row of its pose each is, from 0.  pose: (rows,)."""
-    order = np.argsort(pose, kind="stable")
-    first = np.concatenate([[True], np.diff(pose[order]) > 0])
-    start = np.maximum.accumulate(np.where(first, np.arange(len(pose)), 0))
-    out = np.empty(len(pose), dtype=int)
-    out[order] = np.arange(len(pose)) - start
-    return out
 
 
 def numbered(fit: InstrumentFit) -> Array:
