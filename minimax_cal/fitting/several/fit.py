@@ -12,7 +12,6 @@ from minimax_cal.fitting.found import Parameter, link_by_link
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.options import freed
 from minimax_cal.fitting.pixels.options import SUM, PixelOptions
-from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.several.identify import (
     Alone,
     determined_alone,
@@ -25,7 +24,7 @@ from minimax_cal.fitting.several.options import (
     RelativeOptions,
     sigmas_of,
 )
-from minimax_cal.fitting.several.robust import WeightedRows, with_loss
+from minimax_cal.fitting.several.robust import ALIKE, Shares, of_loss, with_loss
 from minimax_cal.fitting.several.stack import Known, Squares, Stack, started
 from minimax_cal.fitting.several.worst import Worst, least_worst
 from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS, without_resting
@@ -180,7 +179,7 @@ def of_worst(fit: InstrumentFit, options: RelativeOptions) -> InstrumentFit:
         fit,
         state=best.x,
         found=replace(fit.found, status=(best.status,), iterations=np.array([best.iterations])),
-        covariance=covariance_of(problem, best.x, np.square(fit.noise), share),
+        covariance=covariance_of(problem, best.x, np.square(fit.noise), (share, share**2)),
         worst=Worst.of([stack.parts[i] for i in seen], sizes(fit.state), sizes(best.x), best),
         notices=notes,
     )
@@ -220,16 +219,11 @@ def solved(
 ) -> InstrumentFit:
     """What a solved problem says."""
     state = ended.x.take(np.array(0))
-    variance = variances(problem, state)
-    fit = InstrumentFit(
-        problem, nominal, state, told, ended, covariance_of(problem, state, variance),
-        np.sqrt(variance), trains, (),
+    variance, (shares, notices) = variances(problem, state), of_loss(problem, ended)
+    return InstrumentFit(
+        problem, nominal, state, told, ended, covariance_of(problem, state, variance, shares),
+        np.sqrt(variance), trains, (), notices=notices,
     )  # fmt: skip
-    if problem.loss == SQUARE:
-        return fit
-    at = WeightedRows.of(problem, ended)
-    covariance = covariance_of(problem, state, variance, *at.widened())
-    return replace(fit, covariance=covariance, notices=(at.notice(),))
 
 
 def with_alone(robot: Robot, fit: InstrumentFit, options: RelativeOptions) -> InstrumentFit:
@@ -336,28 +330,20 @@ def remaining(problem: Squares, x: State) -> tuple[Array, Array]:
     return np.array([float(error @ error) for error in errors]), spare
 
 
-def covariance_of(
-    problem: Squares,
-    x: State,
-    variance: Array,
-    share: Array | float = 1.0,
-    square: Array | float | None = None,
-) -> Array:
+def covariance_of(problem: Squares, x: State, variance: Array, shares: Shares = ALIKE) -> Array:
     """Covariance (p, p) of all parameters at a solution [SI], NaN where not identified.
 
     s^2 H^-1 F H^-1 with H = sum w j j' + P and F = sum w^2 j j' + P over the rows j of weight w and
     the priors P: a known distance weighs much and is no surer than a coordinate.  s^2: of a number
     of the best instrument, to which the others are weighed.  variance: (b,) as `variances` has it.
-    share: (rows,) how much more each counts in the fit than its weight says; square: in F, the
-    square of that unless given.
+    shares: (rows,) how much more each counts in H, and in F, than its weight says.
     """
     active, stack = problem.active, problem.stack
     _, jacobians = stack.rows(x, active)
     inverse = solve_normal(
-        (jacobians * share) @ jacobians.T + problem.prior, np.eye(len(jacobians))
+        (jacobians * shares[0]) @ jacobians.T + problem.prior, np.eye(len(jacobians))
     )
-    square = np.square(share) if square is None else square
-    middle = (jacobians * stack.weights(x) * square) @ jacobians.T + problem.prior
+    middle = (jacobians * stack.weights(x) * shares[1]) @ jacobians.T + problem.prior
     covariance = np.full((len(active),) * 2, np.nan)
     unit = float((variance * stack.precision).mean())
     covariance[np.ix_(active, active)] = unit * inverse @ middle @ inverse

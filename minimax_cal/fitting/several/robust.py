@@ -13,7 +13,6 @@ import numpy as np
 
 from minimax_cal.fitting.robust import LOSSES, SQUARE, Loss, leaving, reweighted, trimmed
 from minimax_cal.fitting.several.stack import Block, Squares, place_in
-from minimax_cal.fitting.solve import LEAST_NOISE
 from minimax_cal.fitting.suspects import (
     EXPLANATION,
     RIDGE,
@@ -24,36 +23,41 @@ from minimax_cal.fitting.suspects import (
     standardised,
 )
 from minimax_cal.ground.arrays import Array
+from minimax_cal.instruments.protocol import LEAST_SHARE
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.least_squares import LeastSquares, solve_normal
 from minimax_cal.solvers.status import Status
 
 LOW_WEIGHT = 0.5  # measurements of a lower one are counted for the reader
 Solve = Callable[[Squares, State], LeastSquares[State]]
+Shares = tuple[Array | float, Array | float]
+ALIKE: Shares = (1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class AtOnce:
-    """The rows of an instrument, those of n measurements together.
+class Part:
+    """What an instrument measured, n times, and its errors at a fit.
 
-    rows: (n, d) of each, of d at most, -1 for none.  live: (n, d, d) projector on what they tell.
-    about: (r,) as `ResidualRows` has it.  count: of all rows, with sums.
+    rows: (n, d) of R that belong together, -1 where there are fewer.  live: (n, d, d) projector on
+    what they tell.  about: (r,) as `ResidualRows` has it.  weight: (R,) by the loss.  degrees:
+    independent numbers.  error: (R,), slope: (free, R) by the root of the block's precision.
     """
 
     rows: Array
     live: Array
     about: Array
-    count: int
+    weight: Array
+    degrees: int
+    error: Array
+    slope: Array
 
     @staticmethod
-    def of(block: Block, x: State) -> AtOnce:
-        """Of a block's own state."""
+    def of(block: Block, x: State, error: Array, slope: Array) -> Part:
+        """Of a block at its own state."""
         flange, own, one = block.flange(x), block.own(x), block.instrument
         read = one.read(flange, own)
         real = np.flatnonzero(read.by_point.any(axis=1) | read.by_rotation.any(axis=1))
-        of = read.pose[real]
-        if len(read.part) and len(one.parts) > 1:  # corners of one pose are no parts of it
-            of = of + one.poses * read.part[real]
+        of = (block.part_of(read) * one.poses + read.pose)[real]
         _, first, of = np.unique(of, return_index=True, return_inverse=True)
         slot = place_in(of)
         rows = np.full((len(first), int(slot.max()) + 1), -1)
@@ -61,181 +65,161 @@ class AtOnce:
         live, dead = (rows >= 0)[..., None] * np.eye(rows.shape[1]), one.shapeless(flange, own)
         if dead.size:
             live = live - dead[read.pose[real[first]]]
-        return AtOnce(rows, live, read.about, len(read.weights))
+        weight = block.share if len(block.share) else np.ones(len(error))
+        return Part(rows, live, read.about, weight, one.degrees, error, slope)
+
+    @property
+    def weights(self) -> Array:
+        """(n,)."""
+        return self.weight[self.rows[:, 0]]
 
     @cached_property
     def numbers(self) -> Array:
         """(n,) independent ones of each."""
         return np.asarray(np.round(np.trace(self.live, axis1=1, axis2=2)))
 
+    @property
+    def counted(self) -> float:
+        """Independent numbers of those that have a weight."""
+        return float(self.degrees - self.numbers[self.weights == 0.0].sum())
+
     def taken(self, values: Array) -> Array:
         """(..., n, d) of the rows (..., R), 0 where there are fewer than d."""
         return np.asarray(values[..., self.rows] * (self.rows >= 0))
 
-    def share(self, weights: Array) -> Array:
-        """(R,) weights (n,) as those of all rows, 1 of sums."""
-        out = np.ones(self.count)
-        out[self.rows[self.rows >= 0]] = np.repeat(weights, (self.rows >= 0).sum(axis=1))
+    def spread_out(self, values: Array) -> Array:
+        """(R,) values (n,) as those of all rows, 1 of sums."""
+        out, known = np.ones(len(self.error)), self.rows >= 0
+        out[self.rows[known]] = np.repeat(values, known.sum(axis=1))
         return out
 
-    def of_places(self, share: Array) -> Array:
-        """(n,) what the mean about their place takes of each variance.  share: (R,)."""
+    def of_places(self) -> Array:
+        """(n,) what the means about their places take of each variance."""
         if not len(self.about):
             return np.zeros(len(self.rows))
-        weight, about = share[: len(self.about)] + 1e-12, self.about[self.rows[:, 0]]
-        total, twice = (np.bincount(self.about, w)[about] for w in (weight, weight**2))
-        return np.asarray((2.0 * weight[self.rows[:, 0]] - twice / total) / total)
+        weight, first = self.weight[: len(self.about)] + LEAST_SHARE, self.rows[:, 0]
+        total, twice = (np.bincount(self.about, w)[self.about] for w in (weight, weight**2))
+        return np.asarray((2.0 * weight - twice / total) / total)[first]
+
+    def scores(self, cover: Array, spread: Array) -> Scores:
+        """Of each measurement by all others, as `suspects.scores` has them."""
+        rows = np.swapaxes(self.taken(self.slope), 1, 2)[None]
+        hat = 2.0 * self.weights[:, None, None] * hat_blocks(rows, cover) - hat_blocks(rows, spread)
+        left = self.live * (1.0 - self.of_places())[:, None, None] - hat
+        square, directions = standardised(left, self.taken(self.error)[None])
+        return Scores(square[0], directions[0])
 
 
 @dataclass(frozen=True, eq=False)
 class WeightedRows:
-    """A fit of instruments whose measurements have weights, as `fitting.robust.Reweighted`.
+    """A fit of b instruments whose measurements have weights, as `fitting.robust.Reweighted`.
 
-    problem: its rows with weights.  every: what was measured at once, of each of b blocks.
+    problem: its rows with weights.
     """
 
     problem: Squares
     found: LeastSquares[State]
-    every: tuple[AtOnce, ...]
     solve: Solve
     rounds: int = 0
 
-    @staticmethod
-    def of(
-        problem: Squares, found: LeastSquares[State], solve: Solve | None = None
-    ) -> WeightedRows:
-        """Of a fit, the last one without a solver."""
-        stack, x = problem.stack, found.x.take(np.array(0))
-        parts = (AtOnce.of(block, stack.part(x, i)) for i, block in enumerate(stack.blocks))
-        return WeightedRows(problem, found, tuple(parts), solve or (lambda *_: found))
-
-    @property
-    def state(self) -> State:
-        """What was fitted."""
-        return self.found.x.take(np.array(0))
-
     @cached_property
-    def shares(self) -> list[Array]:
-        """(R,) weights of each block's rows."""
-        stack = self.problem.stack
-        blocks = zip(stack.blocks, self.every, strict=True)
-        return [b.share if len(b.share) else np.ones(one.count) for b, one in blocks]
+    def parts(self) -> list[Part]:
+        """What was measured, block by block."""
+        stack, x = self.problem.stack, self.found.x.take(np.array(0))
+        every = zip(stack.blocks, stack.bare_rows(x, self.problem.active), strict=True)
+        return [Part.of(block, stack.part(x, i), *rows) for i, (block, rows) in enumerate(every)]
 
     @property
     def weights(self) -> Array:
         """(n,) of what was measured, block by block."""
-        return np.concatenate(self.split)
-
-    @property
-    def split(self) -> list[Array]:
-        """The weights of each block."""
-        return [w[one.rows[:, 0]] for w, one in zip(self.shares, self.every, strict=True)]
-
-    @cached_property
-    def rows(self) -> list[tuple[Array, Array]]:
-        """Errors (R,) and slopes (free, R) of each block, without weights."""
-        return list(self.problem.stack.rows_by_block(self.state, self.problem.active))
+        return np.concatenate([part.weights for part in self.parts])
 
     @cached_property
     def judged(self) -> tuple[list[Scores], Array]:
-        """Each block's by the others, as `suspects.scores` has them; (b,) degrees of freedom."""
-        precision, prior = self.problem.stack.precision, self.problem.prior
-        every = list(zip(self.every, self.rows, self.shares, precision, strict=True))
+        """How far off each measurement is, by blocks; (b,) degrees of freedom."""
+        prior, parts = self.problem.prior, self.parts
         none, once, twice = (
-            sum(w * (slope * share**power) @ slope.T for _, (_, slope), share, w in every)
+            sum((part.slope * part.weight**power) @ part.slope.T for part in parts)
             for power in (0, 1, 2)
         )
         ridge = RIDGE * np.diag(np.diag(none))
         cover = solve_normal(once + prior + ridge, np.eye(len(prior)))
-        spread, scores, spare = cover @ (twice + prior) @ cover, [], []
-        for one, (error, slope), share, w in every:
-            rows = np.swapaxes(one.taken(slope), 1, 2)[None]
-            own = share[one.rows[:, 0], None, None]
-            hat = w * (2.0 * own * hat_blocks(rows, cover) - hat_blocks(rows, spread))
-            left = one.live * (1.0 - one.of_places(share))[:, None, None] - hat
-            square, directions = standardised(left, one.taken(error)[None])
-            scores.append(Scores(square[0], directions[0]))
-            spare.append(-w * float(((cover @ slope) * (slope * share)).sum()))
-        return scores, np.maximum(np.add(self.degrees, spare), 1.0)
-
-    @property
-    def degrees(self) -> Array:
-        """(b,) independent numbers of each block, but for those that do not count."""
-        stack = self.problem.stack
-        gone = [one.numbers[w == 0.0].sum() for one, w in zip(self.every, self.split, strict=True)]
-        return np.asarray(np.array([one.degrees for one in stack.instruments]) - gone)
+        paid = [float(((cover @ p.slope) * p.slope * p.weight).sum()) for p in parts]
+        spare = np.maximum([p.counted - cost for p, cost in zip(parts, paid, strict=True)], 1.0)
+        return [part.scores(cover, cover @ (twice + prior) @ cover) for part in parts], spare
 
     @cached_property
+    def sigma(self) -> Array:
+        """(b,) of an ordinary row of each block by the root of its precision, or as it is held."""
+        if len(self.problem.scale):
+            return self.problem.scale * np.sqrt(self.problem.stack.precision)
+        return np.array([spread_of(*each).scale for each in zip(*self.judged, strict=True)])
+
+    @property
     def scale(self) -> Array:
-        """(b,) sigma of a row of each block, of ordinary errors, unless it is held [m]."""
-        each = zip(*self.judged, strict=True)
-        held = self.problem.scale
-        return held if len(held) else np.array([spread_of(one, dof).scale for one, dof in each])
+        """(b,) the same of a row as it was measured [m]."""
+        return np.asarray(self.sigma / np.sqrt(self.problem.stack.precision))
 
     def scores(self) -> Scores:
         """Of all blocks, in units of their scales."""
-        found = zip(self.judged[0], self.scale, strict=True)
-        directions = np.concatenate([one.directions for one in self.judged[0]])
-        return Scores(np.concatenate([one.square / s**2 for one, s in found]), directions)
+        every, scale = self.judged[0], self.sigma
+        square = [one.square / s**2 for one, s in zip(every, scale, strict=True)]
+        return Scores(np.concatenate(square), np.concatenate([one.directions for one in every]))
 
     def spread(self, found: Scores) -> Spread:
         """How ordinary errors scatter, in those units."""
         return spread_of(found, float(self.judged[1].sum()))
 
-    def sizes(self, loss: Loss, scale: float = 1.0) -> Array:
-        """(n,) size of each error in tunings of a loss at the scales."""
-        return np.concatenate(
-            [
-                np.sqrt((one.taken(error) ** 2).sum(axis=1)) / (scale * s * loss.tuned(one.numbers))
-                for one, (error, _), s in zip(self.every, self.rows, self.scale, strict=True)
-            ]
-        )
+    def sizes_of(self, loss: Loss) -> list[Array]:
+        """Of each block: size of each error in tunings of a loss at the scale."""
+        return [
+            np.sqrt((part.taken(part.error) ** 2).sum(axis=1)) / (s * loss.tuned(part.numbers))
+            for part, s in zip(self.parts, self.sigma, strict=True)
+        ]
+
+    def sizes(self, loss: Loss, scale: float) -> Array:
+        """Those of all blocks.  scale: in units of theirs."""
+        return np.concatenate(self.sizes_of(loss)) / scale
 
     def again(self, weights: Array) -> WeightedRows:
         """The fit with other weights, from here, the instruments weighed by their scales."""
-        stack, ends = self.problem.stack, np.cumsum([len(one.rows) for one in self.every])
-        each = zip(stack.blocks, self.every, np.split(weights, ends[:-1]), strict=True)
-        stack = replace(stack, blocks=tuple(b.weighed(one.share(w)) for b, one, w in each))
-        problem = replace(self.problem, stack=stack)
-        problem = problem.believed(stack.variance(np.maximum(self.scale, LEAST_NOISE) ** 2))
-        found = self.solve(problem, self.state)
+        stack, ends = self.problem.stack, np.cumsum([len(part.rows) for part in self.parts])
+        each = zip(stack.blocks, self.parts, np.split(weights, ends[:-1]), strict=True)
+        stack = replace(stack, blocks=tuple(b.weighed(part.spread_out(w)) for b, part, w in each))
+        problem = replace(self.problem, stack=stack).believed(stack.variance(self.scale**2))
+        found = self.solve(problem, self.found.x.take(np.array(0)))
         return replace(self, problem=problem, found=found, rounds=self.rounds + 1)
 
     def most(self, share: float) -> int:
         """How many measurements may leave."""
-        count = len(self.weights)
-        paid = 1.0 - self.judged[1].sum() / sum(one.numbers.sum() for one in self.every)
-        return leaving(share, count, -(-int(count * paid) // 1))
+        count, numbers = len(self.weights), sum(part.numbers.sum() for part in self.parts)
+        return leaving(share, count, int(np.ceil(count * (1.0 - self.judged[1].sum() / numbers))))
 
     def unsettled(self) -> WeightedRows:
         """The same, its status telling that the rounds did not come to rest."""
         return replace(self, found=replace(self.found, status=(Status.ITERATION_LIMIT,)))
 
-    def widened(self) -> tuple[Array, Array]:
+    def shares(self) -> Shares:
         """(rows,) what the loss makes of each row's share, and of its square, in a covariance.
 
-        As `fitting.robust.flatness` and `moments`: by the mean derivative of psi, and its mean
-        square, of each block.
+        By the mean derivative of psi, and its mean square, of each block [Huber and Ronchetti 2009,
+        7.6], as `fitting.robust.flatness` has it.
         """
-        loss, share, square = LOSSES[self.problem.loss], [], []
-        sizes = np.split(self.sizes(loss), np.cumsum([len(one.rows) for one in self.every])[:-1])
-        grown = self.degrees / self.judged[1]
-        for one, u, w, more in zip(self.every, sizes, self.shares, grown, strict=True):
-            count, weight = one.numbers, loss.weight(u)
-            flat = (count @ loss.slope(u, count)) / (count @ weight)
-            psi = ((weight * u * loss.tuned(count)) ** 2).sum() / (count @ weight**2)
-            known = np.isin(np.arange(one.count), one.rows)
-            share.append(np.where(known, flat, 1.0))
-            square.append(np.where(known, w * psi * more, 1.0))
-        return np.concatenate(share), np.concatenate(square)
+        loss, out = LOSSES[self.problem.loss], []
+        for part, u, spare in zip(self.parts, self.sizes_of(loss), self.judged[1], strict=True):
+            count, w = part.numbers, part.weights
+            flat = (count @ loss.slope(u, count)) / (count @ w)
+            psi = ((w * u * loss.tuned(count)) ** 2).sum() / (count @ w**2) * part.counted / spare
+            out.append([part.spread_out(each) for each in (flat + 0.0 * w, psi * w)])
+        share, square = map(np.concatenate, zip(*out, strict=True))
+        return share, square
 
     def notice(self) -> str:
         """How many measurements count less than half."""
-        labels, several = self.problem.stack.labels, len(self.every) > 1
-        low = [int((w < LOW_WEIGHT).sum()) for w in self.split]
+        low = [int((part.weights < LOW_WEIGHT).sum()) for part in self.parts]
         each = ", ".join(
-            f"{few} of {len(one.rows)} measurements" + f" of {label}" * several
-            for few, one, label in zip(low, self.every, labels, strict=True)
+            f"{few} of {len(part.rows)} measurements of {label}"
+            for few, part, label in zip(low, self.parts, self.problem.stack.labels, strict=True)
         )
         text = f"loss {self.problem.loss}: {each} count less than half"
         return f"{text}: {EXPLANATION}" if any(low) else text
@@ -247,7 +231,15 @@ def with_loss(
     """The minimum of a loss from a fit of squares, and the problem with its weights and scales."""
     if loss == SQUARE or not np.isfinite(found.cost).all():  # its status tells why
         return problem, found
-    at = trimmed(WeightedRows.of(replace(problem, scale=np.zeros(0)), found, solve))
+    at = trimmed(WeightedRows(replace(problem, scale=np.zeros(0)), found, solve))
     at = replace(at, problem=replace(at.problem, loss=loss, scale=at.scale))
     at = reweighted(at, 1.0, LOSSES[loss], 1.0)
     return at.problem, replace(at.found, iterations=at.found.iterations + at.rounds)
+
+
+def of_loss(problem: Squares, found: LeastSquares[State]) -> tuple[Shares, tuple[str, ...]]:
+    """What a loss does to the covariance of its fit, and a notice."""
+    if problem.loss == SQUARE:
+        return ALIKE, ()
+    at = WeightedRows(problem, found, lambda *_: found)
+    return at.shares(), (at.notice(),)

@@ -102,6 +102,11 @@ class Block:
         slopes = np.concatenate([by[:count], rows.by_own.T[own], by[count:]])
         return rows.settled(slopes, loose=loose, share=self.share)
 
+    def part_of(self, rows: ResidualRows) -> Array:
+        """(r,) which of the instrument's parts each row is of; corners of one pose are none."""
+        several = len(rows.part) and len(self.instrument.parts) > 1
+        return rows.part if several else np.zeros(len(rows.pose), dtype=int)
+
     def weighed(self, share: Array) -> Block:
         """The same with weights (rows,) of the rows."""
         return replace(self, instrument=self.instrument.weighed(share), share=share)
@@ -249,15 +254,21 @@ class Stack:
             yield error, whole
 
     def rows(self, x: State, active: Array) -> tuple[Array, Array]:
-        """Those of all blocks, each by the roots of its precision and of the rows' weights."""
-        found = list(self.rows_by_block(x, active))
-        shares = [block.share if len(block.share) else 1.0 for block in self.blocks]
-        roots = [np.sqrt(w * share) for w, share in zip(self.precision, shares, strict=True)]
+        """Those of all blocks, by the roots of precisions and of the rows' weights."""
+        found = list(self.bare_rows(x, active))
+        roots = [np.sqrt(block.share) if len(block.share) else 1.0 for block in self.blocks]
         errors, jacobians = (
             np.concatenate([root * part for root, part in zip(roots, parts, strict=True)], axis=-1)
             for parts in zip(*found, strict=True)
         )
         return errors, jacobians
+
+    def bare_rows(self, x: State, active: Array) -> Iterator[tuple[Array, Array]]:
+        """`rows_by_block`, each by the root of its precision."""
+        for weight, (error, slope) in zip(
+            self.precision, self.rows_by_block(x, active), strict=True
+        ):
+            yield np.sqrt(weight) * error, np.sqrt(weight) * slope
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -274,11 +285,8 @@ class Stack:
         """(rows,) which of all parts each is of, block by block; -2 of rows that are of several."""
         out, first = [], 0
         for i, block in enumerate(self.blocks):
-            rows = block.read(self.part(x, i))
-            own, count = np.zeros(len(rows.residual), dtype=int), len(block.instrument.parts)
-            if len(rows.part) and count > 1:  # corners of one pose are no parts of it
-                own = rows.part
-            out += [first + own, np.full(len(rows.short), -2)]
+            rows, count = block.read(self.part(x, i)), len(block.instrument.parts)
+            out += [first + block.part_of(rows), np.full(len(rows.short), -2)]
             first += count
         return np.concatenate(out)
 
