@@ -267,7 +267,8 @@ def resting(fit: InstrumentFit) -> InstrumentFit:
     every = np.pad(rests, (fit.stack.lawless - names.geometric, 0))
     known = without_resting(fit.identification, names, every)
     again = replace(fit.problem, active=known.active)
-    covariance = covariance_of(again, fit.state, np.square(fit.noise))
+    shares, _ = of_loss(again, fit.found)
+    covariance = covariance_of(again, fit.state, np.square(fit.noise), shares)
     return replace(fit, identification=known, covariance=covariance)
 
 

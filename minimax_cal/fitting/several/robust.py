@@ -209,7 +209,8 @@ class WeightedRows:
         for part, u, spare in zip(self.parts, self.sizes_of(loss), self.judged[1], strict=True):
             count, w = part.numbers, part.weights
             flat = (count @ loss.slope(u, count)) / (count @ w)
-            psi = ((w * u * loss.tuned(count)) ** 2).sum() / (count @ w**2) * part.counted / spare
+            psi = ((w * u * loss.tuned(count)) ** 2).sum() / (count @ w**2)
+            psi *= count[w > 0.0].sum() / spare  # as the mean square of a fit without a loss
             out.append([part.spread_out(each) for each in (flat + 0.0 * w, psi * w)])
         share, square = map(np.concatenate, zip(*out, strict=True))
         return share, square
