@@ -81,9 +81,7 @@ def scores(model: Model, state: State, weights: Array) -> Scores:
     every = gram(np.ones_like(weights))
     once = every if (weights == model.seen).all() else gram(weights)
     twice = once if ((weights == 0.0) | (weights == 1.0)).all() else gram(weights**2)
-    ridge = RIDGE * np.diag(np.diag(every))
-    cover = solve_normal(once + prior + ridge, np.eye(len(prior)))
-    spread = cover @ (twice + prior) @ cover
+    cover, spread = covers(every, once, twice, prior)
     square, directions = np.zeros(weights.shape), np.zeros(weights.shape, dtype=int)
     for part, error, rows in model.rows(state):
         if every is twice:  # all points count alike
@@ -93,6 +91,13 @@ def scores(model: Model, state: State, weights: Array) -> Scores:
             left = np.eye(3) - 2.0 * own * hat_blocks(rows, cover) + hat_blocks(rows, spread)
         square[:, part], directions[:, part] = standardised(left, np.swapaxes(error, 1, 2))
     return Scores(square, np.where(model.seen, directions, 0))
+
+
+def covers(every: Array, once: Array, twice: Array, prior: Array) -> tuple[Array, Array]:
+    """A^-1 and A^-1 B A^-1 of `scores`, from Gram matrices of weights to the powers 0, 1 and 2."""
+    ridge = RIDGE * np.diag(np.diag(every))
+    cover = solve_normal(once + prior + ridge, np.eye(len(prior)))
+    return cover, cover @ (twice + prior) @ cover
 
 
 def standardised(covariance: Array, error: Array) -> tuple[Array, Array]:

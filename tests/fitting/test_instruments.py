@@ -1015,7 +1015,8 @@ def test_wires_with_gross_errors_beside_the_tracker_find_the_same_arm() -> None:
     assert off(alone, both).max() < 3.0
     assert_allclose(both.noise, np.array([1.0, 4.0]) * NOISE, rtol=0.25)
     low = re.search(r"(\d+) of 180 measurements of wires count less than half", both.notices[0])
-    assert low and (lengths.length != seen.data.length[:60]).sum() <= int(low[1]) <= 25
+    assert low
+    assert (lengths.length != seen.data.length[:60]).sum() <= int(low[1]) <= 25
 
 
 def test_a_result_says_its_loss() -> None:

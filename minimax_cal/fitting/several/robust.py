@@ -15,9 +15,9 @@ from minimax_cal.fitting.robust import LOSSES, SQUARE, Loss, leaving, reweighted
 from minimax_cal.fitting.several.stack import Block, Squares, place_in
 from minimax_cal.fitting.suspects import (
     EXPLANATION,
-    RIDGE,
     Scores,
     Spread,
+    covers,
     hat_blocks,
     spread_of,
     standardised,
@@ -25,7 +25,7 @@ from minimax_cal.fitting.suspects import (
 from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments.protocol import LEAST_SHARE
 from minimax_cal.modelling.parameters import State
-from minimax_cal.solvers.least_squares import LeastSquares, solve_normal
+from minimax_cal.solvers.least_squares import LeastSquares
 from minimax_cal.solvers.status import Status
 
 LOW_WEIGHT = 0.5  # measurements of a lower one are counted for the reader
@@ -40,7 +40,7 @@ class Part:
 
     rows: (n, d) of R that belong together, -1 where there are fewer.  live: (n, d, d) projector on
     what they tell.  about: (r,) as `ResidualRows` has it.  weight: (R,) by the loss.  degrees:
-    independent numbers.  error: (R,), slope: (free, R) by the root of the block's precision.
+    independent numbers.  error: (R,) [m].  slope: (free, R) by the root of the block's precision.
     """
 
     rows: Array
@@ -65,7 +65,7 @@ class Part:
         live, dead = (rows >= 0)[..., None] * np.eye(rows.shape[1]), one.shapeless(flange, own)
         if dead.size:
             live = live - dead[read.pose[real[first]]]
-        weight = block.share if len(block.share) else np.ones(len(error))
+        weight = np.broadcast_to(block.weight, error.shape)
         return Part(rows, live, read.about, weight, one.degrees, error, slope)
 
     @property
@@ -126,8 +126,9 @@ class WeightedRows:
     def parts(self) -> list[Part]:
         """What was measured, block by block."""
         stack, x = self.problem.stack, self.found.x.take(np.array(0))
-        every = zip(stack.blocks, stack.bare_rows(x, self.problem.active), strict=True)
-        return [Part.of(block, stack.part(x, i), *rows) for i, (block, rows) in enumerate(every)]
+        rows, roots = stack.rows_by_block(x, self.problem.active), np.sqrt(stack.precision)
+        every = enumerate(zip(stack.blocks, roots, rows, strict=True))
+        return [Part.of(b, stack.part(x, i), e, root * slope) for i, (b, root, (e, slope)) in every]
 
     @property
     def weights(self) -> Array:
@@ -142,27 +143,21 @@ class WeightedRows:
             sum((part.slope * part.weight**power) @ part.slope.T for part in parts)
             for power in (0, 1, 2)
         )
-        ridge = RIDGE * np.diag(np.diag(none))
-        cover = solve_normal(once + prior + ridge, np.eye(len(prior)))
+        cover, spread = covers(none, once, twice, prior)
         paid = [float(((cover @ p.slope) * p.slope * p.weight).sum()) for p in parts]
         spare = np.maximum([p.counted - cost for p, cost in zip(parts, paid, strict=True)], 1.0)
-        return [part.scores(cover, cover @ (twice + prior) @ cover) for part in parts], spare
+        return [part.scores(cover, spread) for part in parts], spare
 
     @cached_property
-    def sigma(self) -> Array:
-        """(b,) of an ordinary row of each block by the root of its precision, or as it is held."""
-        if len(self.problem.scale):
-            return self.problem.scale * np.sqrt(self.problem.stack.precision)
-        return np.array([spread_of(*each).scale for each in zip(*self.judged, strict=True)])
-
-    @property
     def scale(self) -> Array:
-        """(b,) the same of a row as it was measured [m]."""
-        return np.asarray(self.sigma / np.sqrt(self.problem.stack.precision))
+        """(b,) sigma of an ordinary row of each block, unless it is held [m]."""
+        if len(self.problem.scale):
+            return self.problem.scale
+        return np.array([spread_of(*each).scale for each in zip(*self.judged, strict=True)])
 
     def scores(self) -> Scores:
         """Of all blocks, in units of their scales."""
-        every, scale = self.judged[0], self.sigma
+        every, scale = self.judged[0], self.scale
         square = [one.square / s**2 for one, s in zip(every, scale, strict=True)]
         return Scores(np.concatenate(square), np.concatenate([one.directions for one in every]))
 
@@ -174,7 +169,7 @@ class WeightedRows:
         """Of each block: size of each error in tunings of a loss at the scale."""
         return [
             np.sqrt((part.taken(part.error) ** 2).sum(axis=1)) / (s * loss.tuned(part.numbers))
-            for part, s in zip(self.parts, self.sigma, strict=True)
+            for part, s in zip(self.parts, self.scale, strict=True)
         ]
 
     def sizes(self, loss: Loss, scale: float) -> Array:

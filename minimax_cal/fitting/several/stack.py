@@ -107,6 +107,11 @@ class Block:
         several = len(rows.part) and len(self.instrument.parts) > 1
         return rows.part if several else np.zeros(len(rows.pose), dtype=int)
 
+    @property
+    def weight(self) -> Array:
+        """(rows,) by the loss, or a single one."""
+        return self.share if len(self.share) else np.ones(1)
+
     def weighed(self, share: Array) -> Block:
         """The same with weights (rows,) of the rows."""
         return replace(self, instrument=self.instrument.weighed(share), share=share)
@@ -255,20 +260,15 @@ class Stack:
 
     def rows(self, x: State, active: Array) -> tuple[Array, Array]:
         """Those of all blocks, by the roots of precisions and of the rows' weights."""
-        found = list(self.bare_rows(x, active))
-        roots = [np.sqrt(block.share) if len(block.share) else 1.0 for block in self.blocks]
+        found = list(self.rows_by_block(x, active))
+        roots = [
+            np.sqrt(w * block.weight) for w, block in zip(self.precision, self.blocks, strict=True)
+        ]
         errors, jacobians = (
             np.concatenate([root * part for root, part in zip(roots, parts, strict=True)], axis=-1)
             for parts in zip(*found, strict=True)
         )
         return errors, jacobians
-
-    def bare_rows(self, x: State, active: Array) -> Iterator[tuple[Array, Array]]:
-        """`rows_by_block`, each by the root of its precision."""
-        for weight, (error, slope) in zip(
-            self.precision, self.rows_by_block(x, active), strict=True
-        ):
-            yield np.sqrt(weight) * error, np.sqrt(weight) * slope
 
     @property
     def parts(self) -> tuple[str, ...]:
