@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 import minimax_cal as mc
 import minimax_cal.instruments as mc_instruments
 from experiments.relative import (
+    COMPLIANCE,
     NOISE,
     SIMULATORS,
     SPOT,
@@ -871,6 +872,7 @@ def test_parts_of_several_files_compare_by_their_noises() -> None:
 
 
 SHARE = 0.08  # of the measurements that are wrong
+EFFECT = {"effects": ("joint_compliance:J2",)}
 
 
 def wrong(kind: str, data: Instrument, rng: np.random.Generator) -> Instrument:
@@ -1017,6 +1019,23 @@ def test_wires_with_gross_errors_beside_the_tracker_find_the_same_arm() -> None:
     low = re.search(r"(\d+) of 180 measurements of wires count less than half", both.notices[0])
     assert low
     assert (lengths.length != seen.data.length[:60]).sum() <= int(low[1]) <= 25
+
+
+def test_effects_are_found_and_fitted_beside_gross_errors() -> None:
+    """The same variant of the law as without them, to its sigmas."""
+    arm = Arm.of("irb2600", 1, COMPLIANCE)
+    data = SIMULATORS["wires_3"](arm, np.random.default_rng([1, 5]), 60, NOISE).data
+    bad = wrong("wires_3", data, np.random.default_rng(3))
+    clean, found = (
+        fit_instruments(arm.robot, [Train("", each)], RelativeOptions(**how), silent)
+        for each, how in ((data, EFFECT), (bad, {**EFFECT, "loss": "huber"}))
+    )
+    assert found.stack.laws.names == clean.stack.laws.names
+    laws = slice(clean.stack.lawless, None)
+    sigma = np.sqrt(np.diag(clean.covariance))[laws]
+    apart = found.stack.values(found.state) - clean.stack.values(clean.state)
+    assert np.nanmax(np.abs(apart) / sigma) < 2.0
+    assert off(clean, found).max() < 3.0
 
 
 def test_a_result_says_its_loss() -> None:

@@ -130,7 +130,7 @@ def rows_of_all(scene: Scene, fit: InstrumentFit) -> StackRows:
     every = zip(stack.blocks, read, slots, np.sqrt(stack.precision), starts, strict=False)
     for i, (block, rows, slot, precise, start) in enumerate(every):
         x, columns = stack.part(fit.state, i), stack.columns(i)
-        root = precise / np.sqrt(rows.weights)
+        root = precise * block.weight / np.sqrt(rows.weights)  # no error beyond the loss's bound
         one, own = block.instrument, block.own(x)
         flange = block.flange(x)
         check_point_reader(one, rows, flange.place(one.targets(own)))

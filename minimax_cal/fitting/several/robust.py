@@ -227,7 +227,9 @@ def with_loss(
     """The minimum of a loss from a fit of squares, and the problem with its weights and scales."""
     if loss == SQUARE or not np.isfinite(found.cost).all():  # its status tells why
         return problem, found
-    at = trimmed(WeightedRows(replace(problem, scale=np.zeros(0)), found, solve))
+    at = WeightedRows(replace(problem, scale=np.zeros(0)), found, solve)
+    if not any(len(block.share) for block in problem.stack.blocks):  # else weighed by it before
+        at = trimmed(at)
     at = replace(at, problem=replace(at.problem, loss=loss, scale=at.scale))
     at = reweighted(at, 1.0, LOSSES[loss], 1.0)
     return at.problem, replace(at.found, iterations=at.found.iterations + at.rounds)
