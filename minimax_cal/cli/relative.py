@@ -33,7 +33,7 @@ from minimax_cal.instruments.images import Images
 @options_from(RelativeOptions)
 @options_from(PixelFiles)
 @options_from(PixelOptions, *Images.options)
-@options_from(Options, "qp", "method")
+@options_from(Options, "qp", "method", "loss")
 @plain_option(
     "What is sought",
     "--diagnose",

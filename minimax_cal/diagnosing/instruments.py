@@ -20,6 +20,7 @@ from minimax_cal.diagnosing.what_remains import NOTHING, left_over, motions
 from minimax_cal.evidence.limits import HELPS, MAX_JOINT_JITTER, MINOR
 from minimax_cal.evidence.remains import Remains
 from minimax_cal.evidence.selection import select
+from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.several.fit import InstrumentFit, remaining
 from minimax_cal.fitting.several.kinds import READ, Asked, asked_of, result_of
 from minimax_cal.fitting.several.laws import is_shared
@@ -96,6 +97,8 @@ def diagnosed(
     check_left_out(exclude, EFFECTS)
     if chosen.effects:
         raise OptionError("effects: a diagnosis looks for them; leave them out")
+    if chosen.loss != SQUARE:
+        raise OptionError(f"loss={chosen.loss} is not for a diagnosis yet: leave it out")
     asked = asked_of(robot, data, chosen, sought=True)
     if not all(held.any() for held, _ in asked.splits):
         raise DataError(

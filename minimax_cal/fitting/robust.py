@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -36,6 +37,35 @@ from minimax_cal.solvers.status import Status
 SOFT, STEPS = 8, 20  # reweighted rounds of the start, concentration steps
 
 Fitter = Callable[[Model, State], tuple[Model, LeastSquares[State]]]
+
+
+class Reweighted(Protocol):
+    """A least-squares fit whose points, or whatever was measured at once, have weights."""
+
+    @property
+    def weights(self) -> Array:
+        """Of the points, besides those of the measurements."""
+
+    def again(self, weights: Array) -> Self:
+        """The fit with other weights, from here."""
+
+    def scores(self) -> Scores:
+        """How far off each point is."""
+
+    def spread(self, found: Scores) -> Spread:
+        """How ordinary points scatter."""
+
+    def sizes(self, loss: Loss, scale: float) -> Array:
+        """Distance of each point from its prediction, in tunings of a loss at a scale."""
+
+    def most(self, share: float) -> int:
+        """How many points may leave."""
+
+    def unsettled(self) -> Self:
+        """The same, its status telling that the rounds did not come to rest."""
+
+
+W = TypeVar("W", bound=Reweighted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,19 +119,27 @@ class Weighted:
         used = np.count_nonzero(self.weights[self.judged])
         return spread_of(found, max(3.0 * used - float(self.plain.active.sum()), 1.0))
 
+    def sizes(self, loss: Loss, scale: float) -> Array:
+        """Distance of each point from its prediction, in tunings of a loss at a scale."""
+        return distances(self.plain, self.state) / (scale * loss.tuning)
+
     def most(self, share: float) -> int:
-        """How many points may leave: no more than leave the others a majority, counting what
-        determines the parameters [Rousseeuw and Leroy 1987, ch. 3].
-        """
-        needed = -(-int(self.plain.active.sum()) // 3)
-        return max(min(int(share * self.count), (self.count - needed - 1) // 2), 0)
+        """How many points may leave."""
+        return leaving(share, self.count, -(-int(self.plain.active.sum()) // 3))
 
     def unsettled(self) -> Weighted:
         """The same, its status telling that the rounds did not come to rest."""
         return replace(self, found=replace(self.found, status=(Status.ITERATION_LIMIT,)))
 
 
-def soften(at: Weighted) -> Weighted:
+def leaving(share: float, count: int, needed: int) -> int:
+    """How many points may leave: no more than leave the others a majority, counting what determines
+    the parameters [Rousseeuw and Leroy 1987, ch. 3].
+    """
+    return max(min(int(share * count), (count - needed - 1) // 2), 0)
+
+
+def soften(at: W) -> W:
     """A start that few points pull: the sum of distances instead of that of their squares.
 
     Distances are standardised by leverage: a point that draws the fit to itself is not near.
@@ -121,7 +159,7 @@ def farthest(square: Array, count: int) -> Array:
     return out.reshape(square.shape)
 
 
-def leave(at: Weighted, goes: Callable[[Scores], Array]) -> Weighted:
+def leave(at: W, goes: Callable[[Scores], Array]) -> W:
     """Fits without the points that go (k, m), to a fixed point; who comes and goes stays in."""
     before: list[Array] = []
     for _ in range(STEPS):
@@ -136,7 +174,7 @@ def leave(at: Weighted, goes: Callable[[Scores], Array]) -> Weighted:
     return at.unsettled()
 
 
-def concentrate(at: Weighted, share: float) -> Weighted:
+def concentrate(at: W, share: float) -> W:
     """Least trimmed squares: the share of points farthest off leaves [Rousseeuw and Van Driessen
     2006, "Computing LTS regression for large data sets"].
     """
@@ -146,7 +184,7 @@ def concentrate(at: Weighted, share: float) -> Weighted:
     )
 
 
-def set_aside(at: Weighted, share: float) -> Weighted:
+def set_aside(at: W, share: float) -> W:
     """Only points that stand out leave, and at most the share: the farthest first."""
     count = at.most(share)
 
@@ -155,6 +193,11 @@ def set_aside(at: Weighted, share: float) -> Weighted:
         return farthest(np.where(far, found.square, -1.0), count) & far
 
     return leave(at, goes)
+
+
+def trimmed(at: W, trim: float = 0.0) -> W:
+    """The start of a loss: the fit to the points that belong together."""
+    return set_aside(concentrate(soften(at), max(trim, START_TRIM)), trim or START_TRIM)
 
 
 # ---- losses --------------------------------------------------------------------------------------
@@ -174,43 +217,56 @@ class Loss:
     """rho(z) of a point's distance in robust standard deviations, by the weight rho'(z) / z.
 
     weight, derivative: of u = z / tuning, (n,): the weight, and the derivative of u weight(u).
-    tuning: what makes the fit 95 % as efficient as least squares where all errors are Gaussian, in
-    three dimensions.
+    tunings: what makes the fit 95 % as efficient as least squares where all errors are Gaussian, in
+    one to six dimensions.
     """
 
     weight: Callable[[Array], Array]
     derivative: Callable[[Array], Array]
-    tuning: float
+    tunings: tuple[float, ...]
+
+    @property
+    def tuning(self) -> float:
+        """Of points."""
+        return self.tunings[2]
+
+    def tuned(self, numbers: Array) -> Array:
+        """(n,) tuning for errors of so many numbers each (n,)."""
+        return np.asarray(np.interp(numbers, np.arange(len(self.tunings)) + 1.0, self.tunings))
+
+    def slope(self, u: Array, numbers: Array | float = 3.0) -> Array:
+        """Mean derivative of psi of an error of so many numbers: one along it, others across."""
+        return np.asarray((self.derivative(u) + (numbers - 1.0) * self.weight(u)) / numbers)
 
 
 LOSSES = {  # [Huber 1964; Holland and Welsch 1977; Beaton and Tukey 1974]
     "huber": Loss(
-        lambda u: np.asarray(1.0 / np.maximum(u, 1.0)), lambda u: np.asarray((u < 1.0) * 1.0), 1.628
+        lambda u: np.asarray(1.0 / np.maximum(u, 1.0)),
+        lambda u: np.asarray((u < 1.0) * 1.0),
+        (1.345, 1.5011, 1.628, 1.7311, 1.812, 1.8693),
     ),
     "cauchy": Loss(
         lambda u: np.asarray(1.0 / (1.0 + u**2)),
         lambda u: np.asarray((1.0 - u**2) / (1.0 + u**2) ** 2),
-        2.6656,
+        (2.3849, 2.5486, 2.6656, 2.7516, 2.8154, 2.8624),
     ),
     "tukey": Loss(
         lambda u: np.maximum(1.0 - u**2, 0.0) ** 2,
         lambda u: np.where(u < 1.0, (1.0 - u**2) * (1.0 - 5.0 * u**2), 0.0),
-        5.4902,
+        (4.6851, 5.123, 5.4902, 5.8103, 6.0963, 6.3562),
     ),
 }
 
 
-def reweighted(at: Weighted, kept: Array, loss: Loss, scale: float) -> Weighted:
+def reweighted(at: W, kept: Array | float, loss: Loss, scale: float) -> W:
     """The minimum of a loss by iteratively reweighted least squares, the scale held.
 
     kept: (k, m) 0 for points set aside, which stay out.
     """
     for _ in range(MAX_ROUNDS):
-        size = distances(at.plain, at.state) / (scale * loss.tuning)
-        weights = kept * loss.weight(size)
-        change = float(np.abs(weights - at.weights)[at.judged].max(initial=0.0))
-        at = at.again(weights)
-        if change <= WEIGHT_TOLERANCE:
+        before = at.weights
+        at = at.again(kept * loss.weight(at.sizes(loss, scale)))
+        if float(np.abs(at.weights - before).max(initial=0.0)) <= WEIGHT_TOLERANCE:
             return at
     return at.unsettled()
 
@@ -285,7 +341,7 @@ class Robust:
         return replace(self.plain, weight=self.plain.weight * least)
 
 
-def check_robust(loss: str, trim: float) -> None:
+def check_robust(loss: str, trim: float = 0.0) -> None:
     """Raise OptionError for a choice that does not exist."""
     if loss not in (SQUARE, *LOSSES):
         raise OptionError(f"no loss {loss!r}; choose {', '.join((SQUARE, *LOSSES))}")
@@ -316,7 +372,7 @@ def robust_fit(
     if not np.isfinite(found.cost).all():  # its status tells why; there is nothing to start from
         loss, trim = SQUARE, 0.0
     if loss != SQUARE or trim > 0.0:
-        at = set_aside(concentrate(soften(at), max(trim, START_TRIM)), trim or START_TRIM)
+        at = trimmed(at, trim)
         kept = at.weights if trim else seen
     if loss != SQUARE:
         scale = at.spread(at.scores()).scale
@@ -371,9 +427,10 @@ def moments(model: Model, state: State, loss: str, scale: float) -> tuple[Array,
         return np.ones(len(size)), (size**2).sum(axis=1) / (3.0 * counts)
     own = LOSSES[loss]
     u = size / (scale * own.tuning)
-    weight = own.weight(u)
-    derivative = np.where(model.seen, (own.derivative(u) + 2.0 * weight) / 3.0, 0.0)
-    return derivative.sum(axis=1) / counts, ((weight * size) ** 2).sum(axis=1) / (3.0 * counts)
+    derivative = np.where(model.seen, own.slope(u), 0.0)
+    return derivative.sum(axis=1) / counts, ((own.weight(u) * size) ** 2).sum(axis=1) / (
+        3.0 * counts
+    )
 
 
 def flatness(robust: Robust, state: State) -> float:

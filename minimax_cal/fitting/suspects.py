@@ -81,9 +81,7 @@ def scores(model: Model, state: State, weights: Array) -> Scores:
     every = gram(np.ones_like(weights))
     once = every if (weights == model.seen).all() else gram(weights)
     twice = once if ((weights == 0.0) | (weights == 1.0)).all() else gram(weights**2)
-    ridge = RIDGE * np.diag(np.diag(every))
-    cover = solve_normal(once + prior + ridge, np.eye(len(prior)))
-    spread = cover @ (twice + prior) @ cover
+    cover, spread = covers(every, once, twice, prior)
     square, directions = np.zeros(weights.shape), np.zeros(weights.shape, dtype=int)
     for part, error, rows in model.rows(state):
         if every is twice:  # all points count alike
@@ -95,13 +93,20 @@ def scores(model: Model, state: State, weights: Array) -> Scores:
     return Scores(square, np.where(model.seen, directions, 0))
 
 
+def covers(every: Array, once: Array, twice: Array, prior: Array) -> tuple[Array, Array]:
+    """A^-1 and A^-1 B A^-1 of `scores`, from Gram matrices of weights to the powers 0, 1 and 2."""
+    ridge = RIDGE * np.diag(np.diag(every))
+    cover = solve_normal(once + prior + ridge, np.eye(len(prior)))
+    return cover, cover @ (twice + prior) @ cover
+
+
 def standardised(covariance: Array, error: Array) -> tuple[Array, Array]:
-    """Squares of errors (k, c, 3) over their covariance (k, c, 3, 3), and in how many directions.
+    """Squares of errors (k, c, d) over their covariance (k, c, d, d), and in how many directions.
 
     Those of less variance than FOLLOWED are left out.
     """
     try:
-        np.linalg.cholesky(covariance - MIN_VARIANCE_SHARE * np.eye(3))
+        np.linalg.cholesky(covariance - MIN_VARIANCE_SHARE * np.eye(error.shape[-1]))
     except np.linalg.LinAlgError:
         share, axes = np.linalg.eigh(covariance)
         along = np.einsum("kcab,kca->kcb", axes, error)
@@ -109,13 +114,13 @@ def standardised(covariance: Array, error: Array) -> tuple[Array, Array]:
         square = (along**2 * told / np.where(told, share, 1.0)).sum(axis=-1)
         return square, told.sum(axis=-1)
     solved = np.linalg.solve(covariance, error[..., None])[..., 0]
-    return (error * solved).sum(axis=-1), np.full(error.shape[:2], 3)
+    return (error * solved).sum(axis=-1), np.full(error.shape[:2], error.shape[-1])
 
 
 def hat_blocks(rows: Array, matrix: Array) -> Array:
-    """X_i M X_i' of every point: (k, c, 3, 3).  rows: (k, p, 3, c).  matrix: M (p, p)."""
-    k, p, _, c = rows.shape
-    turned = (matrix @ rows.reshape(k, p, 3 * c)).reshape(rows.shape)
+    """X_i M X_i' of every point: (k, c, d, d).  rows: (k, p, d, c).  matrix: M (p, p)."""
+    k, p, *_ = rows.shape
+    turned = (matrix @ rows.reshape(k, p, -1)).reshape(rows.shape)
     return np.asarray(np.einsum("kpac,kpbc->kcab", rows, turned))
 
 
@@ -137,8 +142,8 @@ class Spread:
 
     def far(self, found: Scores) -> Array:
         """(k, m) True for the points that stand out, see `unlikely`."""
-        edge = fdtri((1, 2, 3), self.dof, 1.0 - FALSE_DISCOVERY_RATE) * (1, 2, 3) * self.scale**2
-        judged = found.directions > 0
+        judged, kinds = found.directions > 0, np.arange(found.directions.max(initial=0)) + 1
+        edge = fdtri(kinds, self.dof, 1.0 - FALSE_DISCOVERY_RATE) * kinds * self.scale**2
         directions, square = found.directions[judged], found.square[judged]
         near_edge = square > (1.0 - 1e-9) * edge[directions - 1]  # none below is unlikely
         p_value = np.ones(len(square))
@@ -162,7 +167,8 @@ def spread_of(found: Scores, dof: float) -> Spread:
     mean_square = found.square[judged] / directions
     if not len(mean_square):
         return Spread(LEAST_SCALE, 1.0)
-    middle = np.median(mean_square / fdtri((1, 2, 3), dof, 0.5)[directions - 1])
+    kinds = np.arange(directions.max()) + 1
+    middle = np.median(mean_square / fdtri(kinds, dof, 0.5)[directions - 1])
     here = Spread(max(float(np.sqrt(middle)), LEAST_SCALE), dof)
     before = [np.zeros(len(mean_square), dtype=bool)]
     for _ in range(MAX_ROUNDS):

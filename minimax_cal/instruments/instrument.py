@@ -225,6 +225,10 @@ class Instrument:
         """The instrument in one fit with all of some others."""
         return self
 
+    def weighed(self, share: Array) -> Self:
+        """The instrument whose rows have weights (r + c,), where it reads means of them."""
+        return self
+
     @property
     def held(self) -> tuple[str, ...]:
         """Its unknowns that are not fitted, as their values are given."""

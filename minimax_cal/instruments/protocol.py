@@ -19,6 +19,7 @@ TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.
 EDGE = 0.1  # how far from their middle the corners lie by which laws are asked [m]
 NONE: Array = np.zeros(0, dtype=int)
 NO_SUMS: Array = np.zeros((0, 0))
+LEAST_SHARE = 1e-12  # of rows about a place, so that one of which none counts has a mean too
 
 
 class FlangePoses(NamedTuple):
@@ -82,23 +83,29 @@ class ResidualRows(NamedTuple):
         member = (self.about == np.arange(count)[:, None]).astype(float)
         return np.pad(member, ((0, 0), (0, len(self.residual) + len(self.sums) - member.shape[1])))
 
-    def settled(self, slopes: Array, *, loose: bool = False) -> tuple[Array, Array]:
+    def settled(
+        self, slopes: Array, *, loose: bool = False, share: Array = NONE
+    ) -> tuple[Array, Array]:
         """Residuals (r + c,) and slopes (p, r + c), places eliminated and sums made.
 
         slopes: (p, r) of the rows.  loose: whether slopes leave the places where they are.
+        share: (r + c,) weights of the rows, empty where all weigh alike.
         """
         error = self.residual
         if not len(self.about):
             return error, slopes
         short, more = self.short, slopes @ self.sums.T if len(self.sums) else slopes[:, :0]
-        error, slopes = self.centred(error), slopes if loose else self.centred(slopes)
+        error = self.centred(error, share)
+        slopes = slopes if loose else self.centred(slopes, share)
         return np.concatenate([error, short]), np.concatenate([slopes, more], axis=1)
 
-    def centred(self, values: Array) -> Array:
-        """Values (..., r) without the mean of those about the same place."""
+    def centred(self, values: Array, share: Array = NONE) -> Array:
+        """Values (..., r) without the mean of those about the same place.  share: as above."""
         order = np.argsort(self.about, kind="stable")
-        _, first, count = np.unique(self.about[order], return_index=True, return_counts=True)
-        mean = np.add.reduceat(values[..., order], first, axis=-1) / count
+        _, first = np.unique(self.about[order], return_index=True)
+        weight = share[order] + LEAST_SHARE if len(share) else np.ones(len(order))
+        total = np.add.reduceat(weight, first)
+        mean = np.add.reduceat(weight * values[..., order], first, axis=-1) / total
         return np.asarray(values - mean[..., self.about])
 
 

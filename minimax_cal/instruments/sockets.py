@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -26,7 +26,7 @@ from minimax_cal.instruments.instrument import (
     without_blind,
 )
 from minimax_cal.instruments.options import InstrumentOptions, Known, known_text
-from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
+from minimax_cal.instruments.protocol import LEAST_SHARE, NONE, FlangePoses, ResidualRows
 from minimax_cal.measuring.grouping import groups, held_out
 from minimax_cal.measuring.measurements import FARTHEST, joint_rows
 from minimax_cal.reading.rows import Rows
@@ -93,7 +93,7 @@ class Visits(Instrument):
 
     socket: (m,) label of the socket that held the ball.  known: sockets whose distance is known
     [m].  sole_length: whether these are the only lengths of the fit; single: whether the closures
-    are all of it.
+    are all of it.  share: (m,) how much each visit counts, empty where all count alike.
 
     Its own: the ball on the flange.  The best place of a socket is the visits' barycentre, whatever
     the other parameters are: eliminating it leaves the visits about it.
@@ -103,6 +103,7 @@ class Visits(Instrument):
     known: tuple[Known, ...] = ()
     sole_length: bool = True
     single: bool = True
+    share: Array = field(default_factory=lambda: NONE)
 
     kind = "closures"
     words = Words(
@@ -195,7 +196,16 @@ class Visits(Instrument):
 
     def centres(self, place: Array) -> Array:
         """(g, 3) barycentres of the visits to each socket.  place: (m, 3) of the ball."""
-        return np.stack([place[self.socket == label].mean(axis=0) for label in self.sockets])
+        return np.stack([self.mean_of(self.socket == label) @ place for label in self.sockets])
+
+    def mean_of(self, mine: Array) -> Array:
+        """(m,) by how much each visit counts in the barycentre of some (m,)."""
+        weight = mine * (self.share + LEAST_SHARE if len(self.share) else 1.0)
+        return np.asarray(weight / weight.sum())
+
+    def weighed(self, share: Array) -> Visits:
+        """With barycentres that are weighted as well."""
+        return replace(self, share=share[: self.poses])
 
     def read(self, arm: FlangePoses, own: Array) -> ResidualRows:
         """Three rows a visit, axis by axis, about the socket's barycentre; known distances.
@@ -220,12 +230,12 @@ class Visits(Instrument):
         heavy = 3 * m if self.sole_length else 1
         sums, short, first = np.zeros((len(self.known), 3, m)), [], []
         for one, (a, b, distance) in zip(sums, self.known, strict=True):
-            mine, other = self.socket == a, self.socket == b
-            gap = place[mine].mean(axis=0) - place[other].mean(axis=0)
+            apart = self.mean_of(self.socket == a) - self.mean_of(self.socket == b)
+            gap = apart @ place
             length = max(float(np.linalg.norm(gap)), 1e-12)
-            one += (gap / length)[:, None] * (mine / mine.sum() - other / other.sum())
+            one += (gap / length)[:, None] * apart
             short.append(distance - length)
-            first.append(int(mine.argmax()))
+            first.append(int((self.socket == a).argmax()))
         return rows._replace(
             sums=np.sqrt(heavy) * sums.reshape(-1, 3 * m), short=np.sqrt(heavy) * np.array(short),
             sum_pose=np.array(first), heavy=float(heavy),

@@ -1,6 +1,7 @@
 """Calibration without coordinates, against simulation with known truth and plain models."""
 
 import json
+import re
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 import minimax_cal as mc
 import minimax_cal.instruments as mc_instruments
 from experiments.relative import (
+    COMPLIANCE,
     NOISE,
     SIMULATORS,
     SPOT,
@@ -30,12 +32,15 @@ from experiments.relative import (
     spot_of,
 )
 from minimax_cal.fitting.identify import Because
+from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.robust import LOSSES
 from minimax_cal.fitting.several import RelativeCalibration, relative
-from minimax_cal.fitting.several.fit import Train, fit_instruments
-from minimax_cal.fitting.several.options import RelativeOptions, silent
+from minimax_cal.fitting.several.fit import InstrumentFit, Train, fit_instruments
+from minimax_cal.fitting.several.options import RelativeOptions, check_options, silent, with_others
 from minimax_cal.fitting.several.stack import Block, Stack, own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments import (
+    Instrument,
     Surface,
     closures,
     contacts,
@@ -484,6 +489,8 @@ def test_fix_and_free():
         ("wires_3", {"objective": "point"}, "no objective 'point'; choose sum or minimax"),
         ("wires_3", {"objective": "minimax", "effects": ["tool_flex"]}, "objective='sum'"),
         ("wires_3", {"objective": "minimax", "qp": "none"}, "none"),
+        ("wires_3", {"loss": "l1"}, "no loss 'l1'; choose square, huber, cauchy, tukey"),
+        ("wires_3", {"loss": "huber", "objective": "minimax"}, "weigh errors twice: give one"),
         ("wires_3", {"resolution": 1.0}, "resolution"),
         ("wires_3", {"fix": ["a9"]}, "no parameter called 'a9'"),
         ("wires_3", {"fix": ["a2"], "free": ["a2"]}, "a2 is both fixed and freed"),
@@ -862,3 +869,197 @@ def test_parts_of_several_files_compare_by_their_noises() -> None:
     assert found.worst.multiplier[at] < 1.0
     assert "what decides the minimax" in found.summary()
     assert found.worst.kkt.residual <= 1e-6
+
+
+# ---- losses --------------------------------------------------------------------------------------
+
+
+SHARE = 0.08  # of the measurements that are wrong
+EFFECT = {"effects": ("joint_compliance:J2",)}
+
+
+def wrong(kind: str, data: Instrument, rng: np.random.Generator) -> Instrument:
+    """The data with a share of gross errors of 3 to 20 mm."""
+    size = rng.uniform(3e-3, 20e-3, (data.poses, 4)) * rng.choice([-1.0, 1.0], (data.poses, 4))
+    size *= rng.uniform(size=size.shape) < SHARE
+    if kind.startswith("wires"):
+        return replace(data, length=data.length + size[:, : data.length.shape[1]])
+    if kind == "poses":
+        pose = data.pose.copy()
+        pose[:, :3, 3] += size[:, :1] * rng.normal(size=(data.poses, 3))
+        return replace(data, pose=pose)
+    q = data.at.q.copy()
+    q += size[:, :1] * rng.normal(size=q.shape)  # a radian is about a metre
+    return replace(data, at=replace(data.at, q=q))
+
+
+@cache
+def fit_by(kind: str, loss: str, *, dirty: bool) -> InstrumentFit:
+    arm, seen = measured("irb2600", kind, 1, NOISE)
+    data = wrong(kind, seen.data, np.random.default_rng(3)) if dirty else seen.data
+    options = RelativeOptions(loss=loss, known_distances=seen.known)
+    return fit_instruments(arm.robot, [Train("", data)], options, silent)
+
+
+def off(fit: InstrumentFit, other: InstrumentFit) -> Array:
+    """By how many sigmas of the first the links differ."""
+    links = fit.state.mdh.size
+    known = fit.identification.active[:links] & other.identification.active[:links]
+    apart = np.abs(fit.state.mdh - other.state.mdh).T.reshape(-1)
+    return apart[known] / np.sqrt(np.diag(fit.covariance)[:links][known])
+
+
+@pytest.mark.parametrize("kind", ["wires_3", "closures_known", "poses"])
+@pytest.mark.parametrize("loss", ["huber", "tukey"])
+def test_gross_errors_do_not_pull_a_loss(kind: str, loss: str) -> None:
+    clean, found = fit_by(kind, "square", dirty=False), fit_by(kind, loss, dirty=True)
+    assert found.found.status[0] is Status.CONVERGED
+    assert off(found, clean).max() < 3.0
+    assert_allclose(found.noise, clean.noise, rtol=0.2)
+    pulled = fit_by(kind, "square", dirty=True)
+    assert off(clean, pulled).max() > 20.0
+    assert pulled.noise[0] > 20.0 * clean.noise[0]
+
+
+@pytest.mark.parametrize("kind", ["wires_3", "closures_known", "poses"])
+def test_without_outliers_a_loss_costs_little(kind: str) -> None:
+    """95 % of the efficiency: sigmas 2.6 % larger, by mean squares of these errors."""
+    plain, found = fit_by(kind, "square", dirty=False), fit_by(kind, "huber", dirty=False)
+    sigma = [np.sqrt(np.diag(fit.covariance))[plain.identification.active] / fit.noise[0]
+             for fit in (plain, found)]  # fmt: skip
+    assert np.median(sigma[1] / sigma[0]) == pytest.approx(0.95**-0.5, abs=0.07)
+    assert_allclose(found.noise, plain.noise, rtol=0.1)
+    assert off(plain, found).max() < 1.0  # sqrt(1 / 0.95 - 1) = 0.23 of a sigma, the largest of 25
+
+
+def test_a_loss_of_lengths_is_that_of_scipy() -> None:
+    """The same rows at the scale that was held, from beside the answer."""
+    arm, seen = measured("irb2600", "wires_3", 1, NOISE)
+    data = wrong("wires_3", seen.data, np.random.default_rng(3))
+    options = RelativeOptions(loss="huber", fix=("theta*", "alpha*", "beta*"))
+    fit = fit_instruments(arm.robot, [Train("", data)], options, silent)
+    problem, edge = fit.problem, fit.problem.scale[0] * LOSSES["huber"].tuned(np.ones(1))[0]
+
+    def rows(x: Array, at: int) -> Array:
+        state = problem.step(fit.state, x * NOISE)
+        return next(problem.stack.rows_by_block(state, problem.active))[at]
+
+    start = np.random.default_rng(0).normal(size=problem.active.sum())
+    theirs = least_squares(
+        lambda x: rows(x, 0) / NOISE, start, lambda x: -rows(x, 1).T, loss="huber",
+        f_scale=edge / NOISE, xtol=1e-12, ftol=1e-14, gtol=1e-10,
+    )  # fmt: skip
+    error = np.abs(rows(np.zeros(len(start)), 0)) / edge
+    ours = (edge / NOISE) ** 2 * np.where(error < 1.0, 0.5 * error**2, error - 0.5).sum()
+    assert ours == pytest.approx(theirs.cost, rel=1e-6)
+    sigma = np.sqrt(np.diag(fit.covariance)[problem.active]) / NOISE
+    assert np.abs(theirs.x / sigma).max() < 1e-3
+
+
+def test_a_loss_of_visits_is_least_where_no_socket_and_no_link_moves_it() -> None:
+    """Huber's, with the sockets' places among the unknowns."""
+    fit = fit_by("closures_known", "huber", dirty=True)
+    problem, block = fit.problem, fit.problem.stack.blocks[0]
+    edge, one = problem.scale[0] * LOSSES["huber"].tuning, block.instrument
+    weight = problem.stack.weights(fit.state)[-1]
+
+    def cost(x: Array, shift: Array) -> float:
+        state = problem.stack.part(problem.step(fit.state, x), 0)
+        place = block.flange(state).place(block.own(state)[:3])
+        centre = one.centres(place) + shift
+        u = np.linalg.norm(place - centre[one.number], axis=1) / edge
+        apart = centre[one.sockets.index(one.known[0][0])] - centre[
+            one.sockets.index(one.known[0][1])]  # fmt: skip
+        short = (np.linalg.norm(apart) - one.known[0][2]) / edge
+        return float(np.where(u < 1.0, u**2, 2.0 * u - 1.0).sum() + weight * short**2)
+
+    sigma = np.sqrt(np.diag(fit.covariance)[problem.active])
+    rng, still = np.random.default_rng(0), (np.zeros(len(sigma)), np.zeros((len(one.sockets), 3)))
+    for _ in range(30):
+        step = 1e-2 * sigma * rng.normal(size=len(sigma))
+        shift = 1e-2 * NOISE * rng.normal(size=still[1].shape)
+        shift[[one.sockets.index(label) for label in one.known[0][:2]]] = 0.0
+        for way in (1.0, -1.0):
+            assert cost(way * step, way * shift) > cost(*still)
+
+
+@cache
+def tracked() -> tuple[Arm, mc.Measurements, InstrumentFit]:
+    """A tracker's points with gross errors, and their fit as those of an instrument."""
+    arm, rng = Arm.of("irb2600", 1, 0.0), np.random.default_rng(4)
+    q = random_poses(arm.robot, 80, rng)
+    y = arm.place(q) + NOISE * rng.normal(size=(80, 3))
+    y += 5e-3 * rng.normal(size=y.shape) * (rng.uniform(size=(80, 1)) < SHARE)
+    data = mc.measurements(q, y, split=np.where(np.arange(80) % 4 == 0, "holdout", "train"))
+    return arm, data, by_huber(arm, data)
+
+
+def by_huber(arm: Arm, data: mc.Measurements, **others: Instrument) -> InstrumentFit:
+    points = Points(data).take(data.columns["split"] == "train")
+    trains = [Train("points", points), *(Train(name, one) for name, one in others.items())]
+    return fit_instruments(arm.robot, trains, RelativeOptions(loss="huber"), silent)
+
+
+def test_points_have_the_loss_that_calibrate_has() -> None:
+    """The same points by both, to a tenth of a sigma."""
+    arm, data, ours = tracked()
+    theirs = mc.calibrate(arm.robot, data, objective="sum", loss="huber", simulated=True)
+    names = ours.stack.names.all[:30]
+    values = dict(zip(names, ours.state.mdh.T.reshape(-1), strict=True))
+    links = [p for p in theirs.parameters if p.identifiable and p.name in values]
+    assert len(links) == ours.identification.active[:30].sum() == 18
+    for p in links:
+        assert abs(p.value - values[p.name]) < 0.1 * p.sigma
+
+
+def test_wires_with_gross_errors_beside_the_tracker_find_the_same_arm() -> None:
+    arm, data, alone = tracked()
+    _, seen = measured("irb2600", "wires_3", 1, 4.0 * NOISE)
+    lengths = wrong("wires_3", seen.data.take(np.arange(60)), np.random.default_rng(3))
+    both = by_huber(arm, data, wires=lengths)
+    assert off(alone, both).max() < 3.0
+    assert_allclose(both.noise, np.array([1.0, 4.0]) * NOISE, rtol=0.25)
+    low = re.search(r"(\d+) of 180 measurements of wires count less than half", both.notices[0])
+    assert low
+    assert (lengths.length != seen.data.length[:60]).sum() <= int(low[1]) <= 25
+
+
+def test_effects_are_found_and_fitted_beside_gross_errors() -> None:
+    """The same variant of the law as without them, to its sigmas."""
+    arm = Arm.of("irb2600", 1, COMPLIANCE)
+    data = SIMULATORS["wires_3"](arm, np.random.default_rng([1, 5]), 60, NOISE).data
+    bad = wrong("wires_3", data, np.random.default_rng(3))
+    clean, found = (
+        fit_instruments(arm.robot, [Train("", each)], RelativeOptions(**how), silent)
+        for each, how in ((data, EFFECT), (bad, {**EFFECT, "loss": "huber"}))
+    )
+    assert found.stack.laws.names == clean.stack.laws.names
+    laws = slice(clean.stack.lawless, None)
+    sigma = np.sqrt(np.diag(clean.covariance))[laws]
+    apart = found.stack.values(found.state) - clean.stack.values(clean.state)
+    assert np.nanmax(np.abs(apart) / sigma) < 2.0
+    assert off(clean, found).max() < 3.0
+
+
+def test_a_result_says_its_loss() -> None:
+    arm, seen = measured("irb2600", "wires_1", 1, NOISE)
+    data = wrong("wires_1", seen.data, np.random.default_rng(3))
+    found = relative(arm.robot, data, loss="tukey", offset=True)
+    assert found.provenance.settings["loss"] == "tukey"
+    said = next(notice for notice in found.notices if notice.startswith("loss tukey: "))
+    assert " of 80 measurements of distances count less than half: a suspect may be" in said
+
+
+def test_calibrate_hands_its_loss_to_other_instruments() -> None:
+    _, seen = measured("irb2600", "wires_3")
+    chosen = with_others([seen.data], Options(objective="sum", loss="tukey"), RelativeOptions())
+    assert chosen.loss == "tukey"
+
+
+def test_what_knows_no_loss_refuses_it() -> None:
+    arm, seen = measured("irb2600", "wires_3")
+    with pytest.raises(mc.OptionError, match="loss=huber is not for a diagnosis yet"):
+        mc.diagnose_relative(arm.robot, seen.data, loss="huber")
+    pixels = type("Pixels", (type(seen.data),), {"kind": "pixels"})(**vars(seen.data))
+    with pytest.raises(mc.OptionError, match="loss=huber is not for pixels yet"):
+        check_options([pixels], RelativeOptions(loss="huber"))

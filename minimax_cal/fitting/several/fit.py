@@ -24,6 +24,7 @@ from minimax_cal.fitting.several.options import (
     RelativeOptions,
     sigmas_of,
 )
+from minimax_cal.fitting.several.robust import ALIKE, Shares, of_loss, with_loss
 from minimax_cal.fitting.several.stack import Known, Squares, Stack, started
 from minimax_cal.fitting.several.worst import Worst, least_worst
 from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS, without_resting
@@ -178,7 +179,7 @@ def of_worst(fit: InstrumentFit, options: RelativeOptions) -> InstrumentFit:
         fit,
         state=best.x,
         found=replace(fit.found, status=(best.status,), iterations=np.array([best.iterations])),
-        covariance=covariance_of(problem, best.x, np.square(fit.noise), share),
+        covariance=covariance_of(problem, best.x, np.square(fit.noise), (share, share**2)),
         worst=Worst.of([stack.parts[i] for i in seen], sizes(fit.state), sizes(best.x), best),
         notices=notes,
     )
@@ -218,10 +219,10 @@ def solved(
 ) -> InstrumentFit:
     """What a solved problem says."""
     state = ended.x.take(np.array(0))
-    variance = variances(problem, state)
+    variance, (shares, notices) = variances(problem, state), of_loss(problem, ended)
     return InstrumentFit(
-        problem, nominal, state, told, ended, covariance_of(problem, state, variance),
-        np.sqrt(variance), trains, (),
+        problem, nominal, state, told, ended, covariance_of(problem, state, variance, shares),
+        np.sqrt(variance), trains, (), notices=notices,
     )  # fmt: skip
 
 
@@ -262,7 +263,8 @@ def resting(fit: InstrumentFit) -> InstrumentFit:
     every = np.pad(rests, (fit.stack.lawless - names.geometric, 0))
     known = without_resting(fit.identification, names, every)
     again = replace(fit.problem, active=known.active)
-    covariance = covariance_of(again, fit.state, np.square(fit.noise))
+    shares, _ = of_loss(again, fit.found)
+    covariance = covariance_of(again, fit.state, np.square(fit.noise), shares)
     return replace(fit, identification=known, covariance=covariance)
 
 
@@ -276,7 +278,7 @@ def weighed(
     """
     points, method = float(problem.stack.points), method_of(options.method)
 
-    def solved(problem: Squares) -> LeastSquares[State]:
+    def solved(problem: Squares, begin: State = begin) -> LeastSquares[State]:
         found = least_squares.solve(problem, begin.batch(), 1, points, method, least_squares.NEAR)
         if not len(problem.room) or is_kept(found.x.take(np.array(0)), problem.whole_room):
             return found
@@ -284,30 +286,20 @@ def weighed(
 
     priors = problem.known is not None and problem.known.any
     if len(problem.stack.blocks) == 1 and not priors:
-        return problem, solved(problem)
+        return with_loss(problem, solved(problem), options.loss, solved)
     count = [one.degrees for one in problem.stack.instruments]
     none = np.zeros(problem.stack.names.count, dtype=bool)
     cost = [float(error @ error) for error, _ in problem.stack.rows_by_block(begin, none)]
     variance = np.maximum(np.divide(cost, count), LEAST_NOISE**2)
-    variance = np.where(np.isnan(problem.stack.given), variance, problem.stack.given)
+    variance = problem.stack.variance(variance)
     for _ in range(PRIOR_ROUNDS):
-        problem = believed(problem, variance)
+        problem = problem.believed(variance)
         found = solved(problem)
         state = found.x.take(np.array(0))
         previous, variance = variance, variances(problem, state)
         if np.all(np.abs(variance - previous) <= SETTLED * previous):
             break
-    return problem, found
-
-
-def believed(problem: Squares, variance: Array) -> Squares:
-    """Instruments and priors weighed by the variances (b,) of their numbers [m^2].
-
-    The best instrument weighs 1, so that a step of the rows is one of metres.
-    """
-    unit, names = float(variance.min()), problem.stack.names
-    weight = problem.known.weights(unit, names.count) if problem.known else np.zeros(0)
-    return replace(problem, stack=replace(problem.stack, precision=unit / variance), weight=weight)
+    return with_loss(problem, found, options.loss, solved)
 
 
 def variances(problem: Squares, x: State) -> Array:
@@ -316,10 +308,12 @@ def variances(problem: Squares, x: State) -> Array:
     Each pays for its share of the parameters, tr(H^-1 G_b) of the whole Gram matrix H [Forstner's
     variance components]; a prior pays for parameters of its own.
     """
+    if len(problem.scale):
+        return problem.stack.variance(problem.scale**2)
     cost, spare = remaining(problem, x)
     weighing = len(problem.stack.blocks) > 1 or len(problem.weight)
     left = np.maximum(cost / spare, (LEAST_NOISE if weighing else MIN_COMPUTED_NOISE) ** 2)
-    return np.where(np.isnan(problem.stack.given), left, problem.stack.given)
+    return problem.stack.variance(left)
 
 
 def remaining(problem: Squares, x: State) -> tuple[Array, Array]:
@@ -333,20 +327,20 @@ def remaining(problem: Squares, x: State) -> tuple[Array, Array]:
     return np.array([float(error @ error) for error in errors]), spare
 
 
-def covariance_of(problem: Squares, x: State, variance: Array, share: Array | float = 1.0) -> Array:
+def covariance_of(problem: Squares, x: State, variance: Array, shares: Shares = ALIKE) -> Array:
     """Covariance (p, p) of all parameters at a solution [SI], NaN where not identified.
 
     s^2 H^-1 F H^-1 with H = sum w j j' + P and F = sum w^2 j j' + P over the rows j of weight w and
     the priors P: a known distance weighs much and is no surer than a coordinate.  s^2: of a number
     of the best instrument, to which the others are weighed.  variance: (b,) as `variances` has it.
-    share: (rows,) how much more each counts in the fit than its weight says.
+    shares: (rows,) how much more each counts in H, and in F, than its weight says.
     """
     active, stack = problem.active, problem.stack
     _, jacobians = stack.rows(x, active)
     inverse = solve_normal(
-        (jacobians * share) @ jacobians.T + problem.prior, np.eye(len(jacobians))
+        (jacobians * shares[0]) @ jacobians.T + problem.prior, np.eye(len(jacobians))
     )
-    middle = (jacobians * stack.weights(x) * np.square(share)) @ jacobians.T + problem.prior
+    middle = (jacobians * stack.weights(x) * shares[1]) @ jacobians.T + problem.prior
     covariance = np.full((len(active),) * 2, np.nan)
     unit = float((variance * stack.precision).mean())
     covariance[np.ix_(active, active)] = unit * inverse @ middle @ inverse

@@ -14,6 +14,7 @@ import numpy as np
 
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.fitting.several.fit import InstrumentFit
+from minimax_cal.fitting.several.stack import place_in
 from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments.protocol import FlangePoses, Given, ResidualRows, by_arm
 from minimax_cal.measuring.grouping import groups
@@ -121,7 +122,7 @@ def rows_of_all(scene: Scene, fit: InstrumentFit) -> StackRows:
     every = zip(stack.blocks, read, slots, np.sqrt(stack.precision), starts, strict=False)
     for i, (block, rows, slot, precise, start) in enumerate(every):
         x, columns = stack.part(fit.state, i), stack.columns(i)
-        root = precise / np.sqrt(rows.weights)
+        root = precise * block.weight / np.sqrt(rows.weights)  # no error beyond the loss's bound
         one, own = block.instrument, block.own(x)
         flange, middle = block.flange(x), one.targets(own).mean(axis=0)
         shapeless = one.shapeless(flange, own)
@@ -189,16 +190,6 @@ def assembled(
     rest = bare.turned(error)[:, 0] * measured
     basis = orthonormal(bare.turned(np.concatenate([nuisance, *beside])) * measured[:, None])
     return replace(bare, error=rest, basis=basis)
-
-
-def place_in(pose: Array) -> Array:
-    """(rows,) which row of its pose each is, from 0.  pose: (rows,)."""
-    order = np.argsort(pose, kind="stable")
-    first = np.concatenate([[True], np.diff(pose[order]) > 0])
-    start = np.maximum.accumulate(np.where(first, np.arange(len(pose)), 0))
-    out = np.empty(len(pose), dtype=int)
-    out[order] = np.arange(len(pose)) - start
-    return out
 
 
 def numbered(fit: InstrumentFit) -> Array:

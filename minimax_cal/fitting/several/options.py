@@ -18,6 +18,7 @@ from minimax_cal.fitting.options import (
     qp_name,
 )
 from minimax_cal.fitting.pixels.options import SUM, WORST_TARGET, PixelOptions
+from minimax_cal.fitting.robust import SQUARE, check_robust
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.stages import Progress as Progress
@@ -57,6 +58,7 @@ class RelativeOptions(InstrumentOptions):
     camera_on, fix_camera, camera_prior: of pixels, as `calibrate_pixels` takes them.
     objective: sum, or minimax: the worst part of any file, as a wire or a contact.  qp: backend of
     its quadratic programs.
+    loss: how errors count: square, or huber, cauchy or tukey, which outliers pull less.
     method: of the least squares.  resolution: relative singular value that counts as not measured.
     """
 
@@ -79,6 +81,7 @@ class RelativeOptions(InstrumentOptions):
     camera_on: str = PixelOptions.camera_on
     fix_camera: bool = PixelOptions.fix_camera
     camera_prior: str = PixelOptions.camera_prior
+    loss: str = Options.loss
     method: str = Options.method
     resolution: float = Options.resolution
 
@@ -128,6 +131,11 @@ def check_options(every: Sequence[Instrument], options: RelativeOptions) -> None
         raise OptionError(f"no objective {options.objective!r}; choose {SUM} or {WORST_TARGET}")
     if options.objective == WORST_TARGET and options.effects:
         raise OptionError("effects= of other instruments are fitted by objective='sum': give one")
+    check_robust(options.loss)
+    if options.loss != SQUARE and options.objective == WORST_TARGET:
+        raise OptionError(f"loss={options.loss} and objective=minimax weigh errors twice: give one")
+    if options.loss != SQUARE and any(one.kind == "pixels" for one in every):
+        raise OptionError(f"loss={options.loss} is not for pixels yet: leave it or them out")
     default = RelativeOptions()
     for found in map(instrument, INSTRUMENTS):
         mine = [data for data in every if data.kind == found.kind]

@@ -9,10 +9,12 @@ from itertools import pairwise
 
 import numpy as np
 
+from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.several.laws import NO_LAWS, Laws
 from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.instruments.protocol import (
+    NONE,
     Arm,
     FlangePoses,
     Given,
@@ -59,11 +61,13 @@ class Block:
 
     A state of it has the links and, as effects, the e parameters of the instrument's own and those
     of the laws by which its arm gives way; its p parameters are in the order of `Names`: links, the
-    base (which is the frame), its own, the laws'.
+    base (which is the frame), its own, the laws'.  share: (rows,) weights by a robust loss, empty
+    where all rows weigh alike.
     """
 
     instrument: Instrument
     arm: Arm
+    share: Array = field(default_factory=lambda: NONE)
 
     @staticmethod
     def of(robot: Robot, one: Instrument) -> Block:
@@ -96,7 +100,21 @@ class Block:
         rows = self.instrument.read(flange, self.own(x))
         by, count = by_arm(flange, rows), int(links.sum())
         slopes = np.concatenate([by[:count], rows.by_own.T[own], by[count:]])
-        return rows.settled(slopes, loose=loose)
+        return rows.settled(slopes, loose=loose, share=self.share)
+
+    def part_of(self, rows: ResidualRows) -> Array:
+        """(r,) which of the instrument's parts each row is of; corners of one pose are none."""
+        several = len(rows.part) and len(self.instrument.parts) > 1
+        return rows.part if several else np.zeros(len(rows.pose), dtype=int)
+
+    @property
+    def weight(self) -> Array:
+        """(rows,) by the loss, or a single one."""
+        return self.share if len(self.share) else np.ones(1)
+
+    def weighed(self, share: Array) -> Block:
+        """The same with weights (rows,) of the rows."""
+        return replace(self, instrument=self.instrument.weighed(share), share=share)
 
     def scene(self, robot: Robot, x: State, spots: Array) -> Scene:
         """What laws look at, with the geometry of a state.  spots: (k, 3) on the flange [m]."""
@@ -245,9 +263,11 @@ class Stack:
             yield error, whole
 
     def rows(self, x: State, active: Array) -> tuple[Array, Array]:
-        """Those of all blocks, each by the root of its precision."""
+        """Those of all blocks, by the roots of precisions and of the rows' weights."""
         found = list(self.rows_by_block(x, active))
-        roots = np.sqrt(self.precision)
+        roots = [
+            np.sqrt(w * block.weight) for w, block in zip(self.precision, self.blocks, strict=True)
+        ]
         errors, jacobians = (
             np.concatenate([root * part for root, part in zip(roots, parts, strict=True)], axis=-1)
             for parts in zip(*found, strict=True)
@@ -269,13 +289,14 @@ class Stack:
         """(rows,) which of all parts each is of, block by block; -2 of rows that are of several."""
         out, first = [], 0
         for i, block in enumerate(self.blocks):
-            rows = block.read(self.part(x, i))
-            own, count = np.zeros(len(rows.residual), dtype=int), len(block.instrument.parts)
-            if len(rows.part) and count > 1:  # corners of one pose are no parts of it
-                own = rows.part
-            out += [first + own, np.full(len(rows.short), -2)]
+            rows, count = block.read(self.part(x, i)), len(block.instrument.parts)
+            out += [first + block.part_of(rows), np.full(len(rows.short), -2)]
             first += count
         return np.concatenate(out)
+
+    def variance(self, left: Array) -> Array:
+        """(b,) of a row of each block, as given or as a fit leaves [m^2]."""
+        return np.where(np.isnan(self.given), left, self.given)
 
     def weights(self, x: State) -> Array:
         """(rows,) how much more each weighs than its noise says."""
@@ -346,6 +367,7 @@ class Squares:
 
     known: of the links and the laws, which counts with the
     weights (p,) where these are given.  room: (k, 2) between which the laws' parameters must lie.
+    loss: by which the rows have weights, at a scale (b,): sigma of a row of each block [m].
     """
 
     stack: Stack
@@ -353,6 +375,8 @@ class Squares:
     known: Known | None = None
     weight: Array = field(default_factory=lambda: np.zeros(0))
     room: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    loss: str = SQUARE
+    scale: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def names(self) -> Names:
@@ -375,6 +399,15 @@ class Squares:
         """(free, free) what the priors add to the Gram matrix."""
         weight = self.weight if len(self.weight) else np.zeros(len(self.active))
         return np.diag(weight[self.active])
+
+    def believed(self, variance: Array) -> Squares:
+        """Instruments and priors weighed by the variances (b,) of their numbers [m^2].
+
+        The best instrument weighs 1, so that a step of the rows is one of metres.
+        """
+        unit = float(variance.min())
+        weight = self.known.weights(unit, self.names.count) if self.known else np.zeros(0)
+        return replace(self, stack=replace(self.stack, precision=unit / variance), weight=weight)
 
     def normal(self, x: State) -> tuple[Array, Array, Array]:
         """Cost (...), gradient (..., free) and Gram matrix (..., free, free)."""
@@ -405,6 +438,16 @@ class Squares:
         whole = np.zeros((*dx.shape[:-1], self.stack.names.count))
         whole[..., self.active] = dx
         return x.step(whole)
+
+
+def place_in(pose: Array) -> Array:
+    """(rows,) which row of its pose each is, from 0.  pose: (rows,)."""
+    order = np.argsort(pose, kind="stable")
+    first = np.concatenate([[True], np.diff(pose[order]) > 0])
+    start = np.maximum.accumulate(np.where(first, np.arange(len(pose)), 0))
+    out = np.empty(len(pose), dtype=int)
+    out[order] = np.arange(len(pose)) - start
+    return out
 
 
 # ---- the start ---------------------------------------------------------------------------------
