@@ -36,10 +36,10 @@ from experiments.pixel_cells import (
     taken,
 )
 from experiments.sweep import Study, study_options
+from minimax_cal.fitting.pixels.calibrate import fitted
 from minimax_cal.fitting.pixels.fit import ANY, PixelSquares, by_depths, fit_drawn, reprojected
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import directions, from_far, poses_of_images, start_scene
-from minimax_cal.fitting.several.pixel_calibration import fitted
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.stages import silent
 from minimax_cal.ground.tables import Table

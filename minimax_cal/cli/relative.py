@@ -21,11 +21,10 @@ from minimax_cal.cli.options import (
 )
 from minimax_cal.diagnosing.diagnose import DiagnosisOptions
 from minimax_cal.fitting.options import Options
-from minimax_cal.fitting.pixels.options import PixelFiles, PixelOptions
+from minimax_cal.fitting.pixels.options import PixelFiles
 from minimax_cal.fitting.several import RelativeOptions, relative
 from minimax_cal.ground.errors import OptionError
-
-CAMERAS = ("camera_on", "fix_camera", "camera_prior")
+from minimax_cal.instruments.images import Images
 
 
 @command
@@ -34,7 +33,6 @@ CAMERAS = ("camera_on", "fix_camera", "camera_prior")
 @options_from(Options, "holdout", "seed", "fix", "free", "priors", "effects")
 @options_from(RelativeOptions)
 @options_from(PixelFiles)
-@options_from(PixelOptions, *CAMERAS)
 @options_from(Options, "qp", "method")
 @plain_option(
     "What is sought",
@@ -71,5 +69,5 @@ def relative_command(
         verb = partial(diagnose_relative, exclude=exclude)
     files = record_of(PixelFiles, chosen)
     if not files.given:
-        refuse(CAMERAS, "is about what cameras see, with pixels=, joints= and camera=")
+        refuse(Images.options, "is about what cameras see, with pixels=, joints= and camera=")
     return together(verb, robot, [*data], files, to, chosen)

@@ -32,6 +32,7 @@ def known_text(known: Known) -> str:
 
 
 fitted = grouped("What is fitted")
+seen = grouped("Cameras")
 
 
 @dataclass(frozen=True)

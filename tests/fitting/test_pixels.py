@@ -21,12 +21,11 @@ from experiments.pixel_cells import (
     make_cell,
     seen_by,
 )
-from minimax_cal.fitting.pixels.determined import determined
+from minimax_cal.fitting.pixels.calibrate import concluded, determined, fitted
 from minimax_cal.fitting.pixels.fit import PixelSquares
-from minimax_cal.fitting.pixels.judge import Claim
 from minimax_cal.fitting.pixels.options import PixelOptions, check_options, doubts_of
+from minimax_cal.fitting.pixels.result import Claim
 from minimax_cal.fitting.pixels.start import by_rotations, directions, merged, start_scene
-from minimax_cal.fitting.several.pixel_calibration import concluded, fitted
 from minimax_cal.fitting.several.stack import own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments.camera import INTRINSICS, distorted, slopes, undistorted

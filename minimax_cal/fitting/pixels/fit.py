@@ -89,7 +89,7 @@ class PixelSquares(Squares):
 
     def at(self, x: State) -> tuple[FlangePoses, Array]:
         """The arm, and the images' own parameters."""
-        return self.block.flange(x), self.block.own(x)
+        return self.block.at(x)
 
     def errors(self, x: State) -> Array:
         """(2, N) measured minus predicted [px]."""

@@ -10,8 +10,7 @@ measured they are as large as elsewhere.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Annotated
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +18,6 @@ from minimax_cal.evidence.noise import fit_components
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.several.identify import lengths_of
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import Fact, Mm, derived
 from minimax_cal.measuring.measurements import measurements
 from minimax_cal.modelling.cell import still
 from minimax_cal.modelling.model import TARGET, model_of
@@ -156,8 +154,6 @@ def unfitted(robot: Robot, fit: PixelFit) -> Array:
 
 
 POSES = 300  # over the joints' whole range
-MARGIN = 2.0 / 3.0  # of the drawing's sigma: an arm less sure may be worse than drawn
-SAME = 1e-9  # arms so far apart are one and the same [m]
 TOOL = np.array([0.0, 0.0, 0.1])  # a point beside the last axes, in the flange [m]
 
 
@@ -240,49 +236,3 @@ def drawn_sigma(robot: Robot, lack: Lack, share: float = 1.0) -> float:
     """
     nothing = np.zeros((5 * robot.joints, len(lack.moment)))
     return position_error(robot, share * drawn_covariance(robot), nothing, lack)
-
-
-@dataclass(frozen=True)
-class Claim:
-    """What is known of positions of the arm, RMS over the joints' range, base and tool fitted [m].
-
-    sigma: of the calibrated arm.  drawn: of the drawing, by `drawn_within`.  change: between the
-    two.  shown: of the drawing, by how far the pixels show it to be off; 0 where they do not.
-    """
-
-    sigma: Mm
-    drawn: Annotated[float, Fact(key="drawn_sigma_mm", scale=1e3)]
-    change: Mm
-    shown: Annotated[float, Fact(key="drawn_shown_mm", scale=1e3)]
-
-    @derived(key="better")
-    def is_better(self) -> bool:
-        """Whether the calibrated arm is known clearly better than the drawn one."""
-        return self.sigma < MARGIN * self.shown
-
-    def texts(self) -> dict[str, str]:
-        """Each number for people."""
-        return {f.name: f"{1e3 * getattr(self, f.name):#.3g} mm" for f in fields(self)}
-
-    def sentence(self) -> str:
-        """For people."""
-        mm = self.texts()
-        if self.change < SAME:
-            return (
-                "The arm stays as drawn: cameras and targets go with it, whose positions the "
-                f"drawing knows to {mm['drawn']} RMS (drawn_within)."
-            )
-        said = (
-            f"These pixels determine a position of the arm to {mm['sigma']} RMS (sigma over the "
-            "joints' whole range, lack of fit and the lenses' doubt included); the drawing knows "
-            f"it to {mm['drawn']} (drawn_within), and the calibrated arm differs from it by "
-            f"{mm['change']}"
-        )
-        if self.is_better:
-            return f"{said}: the calibrated arm is better."
-        if self.sigma >= self.drawn:
-            return f"{said}: keep the drawn arm; take more images, nearer, with more tilt."
-        return (
-            f"{said}. By that the drawing is off by {mm['shown']}, too little to be sure: keep the "
-            "drawn arm."
-        )

@@ -318,6 +318,16 @@ class RelativeCalibration(Measured, Result):
         return (*filled(*every), parameter_table(self.parameters))
 
     @property
+    def outcome(self) -> str:
+        """How many parameters were identified, and how the numbers ended, as sentences."""
+        text = (
+            f"{self.identified} of {len(self.parameters)} parameters identified (condition "
+            f"{self.identification.condition:.3g}); {self.status} after {self.iterations} "
+            f"iterations, {self.seconds:.2f} s."
+        )
+        return text + (f" {self.worst.sentence()}" if self.worst else "")
+
+    @property
     def position_claim(self) -> str:
         """How good positions are, as a sentence."""
         if self.positions_open:
@@ -337,12 +347,8 @@ class RelativeCalibration(Measured, Result):
         text = (
             f"{self.words.quantity.capitalize()}: RMS error {before.rms_mm:.3f} mm -> "
             f"{after.rms_mm:.3f} mm, largest {before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, "
-            f"at {where}. {self.words.caution}{self.position_claim} {self.identified} of "
-            f"{len(self.parameters)} parameters identified (condition "
-            f"{self.identification.condition:.3g}); {self.status} after {self.iterations} "
-            f"iterations, {self.seconds:.2f} s."
+            f"at {where}. {self.words.caution}{self.position_claim} {self.outcome}"
         )
-        text += f" {self.worst.sentence()}" if self.worst else ""
         return text + (f" {self.status.advice}." if self.status.advice else "")
 
     def summary(self, width: int = 110) -> str:

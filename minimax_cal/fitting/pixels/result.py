@@ -4,23 +4,89 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Any
 
 from minimax_cal.fitting.accuracy import NO_ENDS, Accuracy
 from minimax_cal.fitting.fit import ACCURACIES
 from minimax_cal.fitting.found import parameter_table
-from minimax_cal.fitting.pixels.judge import Claim
-from minimax_cal.fitting.pixels.worst import WorstPixels
 from minimax_cal.fitting.several.result import RelativeCalibration
-from minimax_cal.ground.facts import APART, Fact
+from minimax_cal.fitting.several.worst import WorstPixels
+from minimax_cal.ground.facts import APART, Fact, Mm, derived
 from minimax_cal.ground.results import merged
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import capitalise
 from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.solvers.status import Status
 
-PIXELS = "pixels"  # what was measured
+MARGIN = 2.0 / 3.0  # of the drawing's sigma: an arm less sure may be worse than drawn
+SAME = 1e-9  # arms so far apart are one and the same [m]
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What is known of positions of the arm, RMS over the joints' range, base and tool fitted [m].
+
+    sigma: of the calibrated arm.  drawn: of the drawing, by `drawn_within`.  change: between the
+    two.  shown: of the drawing, by how far the pixels show it to be off; 0 where they do not.
+    """
+
+    sigma: Mm
+    drawn: Annotated[float, Fact(key="drawn_sigma_mm", scale=1e3)]
+    change: Mm
+    shown: Annotated[float, Fact(key="drawn_shown_mm", scale=1e3)]
+
+    @derived(key="better")
+    def is_better(self) -> bool:
+        """Whether the calibrated arm is known clearly better than the drawn one."""
+        return self.sigma < MARGIN * self.shown
+
+    def texts(self) -> dict[str, str]:
+        """Each number for people."""
+        return {f.name: f"{1e3 * getattr(self, f.name):#.3g} mm" for f in fields(self)}
+
+    def why_kept(self) -> str:
+        """Why the drawn arm is kept."""
+        mm = self.texts()
+        why = (
+            f"the calibrated arm, known to {mm['sigma']}, differs from the drawn one by "
+            f"{mm['change']}, which shows the drawing to be off by {mm['shown']}: too little to be "
+            "sure"
+        )
+        if self.sigma >= self.drawn:
+            why = (
+                f"the drawing is known better ({mm['drawn']}) than these pixels tell the arm "
+                f"({mm['sigma']})"
+            )
+        return (
+            f"{why}: the drawn arm is kept; take more images, nearer and more tilted, or say how "
+            "well the drawing is known (drawn_within)"
+        )
+
+    def sentence(self) -> str:
+        """For people."""
+        mm = self.texts()
+        if self.change < SAME:
+            return (
+                "The arm stays as drawn: cameras and targets go with it, whose positions the "
+                f"drawing knows to {mm['drawn']} RMS (drawn_within)."
+            )
+        said = (
+            f"These pixels determine a position of the arm to {mm['sigma']} RMS (sigma over the "
+            "joints' whole range, lack of fit and the lenses' doubt included); the drawing knows "
+            f"it to {mm['drawn']} (drawn_within), and the calibrated arm differs from it by "
+            f"{mm['change']}"
+        )
+        if self.is_better:
+            return f"{said}: the calibrated arm is better."
+        if self.sigma >= self.drawn:
+            return f"{said}: keep the drawn arm; take more images, nearer, with more tilt."
+        return (
+            f"{said}. By that the drawing is off by {mm['shown']}, too little to be sure: keep the "
+            "drawn arm."
+        )
+
+
 NO_CLAIM = Claim(*[math.nan] * 4)
 
 
@@ -78,19 +144,15 @@ class PixelCalibration(RelativeCalibration):
     def headline(self) -> str:
         """The result in some sentences, with what it does not say."""
         before, after, where = self.before_and_after()
-        key = "holdout" if self.accuracy["holdout"].poses else "train"
-        drawn = {"holdout": "nominal", "train": "nominal_train"}[key]
-        (px_before, _), (px_after, _) = (self.pixels.get(name, NO_ENDS) for name in (drawn, key))
+        keys = (
+            ("nominal", "holdout") if self.accuracy["holdout"].poses else ("nominal_train", "train")
+        )
+        (px_before, _), (px_after, _) = (self.pixels.get(key, NO_ENDS) for key in keys)
         text = (
             f"Pixels: RMS error {px_before:.3f} px -> {px_after:.3f} px ({before.rms_mm:.3f} mm -> "
             f"{after.rms_mm:.3f} mm at the target), at {where}. That says nothing of the arm's "
-            f"positions by itself. {self.claim.sentence()} {self.identified} of "
-            f"{len(self.parameters)} parameters identified (condition "
-            f"{self.identification.condition:.3g}); {self.status} after {self.iterations} "
-            f"iterations, {self.seconds:.2f} s."
+            f"positions by itself. {self.claim.sentence()} {self.outcome}"
         )
-        if self.worst:
-            text += f" {self.worst.sentence()}"
         if self.set_aside:
             text += f" {len(self.set_aside)} pixels set aside as wrong."
         if self.reason:
@@ -115,9 +177,6 @@ class PixelCalibration(RelativeCalibration):
     ) -> dict[str, Any]:
         """As `RelativeCalibration`, and what pixels tell besides."""
         own = super().told_beside(content, told, source)
-        stated = own["stated"]
         calibrated = robot_from_dict(content["calibrated_robot"], f"{source}: calibrated_robot")
-        return own | {
-            "calibrated": calibrated,
-            "pixels": {key: (each.rms_px, each.max_px) for key, each in stated.items()},
-        }
+        pixels = {key: (each.rms_px, each.max_px) for key, each in own["stated"].items()}
+        return own | {"calibrated": calibrated, "pixels": pixels}
