@@ -32,7 +32,6 @@ def known_text(known: Known) -> str:
 
 
 fitted = grouped("What is fitted")
-seen = grouped("Cameras")
 
 
 @dataclass(frozen=True)

@@ -11,24 +11,24 @@ import numpy as np
 
 from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.pixels.beside import FittedImages, as_instrument, fitted_on
-from minimax_cal.fitting.pixels.drawing import Drawing, Scale, scale_of
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.pixels.judge import (
+    Drawing,
     Uncertainty,
     arms_apart,
     drawn_sigma,
     position_sigma,
+    scale_of,
     uncertainty_of,
 )
 from minimax_cal.fitting.pixels.options import FIELDS, WORST_CAMERA, PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import contradiction, file_notices, outlier_notices
-from minimax_cal.fitting.pixels.result import Claim, PixelCalibration
 from minimax_cal.fitting.several.fit import at_worst
 from minimax_cal.fitting.several.kinds import READ, Asked, assembled, by_key, extremes
 from minimax_cal.fitting.several.options import SUM
-from minimax_cal.fitting.several.result import Measured
+from minimax_cal.fitting.several.result import Claim, Measured, PixelCalibration
 from minimax_cal.fitting.several.stack import Block, Stack
-from minimax_cal.fitting.several.worst import Worst, WorstPixels
+from minimax_cal.fitting.several.worst import WorstPixels
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
@@ -114,26 +114,19 @@ def fitted(
 
 @dataclass(frozen=True, eq=False)
 class Determined:
-    """What pixels determine.  held: (m,) poses left out.  drawing, scale: of the least squares."""
+    """What pixels determine.  held: (m,) poses left out."""
 
     robot: Robot
     data: PixelData
     held: Array
     fit: PixelFit
     sure: Uncertainty
-    drawing: Drawing
-    scale: Scale | None
     notices: tuple[str, ...]
 
     @property
     def train(self) -> PixelData:
         """The pixels that were fitted."""
         return self.data.some(~self.held[self.data.pose])
-
-    @property
-    def worst(self) -> Worst | None:
-        """What a minimax rests on."""
-        return self.fit.worst
 
 
 def determined(
@@ -146,10 +139,7 @@ def determined(
     fit = of_worst(fitted_on(robot, train, options, progress), options)
     progress("sigmas")
     _, group = np.unique(groups(data.at)[train.pose], return_inverse=True)
-    sure = uncertainty_of(robot, fit, group.reshape(-1))
-    length = np.arange(5 * robot.joints) < 2 * robot.joints  # known already where by_drawing
-    drawing = Drawing.of(robot, fit, sure, ~(length & fit.by_drawing))
-    return Determined(robot, data, held, fit, sure, drawing, scale_of(robot, fit, sure), said)
+    return Determined(robot, data, held, fit, uncertainty_of(robot, fit, group.reshape(-1)), said)
 
 
 def of_worst(fit: PixelFit, options: PixelOptions) -> PixelFit:
@@ -171,10 +161,11 @@ def of_worst(fit: PixelFit, options: PixelOptions) -> PixelFit:
 
 def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCalibration:
     """The result: whether to use the arm, and how good it is.  began: by `time.perf_counter`."""
-    robot, data, held, scale = one.robot, one.data, one.held, one.scale
-    fit, sure = one.fit, one.sure
+    robot, data, held, fit, sure = one.robot, one.data, one.held, one.fit, one.sure
+    among = np.arange(5 * robot.joints) >= 2 * robot.joints * fit.by_drawing  # lengths are in it
+    scale, drawing = scale_of(robot, fit, sure), Drawing.of(robot, fit, sure, among)
     if options.drawn_prior:
-        fit, sure = one.drawing.beside(fit, sure)
+        fit, sure = drawing.beside(fit, sure)
     images = FittedImages.of(robot, fit)
     stack = Stack.of(robot, [images], [images.kind])
     found = replace(fit, problem=replace(fit.problem, stack=stack), covariance=sure.covariance,
@@ -193,7 +184,7 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
         instrument=images.placed(*arms[1], fit.nominal.effects) | scaled,
     )  # fmt: skip
     arm = robot.with_mdh(fit.state.mdh)
-    claim = claimed(robot, arm, sure, one.drawing.share)
+    claim = claimed(robot, arm, sure, drawing.share)
     reason, status = contradiction(robot, one.train, fit, scale, options), fit.found.status[0]
     told = () if reason else file_notices(one.train, fit, scale)
     fits_links = fit.problem.active[: 5 * robot.joints].any()

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.fitting.options import Options, check_resolution
-from minimax_cal.fitting.several.options import SUM, WORST_TARGET, RelativeOptions
+from minimax_cal.fitting.several.options import SUM, WORST_TARGET, RelativeOptions, seen
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.instruments.camera import FLANGE, GROUND, INTRINSICS
-from minimax_cal.instruments.options import seen
 from minimax_cal.reading.rows import Rows
 
 WORST_CAMERA = "camera"

@@ -10,8 +10,8 @@ import scipy
 
 from minimax_cal.fitting.checks import POOR_FIT, check_mends, too_changed
 from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
-from minimax_cal.fitting.pixels.drawing import Scale
 from minimax_cal.fitting.pixels.fit import FAR_LENS, PixelFit
+from minimax_cal.fitting.pixels.judge import Scale
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import IMAGES, Started, poses_of_images, start_scene
 from minimax_cal.ground.arrays import Array

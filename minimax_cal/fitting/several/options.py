@@ -19,10 +19,11 @@ from minimax_cal.fitting.options import (
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.options import grouped
 from minimax_cal.ground.stages import Progress as Progress
 from minimax_cal.ground.stages import silent as silent
 from minimax_cal.instruments.instrument import Instrument
-from minimax_cal.instruments.options import InstrumentOptions, fitted, seen
+from minimax_cal.instruments.options import InstrumentOptions, fitted
 from minimax_cal.instruments.table import INSTRUMENTS, instrument
 from minimax_cal.instruments.tracker import Points
 from minimax_cal.measuring.measurements import Measurements
@@ -31,6 +32,7 @@ from minimax_cal.modelling.parameters import Names
 from minimax_cal.solvers.least_squares import AUTO, METHODS
 
 SUM, WORST_TARGET = "sum", "minimax"  # what is minimised
+seen = grouped("Cameras")
 
 
 def noise_of(text: str) -> tuple[str, float]:
