@@ -66,12 +66,17 @@ class FittedImages(Images):
         Of all images, where `fit` is of those that are not held.
         """
         fit, data = self.fit, self.images
-        known, wrong = fit.known_of(data), np.zeros(data.count, dtype=bool)
+        seen = np.isin(np.arange(len(data.targets)), fit.images.pixels.target)
+        known, wrong = (seen | self.has_length)[data.target], np.zeros(data.count, dtype=bool)
         trained = ~held[data.pose]
         wrong[trained] = ~fit.images.counted
         later = np.flatnonzero(~trained & known)
         limit = np.linalg.norm(fit.problem.errors(fit.state)[:, fit.images.counted], axis=0)
-        wrong[later] = standing_out(fit.everywhere(self.robot, data), fit.state, later, limit)
+        alike = replace(
+            self, pixels=data, weight=np.ones(data.count), doubt=self.doubt[:0], metre=1.0
+        )
+        problem = PixelSquares.of(self.robot, alike)
+        wrong[later] = standing_out(problem, fit.state, later, limit)
         return known & ~wrong, wrong
 
     def errors(self, arm: FlangePoses, own: Array, held: Array) -> Array:

@@ -170,8 +170,8 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
     stack = Stack.of(robot, [images], [images.kind])
     found = replace(fit, problem=replace(fit.problem, stack=stack), covariance=sure.covariance,
                     noise=images.metre * fit.noise)  # fmt: skip
-    asked = Asked(robot, [as_instrument(data)], options, [(held, one.notices)])
-    every = images.at_rows_of(as_instrument(data))
+    plain = as_instrument(data)
+    asked, every = Asked(robot, [plain], options, [(held, one.notices)]), images.at_rows_of(plain)
     counts, wrong = every.counting(held)
     arms = [Block.of(robot, every).at(x) for x in (fit.nominal, fit.state)]
     before, after = (every.table(*arm, counts) for arm in arms)
