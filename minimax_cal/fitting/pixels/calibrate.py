@@ -24,9 +24,9 @@ from minimax_cal.fitting.pixels.judge import (
 from minimax_cal.fitting.pixels.options import FIELDS, WORST_CAMERA, PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import contradiction, file_notices, outlier_notices
 from minimax_cal.fitting.several.fit import at_worst
-from minimax_cal.fitting.several.kinds import READ, Asked, assembled, by_key, extremes
+from minimax_cal.fitting.several.kinds import READ, Asked, assembled, by_key, extremes, measured_by
 from minimax_cal.fitting.several.options import SUM
-from minimax_cal.fitting.several.result import Claim, Measured, PixelCalibration
+from minimax_cal.fitting.several.result import Claim, PixelCalibration
 from minimax_cal.fitting.several.stack import Block, Stack
 from minimax_cal.fitting.several.worst import WorstPixels
 from minimax_cal.ground.arrays import Array
@@ -174,15 +174,14 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
     asked, every = Asked(robot, [plain], options, [(held, one.notices)]), images.at_rows_of(plain)
     counts, wrong = every.counting(held)
     arms = [Block.of(robot, every).at(x) for x in (fit.nominal, fit.state)]
-    before, after = (every.table(*arm, counts) for arm in arms)
     drawn, ended = (np.linalg.norm(every.off(*arm), axis=0)[None, counts] for arm in arms)
-    errors = by_key(before, after, held)
+    measured = measured_by(robot, found, 0, plain, held)
     scaled = {"lengths_over_drawn": {"share": scale.share, "sigma": scale.sigma}} if scale else {}
-    measured = Measured(
-        kind=every.kind, parts=every.parts, errors=errors, turns={},
-        numbers={key: 2 * sum(accuracy(error).counts) for key, error in errors.items()},
-        instrument=images.placed(*arms[1], fit.nominal.effects) | scaled,
-    )  # fmt: skip
+    measured = replace(
+        measured,
+        numbers={key: 2 * sum(each.counts) for key, each in measured.accuracy.items()},
+        instrument={**measured.instrument, **scaled},
+    )
     arm = robot.with_mdh(fit.state.mdh)
     claim = claimed(robot, arm, sure, drawing.share)
     reason, status = contradiction(robot, one.train, fit, scale, options), fit.found.status[0]
