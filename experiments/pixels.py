@@ -36,10 +36,10 @@ from experiments.pixel_cells import (
     taken,
 )
 from experiments.sweep import Study, study_options
+from minimax_cal.fitting.pixels.calibrate import fitted
 from minimax_cal.fitting.pixels.fit import ANY, PixelSquares, by_depths, fit_drawn, reprojected
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import directions, from_far, poses_of_images, start_scene
-from minimax_cal.fitting.several.pixel_calibration import fitted
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.stages import silent
 from minimax_cal.ground.tables import Table
@@ -132,9 +132,8 @@ def whole_poses(job: Job) -> Found:
     """A pose from each image, then a calibration from whole poses."""
     cell = cell_of(job)
     data = data_of(cell)
-    image = poses_of_images(data, directions(data))
-    rows = [pose for _, pose in image]
-    pose = np.stack([resected(cell, data, row, found) for (_, row), found in image.items()])
+    rows, image = poses_of_images(data, directions(data))[0]
+    pose = np.stack([resected(cell, data, *each) for each in zip(rows, image, strict=True)])
     fit = mc.relative(cell.drawn, flange_poses(data.at.q[rows], np.linalg.inv(pose)))
     return Found(arm_error(cell, fit.robot), 1e3 * fit.position_sigma, np.nan)
 

@@ -24,8 +24,8 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.fitting.calibrate import calibrate, calibrate_many
     from minimax_cal.fitting.fit import Fit, load_fit
     from minimax_cal.fitting.options import Options
+    from minimax_cal.fitting.pixels.calibrate import calibrate_pixels
     from minimax_cal.fitting.several.kinds import relative
-    from minimax_cal.fitting.several.pixel_calibration import calibrate_pixels
     from minimax_cal.ground.errors import (
         CalibrationError,
         CalibrationWarning,
@@ -163,7 +163,7 @@ MODULES = {  # name: where it is defined
     "Options": "fitting.options",
     "calibrate": "fitting.calibrate",
     "calibrate_many": "fitting.calibrate",
-    "calibrate_pixels": "fitting.several.pixel_calibration",
+    "calibrate_pixels": "fitting.pixels.calibrate",
     "relative": "fitting.several.kinds",
     "bootstrap": "judging.bootstrap",
     "evaluate": "judging.saved",

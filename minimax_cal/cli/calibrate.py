@@ -26,9 +26,10 @@ from minimax_cal.cli.options import (
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options
-from minimax_cal.fitting.pixels.options import PixelFiles, PixelOptions
+from minimax_cal.fitting.pixels.options import FIELDS, PixelFiles, PixelOptions
 from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.ground.files import json_text, plain
+from minimax_cal.instruments.images import Images
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.reporting.plots.figures import save_errors
 from minimax_cal.robots.kernels.choice import work
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from minimax_cal.judging.bootstrap import Bootstrap
 
 OPTIONS = {f.name for kind in (Options, RelativeOptions) for f in fields(kind)}
+CAMERAS = (*Images.options, "drawn_prior")
 BRIEF = 1000  # poses that one fit needs no compiled kernels for
 
 
@@ -47,7 +49,7 @@ BRIEF = 1000  # poses that one fit needs no compiled kernels for
 @options_from(Options)
 @options_from(RelativeOptions, "offset", "known_distances", "noises")
 @options_from(PixelFiles)
-@options_from(PixelOptions)
+@options_from(PixelOptions, *CAMERAS)
 @ROWS
 @plain_option(
     "What is known",
@@ -118,11 +120,10 @@ def calibrate_command(
 
 def by_cameras(robot: str, files: PixelFiles, to: Output, chosen: dict[str, Any]) -> int:
     """Calibrate from pixels.  Raises OptionError for what they do not know."""
-    from minimax_cal.fitting.several.pixel_calibration import calibrate_pixels
+    from minimax_cal.fitting.pixels.calibrate import calibrate_pixels
 
-    known = {field.name for field in fields(PixelOptions)}
-    refuse({*chosen, "replicates", "in_rows", "without"} - known, "is not for pixels")
-    own = {name: chosen[name] for name in on_command_line() & known}
+    refuse({*chosen, "replicates", "in_rows", "without"} - {*FIELDS}, "is not for pixels")
+    own = {name: chosen[name] for name in on_command_line() & {*FIELDS}}
     fit = to.work(calibrate_pixels, robot, *files.paths(), **own)
     return to.finish(fit, status=fit.status, reason=fit.reason)
 

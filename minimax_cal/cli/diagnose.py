@@ -34,7 +34,7 @@ from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.dynamics.logs import are_logs
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.options import Options
-from minimax_cal.fitting.pixels.options import PixelFiles, PixelOptions
+from minimax_cal.fitting.pixels.options import PixelFiles
 from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Table, filled
@@ -50,9 +50,8 @@ from minimax_cal.solvers.status import Status
 @SOME_CAMPAIGNS
 @options_from(Options, "holdout", "seed", "holdout_by", "instrument")
 @options_from(DiagnosisOptions)
-@options_from(RelativeOptions, "offset", "known_distances", "lever", "noises")
+@options_from(RelativeOptions, "offset", "known_distances", "lever", "noises", *Images.options)
 @options_from(PixelFiles)
-@options_from(PixelOptions, *Images.options)
 @workers(1, "1")
 @ROWS
 @result_options("the diagnosis (JSON)", keep="diagnosis.json", figure="the gap and where it lies")

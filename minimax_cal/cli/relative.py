@@ -20,10 +20,9 @@ from minimax_cal.cli.options import (
 )
 from minimax_cal.diagnosing.diagnose import DiagnosisOptions
 from minimax_cal.fitting.options import Options
-from minimax_cal.fitting.pixels.options import PixelFiles, PixelOptions
+from minimax_cal.fitting.pixels.options import PixelFiles
 from minimax_cal.fitting.several import RelativeOptions, relative
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.instruments.images import Images
 
 
 @command
@@ -32,7 +31,6 @@ from minimax_cal.instruments.images import Images
 @options_from(Options, "holdout", "seed", "fix", "free", "priors", "effects")
 @options_from(RelativeOptions)
 @options_from(PixelFiles)
-@options_from(PixelOptions, *Images.options)
 @options_from(Options, "qp", "method", "loss")
 @plain_option(
     "What is sought",

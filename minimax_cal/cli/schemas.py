@@ -12,7 +12,7 @@ KINDS = {  # by name the class that reads such a file
     "robot": "robots.robot.RobotSchema",
     "calibration": "fitting.fit.Fit",
     "relative": "fitting.several.result.RelativeCalibration",
-    "pixels": "fitting.several.pixel_result.PixelCalibration",
+    "pixels": "fitting.several.result.PixelCalibration",
     "diagnosis": "diagnosing.result.Diagnosis",
     "simulator_gap": "simulators.result.SimulatorGap",
     "motion_gap": "simulators.result.MotionGap",

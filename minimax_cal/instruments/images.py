@@ -243,14 +243,10 @@ class Images(Instrument):
         every = np.concatenate([self.lens(own), self.intrinsic[:, LENS:]], axis=1).T
         return every if every.shape[1] == 1 else every[:, self.pixels.camera]
 
-    def predicted(self, arm: FlangePoses, own: Array) -> Array:
-        """(2, N) [px]."""
-        x, y, z = self.in_view(arm, own).point.T
-        return distorted(self.lenses(own), x / z, y / z)
-
     def off(self, arm: FlangePoses, own: Array) -> Array:
         """(2, N) measured minus predicted [px]."""
-        return np.asarray(self.pixels.pixel.T - self.predicted(arm, own))
+        x, y, z = self.in_view(arm, own).point.T
+        return np.asarray(self.pixels.pixel.T - distorted(self.lenses(own), x / z, y / z))
 
     def depth(self, arm: FlangePoses, own: Array) -> Array:
         """(N,) of the targets in the cameras [m]."""

@@ -197,7 +197,7 @@ def of_instrument(source: Given, one: Instrument, rung: int | None) -> Evaluatio
     one, options = replace(one, at=check_joints(robot, one.at)), RelativeOptions()
     stack = stack_of(robot, [Train("", one)], options)
     x, block = start_of(robot, stack, allowed_of(stack, options)[0]), stack.blocks[0]
-    error = block.instrument.errors(block.flange(x), block.own(x), np.zeros(one.poses, dtype=bool))
+    error = block.instrument.errors(*block.at(x), np.zeros(one.poses, dtype=bool))
     found, data = accuracy(error), one.at
     seen = bool(data.digest) and data.digest in opened.digest.split()
     said = [f"{data.source}: what the instrument has of its own is fitted to these rows"]

@@ -22,7 +22,7 @@ from minimax_cal.fitting.identify import RESOLUTION
 from minimax_cal.fitting.pixels.fit import PixelSquares
 from minimax_cal.fitting.pixels.judge import everywhere, free_motion
 from minimax_cal.fitting.pixels.options import PixelOptions
-from minimax_cal.fitting.several.pixel_result import PixelCalibration
+from minimax_cal.fitting.several.result import PixelCalibration
 from minimax_cal.fitting.several.stack import own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError

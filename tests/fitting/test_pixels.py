@@ -21,12 +21,11 @@ from experiments.pixel_cells import (
     make_cell,
     seen_by,
 )
-from minimax_cal.fitting.pixels.determined import determined
+from minimax_cal.fitting.pixels.calibrate import concluded, determined, fitted
 from minimax_cal.fitting.pixels.fit import PixelSquares
-from minimax_cal.fitting.pixels.judge import Claim
 from minimax_cal.fitting.pixels.options import PixelOptions, check_options, doubts_of
 from minimax_cal.fitting.pixels.start import by_rotations, directions, merged, start_scene
-from minimax_cal.fitting.several.pixel_calibration import concluded, fitted
+from minimax_cal.fitting.several.result import Claim
 from minimax_cal.fitting.several.stack import own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments.camera import INTRINSICS, distorted, slopes, undistorted
@@ -336,7 +335,7 @@ def test_the_minimax_is_that_of_slsqp(objective, count):
     cell = cell_of(4, views=two_views(), points=board_points((4, 3), 0.06), poses=20)
     data, options = data_of(cell), PixelOptions(objective=objective, fix_camera=True)
     plain = determined(cell.drawn, data, replace(options, objective="sum"))
-    found = determined(cell.drawn, data, options)
+    found = determined(cell.drawn, data, options).fit
     assert found.worst is not None
     assert len(found.worst.functions) == count
     problem, kept = plain.fit.problem, plain.fit.images.counted

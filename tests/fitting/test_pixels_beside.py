@@ -23,8 +23,8 @@ from experiments.pixel_cells import (
     write_cell,
 )
 from minimax_cal.fitting.pixels.beside import as_instrument, detected
+from minimax_cal.fitting.pixels.calibrate import fitted
 from minimax_cal.fitting.pixels.options import PixelOptions
-from minimax_cal.fitting.several.pixel_calibration import fitted
 from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments.camera import read_camera
 from minimax_cal.instruments.pixels import read_pixels

@@ -26,9 +26,8 @@ from experiments.pixel_cells import (
     taken,
     write_cell,
 )
-from minimax_cal.fitting.pixels.determined import determined
+from minimax_cal.fitting.pixels.calibrate import determined, fitted
 from minimax_cal.fitting.pixels.options import PixelOptions
-from minimax_cal.fitting.several.pixel_calibration import fitted
 from minimax_cal.ground.arrays import Array
 from minimax_cal.planning.result import Plan
 from minimax_cal.robots.transforms import inverse

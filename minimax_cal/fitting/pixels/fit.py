@@ -20,7 +20,6 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.stages import Progress
 from minimax_cal.instruments.images import AXES, LENS, Images, Sight
-from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.instruments.protocol import FlangePoses
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.parameters import State, links_of, zero_positions
@@ -89,7 +88,7 @@ class PixelSquares(Squares):
 
     def at(self, x: State) -> tuple[FlangePoses, Array]:
         """The arm, and the images' own parameters."""
-        return self.block.flange(x), self.block.own(x)
+        return self.block.at(x)
 
     def errors(self, x: State) -> Array:
         """(2, N) measured minus predicted [px]."""
@@ -168,16 +167,6 @@ class PixelFit(InstrumentFit):
         _, slope = self.problem.block.rows(self.squares, self.problem.active)
         lens = slope[:, 2 * len(self.images.weight) :]
         return np.asarray((lens**2).sum(axis=1) + np.diag(self.problem.prior))
-
-    def known_of(self, data: PixelData) -> Array:
-        """(N,) True for pixels of targets whose place is known."""
-        seen = np.isin(np.arange(len(data.targets)), self.images.pixels.target)
-        return (seen | self.images.has_length)[data.target]
-
-    def everywhere(self, robot: Robot, data: PixelData) -> PixelSquares:
-        """Pixels of all poses, alike, without what files know."""
-        plain = replace(self.images, at=data.at, pixels=data, doubt=self.doubt[:0])
-        return PixelSquares.of(robot, replace(plain, weight=np.ones(data.count)))
 
 
 def sigma_of(error: Array, weight: Array | None = None) -> float:

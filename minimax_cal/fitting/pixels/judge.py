@@ -6,25 +6,28 @@ What no link holds (gears, bending, servos) moves all pixels of an image togethe
 fitted along.  Each joint is taken to be turned by random functions of the pose (`modelling.lack`)
 and by a number of its own at each pose; how large they are, the pixels tell.  Where no pose was
 measured they are as large as elsewhere.
+
+A drawing may be better than its tolerance: how much, the pixels tell, by how far the arm that they
+make is from it [empirical Bayes, Efron and Morris 1973].
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Annotated
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import scipy
 
 from minimax_cal.evidence.noise import fit_components
 from minimax_cal.fitting.claims import TOOL
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.several.identify import lengths_of
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.facts import Fact, Mm, derived
 from minimax_cal.measuring.measurements import measurements
 from minimax_cal.modelling.cell import still
 from minimax_cal.modelling.model import TARGET, model_of
-from minimax_cal.modelling.parameters import State, zero_positions
+from minimax_cal.modelling.parameters import State, links_of, zero_positions
 from minimax_cal.modelling.rows import DRIVERS, UNIT, by_pose, joint_units
 from minimax_cal.modelling.start import fit_base
 from minimax_cal.robots.robot import Robot
@@ -157,8 +160,6 @@ def unfitted(robot: Robot, fit: PixelFit) -> Array:
 
 
 POSES = 300  # over the joints' whole range
-MARGIN = 2.0 / 3.0  # of the drawing's sigma: an arm less sure may be worse than drawn
-SAME = 1e-9  # arms so far apart are one and the same [m]
 
 
 def missed(robot: Robot, q: Array, point: Array) -> float:
@@ -242,47 +243,90 @@ def drawn_sigma(robot: Robot, lack: Lack, share: float = 1.0) -> float:
     return position_error(robot, share * drawn_covariance(robot), nothing, lack)
 
 
-@dataclass(frozen=True)
-class Claim:
-    """What is known of positions of the arm, RMS over the joints' range, base and tool fitted [m].
+# ---- the drawing beside the pixels --------------------------------------------------------------
 
-    sigma: of the calibrated arm.  drawn: of the drawing, by `drawn_within`.  change: between the
-    two.  shown: of the drawing, by how far the pixels show it to be off; 0 where they do not.
+
+SHARES = np.geomspace(1e-6, 1.0, 121)  # of the drawing's variance that are tried
+LEAST = 1e-12  # variance of a direction, in parts of the drawing's
+# twice a log-likelihood ratio: pixels contradict a drawing without error (1 of 100)
+EVIDENCE = 5.41
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """What a drawing knows of the links that were fitted.
+
+    links: (l,) their numbers.  off: (l,) of the drawing from the fit [m, rad].  cover: (l, l)
+    covariance of the fit, links that were not fitted as they are drawn.  noise: (l, l) of the
+    drawing, by `drawn_within`, with what the errors of those move the others.
     """
 
-    sigma: Mm
-    drawn: Annotated[float, Fact(key="drawn_sigma_mm", scale=1e3)]
-    change: Mm
-    shown: Annotated[float, Fact(key="drawn_shown_mm", scale=1e3)]
+    links: Array
+    off: Array
+    cover: Array
+    noise: Array
 
-    @derived(key="better")
-    def is_better(self) -> bool:
-        """Whether the calibrated arm is known clearly better than the drawn one."""
-        return self.sigma < MARGIN * self.shown
+    @staticmethod
+    def of(robot: Robot, fit: PixelFit, sure: Uncertainty, among: Array) -> Drawing:
+        """That of an arm.  among: (5n,) True for links that count."""
+        links = np.flatnonzero(among & fit.problem.active[: len(among)])
+        off = links_of(robot.mdh - fit.state.mdh)[links]
+        some = np.ix_(links, links)
+        noise = drawn_covariance(robot)[some] + (sure.drawn @ sure.drawn.T)[some]
+        return Drawing(links, off, sure.covariance[some], noise)
 
-    def texts(self) -> dict[str, str]:
-        """Each number for people."""
-        return {f.name: f"{1e3 * getattr(self, f.name):#.3g} mm" for f in fields(self)}
+    @cached_property
+    def share(self) -> float:
+        """The likeliest share of the variance by `drawn_within`, 0 where none is as likely."""
+        root = np.linalg.inv(np.linalg.cholesky(self.noise))
+        size, axes = np.linalg.eigh(root @ self.cover @ root.T)
+        square = (axes.T @ root @ self.off) ** 2
+        every = np.maximum(size, LEAST) + np.append(0.0, SHARES)[:, None]
+        deviance = (np.log(every) + square / every).sum(axis=1)
+        best = int(np.argmin(deviance))
+        return float(SHARES[best - 1]) if deviance[0] - deviance[best] > EVIDENCE else 0.0
 
-    def sentence(self) -> str:
-        """For people."""
-        mm = self.texts()
-        if self.change < SAME:
-            return (
-                "The arm stays as drawn: cameras and targets go with it, whose positions the "
-                f"drawing knows to {mm['drawn']} RMS (drawn_within)."
-            )
-        said = (
-            f"These pixels determine a position of the arm to {mm['sigma']} RMS (sigma over the "
-            "joints' whole range, lack of fit and the lenses' doubt included); the drawing knows "
-            f"it to {mm['drawn']} (drawn_within), and the calibrated arm differs from it by "
-            f"{mm['change']}"
-        )
-        if self.is_better:
-            return f"{said}: the calibrated arm is better."
-        if self.sigma >= self.drawn:
-            return f"{said}: keep the drawn arm; take more images, nearer, with more tilt."
-        return (
-            f"{said}. By that the drawing is off by {mm['shown']}, too little to be sure: keep the "
-            "drawn arm."
-        )
+    def beside(self, fit: PixelFit, sure: Uncertainty) -> tuple[PixelFit, Uncertainty]:
+        """The fit with the drawing as a prior; as it was where it is taken to be without error."""
+        if not self.share:
+            return fit, sure
+        noise = self.share * self.noise
+        across = np.nan_to_num(sure.covariance[self.links])
+        gain = np.linalg.solve(self.cover + noise, across).T
+        step = np.where(fit.problem.active, gain @ self.off, 0.0)
+        return replace(fit, state=fit.state.step(step)), sure.after(gain, self.links, noise)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """By which share the arm's lengths come out longer than drawn, as one factor.
+
+    sigma: of that, by pixels, drawing and by how little one factor explains.  p_value: of no
+    factor.
+    """
+
+    share: float
+    sigma: float
+    p_value: float
+
+
+def scale_of(robot: Robot, fit: PixelFit, sure: Uncertainty) -> Scale | None:
+    """One factor of all lengths, by generalised least squares; None where nothing tells it.
+
+    Without a board the drawing gives the scale; the tool's lengths may be anything.
+    """
+    n = robot.joints
+    number = np.arange(5 * n)
+    length = number < 2 * n
+    drawing = Drawing.of(robot, fit, sure, ~(length & (number % n == n - 1)))
+    drawn = np.where(length, links_of(robot.mdh), 0.0)[drawing.links]
+    dof = len(drawn) - 1
+    if not fit.images.has_length or robot.rough or not drawn.any() or dof < 1:
+        return None
+    root = np.linalg.cholesky(drawing.cover + drawing.noise)
+    white = np.linalg.solve(root, np.stack([drawn, -drawing.off], axis=1))
+    told = float(white[:, 0] @ white[:, 0])
+    share = float(white[:, 0] @ white[:, 1]) / told
+    left = float(((white[:, 1] - share * white[:, 0]) ** 2).sum()) / dof
+    sigma = float(np.sqrt(max(left, 1.0) / told))
+    return Scale(share, sigma, float(2.0 * scipy.stats.t.sf(abs(share) / sigma, dof)))

@@ -9,14 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.fitting.options import Options, QpSolver, check_resolution, qp_name
+from minimax_cal.fitting.options import Options, check_resolution
+from minimax_cal.fitting.several.options import SUM, WORST_TARGET, RelativeOptions, seen
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.options import grouped
 from minimax_cal.instruments.camera import FLANGE, GROUND, INTRINSICS
 from minimax_cal.reading.rows import Rows
 
-SUM, WORST_TARGET, WORST_CAMERA = OBJECTIVES = ("sum", "minimax", "camera")
+WORST_CAMERA = "camera"
+OBJECTIVES = (SUM, WORST_TARGET, WORST_CAMERA)
 # How well a camera's file knows its lens: a share of the focal length, pixels of the centre, and
 # the first radial and both tangential coefficients; higher radial ones are known worse.
 DOUBTS = {"f": 1e-3, "c": 2.0, "k": 5e-3, "p": 5e-4}
@@ -57,9 +58,6 @@ def cameras_of(texts: Sequence[str]) -> dict[str, str]:
     if len(named) < len(texts):
         raise OptionError("camera= gives one name twice; each camera has its own")
     return named
-
-
-seen = grouped("Cameras")
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,9 +106,15 @@ class PixelFiles:
         return self.pixels, self.joints, cameras_of(self.camera), self.board
 
 
+FIELDS = (  # that are of pixels
+    "objective", "qp", "camera_on", "fix_camera", "camera_prior", "drawn_prior", "holdout", "seed",
+    "fix", "free", "resolution", "allow_large_changes",
+)  # fmt: skip
+
+
 @dataclass(frozen=True)
-class PixelOptions:
-    """How to calibrate.
+class PixelOptions(RelativeOptions):
+    """How to calibrate, by `FIELDS`.
 
     objective: sum, minimax (the worst target) or camera (the worst camera).
     qp: backend of the minimax QPs.  camera_on: flange or ground; what fits better unless given.
@@ -123,36 +127,15 @@ class PixelOptions:
     allow_large_changes: accept an arm that is another than the one drawn.
     """
 
-    objective: str = SUM
-    qp: QpSolver = Options.qp
-    camera_on: str = seen(
-        "",
-        "What the cameras are fixed to: flange or ground [default: what fits better].",
-        metavar="flange|ground",
-    )
-    fix_camera: bool = seen(
-        False,
-        "Hold the lenses as their files say, taken as known but where a prior of theirs is given.",
-    )
-    camera_prior: str = seen(
-        "",
-        "How well the files know the lenses: focal length, centre, radial and tangential "
-        "distortion [default: f 0.1%, c 2px, k 0.005, p 0.0005].",
-        metavar='"f 0.1%, c 2px"',
-    )
     drawn_prior: bool = seen(
         False, "Take the drawing as a prior, as well as the robot's drawn_within says or better."
     )
-    holdout: float = Options.holdout
-    seed: int = Options.seed
-    fix: Sequence[str] = ()
-    free: Sequence[str] = ()
-    resolution: float = Options.resolution
     allow_large_changes: bool = Options.allow_large_changes
 
     def settings(self) -> dict[str, object]:
         """For the record."""
-        return {**vars(self), "qp": qp_name(self.qp)}
+        every = super().settings()
+        return {name: every[name] for name in FIELDS}
 
     def lens_sigma(self, intrinsic: Array) -> Array:
         """(c, 9) standard deviations of the lenses.  intrinsic: (c, 16)."""

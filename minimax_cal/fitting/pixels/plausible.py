@@ -10,8 +10,8 @@ import scipy
 
 from minimax_cal.fitting.checks import POOR_FIT, check_mends, too_changed
 from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
-from minimax_cal.fitting.pixels.drawing import Scale
 from minimax_cal.fitting.pixels.fit import FAR_LENS, PixelFit
+from minimax_cal.fitting.pixels.judge import Scale
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import IMAGES, Started, poses_of_images, start_scene
 from minimax_cal.ground.arrays import Array
@@ -71,13 +71,10 @@ def other_poses(robot: Robot, data: PixelData, seen: Array) -> list[tuple[str, P
     The angle by which a board turns between two images is that of the arm between their poses,
     wherever the camera and the board are.  seen: (2, N) directions.
     """
-    first = int(np.bincount(data.camera).argmax())
-    image = poses_of_images(data, seen)
-    rows = np.array([pose for camera, pose in image if camera == first], dtype=int)
+    rows, shown = poses_of_images(data, seen)[int(np.bincount(data.camera).argmax())]
     if not IMAGES < len(rows) <= MOST_PAIRED:
         return []
-    shown = angles_between(np.stack([image[first, row] for row in rows]))
-    pose = paired(shown, angles_between(robot.pose(data.at.q)), rows)
+    pose = paired(angles_between(shown), angles_between(robot.pose(data.at.q)), rows)
     place = np.arange(data.at.poses)
     place[rows] = pose
     known = np.isin(data.pose, rows)

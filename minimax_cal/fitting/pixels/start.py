@@ -47,6 +47,7 @@ NEARBY = 1e-3  # least depth of a target [m]
 SHALLOW = 0.05  # of the largest depth: what is nearer counts no more
 BEHIND = 0.2  # error of what lies behind a camera, as a tangent
 SOFT = 0.01  # errors count less from here on
+Shown = tuple[Array, Array]  # (i,) rows of poses, and (i, 4, 4) pose of a board at each
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +92,9 @@ def from_far(robot: Robot, data: PixelData, started: Started) -> Started:
     any start.
     """
     on_flange, image = started.images.on_flange, poses_of_images(data, started.direction)
-    first = int(np.bincount(data.camera).argmax())
-    rows = np.array([pose for camera, pose in image if camera == first], dtype=int)
+    rows, pose = image[int(np.bincount(data.camera).argmax())]
     if len(rows) < IMAGES:
         return started
-    pose = np.stack([image[first, row] for row in rows])
     targets = seen_reflectors(data, rows, np.linalg.inv(pose) if on_flange else pose)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CalibrationWarning)
@@ -115,12 +114,13 @@ def from_far(robot: Robot, data: PixelData, started: Started) -> Started:
     return replace(started, begin=own_state(arm.mdh, own))
 
 
-def depths(data: PixelData, image: dict[tuple[int, int], Array]) -> Array:
+def depths(data: PixelData, image: Sequence[Shown]) -> Array:
     """(N,) of each target by the pose of its board in its image, 0 where there is none [m]."""
     out = np.zeros(data.count)
-    for (camera, pose), found in image.items():
-        mine = (data.camera == camera) & (data.pose == pose)
-        out[mine] = data.board[data.target[mine]] @ found[2, :3] + found[2, 3]
+    for camera, shown in enumerate(image):
+        for row, found in zip(*shown, strict=True):
+            mine = (data.camera == camera) & (data.pose == row)
+            out[mine] = data.board[data.target[mine]] @ found[2, :3] + found[2, 3]
     return out
 
 
@@ -149,19 +149,22 @@ def plane_of(board: Array) -> Array:
     return transform(axes.T, centre)
 
 
-def poses_of_images(data: PixelData, seen: Array) -> dict[tuple[int, int], Array]:
-    """Pose (4, 4) of a flat board in the camera by camera and pose, where it shows [m]."""
+def poses_of_images(data: PixelData, seen: Array) -> list[Shown]:
+    """Of each camera where a flat board shows, and its pose in the camera there [m]."""
     if not is_flat(data.board):
-        return {}
+        return [(np.zeros(0, dtype=int), np.zeros((0, 4, 4)))] * len(data.cameras)
     plane = plane_of(data.board)
     local = (data.board - plane[:3, 3]) @ plane[:3, :3]
-    out = {}
-    for camera, pose in sorted(set(zip(data.camera.tolist(), data.pose.tolist(), strict=True))):
-        rows = np.flatnonzero((data.camera == camera) & (data.pose == pose))
-        if len(rows) >= CORNERS:
-            found = pose_of_plane(local[data.target[rows], :2], seen[:, rows].T)
-            if found is not None:
-                out[camera, pose] = found @ np.linalg.inv(plane)
+    out = []
+    for camera in range(len(data.cameras)):
+        every = {}
+        for pose in np.unique(data.pose[data.camera == camera]):
+            rows = np.flatnonzero((data.camera == camera) & (data.pose == pose))
+            if len(rows) >= CORNERS:
+                found = pose_of_plane(local[data.target[rows], :2], seen[:, rows].T)
+                if found is not None:
+                    every[pose] = found @ np.linalg.inv(plane)
+        out.append((np.array([*every], dtype=int), np.array([*every.values()]).reshape(-1, 4, 4)))
     return out
 
 
@@ -210,33 +213,23 @@ def centred(places: Array) -> tuple[Array, Array]:
 
 
 def by_poses(
-    robot: Robot, data: PixelData, on_flange: bool, image: dict[tuple[int, int], Array]
+    robot: Robot, data: PixelData, on_flange: bool, image: Sequence[Shown]
 ) -> list[tuple[Array, Array, Array]]:
     """`by_pose` of each camera; none where one of them has too few images."""
-    every = (by_pose(robot, data, on_flange, image, i) for i in range(len(data.cameras)))
-    found = [each for each in every if each is not None]
-    return found if len(found) == len(data.cameras) else []
+    if any(len(rows) < IMAGES for rows, _ in image):
+        return []
+    return [by_pose(robot, data, on_flange, *shown) for shown in image]
 
 
 def by_pose(
-    robot: Robot,
-    data: PixelData,
-    on_flange: bool,
-    image: dict[tuple[int, int], Array],
-    camera: int,
-) -> tuple[Array, Array, Array] | None:
+    robot: Robot, data: PixelData, on_flange: bool, rows: Array, pose: Array
+) -> tuple[Array, Array, Array]:
     """Pose (4, 4) of a camera, pose (4, 4) of the board, and the places (k, 3) of its targets.
 
-    As a tracker sees whole poses: the still one of camera and board is the tracker.  None where
-    too few images tell a pose.
+    As a tracker sees whole poses: the still one of camera and board is the tracker.  rows, pose:
+    as `Shown`.
     """
-    rows = [pose for each, pose in image if each == camera]
-    if len(rows) < IMAGES:
-        return None
-    pose = np.stack([image[camera, row] for row in rows])
-    if on_flange:
-        pose = np.linalg.inv(pose)
-    targets = seen_reflectors(data, np.array(rows), pose)
+    targets = seen_reflectors(data, rows, np.linalg.inv(pose) if on_flange else pose)
     for _ in range(REWEIGHED):  # images that the arm contradicts are left out
         found = fit_base(model_of(robot, targets), robot.mdh).state
         error = np.linalg.norm(model_of(robot, targets).error(found), axis=-1).max(axis=0)

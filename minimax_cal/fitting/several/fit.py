@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import TypeVar, cast
 
 import numpy as np
 
 from minimax_cal.fitting.found import Parameter, link_by_link
 from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.options import freed
-from minimax_cal.fitting.pixels.options import SUM, PixelOptions
+from minimax_cal.fitting.options import QpSolver, freed
 from minimax_cal.fitting.several.identify import (
     Alone,
     determined_alone,
@@ -20,6 +19,7 @@ from minimax_cal.fitting.several.identify import (
 )
 from minimax_cal.fitting.several.laws import Laws
 from minimax_cal.fitting.several.options import (
+    SUM,
     Progress,
     RelativeOptions,
     sigmas_of,
@@ -86,6 +86,9 @@ class InstrumentFit:
         return self.stack.part(self.nominal, i), self.stack.part(self.state, i)
 
 
+F = TypeVar("F", bound=InstrumentFit)
+
+
 def stack_of(robot: Robot, trains: Sequence[Train], options: RelativeOptions) -> Stack:
     """The training measurements as a least-squares problem."""
     alone = [each.data.ready(robot, options) for each in trains]
@@ -96,7 +99,7 @@ def stack_of(robot: Robot, trains: Sequence[Train], options: RelativeOptions) ->
     return replace(stack, given=np.square(of_rows))
 
 
-def allowed_of(stack: Stack, options: RelativeOptions | PixelOptions) -> tuple[Array, Array]:
+def allowed_of(stack: Stack, options: RelativeOptions) -> tuple[Array, Array]:
     """What may be fitted (p,), and what is to be given up last (p,); the base is no unknown."""
     names = stack.names
     allowed = ~names.match(options.fix, "fix")
@@ -162,27 +165,37 @@ def of_worst(fit: InstrumentFit, options: RelativeOptions) -> InstrumentFit:
     """
     if options.objective == SUM or fit.found.status[0] is Status.FAILED:
         return fit
-    stack, problem, every = fit.stack, fit.problem, fit.stack.part_of_rows(fit.state)
-    seen, number = np.unique(every[every >= 0], return_inverse=True)
-    of = every.copy()
-    of[every >= 0] = number.reshape(-1)
-    best, share, notes = least_worst(problem, of, 1, fit.state, options.qp, LEAST_NOISE)
+    of, names = fit.stack.part_of_rows(fit.state), fit.stack.parts
+    fit, share = at_worst(fit, of, names, 1, options.qp, LEAST_NOISE, Worst)
+    shares = share, share**2
+    covariance = covariance_of(fit.problem, fit.state, np.square(fit.noise), shares)
+    return replace(fit, covariance=covariance)
+
+
+def at_worst(
+    fit: F, of: Array, names: Sequence[str], numbers: int, qp: QpSolver, rounding: float,
+    kind: type[Worst],
+) -> tuple[F, Array]:  # fmt: skip
+    """The minimax from a fit of the sum, and (r,) how much each row counts in it.
+
+    of: (r,) which of the names each row is of, else as `RowMinimax.at` has it, as numbers.
+    rounding: as of `least_worst`.
+    """
+    some = of >= 0
+    seen, number = np.unique(of[some], return_inverse=True)
+    of, number = of.copy(), number.reshape(-1)
+    of[some] = number
+    best, share, notes = least_worst(fit.problem, of, numbers, fit.state, qp, rounding)
 
     def sizes(x: State) -> Array:
-        none = np.zeros(stack.names.count, dtype=bool)
-        square = np.concatenate([error for error, _ in stack.rows_by_block(x, none)]) ** 2
-        return np.asarray(
-            np.sqrt(np.bincount(of[of >= 0], square[of >= 0]) / np.bincount(of[of >= 0]))
-        )
+        none = np.zeros(fit.stack.names.count, dtype=bool)
+        error = np.concatenate([error for error, _ in fit.stack.rows_by_block(x, none)])
+        square = numbers * np.bincount(number, error[some] ** 2)
+        return np.asarray(np.sqrt(square / np.bincount(number)))
 
-    return replace(
-        fit,
-        state=best.x,
-        found=replace(fit.found, status=(best.status,), iterations=np.array([best.iterations])),
-        covariance=covariance_of(problem, best.x, np.square(fit.noise), (share, share**2)),
-        worst=Worst.of([stack.parts[i] for i in seen], sizes(fit.state), sizes(best.x), best),
-        notices=notes,
-    )
+    worst = kind.of([names[i] for i in seen], sizes(fit.state), sizes(best.x), best)
+    found = replace(fit.found, status=(best.status,), iterations=np.array([best.iterations]))
+    return replace(fit, state=best.x, found=found, worst=worst, notices=notes), share
 
 
 def with_laws(

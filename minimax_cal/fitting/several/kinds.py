@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -53,6 +53,7 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.status import Status
 
+R = TypeVar("R", bound=RelativeCalibration)
 READ: Mapping[str, Callable[[Any], Any]] = {  # what people give of an option, as its record has it
     "fix": listed,
     "free": listed,
@@ -183,13 +184,32 @@ def labels_of(every: Sequence[Instrument]) -> list[str]:
 
 def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalibration:
     """What a fit says of all poses.  began: when the work did [s]."""
-    robot, every, splits, options = asked.robot, asked.every, asked.splits, asked.options
+    robot, options, pairs = asked.robot, asked.options, zip(asked.every, asked.splits, strict=True)
     measured = [
-        measured_by(robot, found, i, data, held)
-        for i, (data, (held, _)) in enumerate(zip(every, splits, strict=True))
+        measured_by(robot, found, i, data, held) for i, (data, (held, _)) in enumerate(pairs)
     ]
-    single = len(every) == 1
-    whole = measured[0] if single else together(found.stack.parts, measured)
+    left_open, sigma = open_positions(robot, found), sigma_of_positions(robot, found)
+    result = assembled(
+        asked, found, measured, began, RelativeCalibration,
+        position_sigma=np.nan if left_open else sigma,
+        positions_open=left_open,
+        beyond=plausible.beyond(robot, found, options) if len(measured) == 1 else (),
+        cell=cell_of(robot, found) if found.stiff else None,
+    )  # fmt: skip
+    return judged(asked, found, measured, result, sigma)
+
+
+def assembled(
+    asked: Asked,
+    found: InstrumentFit,
+    measured: Sequence[Measured],
+    began: float,
+    kind: type[R],
+    **more: Any,
+) -> R:
+    """A kind of result of what was measured, before it is judged.  more: fields of its own."""
+    robot, every, splits, options = asked.robot, asked.every, asked.splits, asked.options
+    whole = measured[0] if len(every) == 1 else together(found.stack.parts, measured)
     notices = [
         said
         for data, (_, notes) in zip(every, splits, strict=True)
@@ -198,12 +218,10 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
     sources = ", ".join(data.at.source for data in every)
     source = replace(every[0].at, source=sources, digest=" ".join(d.at.digest for d in every))
     geometry = found.stiff or found
-    settings, left_open = options.settings(), open_positions(robot, found)
-    sigma = sigma_of_positions(robot, found)
+    settings = options.settings()
     for one in reversed(found.stack.instruments):  # the first one's stand
         settings |= one.choices
-    result = RelativeCalibration(
-        **vars(whole),
+    own: dict[str, Any] = dict(vars(whole)) | dict(
         robot=robot.with_mdh(geometry.state.mdh),
         nominal=robot,
         status=found.found.status[0],
@@ -211,18 +229,15 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
         seconds=time.perf_counter() - began,
         parameters=fit.parameters_of(robot, found),
         identification=found.identification,
-        position_sigma=np.nan if left_open else sigma,
-        positions_open=left_open,
-        beyond=plausible.beyond(robot, found, options) if single else (),
+        beyond=(),
         notices=tuple(dict.fromkeys(notices)),
         provenance=Provenance.of(robot, source, settings),
         instruments=instruments_of(found, every, splits, measured),
-        cell=cell_of(robot, found) if found.stiff else None,
         objective=options.objective,
         qp=qp_name(options.qp) if found.worst else "",
         worst=found.worst,
     )
-    return judged(asked, found, measured, result, sigma)
+    return kind(**{**own, **more})
 
 
 def judged(
@@ -265,7 +280,7 @@ def measured_by(
     stack, seen = found.stack, []
     for x in found.state_of(i):
         block = stack.blocks[i].at_rows_of(robot, data, stack.laws, x)
-        seen.append((block.instrument, block.flange(x), block.own(x)))
+        seen.append((block.instrument, *block.at(x)))
     nominal, calibrated = (one.errors(arm, own, held) for one, arm, own in seen)
     turned = [one.turns(arm, own)[None] for one, arm, own in seen]
     turns = by_key(turned[0], turned[1], held) if turned[0].size else {}
@@ -276,8 +291,7 @@ def measured_by(
         parts=train.parts,
         errors=by_key(nominal, calibrated, held),
         numbers={key: counts[is_held] for key, is_held in HELD.items()},
-        turns={key: (rms(t), float(t.max()) if t.size else np.nan)
-               for key, t in turns.items()},
+        turns=extremes(turns),
         instrument=train.placed(stack.blocks[i].flange(x), own, drawn),
     )  # fmt: skip
 
@@ -288,6 +302,11 @@ def by_key(nominal: Array, calibrated: Array, held: Array) -> dict[str, Array]:
         key: (nominal if key.startswith("nominal") else calibrated)[:, held == is_held]
         for key, is_held in HELD.items()
     }
+
+
+def extremes(sizes: Mapping[str, Array]) -> dict[str, tuple[float, float]]:
+    """RMS and largest, by the same keys."""
+    return {key: (rms(s), float(s.max()) if s.size else np.nan) for key, s in sizes.items()}
 
 
 def together(parts: tuple[str, ...], measured: Sequence[Measured]) -> Measured:

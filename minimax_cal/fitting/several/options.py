@@ -17,10 +17,10 @@ from minimax_cal.fitting.options import (
     known_within,
     qp_name,
 )
-from minimax_cal.fitting.pixels.options import SUM, WORST_TARGET, PixelOptions
 from minimax_cal.fitting.robust import SQUARE, check_robust
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.options import grouped
 from minimax_cal.ground.stages import Progress as Progress
 from minimax_cal.ground.stages import silent as silent
 from minimax_cal.instruments.instrument import Instrument
@@ -31,6 +31,9 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.solvers.least_squares import AUTO, METHODS
+
+SUM, WORST_TARGET = "sum", "minimax"  # what is minimised
+seen = grouped("Cameras")
 
 
 def noise_of(text: str) -> tuple[str, float]:
@@ -78,9 +81,21 @@ class RelativeOptions(InstrumentOptions):
     )
     priors: Mapping[str, float] = field(default_factory=dict)
     effects: Sequence[str | Term] = ()
-    camera_on: str = PixelOptions.camera_on
-    fix_camera: bool = PixelOptions.fix_camera
-    camera_prior: str = PixelOptions.camera_prior
+    camera_on: str = seen(
+        "",
+        "What the cameras are fixed to: flange or ground [default: what fits better].",
+        metavar="flange|ground",
+    )
+    fix_camera: bool = seen(
+        False,
+        "Hold the lenses as their files say, taken as known but where a prior of theirs is given.",
+    )
+    camera_prior: str = seen(
+        "",
+        "How well the files know the lenses: focal length, centre, radial and tangential "
+        "distortion [default: f 0.1%, c 2px, k 0.005, p 0.0005].",
+        metavar='"f 0.1%, c 2px"',
+    )
     loss: str = Options.loss
     method: str = Options.method
     resolution: float = Options.resolution

@@ -53,7 +53,7 @@ def check_slips(robot: Robot, data: Instrument, options: RelativeOptions) -> Non
         stack = stack_of(robot, [Train("", one)], options)
         x = start_of(robot, stack, allowed_of(stack, options)[0])
         block = stack.blocks[0]
-        return block.instrument, block.flange(x), block.own(x)
+        return block.instrument, *block.at(x)
 
     data.check_given(fitted)
     some, good = data.tried(), POOR_FIT * robot.reach()

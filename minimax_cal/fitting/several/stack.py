@@ -82,9 +82,13 @@ class Block:
         """The flange at a state.  active: (5n + d,) as `Arm.at` has it."""
         return self.arm.at(x.mdh, x.effects[len(self.instrument.names) :], active)
 
+    def at(self, x: State) -> tuple[FlangePoses, Array]:
+        """The flange, and what is of the instrument."""
+        return self.flange(x), self.own(x)
+
     def read(self, x: State) -> ResidualRows:
         """What the instrument says at a state."""
-        return self.instrument.read(self.flange(x), self.own(x))
+        return self.instrument.read(*self.at(x))
 
     def rows(self, x: State, active: Array, *, loose: bool = False) -> tuple[Array, Array]:
         """Measured minus predicted (..., rows) [m], derivative of the latter (..., active, rows).

@@ -149,6 +149,16 @@ class Worst:
         return Table.made("what decides the minimax", rows, columns)
 
 
+@dataclass(frozen=True, eq=False)
+class WorstPixels(Worst):
+    """What the minimax rests on: targets in a camera, or cameras.  size, before: [px]."""
+
+    UNIT: ClassVar[tuple[str, float]] = ("px", 1.0)
+
+    size: Annotated[Array, Fact(key="rms_px")]
+    before: Annotated[float, Fact(key="sum_largest_rms_px")]
+
+
 def least_worst(
     problem: Squares, of: Array, numbers: int, start: State, qp: QpSolver, rounding: float
 ) -> tuple[Optimum[State], Array, tuple[str, ...]]:

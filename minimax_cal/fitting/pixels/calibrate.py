@@ -4,45 +4,47 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.accuracy import HELD, accuracy
-from minimax_cal.fitting.fit import Provenance
-from minimax_cal.fitting.options import listed, qp_name
-from minimax_cal.fitting.pixels.determined import Determined, counting, determined, metre_of, placed
-from minimax_cal.fitting.pixels.drawing import Scale
-from minimax_cal.fitting.pixels.fit import PixelFit, PixelSquares
+from minimax_cal.fitting.accuracy import accuracy
+from minimax_cal.fitting.pixels.beside import FittedImages, as_instrument, fitted_on
+from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.pixels.judge import (
-    Claim,
+    Drawing,
     Uncertainty,
     arms_apart,
     drawn_sigma,
     position_sigma,
+    scale_of,
+    uncertainty_of,
 )
-from minimax_cal.fitting.pixels.options import PixelOptions, check_options
+from minimax_cal.fitting.pixels.options import FIELDS, WORST_CAMERA, PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import contradiction, file_notices, outlier_notices
-from minimax_cal.fitting.several.fit import parameters_of
-from minimax_cal.fitting.several.identify import Alone
-from minimax_cal.fitting.several.kinds import by_key
-from minimax_cal.fitting.several.pixel_result import PIXELS, PixelCalibration
-from minimax_cal.fitting.several.result import InstrumentResult, Measured
-from minimax_cal.ground.arrays import Array, rms
+from minimax_cal.fitting.several.fit import at_worst
+from minimax_cal.fitting.several.kinds import READ, Asked, assembled, by_key, extremes, measured_by
+from minimax_cal.fitting.several.options import SUM
+from minimax_cal.fitting.several.result import Claim, PixelCalibration
+from minimax_cal.fitting.several.stack import Block, Stack
+from minimax_cal.fitting.several.worst import WorstPixels
+from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.ground.threads import one_thread
 from minimax_cal.instruments.camera import FLANGE, read_camera
 from minimax_cal.instruments.pixels import PixelData, read_pixels
 from minimax_cal.measuring.checks import arm_notices, check_joints
+from minimax_cal.measuring.grouping import groups, held_out
 from minimax_cal.measuring.measurements import TOOL, SetAside
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.status import Status
 
+MAX_ROUNDING = 1e-6  # an error below is rounding: pixels that were computed, not seen [px]
 
-@takes(options=PixelOptions, read={"fix": listed, "free": listed})
+
+@takes(options=(PixelOptions, FIELDS), read=READ)
 def calibrate_pixels(
     robot: Robot | str | Path,
     pixels: Path | str,
@@ -110,84 +112,102 @@ def fitted(
     return concluded(determined(robot, data, options, progress), options, began)
 
 
+@dataclass(frozen=True, eq=False)
+class Determined:
+    """What pixels determine.  held: (m,) poses left out."""
+
+    robot: Robot
+    data: PixelData
+    held: Array
+    fit: PixelFit
+    sure: Uncertainty
+    notices: tuple[str, ...]
+
+    @property
+    def train(self) -> PixelData:
+        """The pixels that were fitted."""
+        return self.data.some(~self.held[self.data.pose])
+
+
+def determined(
+    robot: Robot, data: PixelData, options: PixelOptions, progress: Progress = silent
+) -> Determined:
+    """The fit of pixels, and how sure it is."""
+    held, said = held_out(data.at, options.holdout, options.seed)
+    train = data.some(~held[data.pose])
+    progress("start")
+    fit = of_worst(fitted_on(robot, train, options, progress), options)
+    progress("sigmas")
+    _, group = np.unique(groups(data.at)[train.pose], return_inverse=True)
+    return Determined(robot, data, held, fit, uncertainty_of(robot, fit, group.reshape(-1)), said)
+
+
+def of_worst(fit: PixelFit, options: PixelOptions) -> PixelFit:
+    """The minimax from a fit of the sum, where the objective asks for one.
+
+    f_i is the mean square of the pixels of one target in one camera, or of one camera.
+    """
+    if options.objective == SUM or fit.found.status[0] is Status.FAILED:
+        return fit
+    data = fit.images.pixels
+    of, names = data.part, data.parts
+    if options.objective == WORST_CAMERA:
+        of, names = data.camera, tuple(camera.name for camera in data.cameras)
+    of = np.where(fit.images.counted, of, -1)
+    rows = np.concatenate([of, of, np.full(fit.images.lens_rows, -2)])
+    fit, share = at_worst(fit, rows, names, 2, options.qp, MAX_ROUNDING, WorstPixels)
+    return replace(fit, share=share[: data.count])
+
+
 def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCalibration:
     """The result: whether to use the arm, and how good it is.  began: by `time.perf_counter`."""
-    robot, data, train, held = one.robot, one.data, one.train, one.held
-    fit, sure, scale = one.fit, one.sure, one.scale
+    robot, data, held, fit, sure = one.robot, one.data, one.held, one.fit, one.sure
+    among = np.arange(5 * robot.joints) >= 2 * robot.joints * fit.by_drawing  # lengths are in it
+    scale, drawing = scale_of(robot, fit, sure), Drawing.of(robot, fit, sure, among)
     if options.drawn_prior:
-        fit, sure = one.drawing.beside(fit, sure)
-    counts, wrong = counting(robot, data, held, fit)
-    errors, pixels, whole = left_by(fit, fit.everywhere(robot, data), held, counts, wrong)
+        fit, sure = drawing.beside(fit, sure)
+    images = FittedImages.of(robot, fit)
+    stack = Stack.of(robot, [images], [images.kind])
+    found = replace(fit, problem=replace(fit.problem, stack=stack), covariance=sure.covariance,
+                    noise=images.metre * fit.noise)  # fmt: skip
+    plain = as_instrument(data)
+    asked, every = Asked(robot, [plain], options, [(held, one.notices)]), images.at_rows_of(plain)
+    counts, wrong = every.counting(held)
+    arms = [Block.of(robot, every).at(x) for x in (fit.nominal, fit.state)]
+    drawn, ended = (np.linalg.norm(every.off(*arm), axis=0)[None, counts] for arm in arms)
+    measured = measured_by(robot, found, 0, plain, held)
+    scaled = {"lengths_over_drawn": {"share": scale.share, "sigma": scale.sigma}} if scale else {}
+    measured = replace(
+        measured,
+        numbers={key: 2 * sum(each.counts) for key, each in measured.accuracy.items()},
+        instrument={**measured.instrument, **scaled},
+    )
     arm = robot.with_mdh(fit.state.mdh)
-    claim = claimed(robot, arm, sure, one.drawing.share)
-    reason, status = contradiction(robot, train, fit, scale, options), fit.found.status[0]
-    told = () if reason else file_notices(train, fit, scale)
+    claim = claimed(robot, arm, sure, drawing.share)
+    reason, status = contradiction(robot, one.train, fit, scale, options), fit.found.status[0]
+    told = () if reason else file_notices(one.train, fit, scale)
+    fits_links = fit.problem.active[: 5 * robot.joints].any()
     if reason:
         status = Status.FAILED
-    elif (
-        fit.problem.active[: 5 * robot.joints].any()
-        and not claim.is_better
-        and status is not Status.FAILED
-    ):
-        status, reason = Status.NO_BETTER, kept_because(claim)
-    numbers = {key: 2 * sum(accuracy(error).counts) for key, error in errors.items()}
-    measured = Measured(
-        kind=PIXELS, parts=data.parts, errors=errors, numbers=numbers, turns={},
-        instrument=placed(fit.images, fit.state.effects, fit) | of_scale(scale),
-    )  # fmt: skip
-    at = replace(data.at, source=data.source, digest=data.digest)
-    noise, aside = metre_of(fit) * fit.noise_px, np.flatnonzero(wrong)
-    return PixelCalibration(
-        **vars(measured),
+    elif fits_links and not claim.is_better and status is not Status.FAILED:
+        status, reason = Status.NO_BETTER, claim.why_kept()
+    aside = np.flatnonzero(wrong)
+    return assembled(
+        asked, found, [measured], began, PixelCalibration,
         robot=robot if status is Status.NO_BETTER else arm,
-        nominal=robot,
         status=status,
-        iterations=int(fit.found.iterations[0]),
-        seconds=time.perf_counter() - began,
-        parameters=parameters_of(robot, replace(fit, covariance=sure.covariance)),
-        instruments=(InstrumentResult.of(PIXELS, measured, at, held, noise, Alone(0, ())),),
-        identification=fit.identification,
         position_sigma=claim.sigma,
-        beyond=(),
         notices=(
-            *data.notices, *arm_notices(robot, data.at), *one.notices, *notices_of(fit, held),
-            *told, *outlier_notices(data, aside),
+            *data.notices, *arm_notices(robot, data.at), *one.notices, *fit.notices,
+            *notices_of(fit, held), *told, *outlier_notices(data, aside),
         ),
-        provenance=Provenance.of(robot, at, options.settings()),
         calibrated=arm,
-        pixels=pixels,
+        pixels=extremes(by_key(drawn, ended, held[data.pose][counts])),
         claim=claim,
         set_aside=set_aside(data, aside),
-        with_them=accuracy(whole) if len(aside) else None,
+        with_them=accuracy(every.table(*arms[1], counts | wrong)[:, held]) if len(aside) else None,
         reason=reason,
-        objective=options.objective,
-        qp=qp_name(options.qp) if one.worst else "",
-        worst=one.worst,
     )  # fmt: skip
-
-
-def left_by(
-    fit: PixelFit, every: PixelSquares, held: Array, counts: Array, wrong: Array
-) -> tuple[dict[str, Array], dict[str, tuple[float, float]], Array]:
-    """Errors (parts, m, 3) by key [m], RMS and largest pixel by key [px], held out with all pixels.
-
-    every: pixels of all poses.  counts, wrong: (N,) as `counting` has them.  held: (m,).
-    """
-    images, later = every.images, held[every.images.pixels.pose]
-    arms = every.at(fit.nominal), every.at(fit.state)
-    before, after = (images.table(*arm, counts) for arm in arms)
-    drawn, found = (np.linalg.norm(images.off(*arm), axis=0) for arm in arms)
-    pixels = {}
-    for key, is_held in HELD.items():
-        size = (drawn if key.startswith("nominal") else found)[counts & (later == is_held)]
-        pixels[key] = (rms(size), float(size.max())) if size.size else (np.nan, np.nan)
-    whole = images.table(*arms[1], counts | wrong)[:, held]
-    return by_key(before, after, held), pixels, whole
-
-
-def of_scale(scale: Scale | None) -> dict[str, Any]:
-    """For JSON."""
-    return {"lengths_over_drawn": {"share": scale.share, "sigma": scale.sigma}} if scale else {}
 
 
 def claimed(robot: Robot, arm: Robot, sure: Uncertainty, share: float) -> Claim:
@@ -195,24 +215,6 @@ def claimed(robot: Robot, arm: Robot, sure: Uncertainty, share: float) -> Claim:
     shown = drawn_sigma(robot, sure.lack, share) if share else 0.0
     drawn = drawn_sigma(robot, sure.lack)
     return Claim(position_sigma(arm, sure), drawn, arms_apart(robot, arm), shown)
-
-
-def kept_because(claim: Claim) -> str:
-    """Why the drawn arm is kept."""
-    mm = claim.texts()
-    why = (
-        f"the calibrated arm, known to {mm['sigma']}, differs from the drawn one by "
-        f"{mm['change']}, which shows the drawing to be off by {mm['shown']}: too little to be sure"
-    )
-    if claim.sigma >= claim.drawn:
-        why = (
-            f"the drawing is known better ({mm['drawn']}) than these pixels tell the arm "
-            f"({mm['sigma']})"
-        )
-    return (
-        f"{why}: the drawn arm is kept; take more images, nearer and more tilted, or say how well "
-        "the drawing is known (drawn_within)"
-    )
 
 
 def notices_of(fit: PixelFit, held: Array) -> list[str]:
