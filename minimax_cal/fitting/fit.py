@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 import scipy
@@ -41,6 +41,7 @@ from minimax_cal.fitting.suspects import Suspect, aside, table_of
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, uncertainty_from_dict
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.facts import APART, Fact, Later, derived, facts_in_words, in_file, scaled
+from minimax_cal.ground.files import saved_content
 from minimax_cal.ground.records import array, as_kind, read
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table, filled
@@ -732,7 +733,8 @@ def load_fit(path: Fit | Path | str) -> Fit:
     Returns
     -------
     Fit
-        The calibration, whole.
+        The calibration, whole.  A `RelativeCalibration` where the data were not points of trackers
+        alone.
 
     Raises
     ------
@@ -743,4 +745,11 @@ def load_fit(path: Fit | Path | str) -> Fit:
     --------
     >>> print(mc.load_fit("fit.json").summary())
     """
-    return Fit.load(path)
+    if isinstance(path, Fit):
+        return path
+    content = saved_content(path)
+    if "measured" in content and content.get("kind") != Fit.KIND:
+        from minimax_cal.fitting.several.result import read_result  # it knows this file
+
+        return cast(Fit, read_result(content, str(path)))  # as nearly all files have it
+    return Fit.from_dict(content, str(path))

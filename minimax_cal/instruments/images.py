@@ -21,7 +21,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments.camera import INTRINSICS, distorted, slopes
 from minimax_cal.instruments.instrument import UNREADY, Instrument, Words, anywhere
 from minimax_cal.instruments.pixels import PixelData
-from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
+from minimax_cal.instruments.protocol import OF_NONE, FlangePoses, ResidualRows
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.robots.kinematics import right_jacobian, rotation, rotation_vector
 from minimax_cal.robots.robot import Robot
@@ -323,6 +323,7 @@ class Images(Instrument):
             by_point=np.concatenate([along, none]),
             by_rotation=np.zeros((len(along) + len(none), 3)),
             by_own=np.concatenate([by_own.reshape(len(own), -1), known], axis=1).T,
+            part=np.concatenate([np.tile(pixels.part, count), np.full(len(short), OF_NONE)]),
         )
 
     def lens_known(self, own: Array) -> tuple[Array, Array]:

@@ -18,6 +18,7 @@ from minimax_cal.robots.robot import Robot
 TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
 EDGE = 0.1  # how far from their middle the corners lie by which laws are asked [m]
 NONE: Array = np.zeros(0, dtype=int)
+OF_NONE = -1
 NO_SUMS: Array = np.zeros((0, 0))
 LEAST_SHARE = 1e-12  # of rows about a place, so that one of which none counts has a mean too
 
@@ -46,7 +47,7 @@ class ResidualRows(NamedTuple):
 
     residual: (r,) [m].  pose: (r,).  point: (r, 3) looked at, in the base [m].  by_point,
     by_rotation: (r, 3) slopes by that point and by a rotation of the flange.  by_own: (r, e).
-    part: (r,) which of the instrument's parts it is of; empty for the first.
+    part: (r,) which of the instrument's parts it is of, or OF_NONE; empty for the first.
     about: (r,) numbers from 0; rows of one number are taken about their mean, as a place that they
     share is eliminated; empty for none.
     sums: (c, r) further rows as sums of these; short: (c,) their residuals, weighed like the sums;

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.fit import load_fit
+from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.measuring.measurements import Measurements, read_measurements
@@ -51,7 +51,7 @@ def points_of(
 
     The moments and lengths of both files are those for which the answer holds.
     """
-    found, whole = load_fit(fit), read_measurements(poses)
+    found, whole = Fit.load(fit), read_measurements(poses)
     size = {name: 1e3 * np.linalg.norm(e, axis=-1) for name, e in
             (("before", found.error_nominal), ("after", found.error))}  # fmt: skip
     rows = {int(line): row for row, line in enumerate(found.data.line)}

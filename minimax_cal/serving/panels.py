@@ -10,7 +10,7 @@ from typing import Any
 from numpy import nan_to_num
 
 from minimax_cal.diagnosing.result import load_diagnosis
-from minimax_cal.fitting.fit import load_fit
+from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import json_of
 from minimax_cal.ground.tables import Table, filled
@@ -209,7 +209,7 @@ def accuracy_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | Non
 @lru_cache(maxsize=KEPT)
 def fit_words(path: str, moment: int, size: int) -> tuple[str, list[Tile], Table, str]:
     """Headline, numbers, accuracy and facts of a calibration's file as it was at a moment."""
-    fit = load_fit(path)
+    fit = Fit.load(path)
     seen = fit.within
     known = sum(parameter.identifiable for parameter in fit.parameters)
     tiles = [

@@ -13,7 +13,7 @@ from minimax_cal.diagnosing.diagnose import diagnose
 from minimax_cal.diagnosing.result import Diagnosis, load_diagnosis
 from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.calibrate import again, calibrate
-from minimax_cal.fitting.fit import Fit, Provenance, load_fit
+from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.floor import Floor
 from minimax_cal.fitting.options import Progress, silent
 from minimax_cal.fitting.same_arm import check_arm
@@ -91,7 +91,7 @@ def causes_of(
     its springs are the model's.  chosen: share and seed of the held-out poses, for a new diagnosis.
     """
     robot = chain.robot
-    fit = load_fit(fit) if isinstance(fit, Path | str) else fit
+    fit = Fit.load(fit) if isinstance(fit, Path | str) else fit
     told = load_diagnosis(diagnosis) if isinstance(diagnosis, Path | str) else diagnosis
     if fit is None and told is None:
         told = diagnose(robot, data, holdout=chosen[0], seed=chosen[1], progress=progress)

@@ -121,6 +121,34 @@ def test_wrong_pixels_do_not_count():
     assert both.instruments[1].accuracy["train"].max_mm < 0.5
 
 
+def test_images_of_other_poses_are_named_and_judge_nothing():
+    cell = cell_of(2)
+    data = data_of(cell)
+    late = data.at.columns | {"split": np.array(["holdout"] * 4 + ["train"] * 16)}
+    q = data.at.q.copy()
+    q[[0, 9]] += 0.2  # one that is held out, and one that is not
+    data = replace(data, at=replace(data.at, q=q, columns=late))
+    both = mc.relative(cell.drawn, [tracked(cell, 2, 24, 3e-5), as_instrument(data)])
+    named = "whole images are outliers, set aside: pose P9 of camera cam0"
+    assert any(named in said for said in both.notices)
+    assert arm_error(cell, both.robot) < 0.02
+    alone = fitted(cell.drawn, data, PixelOptions())
+    assert any("2 whole images" in said and "pose P0" in said for said in alone.notices)
+    assert alone.pixels["holdout"][0] < 3.0 * NOISE
+    assert alone.with_them is not None
+    assert alone.with_them.rms_mm > 5.0
+
+
+def test_the_worst_of_pixels_is_a_target_of_a_camera():
+    cell = cell_of(2)
+    given = [tracked(cell, 2, 24, 3e-5), as_instrument(data_of(cell))]
+    both = mc.relative(cell.drawn, given, objective="minimax")
+    assert both.worst is not None
+    assert {"pixels c0", "pixels c29"} < {*both.worst.functions}
+    with pytest.raises(mc.OptionError, match="camera_on='roof': give flange or ground"):
+        mc.relative(cell.drawn, given, camera_on="roof")
+
+
 @pytest.mark.parametrize("board", [True, False], ids=["board", "tags"])
 def test_lenses_that_are_held_stay(board):
     cell = cell_of(2)
@@ -191,6 +219,7 @@ def test_from_files_to_a_report(tmp_path, answered, refuses):
     assert {"alone", "directions_alone", "file", "noise", "unit"} <= set(content["instruments"][1])
     assert arm_error(cell, mc.load_robot(result)) < 0.03
     assert run("report", result, "-o", tmp_path / "report.html") == 0
+    assert repr(mc.load_fit(result)) == "<RelativeCalibration of Universal Robots UR5: converged>"
     cameras = {"cam0": tmp_path / "cam0.yaml"}
     images = detected(
         tmp_path / "detections.csv", tmp_path / "joints.csv", cameras, tmp_path / "board.csv"

@@ -10,9 +10,15 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.fitting.checks import POOR_FIT
+from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
 from minimax_cal.fitting.pixels.fit import ROUNDS, PixelFit, PixelSquares, fit_pixels, right, softly
-from minimax_cal.fitting.pixels.options import PixelOptions
-from minimax_cal.fitting.pixels.plausible import WHOLE_IMAGE, check_start
+from minimax_cal.fitting.pixels.options import PixelOptions, check_options
+from minimax_cal.fitting.pixels.plausible import (
+    MOST_ASIDE,
+    WHOLE_IMAGE,
+    check_start,
+    outlier_notices,
+)
 from minimax_cal.fitting.pixels.start import from_far, start_scene
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress, silent
@@ -54,6 +60,7 @@ class FittedImages(Images):
         """Fitted by itself, as it then weighs.  Raises DataError."""
         chosen = {name: getattr(options, name) for name in self.options}
         own = PixelOptions(holdout=0.0, **chosen)
+        check_options(own)
         return FittedImages.of(robot, fitted_on(robot, self.images, own, silent))
 
     def starts(self, arm: FlangePoses, free: Array) -> Sequence[Array]:
@@ -76,8 +83,14 @@ class FittedImages(Images):
             self, pixels=data, weight=np.ones(data.count), doubt=self.doubt[:0], metre=1.0
         )
         problem = PixelSquares.of(self.robot, alike)
-        wrong[later] = standing_out(problem, fit.state, later, limit)
+        far = MAX_MISS_OF_REACH * self.robot.reach()
+        astray = of_other_poses(problem.images, *problem.at(fit.state), later, far)
+        wrong[later] = astray | standing_out(problem, fit.state, later, limit)
         return known & ~wrong, wrong
+
+    def remarks(self, parameters: Sequence[Any], noise: float) -> tuple[str, ...]:
+        """Which of its pixels do not count."""
+        return tuple(outlier_notices(self.images, np.flatnonzero(~self.counted)))
 
     def errors(self, arm: FlangePoses, own: Array, held: Array) -> Array:
         """At the targets, of all images; wrong pixels are left out."""
@@ -120,6 +133,18 @@ def fitted_on(robot: Robot, data: PixelData, options: PixelOptions, progress: Pr
     begun = [from_far(robot, data, started) for started in both]
     fits = [fit_pixels(robot, started, options, progress) for started in begun]
     return min(fits, key=lambda fit: fit.noise_px)
+
+
+def of_other_poses(images: Images, arm: FlangePoses, own: Array, rows: Array, far: float) -> Array:
+    """Which rows (r,) are of images most of which lie farther off than any arm does; none where
+    many images do.  far: at the target [m].
+    """
+    size = np.linalg.norm(images.at_targets(arm, own), axis=0)[rows]
+    pixels = images.pixels
+    place = (pixels.pose * len(pixels.cameras) + pixels.camera)[rows]
+    image = np.unique(place, return_inverse=True)[1].reshape(-1)
+    astray = np.bincount(image, size > far) > WHOLE_IMAGE * np.bincount(image)
+    return np.asarray(astray[image] & (astray.mean() <= MOST_ASIDE if len(astray) else False))
 
 
 def standing_out(problem: PixelSquares, x: State, rows: Array, size: Array) -> Array:

@@ -227,7 +227,7 @@ class InstrumentResult(Measured):
         return InstrumentResult(**told, **apart, interval=Interval(*ends))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class RelativeCalibration(Measured, Result):
     """A robot calibrated from lengths, closures or poses, or from several files together.
 
@@ -262,6 +262,9 @@ class RelativeCalibration(Measured, Result):
     reason: str = ""
     worst: Annotated[Worst | None, Fact(key="minimax")] = None
     cell: Annotated[Cell | None, APART] = None
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self.robot.name}: {self.status}>"
 
     @derived()
     def advice(self) -> str:
@@ -457,7 +460,7 @@ class Claim:
 NO_CLAIM = Claim(*[np.nan] * 4)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PixelCalibration(RelativeCalibration):
     """A robot calibrated by cameras; `robot` is the drawn one where that is kept.
 
@@ -547,3 +550,9 @@ class PixelCalibration(RelativeCalibration):
         calibrated = robot_from_dict(content["calibrated_robot"], f"{source}: calibrated_robot")
         pixels = {key: (each.rms_px, each.max_px) for key, each in own["stated"].items()}
         return own | {"calibrated": calibrated, "pixels": pixels}
+
+
+def read_result(content: Mapping[str, Any], source: str) -> RelativeCalibration:
+    """A calibration of other instruments than trackers from its JSON.  Raises CalibrationError."""
+    kind = PixelCalibration if "arm_position" in content else RelativeCalibration
+    return kind.from_dict(content, source)

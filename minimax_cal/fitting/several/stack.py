@@ -15,6 +15,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.instruments.protocol import (
     NONE,
+    OF_NONE,
     Arm,
     FlangePoses,
     Given,
@@ -294,7 +295,9 @@ class Stack:
         out, first = [], 0
         for i, block in enumerate(self.blocks):
             rows, count = block.read(self.part(x, i)), len(block.instrument.parts)
-            out += [first + block.part_of(rows), np.full(len(rows.short), -2)]
+            part = block.part_of(rows)
+            part = np.where(part == OF_NONE, -2, first + part)
+            out += [part, np.full(len(rows.short), -2)]
             first += count
         return np.concatenate(out)
 

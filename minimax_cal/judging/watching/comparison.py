@@ -21,7 +21,7 @@ from minimax_cal.fitting import identify
 from minimax_cal.fitting.accuracy import Accuracy, accuracy
 from minimax_cal.fitting.beyond import needed, step_without
 from minimax_cal.fitting.checks import wild
-from minimax_cal.fitting.fit import Fit, load_fit
+from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
@@ -172,7 +172,7 @@ def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
     --------
     >>> print(mc.compare("may.json", "june.json").summary())
     """
-    fits = tuple(load_fit(fit) for fit in (a, b))
+    fits = tuple(Fit.load(fit) for fit in (a, b))
     one, other = fits
     names = tuple("calibration" if isinstance(each, Fit) else str(each) for each in (a, b))
     names = (f"{names[0]} A", f"{names[1]} B") if names[0] == names[1] else names

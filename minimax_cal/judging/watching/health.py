@@ -20,7 +20,7 @@ from minimax_cal.fitting.accuracy import (
     max_interval,
     rms_interval,
 )
-from minimax_cal.fitting.fit import Fit, load_fit
+from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import listed
 from minimax_cal.fitting.same_arm import check_arm, computed, residual
 from minimax_cal.fitting.set_aside import errors_of, with_them
@@ -161,7 +161,7 @@ def check(
     """
     limits, known = required(tolerance), checked_known(known)
     check_seed(seed)
-    fit = load_fit(fit)
+    fit = Fit.load(fit)
     data = read_measurements(data)
     watched, said = watched_of(fit, data, known)
     check_arm(fit.cell.robot, watched.data)

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from minimax_cal.fitting.calibrate import calibrate
-from minimax_cal.fitting.fit import Fit, load_fit
+from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import silent
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning, OptionError
 from minimax_cal.ground.files import check_writable, made_folder, read_toml, write_whole
@@ -226,7 +226,7 @@ def calibrated(job: Job) -> Row:
     changed: tuple[str, ...] = ()
     said, notices = [one.sentence() for one in judged], fit.notices
     if told.fit:
-        other = compare(load_fit(job.path(told.fit)), fit)
+        other = compare(Fit.load(job.path(told.fit)), fit)
         changed = other.joints
         said.append(other.headline())
         notices = (*notices, *other.notices)

@@ -19,7 +19,7 @@ from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.fitting.pose_rows import comes_back
 from minimax_cal.fitting.several import RelativeCalibration
-from minimax_cal.fitting.several.result import PixelCalibration
+from minimax_cal.fitting.several.result import read_result
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import json_of, read_raw
@@ -210,8 +210,7 @@ def without_coordinates(content: dict[str, Any], file: File) -> Sources:
     if "diagnosis" in content:
         causes = RelativeDiagnosis.from_dict(content, file.path)
         return Sources(None, None, (file,), relative=causes.calibration, causes=causes)
-    read = PixelCalibration if content.get("measured") == "pixels" else RelativeCalibration
-    return Sources(None, None, (file,), relative=read.from_dict(content, file.path))
+    return Sources(None, None, (file,), relative=read_result(content, file.path))
 
 
 def simulated(arm: SimulatorGap | None, fit: Fit | None, gap: Diagnosis | None) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from minimax_cal.dynamics.diagnose import diagnose_motion
 from minimax_cal.dynamics.given import MotionKnown, Payload, read_logs, runs_of
 from minimax_cal.dynamics.logs.table import CURRENT, NOTHING, Run
 from minimax_cal.dynamics.result import MotionDiagnosis, MotionEffect, load_motion
-from minimax_cal.fitting.fit import Fit, load_fit
+from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.ground.options import takes
@@ -115,7 +115,7 @@ def motion_gap(
         judge = judge.driving(opened, gains) if driven else judge
         first, notices = [judge.rung("as given", opened.chain)], tuple[str, ...]()
         if fit is not None:
-            opened, notices = calibrated(opened, load_fit(fit))
+            opened, notices = calibrated(opened, Fit.load(fit))
             judge = judge.of_model(opened)
             first.append(judge.rung("calibrated geometry", opened.chain))
         if judge.held.unit == NOTHING:
