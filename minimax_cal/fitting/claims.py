@@ -128,7 +128,7 @@ def unseen_suspects(
     weights = np.zeros(model.weight.shape)
     weights[:, ~held] = solved.robust.weights
     model = model.only(solved.identification.active).with_prior(solved.estimator.model.prior)
-    spread = solved.robust.judged[1]
+    spread = solved.robust.scored[1]
     return held_suspects(model, state, weights, held, spread, data.line)
 
 

@@ -383,21 +383,21 @@ def geometry(task: Task, progress: Progress, *, wide: bool = True) -> Stage:
     # a few gross outliers are no reason to search: what counts is how the believed points are met
     notices: tuple[str, ...] = ()
     if wide:
-        better, notices = wider(task.robot, robust.model, robust.fit, progress)
-        if better is not robust.fit:
+        better, notices = wider(task.robot, robust.model, robust.found, progress)
+        if better is not robust.found:
             robust = task.robust(robust.plain, better)
     for _ in range(MAX_GROWTHS):
-        at = task.base.emphasise(task.share), robust.fit.x.take(np.array(0)), identification
+        at = task.base.emphasise(task.share), robust.state, identification
         more = task.grown(*at, 0.0)
         if more is None:
             break
         clear = task.grown(*at, MIN_GROWN_SINGULAR)
         more = clear or more
         model, squares = task.squares(robust.plain.only(more.active), at[1])
-        if clear is None and squares.cost[0] > MAX_REMAINING_COST * robust.fit.cost[0]:
+        if clear is None and squares.cost[0] > MAX_REMAINING_COST * robust.found.cost[0]:
             break
         identification, robust = more, task.robust(model, squares)
-    return Stage(task.base, identification, robust, robust.fit, notices=notices)
+    return Stage(task.base, identification, robust, robust.found, notices=notices)
 
 
 def by_drawing(task: Task, stage: Stage, progress: Progress) -> tuple[Task, Stage]:
@@ -485,7 +485,7 @@ def jointly(task: Task, stage: Stage, terms: tuple[Term, ...]) -> tuple[Task, St
     """Geometry and effects together; the task with the data where its sessions then stand."""
     robot, robust, identification = task.robot, stage.robust, stage.identification
     for _ in range(EFFECT_PASSES):
-        frames, here = turned_in(task.data.frames, robust.fit.x.take(np.array(0)))
+        frames, here = turned_in(task.data.frames, robust.state)
         task = replace(task, data=seen_from(task.data, frames))
         y = model_of(robot, task.data).y if frames else task.base.y
         task, plain = replace(task, base=replace(task.base, y=y)), replace(robust.plain, y=y)
@@ -500,7 +500,7 @@ def jointly(task: Task, stage: Stage, terms: tuple[Term, ...]) -> tuple[Task, St
     base = replace(
         task.base, names=model.names, fields=model.fields, moved=model.moved, room=model.room
     )
-    return task, Stage(base, identification, robust, robust.fit, terms, stage.notices)
+    return task, Stage(base, identification, robust, robust.found, terms, stage.notices)
 
 
 def room_of(task: Task, model: Model, state: State, terms: tuple[Term, ...]) -> Array:
