@@ -363,9 +363,12 @@ class Known:
         links = np.swapaxes(x.mdh, -1, -2)  # in the order of `parameters.links_of`
         links = links.reshape(*links.shape[:-2], -1)
         out = np.zeros((*links.shape[:-1], count))
-        out[..., : len(self.mean)] = self.mean - links
+        out[..., : len(self.mean)] = self.mean - links[..., : len(self.mean)]
         out[..., count - len(self.laws) :] = -x.effects[..., x.effects.shape[-1] - len(self.laws) :]
         return out
+
+
+NOTHING = Known(np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,7 +382,7 @@ class Squares:
 
     stack: Stack
     active: Array
-    known: Known | None = None
+    known: Known = NOTHING
     weight: Array = field(default_factory=lambda: np.zeros(0))
     room: Array = field(default_factory=lambda: np.zeros((0, 2)))
     loss: str = SQUARE
@@ -413,7 +416,7 @@ class Squares:
         The best instrument weighs 1, so that a step of the rows is one of metres.
         """
         unit = float(variance.min())
-        weight = self.known.weights(unit, self.names.count) if self.known else np.zeros(0)
+        weight = self.known.weights(unit, self.names.count)
         return replace(self, stack=replace(self.stack, precision=unit / variance), weight=weight)
 
     def normal(self, x: State) -> tuple[Array, Array, Array]:
@@ -422,7 +425,7 @@ class Squares:
         cost = np.einsum("...r,...r->...", error, error)
         gradient = (jacobian @ error[..., None])[..., 0]
         gram = jacobian @ np.swapaxes(jacobian, -1, -2)
-        if self.known and len(self.weight):
+        if len(self.weight):
             off = self.known.off(x, len(self.active))[..., self.active]
             weight = self.weight[self.active]
             cost = cost + (weight * off**2).sum(axis=-1)
