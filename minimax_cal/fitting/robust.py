@@ -400,9 +400,8 @@ def moments(model: Model, state: State, loss: str, scale: float) -> tuple[Array,
     own = LOSSES[loss]
     u = size / (scale * own.tuning)
     derivative = np.where(model.seen, own.slope(u), 0.0)
-    return derivative.sum(axis=1) / counts, ((own.weight(u) * size) ** 2).sum(axis=1) / (
-        3.0 * counts
-    )
+    square = (own.weight(u) * size) ** 2
+    return derivative.sum(axis=1) / counts, square.sum(axis=1) / (3.0 * counts)
 
 
 def flatness(robust: Robust, state: State) -> float:

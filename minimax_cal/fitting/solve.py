@@ -290,7 +290,9 @@ def fit_cell(
     if options.objective == "pose":
         mix = pose_weights(data, options.lever)
         model = stage.robust.by_pose
-        stage = replace(stage, squares=of_poses(task, with_poses(model, mix), stage))
+        # the turn that fits the errors best vanishes for half a turn too: start near the answer
+        squares = nearby(with_poses(model, mix), stage.state, options.method)
+        stage = replace(stage, squares=squares)
     distances = trusted_distances(data, stage.robust.weights, options.distance_tolerance)
     optimum, certificate, said = worst_case(task, model, stage.state, distances, progress)
     state, identification = optimum.x if optimum else stage.state, stage.identification
@@ -518,14 +520,6 @@ def without_resting(known: Identification, names: Names, rests: Array) -> Identi
     gone = np.pad(rests, (names.geometric, 0)) & known.active
     said = dict.fromkeys((names.all[i] for i in np.flatnonzero(gone)), Reason(AT_BOUND))
     return replace(known, active=known.active & ~gone, reasons={**known.reasons, **said})
-
-
-def of_poses(task: Task, model: Model, stage: Stage) -> LeastSquares[State]:
-    """The least squares of pose errors, from that of points.
-
-    The turn that fits the errors best vanishes for half a turn too: start near the answer.
-    """
-    return nearby(model, stage.state, task.options.method)
 
 
 def worst_case(
