@@ -23,9 +23,6 @@ from minimax_cal.fitting.accuracy import (
     accuracy,
     before_and_after,
     by_key,
-    max_interval,
-    rms_interval,
-    told,
     with_ends,
 )
 from minimax_cal.fitting.between_sessions import Change
@@ -364,13 +361,7 @@ class Fit(Result):
             return {key: ends_of(one) for key, one in seen.items()}
         rng = np.random.default_rng(self.options.seed)
         group = grouped(self.data, self.options.holdout_by)[self.held]
-        return {
-            key: (
-                told(rms_interval(self.errors[key], group, rng=rng), 1e-3 * one.rms_mm),
-                told(max_interval(self.errors[key], group, rng=rng), 1e-3 * one.max_mm),
-            )
-            for key, one in seen.items()
-        }
+        return {key: intervals_of(self.errors[key], group, rng) for key in seen}
 
     @property
     def unjudged(self) -> Array:

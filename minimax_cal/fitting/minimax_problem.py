@@ -74,9 +74,7 @@ def measured_distances(data: Measurements, tolerance: float | None = None) -> Di
     )
 
 
-def trusted_distances(
-    data: Measurements, weights: Array, tolerance: float | None = None
-) -> Distances:
+def trusted_distances(data: Measurements, weights: Array, tolerance: float | None) -> Distances:
     """`measured_distances` of the points that a fit gave weight.  weights: (k, m)."""
     trusted = np.where(weights.T[..., None] > MIN_TRUSTED_WEIGHT, data.y, np.nan)
     return measured_distances(data.with_y(trusted), tolerance)

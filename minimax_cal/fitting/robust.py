@@ -209,7 +209,6 @@ MAX_TRIM = 0.5  # no method tells wrong points from right ones where they are th
 MAX_ROUNDS = 200  # of reweighting
 WEIGHT_TOLERANCE = 1e-6  # change of a weight that ends them
 MAX_VARIANCE_GROWTH = 100.0  # times the variance: these poses no longer tell a parameter
-ALL: Array = np.ones(0, dtype=bool)
 
 
 @dataclass(frozen=True)
@@ -330,7 +329,8 @@ def robust_fit(
     line: Array,
     loss: str = SQUARE,
     trim: float = 0.0,
-    judged: Array = ALL,
+    *,
+    judged: Array,
 ) -> Robust:
     """Minimise a loss of the distances, with at most a share of the points set aside.
 
@@ -339,7 +339,6 @@ def robust_fit(
     targets that do not pull at the fit.  Raises OptionError.
     """
     check_robust(loss, trim)
-    judged = judged if len(judged) else np.ones(len(plain.y), dtype=bool)
     seen = plain.seen.astype(float)
     at, kept = Weighted(fitter, plain, found, seen, judged), seen
     scale = np.nan

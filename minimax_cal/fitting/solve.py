@@ -240,8 +240,9 @@ class Task:
     def robust(self, model: Model, found: LeastSquares[State]) -> Robust:
         """The fit with the loss and the trimming that were asked for."""
         line, options = self.data.line, self.options
-        squares, judged = self.squares, self.judged
-        return robust_fit(squares, model, found, line, options.loss, options.trim, judged)
+        return robust_fit(
+            self.squares, model, found, line, options.loss, options.trim, judged=self.judged
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -535,9 +536,7 @@ def worst_case(
     qp, notices = solver_of(options.qp, QP_TOLERANCE)
     settings = Sqp(hessian=options.hessian)
     links = model.active[: 5 * task.robot.joints]
-    other = not options.allow_large_changes and too_changed(
-        task.robot, task.robot.with_mdh(state.mdh), links
-    )
+    other = not options.allow_large_changes and too_changed(task.robot, state.mdh, links)
     if other or problem.size > (MIN_HOPELESS_MISS * task.robot.reach()) ** 2:
         settings = replace(settings, iterations=min(settings.iterations, LAST_STEPS))
     optimum = minimax.solve(problem, state, qp, settings)

@@ -271,9 +271,8 @@ def with_lenses(problem: PixelSquares, x: State) -> State:
     """
     error, doubt = problem.errors(x), LOOSE * problem.images.doubt
     free = replace(problem, active=problem.active | problem.lenses)
-    return free.changed(noise=sigma_of(error), doubt=doubt, weight=softly(error)).solved(x, COARSE)[
-        0
-    ]
+    loose = free.changed(noise=sigma_of(error), doubt=doubt, weight=softly(error))
+    return loose.solved(x, COARSE)[0]
 
 
 def reprojected(problem: PixelSquares, x: State) -> tuple[PixelSquares, State, LeastSquares[State]]:

@@ -150,16 +150,10 @@ def contradiction(robot: Robot, fit: PixelFit, scale: Scale | None, options: Pix
             f"{said}: check that joints, detections, board and camera files belong together, and "
             "what the cameras are fixed to (camera_on)"
         )
-    links = fit.problem.active[: 5 * robot.joints]
-    return (
-        other_lens(fit)
-        or other_size(scale, OTHER_SIZE, LEAST_SIZE)
-        or (
-            ""
-            if options.allow_large_changes
-            else too_changed(robot, robot.with_mdh(fit.state.mdh), links)
-        )
-    )
+    wrong = other_lens(fit) or other_size(scale, OTHER_SIZE, LEAST_SIZE)
+    if wrong or options.allow_large_changes:
+        return wrong
+    return too_changed(robot, fit.state.mdh, fit.problem.active[: 5 * robot.joints])
 
 
 def other_lens(fit: PixelFit) -> str:

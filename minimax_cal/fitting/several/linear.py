@@ -115,7 +115,7 @@ def rows_of_all(scene: Scene, fit: InstrumentFit) -> StackRows:
     """The rows of all instruments.  scene: `scene_of_all`; fit: of geometry alone."""
     stack, active = fit.stack, fit.identification.active
     starts = np.cumsum([0, *(len(block.arm.q) for block in stack.blocks)]).tolist()
-    read = [block.read(stack.part(fit.state, i)) for i, block in enumerate(stack.blocks)]
+    read = [block.read(at) for block, at in stack.parted(fit.state)]
     slots = [place_in(rows.pose_of_row) for rows in read]
     width = max(int(slot.max()) + 1 for slot in slots)
     looks, errors, slopes, places = [], [], [], []
