@@ -180,9 +180,7 @@ def known_by_noise(fit: Solved) -> Uncertainty:
     """The uncertainty of a fit by its noises alone."""
     active = fit.estimator.model.active
     out = np.full((len(active),) * 2, np.nan)
-    out[np.ix_(active, active)] = by_noise(
-        Poses.of(fit.estimator, fit.state), fit.uncertainty.noise
-    )
+    out[np.ix_(active, active)] = by_noise(Poses(fit.estimator, fit.state), fit.uncertainty.noise)
     told = fit.uncertainty
     return Uncertainty(told.names, told.units, out, told.listen, told.dof, "noise")
 

@@ -185,7 +185,7 @@ def shift_of(
     """
     model = model_of(fit.nominal.robot, data)
     every = Estimator(model.only(np.ones(model.names.count, dtype=bool)), np.ones(len(model.y)))
-    poses, n = Poses.of(every, fit.cell.state), fit.robot.joints
+    poses, n = Poses(every, fit.cell.state), fit.robot.joints
     slope, after = poses.jacobian, late[:, None, None]
     identified = slope[..., : 5 * n][..., fit.identification.active[: 5 * n]]
     place = slope[..., 5 * n :]

@@ -31,9 +31,10 @@ class Case:
     found: LeastSquares[State]
     bad: Array
 
-    def robust(self, loss: str = "square", trim: float = 0.0, **more: Array) -> Robust:
+    def robust(self, loss: str = "square", trim: float = 0.0) -> Robust:
         """The robust fit."""
-        return robust_fit(fit, self.model, self.found, self.data.line, loss, trim, **more)
+        given, judged = (fit, self.model, self.found, self.data.line), np.ones(len(self.model.y))
+        return robust_fit(*given, loss, trim, judged=judged > 0.0)
 
     def without(self) -> State:
         """Least squares on the right points alone."""

@@ -67,7 +67,7 @@ def beyond_of(study: Study, causes: Causes, judges: Judges, progress: Progress) 
     waiting = [i for i, state in enumerate(states) if state is not None]
     for part, state in zip(found, states, strict=True):
         if state is None:
-            errors.miss(part.name)
+            errors.missed.append(part.name)
     calls = [(study, causes, ~masks[i], states[i], data.take(found[i].rows)) for i in waiting]
     ended = {}
     for number, pair in share(fold_errors, calls, processes=causes.jobs, cluster=causes.cluster):

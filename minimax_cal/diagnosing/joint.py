@@ -57,7 +57,7 @@ class Joint(Predicting):
     @cached_property
     def poses(self) -> Poses:
         """Pose by pose, linear where the fit ended."""
-        return Poses.of(self.estimator, self.state)
+        return Poses(self.estimator, self.state)
 
     @cached_property
     def cell(self) -> Cell:
@@ -98,7 +98,7 @@ def joint(study: Study, terms: Sequence[Term]) -> Joint:
     parts = unsized(terms, study.scene)
     for _ in range(PASSES):
         model, state = extended(base, robot, data, state, terms) if terms else (base, state)
-        poses = Poses.of(Estimator(model, np.ones(len(model.y))), state)
+        poses = Poses(Estimator(model, np.ones(len(model.y))), state)
         weight = weights_of(poses, state.effects, parts)
         prior = np.concatenate([np.zeros(len(poses.prior) - len(weight)), weight])
         pull = poses.score.sum(axis=0) + poses.prior * poses.off

@@ -141,7 +141,7 @@ class Trials:
         model, state = study.model.only(study.fit.identification.active), study.fit.state
         if every:
             model, state = extended(model, study.robot, study.data, state, every)
-        self.whole = Poses.of(Estimator(model, np.ones(len(model.y))), state)
+        self.whole = Poses(Estimator(model, np.ones(len(model.y))), state)
         self.error, self.jacobian = self.whole.error, self.whole.jacobian
         allowed = bounds(scene, every)
         count = self.jacobian.shape[2] - len(allowed)

@@ -89,6 +89,14 @@ def accuracy(error: Array) -> Accuracy:
     )
 
 
+def by_key(nominal: Array, calibrated: Array, held: Array) -> dict[str, Array]:
+    """Errors (k, m, ...) of all poses by the keys of a result.  held: (m,)."""
+    return {
+        key: (nominal if key.startswith("nominal") else calibrated)[:, held == is_held]
+        for key, is_held in HELD.items()
+    }
+
+
 def before_and_after(accuracies: Mapping[str, Accuracy]) -> tuple[Accuracy, Accuracy, str]:
     """Before and after a fit, at held-out poses where there are any, and which poses those are."""
     held, train = accuracies["holdout"], accuracies["train"]

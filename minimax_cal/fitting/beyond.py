@@ -208,10 +208,6 @@ class Errors:
         out = np.zeros(final.shape[:2], dtype=bool) if doubted is None else doubted
         self.trusted.append(np.where(out[..., None], np.nan, final))
 
-    def miss(self, name: str) -> None:
-        """One part without which there is no fit."""
-        self.missed.append(name)
-
     def beyond(self, reason: str = NOTHING_LEFT, sought: bool | None = None) -> Beyond:
         """The claim.  reason: why there is none, if there is none.  sought: see `Beyond`."""
         if not self.names:
@@ -251,12 +247,9 @@ class Errors:
             max(range(len(folds)), key=lambda i: getattr(folds[i], kind))
             for kind in ("rms_mm", "max_mm")
         )
-        rms, largest = (
-            rms_interval(self.final[worst], rng=rng),
-            max_interval(self.final[far], rng=rng),
-        )
-        seen = 1e-3 * folds[worst].rms_mm, 1e-3 * folds[far].max_mm
-        return 1e3 * told(rms, seen[0]).high, 1e3 * told(largest, seen[1]).high
+        rms = told(rms_interval(self.final[worst], rng=rng), 1e-3 * folds[worst].rms_mm)
+        largest = told(max_interval(self.final[far], rng=rng), 1e-3 * folds[far].max_mm)
+        return 1e3 * rms.high, 1e3 * largest.high
 
 
 def pooled(every: Sequence[Accuracy]) -> float:
@@ -308,7 +301,7 @@ def without(
     """
     if not parts:
         return []
-    poses, model = Poses.of(estimator, state), estimator.model
+    poses, model = Poses(estimator, state), estimator.model
     free = np.flatnonzero(model.active) < model.names.geometric + frames
     every = poses.sums_by_part(parts)
     lost = are_needed(poses.normal_matrix[np.ix_(free, free)], every.gram[:, free][:, :, free])
@@ -405,7 +398,7 @@ def left_out(
             alone = error_of(other, part.rows) if geometric else final
             errors.add(part.name, final, alone, doubted[:, part.rows])
         else:
-            errors.miss(part.name)
+            errors.missed.append(part.name)
     if not parts:
         return Beyond(reason="the poses are too few or too much alike")
     return errors.beyond(sought=False if geometric else None)

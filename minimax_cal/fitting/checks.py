@@ -366,17 +366,17 @@ def wild(names: Names, change: Array, reach: float) -> str:
     )
 
 
-def too_changed(robot: Robot, after: Robot, active: Array) -> str:
+def too_changed(robot: Robot, mdh: Array, active: Array) -> str:
     """Why a result is of another arm than the one drawn, by its links; empty where it is not.
 
-    after: calibrated.  active: (5n,) True for link parameters that were identified.  What moves all
-    points as the base or the tool does (d and theta of the first joint, the last link) may be
-    anywhere.
+    mdh: (n, 5) calibrated.  active: (5n,) True for link parameters that were identified.  What
+    moves all points as the base or the tool does (d and theta of the first joint, the last link)
+    may be anywhere.
     """
     kinds = np.arange(5 * robot.joints).reshape(5, -1)  # a, d, theta, alpha, beta of each joint
     counts = active.copy()
     counts[[kinds[1, 0], kinds[2, 0], *kinds[:, -1]]] = False
-    change = links_of(after.mdh - robot.mdh)
+    change = links_of(mdh - robot.mdh)
     change[2 * robot.joints :] = np.angle(np.exp(1j * change[2 * robot.joints :]))
     zero = kinds[2]
     most = np.full(len(change), LARGE_TWIST)

@@ -128,7 +128,7 @@ def unseen_suspects(
     weights = np.zeros(model.weight.shape)
     weights[:, ~held] = solved.robust.weights
     model = model.only(solved.identification.active).with_prior(solved.estimator.model.prior)
-    spread = solved.robust.judged[1]
+    spread = solved.robust.scored[1]
     return held_suspects(model, state, weights, held, spread, data.line)
 
 
@@ -210,10 +210,8 @@ def too_far(
     floor: of noise [mm], and how it is known.  scores: of parts of the poses by their names, over
     all points and without those that are suspect.
     """
-    limit, what = (
-        1e3 * MAX_MISS_OF_REACH * robot.reach(),
-        f"{100 * MAX_MISS_OF_REACH:g} % of the arm's reach",
-    )
+    limit = 1e3 * MAX_MISS_OF_REACH * robot.reach()
+    what = f"{100 * MAX_MISS_OF_REACH:g} % of the arm's reach"
     if floor and MAX_MISS_OF_FLOOR * floor[0] < limit:
         limit = MAX_MISS_OF_FLOOR * floor[0]
         what = f"{MAX_MISS_OF_FLOOR:g} times the noise floor ({floor[1]})"
@@ -259,37 +257,19 @@ def is_crossed(options: Options, held: Measurements) -> bool:
 
 def crossed_of(
     robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
-) -> Array:
-    """Errors (k, m, 3) of every pose by a fit without it [m]."""
-    group = grouped(data, options.holdout_by)
-    return crossed(
-        solved.estimator,
-        solved.state,
-        held,
-        group,
-        errors_of(robot, data, solved),
-        options.seed,
-        steps_of(data.frames),
-    )
+) -> tuple[Array, Array]:
+    """Errors (k, m, 3) of every pose by fits without it, of the drawn and the calibrated arm [m].
 
-
-def drawn_crossed_of(
-    robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
-) -> Array:
-    """The same of the drawn arm: base, targets and frames are fitted without each pose."""
+    Of the drawn one base, targets and frames are fitted without each pose.
+    """
     train, names = data.take(~held), data.target_names
     free = np.arange(5 * robot.joints + 6 + 3 * len(names)) >= 5 * robot.joints
     free &= solved.identification.active[: len(free)]
     model, state = refitted(robot, train, solved.nominal, free)
-    return crossed(
-        Estimator(model, np.ones(len(names))),
-        state,
-        held,
-        grouped(data, options.holdout_by),
-        errors_of(robot, data, solved),
-        options.seed,
-        steps_of(data.frames),
-    )
+    group, error_of = grouped(data, options.holdout_by), errors_of(robot, data, solved)
+    given = held, group, error_of, options.seed, steps_of(data.frames)
+    drawn = crossed(Estimator(model, np.ones(len(names))), state, *given)
+    return drawn, crossed(solved.estimator, solved.state, *given)
 
 
 def beyond_of(

@@ -31,10 +31,8 @@ FACTORS = np.geomspace(0.1, 30.0, 26)  # of the links' errors
 NOISES = np.geomspace(2e-6, 2e-2, 30)  # of a coordinate, with what no link explains [m]
 POSES = 60  # that tell a scale
 LEAST_LENGTH, FEWEST = 0.05, 4  # of lengths that tell a common share: size [m]; their number
-MAX_P_VALUE, MAX_DOUBTFUL_P_VALUE = (
-    0.003,
-    0.05,
-)  # that lengths which are off at random agree so well on a share
+# that lengths which are off at random agree so well on a share
+MAX_P_VALUE, MAX_DOUBTFUL_P_VALUE = 0.003, 0.05
 # sigmas of what the angles let expect, beside which doubtful agreement is enough
 MIN_CLEAR_SIGMAS = 3.0
 PARTS = np.linspace(0.0, 1.0, 33)  # of the range in which lengths are off at random,

@@ -60,7 +60,7 @@ def crossed(
     group: Array,
     error_of: Callable[[State, Array], Array],
     seed: int,
-    frames: int = 0,
+    frames: int,
 ) -> Array:
     """(k, m, 3) errors of every pose by a fit without it, NaN where no fit can do without [m].
 
@@ -80,7 +80,9 @@ def crossed(
     return out
 
 
-def intervals_of(error: Array, group: Array, seed: int) -> tuple[Interval, Interval]:
+def intervals_of(
+    error: Array, group: Array, seed: int | np.random.Generator
+) -> tuple[Interval, Interval]:
     """95 % intervals of the RMS and of the largest of errors (k, m, 3) [m], as they are told.
 
     group: (m,).

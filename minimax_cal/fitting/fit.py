@@ -22,9 +22,7 @@ from minimax_cal.fitting.accuracy import (
     Interval,
     accuracy,
     before_and_after,
-    max_interval,
-    rms_interval,
-    told,
+    by_key,
     with_ends,
 )
 from minimax_cal.fitting.between_sessions import Change
@@ -290,12 +288,7 @@ class Fit(Result):
     @property
     def errors(self) -> Mapping[str, Array]:
         """Errors (k, m, 3) by the keys of `accuracy` [m]."""
-        return {
-            "nominal": self.error_nominal[:, self.held],
-            "train": self.error[:, ~self.held],
-            "holdout": self.error[:, self.held],
-            "nominal_train": self.error_nominal[:, ~self.held],
-        }
+        return by_key(self.error_nominal, self.error, self.held)
 
     @property
     def trusted(self) -> Accuracy:
@@ -368,13 +361,7 @@ class Fit(Result):
             return {key: ends_of(one) for key, one in seen.items()}
         rng = np.random.default_rng(self.options.seed)
         group = grouped(self.data, self.options.holdout_by)[self.held]
-        return {
-            key: (
-                told(rms_interval(self.errors[key], group, rng=rng), 1e-3 * one.rms_mm),
-                told(max_interval(self.errors[key], group, rng=rng), 1e-3 * one.max_mm),
-            )
-            for key, one in seen.items()
-        }
+        return {key: intervals_of(self.errors[key], group, rng) for key in seen}
 
     @property
     def unjudged(self) -> Array:
@@ -526,14 +513,14 @@ class Fit(Result):
         count, identified = len(self.parameters), sum(p.identifiable for p in self.parameters)
         rest = ", the others stay nominal" if identified < count else ""
         advice = "" if self.reason else self.advice
+        who = f"; quadratic programs of the minimax: {self.answerers()}" if self.answered else ""
         every = (
             f"{capitalise(self.reason)}." if self.reason else "",
             f"RMS error {before.rms_mm:.3f} mm -> {after.rms_mm:.3f} mm, largest "
             f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}.",
             self.aside_sentence() if self.set_aside else "",
             self.beyond.sentence(),
-            f"{identified} of {count} parameters identified{rest}; {self.status}"
-            f"{self.answered_by()}.",
+            f"{identified} of {count} parameters identified{rest}; {self.status}{who}.",
             f"{advice}." if advice else "",
         )
         return tuple(sentence for sentence in every if sentence)
@@ -554,10 +541,6 @@ class Fit(Result):
         steps = f"{work.steps} steps of least squares ({work.least_squares})"
         warm = f"({work.warm_starts} warm-started)"
         return f" QPs: {self.answerers()} {warm}, after {steps}."
-
-    def answered_by(self) -> str:
-        """Who answered the quadratic programs, as a clause; empty where there were none."""
-        return f"; quadratic programs of the minimax: {self.answerers()}" if self.answered else ""
 
     def answerers(self) -> str:
         """Backends with the number of QPs they answered, and how rough the answers were."""
@@ -605,6 +588,9 @@ class Fit(Result):
                if poses and crossed else {}),
         }  # fmt: skip
         errors = {"nominal": self.error_nominal, "final": self.error}
+        new = self.within
+        judged = in_file(with_ends(new.after, new.rms, new.largest))
+        judged |= {"not_judged": self.unjudged, "nominal": new.before}
         told = poses and self.data.poses
         return {
             **kept,
@@ -619,17 +605,12 @@ class Fit(Result):
                    for key, seen in self.accuracy.items()},
                 "holdout_trusted": self.trusted,
                 "beyond": self.beyond,
-                **({"cv": self.crossed_accuracy()} if crossed else {}),
+                **({"cv": judged} if crossed else {}),
             },
             "covariance": self.uncertainty,
             "arrays": arrays,
             **({"poses": pose_rows(self.data, self.held, errors)} if told else {}),
         }  # fmt: skip
-
-    def crossed_accuracy(self) -> dict[str, Any]:
-        """The cross-validated accuracy."""
-        judged = in_file(with_ends(self.within.after, self.within.rms, self.within.largest))
-        return judged | {"not_judged": self.unjudged, "nominal": self.within.before}
 
     @classmethod
     def told_beside(

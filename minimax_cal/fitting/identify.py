@@ -16,11 +16,11 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import name_first
+from minimax_cal.instruments.instrument import PLENTY, anywhere
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
-from minimax_cal.robots.sampling import random_joints
 from minimax_cal.solvers.least_squares import solve_normal
 
 PARALLEL = np.sin(np.radians(5.0))  # neighbouring axes closer than this count as parallel
@@ -221,7 +221,8 @@ def determined(
     plain = gram_of(reference, replace(state, effects=np.zeros(0)))
     plain = np.pad(plain, (0, names.count - len(plain)))
     order = doubted_last(order, names, known)
-    gone = redundant(plain, kept.active & geometric(names), order, RANK_TOLERANCE)
+    of_geometry = np.arange(names.count) < names.geometric
+    gone = redundant(plain, kept.active & of_geometry, order, RANK_TOLERANCE)
     kept = kept.without([i for i in gone if not known[i]], Because.SAME_MOTION)
     gone = redundant(with_priors(gram, known), kept.active, order, resolution)
     return kept.without(gone, Because.NOT_TOLD), gram, scale
@@ -244,11 +245,6 @@ def with_priors(gram: Array, known: Array) -> Array:
     return np.asarray(gram + np.diag(np.where(known, np.diag(gram), 0.0)))
 
 
-def geometric(names: Names) -> Array:
-    """(p,) True for parameters that are not of effects."""
-    return np.asarray(np.arange(names.count) < names.geometric)
-
-
 def gram_of(model: Model, state: State) -> Array:
     """The Gram matrix J'WJ of all parameters at a state: (p, p)."""
     every = np.ones(model.names.count, dtype=bool)
@@ -269,7 +265,7 @@ def generic_count(robot: Robot, reference: Model, order: Array, allowed: Array) 
 
 # the answers of `generic_count`, and the joints of `plenty_of_poses`: every fit of a robot asks
 COUNTED: WeakKeyDictionary[Robot, dict[tuple[int, bytes, bytes], int]] = WeakKeyDictionary()
-DRAWN: WeakKeyDictionary[Robot, dict[int, Array]] = WeakKeyDictionary()
+DRAWN: WeakKeyDictionary[Robot, Array] = WeakKeyDictionary()
 
 
 def definite(matrix: Array) -> bool:
@@ -319,17 +315,16 @@ def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int
     return gone
 
 
-def plenty_of_poses(robot: Robot, model: Model, poses: int = 200) -> Model:
+def plenty_of_poses(robot: Robot, model: Model) -> Model:
     """A model of the same cell at random poses over the joints' whole range."""
-    k, asked = len(model.y), DRAWN.setdefault(robot, {})
-    if poses not in asked:
-        asked[poses] = robot.turned(random_joints(robot, (poses,), np.random.default_rng(0)))
-    q = asked[poses]
+    if robot not in DRAWN:
+        DRAWN[robot] = robot.turned(anywhere(robot, PLENTY).q)
+    k = len(model.y)
     return Model(
-        q=q,
+        q=DRAWN[robot],
         prismatic=model.prismatic,
-        y=np.zeros((k, 3, poses)),
-        weight=np.ones((k, poses)),
+        y=np.zeros((k, 3, PLENTY)),
+        weight=np.ones((k, PLENTY)),
         names=model.names,
         active=model.active,
         prior=model.prior,

@@ -9,14 +9,13 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from minimax_cal.fitting.accuracy import accuracy
+from minimax_cal.fitting.accuracy import accuracy, by_key
 from minimax_cal.fitting.between_sessions import Change, between_sessions
 from minimax_cal.fitting.checks import POOR_FIT, wild
 from minimax_cal.fitting.claims import (
     bad_rows,
     beyond_of,
     crossed_of,
-    drawn_crossed_of,
     is_crossed,
     other_points,
     unjudged,
@@ -124,8 +123,7 @@ class Judged:
         """(k, m, 3) errors of both arms by fits without each pose, where so judged [m]."""
         if not is_crossed(self.options, self.poses.held):
             return NOT_CROSSED, NOT_CROSSED
-        given = self.robot, self.options, self.data, self.held, self.solved
-        return drawn_crossed_of(*given), crossed_of(*given)
+        return crossed_of(self.robot, self.options, self.data, self.held, self.solved)
 
     @cached_property
     def unseen(self) -> tuple[Array, Array]:
@@ -208,10 +206,7 @@ class Judged:
             iterations=solved.iterations,
             parameters=parameters_of(self.robot, solved),
             accuracy={
-                "nominal": accuracy(before[:, held]),
-                "train": accuracy(after[:, ~held]),
-                "holdout": accuracy(after[:, held]),
-                "nominal_train": accuracy(before[:, ~held]),
+                **{key: accuracy(error) for key, error in by_key(before, after, held).items()},
                 **({"holdout_with_them": counted} if counted else {}),
             },
             identification=solved.identification,

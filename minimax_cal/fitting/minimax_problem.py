@@ -74,9 +74,7 @@ def measured_distances(data: Measurements, tolerance: float | None = None) -> Di
     )
 
 
-def trusted_distances(
-    data: Measurements, weights: Array, tolerance: float | None = None
-) -> Distances:
+def trusted_distances(data: Measurements, weights: Array, tolerance: float | None) -> Distances:
     """`measured_distances` of the points that a fit gave weight.  weights: (k, m)."""
     trusted = np.where(weights.T[..., None] > MIN_TRUSTED_WEIGHT, data.y, np.nan)
     return measured_distances(data.with_y(trusted), tolerance)
@@ -132,11 +130,6 @@ class MinimaxProblem:
         return np.asarray(self.model.room[which] * self.scale[self.held, None])
 
     @cached_property
-    def squared_scale(self) -> Array:
-        """(free, free): one divisor an entry, so that a quotient is as symmetric as what it was."""
-        return self.size * np.outer(self.scale, self.scale)
-
-    @cached_property
     def columns(self) -> Array:
         """(2, l, 3) the parameters of both targets of each pair."""
         first = 5 * self.model.names.joints + 6
@@ -184,12 +177,14 @@ class MinimaxProblem:
             off = (model.prior.mean - model.values(x))[model.active]
             slope, held = slope - 2.0 * weight * off / total, prior_of(model, x)
         c, normal = self.deviation(x)
+        # one divisor an entry, so that a quotient is as symmetric as what it was
+        divisor = self.size * np.outer(self.scale, self.scale)
 
         def curvature(weights: Array) -> Array:
             both = at.curvature(weights)
             if known:
                 both = both + 2.0 * weights.sum() * np.diag(weight) / total
-            return np.asarray(both / self.squared_scale)
+            return np.asarray(both / divisor)
 
         return Linear(
             f=(at.f + held) / self.size,

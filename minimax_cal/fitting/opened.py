@@ -15,7 +15,7 @@ import numpy as np
 
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Fit
-from minimax_cal.fitting.options import Options, read_options
+from minimax_cal.fitting.options import Options, listed, read_options
 from minimax_cal.fitting.pose_rows import measured_poses
 from minimax_cal.fitting.spans import Span, spans_of
 from minimax_cal.fitting.stations import MIN_FRAME_POINTS, moving
@@ -292,9 +292,7 @@ def listed_effects(given: object) -> tuple[str | Term, ...]:
 
     Raises CalibrationError.
     """
-    if isinstance(given, str):
-        given = tuple(filter(None, given.replace(" ", "").split(",")))
-    several = given if isinstance(given, Sequence) else (given,)
+    several = listed(given) if isinstance(given, Sequence) else (given,)
     out: list[str | Term] = []
     for each in several:
         if isinstance(each, Term) or (isinstance(each, str) and not each.endswith(".json")):

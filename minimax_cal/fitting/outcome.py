@@ -8,7 +8,7 @@ so that what both miss alike, as noise, does not count.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -100,12 +100,9 @@ def improvement(
     judged = np.isfinite(calibrated[..., 0])
     if not (wrong & judged).any() or (judged & ~wrong).sum() < MIN_POINTS_LEFT * judged.sum():
         return whole
-    hidden = np.where(wrong[..., None], np.nan, calibrated)
-    less = compare_arms(drawn, hidden, group)
+    less = compare_arms(*hidden(drawn, calibrated, wrong), group)
     named = points_of(data, wrong & judged, calibrated)
-    if less.is_better:
-        return Improvement(less.before, less.after, less.gain, less.error, named)
-    return Improvement(whole.before, whole.after, whole.gain, whole.error)
+    return replace(less, wrong=named) if less.is_better else whole
 
 
 def points_of(data: Measurements, which: Array, error: Array) -> str:
@@ -151,11 +148,9 @@ def rms_of(drawn: Array, calibrated: Array) -> tuple[float, float]:
 def exchanged_rows(robot: Robot, data: Measurements, before: Array) -> Array:
     """(b,) rows whose points belong to other rows.  before: (k, m, 3) errors as drawn [m]."""
     far = np.nanmax(np.linalg.norm(before, axis=-1), initial=0.0)
-    return (
-        exchanged(robot, data)
-        if far > MIN_STRAY_OF_REACH * robot.reach()
-        else np.zeros(0, dtype=int)
-    )
+    if far > MIN_STRAY_OF_REACH * robot.reach():
+        return exchanged(robot, data)
+    return np.zeros(0, dtype=int)
 
 
 def said_of_exchanged(data: Measurements, rows: Array) -> str:
@@ -189,7 +184,7 @@ def impossible(
         return said_of_exchanged(data, swapped)
     changed = ""
     if not options.allow_large_changes:
-        changed = too_changed(robot, robot.with_mdh(solved.state.mdh), active[:links])
+        changed = too_changed(robot, solved.state.mdh, active[:links])
     placed = float(active[links:].sum())
     return (
         contradiction(robot, data, after, held, suspects)

@@ -118,11 +118,11 @@ def told_errors(given: Mapping[str, Any], name: str, data: Measurements) -> Arra
     return np.moveaxis(np.where(np.isfinite(told), told, np.nan), 1, 0)
 
 
-def errors_of(cell: Cell | None, data: Measurements, told: Array) -> Array:
+def errors_of(cell: Cell, data: Measurements, told: Array) -> Array:
     """(k, m, 3) errors of a cell [m]: worked out, or as they stand in a file that lacks columns of
     the measurements which its effects look at.
     """  # fmt: skip
-    if cell is None or not data.poses:
+    if not data.poses:
         return told
     exact = cell.error(data)
     return exact if comes_back(exact, told) else told

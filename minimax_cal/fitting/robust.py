@@ -209,7 +209,6 @@ MAX_TRIM = 0.5  # no method tells wrong points from right ones where they are th
 MAX_ROUNDS = 200  # of reweighting
 WEIGHT_TOLERANCE = 1e-6  # change of a weight that ends them
 MAX_VARIANCE_GROWTH = 100.0  # times the variance: these poses no longer tell a parameter
-ALL: Array = np.ones(0, dtype=bool)
 
 
 @dataclass(frozen=True)
@@ -277,62 +276,36 @@ def distances(model: Model, state: State) -> Array:
     return np.asarray(np.sqrt(np.concatenate(parts, axis=-1)))
 
 
-@dataclass(frozen=True, eq=False)
-class Robust:
-    """A fit whose points have weights.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Robust(Weighted):
+    """A fit whose points have weights, as it ended: from 0 to 1, and 0 where not measured.
 
-    at: the fit.  kept: its model with the points set aside at weight 0, not weighted by the loss.
+    kept: its model with the points set aside at weight 0, not weighted by the loss.
     loss_scale: standard deviation of a coordinate at which the loss was taken [m].
     line: (m,) of the file.
     """
 
-    at: Weighted
     kept: Model
     loss: str
     loss_scale: float
     line: Array
     notices: tuple[str, ...] = ()
 
-    @property
-    def plain(self) -> Model:
-        """The model as given, with the prior of the last fit."""
-        return self.at.plain
-
-    @property
-    def model(self) -> Model:
-        """The model weighted by the loss too."""
-        return self.at.model
-
-    @property
-    def fit(self) -> LeastSquares[State]:
-        """Its least squares."""
-        return self.at.found
-
-    @property
-    def weights(self) -> Array:
-        """(k, m) from 0 to 1, beside those of the measurements; 0 where not measured."""
-        return self.at.weights
-
-    @property
-    def rounds(self) -> int:
-        """How many fits it took."""
-        return self.at.rounds
-
     @cached_property
-    def judged(self) -> tuple[Scores, Spread]:
+    def scored(self) -> tuple[Scores, Spread]:
         """How far off each point is, and how ordinary points scatter."""
-        found = self.at.scores()
-        return found, self.at.spread(found)
+        found = self.scores()
+        return found, self.spread(found)
 
     @property
     def scale(self) -> float:
         """Standard deviation of a coordinate of an ordinary point [m], of the typical weight."""
-        return self.judged[1].scale
+        return self.scored[1].scale
 
     @cached_property
     def suspects(self) -> tuple[Suspect, ...]:
         """The points that stand out from the fit, the least likely first."""
-        return suspects_of(self.at.plain, self.at.state, *self.judged, self.line)
+        return suspects_of(self.plain, self.state, *self.scored, self.line)
 
     @property
     def by_pose(self) -> Model:
@@ -356,7 +329,8 @@ def robust_fit(
     line: Array,
     loss: str = SQUARE,
     trim: float = 0.0,
-    judged: Array = ALL,
+    *,
+    judged: Array,
 ) -> Robust:
     """Minimise a loss of the distances, with at most a share of the points set aside.
 
@@ -365,7 +339,6 @@ def robust_fit(
     targets that do not pull at the fit.  Raises OptionError.
     """
     check_robust(loss, trim)
-    judged = judged if len(judged) else np.ones(len(plain.y), dtype=bool)
     seen = plain.seen.astype(float)
     at, kept = Weighted(fitter, plain, found, seen, judged), seen
     scale = np.nan
@@ -378,15 +351,13 @@ def robust_fit(
         scale = at.spread(at.scores()).scale
         at = reweighted(at, kept, LOSSES[loss], scale)
     kept_model = replace(at.plain, weight=plain.weight * kept)
-    robust = Robust(at, kept_model, loss, scale, line)
-    if not at.rounds:
-        return robust
-    return replace(robust, notices=tuple(remarks(at, kept, robust.suspects, trim)))
+    robust = Robust(**vars(at), kept=kept_model, loss=loss, loss_scale=scale, line=line)
+    return replace(robust, notices=tuple(remarks(robust, kept, trim))) if at.rounds else robust
 
 
-def remarks(at: Weighted, kept: Array, suspects: tuple[Suspect, ...], trim: float) -> Iterator[str]:
+def remarks(at: Robust, kept: Array, trim: float) -> Iterator[str]:
     """What the reader should know beside the list of suspects."""
-    away = int((at.plain.seen & (kept == 0.0)).sum())
+    suspects, away = at.suspects, int((at.plain.seen & (kept == 0.0)).sum())
     if suspects:
         yield f"{len(suspects)} of {at.count} points are outliers: {EXPLANATION}"
     if trim:
@@ -428,9 +399,8 @@ def moments(model: Model, state: State, loss: str, scale: float) -> tuple[Array,
     own = LOSSES[loss]
     u = size / (scale * own.tuning)
     derivative = np.where(model.seen, own.slope(u), 0.0)
-    return derivative.sum(axis=1) / counts, ((own.weight(u) * size) ** 2).sum(axis=1) / (
-        3.0 * counts
-    )
+    square = (own.weight(u) * size) ** 2
+    return derivative.sum(axis=1) / counts, square.sum(axis=1) / (3.0 * counts)
 
 
 def flatness(robust: Robust, state: State) -> float:

@@ -240,8 +240,9 @@ class Task:
     def robust(self, model: Model, found: LeastSquares[State]) -> Robust:
         """The fit with the loss and the trimming that were asked for."""
         line, options = self.data.line, self.options
-        squares, judged = self.squares, self.judged
-        return robust_fit(squares, model, found, line, options.loss, options.trim, judged)
+        return robust_fit(
+            self.squares, model, found, line, options.loss, options.trim, judged=self.judged
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,7 +291,9 @@ def fit_cell(
     if options.objective == "pose":
         mix = pose_weights(data, options.lever)
         model = stage.robust.by_pose
-        stage = replace(stage, squares=of_poses(task, with_poses(model, mix), stage))
+        # the turn that fits the errors best vanishes for half a turn too: start near the answer
+        squares = nearby(with_poses(model, mix), stage.state, options.method)
+        stage = replace(stage, squares=squares)
     distances = trusted_distances(data, stage.robust.weights, options.distance_tolerance)
     optimum, certificate, said = worst_case(task, model, stage.state, distances, progress)
     state, identification = optimum.x if optimum else stage.state, stage.identification
@@ -383,21 +386,21 @@ def geometry(task: Task, progress: Progress, *, wide: bool = True) -> Stage:
     # a few gross outliers are no reason to search: what counts is how the believed points are met
     notices: tuple[str, ...] = ()
     if wide:
-        better, notices = wider(task.robot, robust.model, robust.fit, progress)
-        if better is not robust.fit:
+        better, notices = wider(task.robot, robust.model, robust.found, progress)
+        if better is not robust.found:
             robust = task.robust(robust.plain, better)
     for _ in range(MAX_GROWTHS):
-        at = task.base.emphasise(task.share), robust.fit.x.take(np.array(0)), identification
+        at = task.base.emphasise(task.share), robust.state, identification
         more = task.grown(*at, 0.0)
         if more is None:
             break
         clear = task.grown(*at, MIN_GROWN_SINGULAR)
         more = clear or more
         model, squares = task.squares(robust.plain.only(more.active), at[1])
-        if clear is None and squares.cost[0] > MAX_REMAINING_COST * robust.fit.cost[0]:
+        if clear is None and squares.cost[0] > MAX_REMAINING_COST * robust.found.cost[0]:
             break
         identification, robust = more, task.robust(model, squares)
-    return Stage(task.base, identification, robust, robust.fit, notices=notices)
+    return Stage(task.base, identification, robust, robust.found, notices=notices)
 
 
 def by_drawing(task: Task, stage: Stage, progress: Progress) -> tuple[Task, Stage]:
@@ -485,7 +488,7 @@ def jointly(task: Task, stage: Stage, terms: tuple[Term, ...]) -> tuple[Task, St
     """Geometry and effects together; the task with the data where its sessions then stand."""
     robot, robust, identification = task.robot, stage.robust, stage.identification
     for _ in range(EFFECT_PASSES):
-        frames, here = turned_in(task.data.frames, robust.fit.x.take(np.array(0)))
+        frames, here = turned_in(task.data.frames, robust.state)
         task = replace(task, data=seen_from(task.data, frames))
         y = model_of(robot, task.data).y if frames else task.base.y
         task, plain = replace(task, base=replace(task.base, y=y)), replace(robust.plain, y=y)
@@ -500,7 +503,7 @@ def jointly(task: Task, stage: Stage, terms: tuple[Term, ...]) -> tuple[Task, St
     base = replace(
         task.base, names=model.names, fields=model.fields, moved=model.moved, room=model.room
     )
-    return task, Stage(base, identification, robust, robust.fit, terms, stage.notices)
+    return task, Stage(base, identification, robust, robust.found, terms, stage.notices)
 
 
 def room_of(task: Task, model: Model, state: State, terms: tuple[Term, ...]) -> Array:
@@ -520,14 +523,6 @@ def without_resting(known: Identification, names: Names, rests: Array) -> Identi
     return replace(known, active=known.active & ~gone, reasons={**known.reasons, **said})
 
 
-def of_poses(task: Task, model: Model, stage: Stage) -> LeastSquares[State]:
-    """The least squares of pose errors, from that of points.
-
-    The turn that fits the errors best vanishes for half a turn too: start near the answer.
-    """
-    return nearby(model, stage.state, task.options.method)
-
-
 def worst_case(
     task: Task, model: Model, state: State, distances: Distances, progress: Progress
 ) -> tuple[Optimum[State] | None, Certificate | None, tuple[str, ...]]:
@@ -541,9 +536,7 @@ def worst_case(
     qp, notices = solver_of(options.qp, QP_TOLERANCE)
     settings = Sqp(hessian=options.hessian)
     links = model.active[: 5 * task.robot.joints]
-    other = not options.allow_large_changes and too_changed(
-        task.robot, task.robot.with_mdh(state.mdh), links
-    )
+    other = not options.allow_large_changes and too_changed(task.robot, state.mdh, links)
     if other or problem.size > (MIN_HOPELESS_MISS * task.robot.reach()) ** 2:
         settings = replace(settings, iterations=min(settings.iterations, LAST_STEPS))
     optimum = minimax.solve(problem, state, qp, settings)

@@ -26,10 +26,8 @@ from minimax_cal.robots.transforms import nearest_rotation, transform
 
 MIN_FRAME_POINTS = 3  # points that give a frame
 MIN_SESSION_POSES = 12  # poses of a session that place the robot by themselves
-MAX_ROUNDS, MAX_SETTLED_MOVE = (
-    20,
-    1e-9,
-)  # of placing targets and frames in turn, until these move less [m]
+MAX_ROUNDS = 20  # of placing targets and frames in turn,
+MAX_SETTLED_MOVE = 1e-9  # until these move less [m]
 
 
 def stationed(robot: Robot, data: Measurements, train: Array) -> Measurements:

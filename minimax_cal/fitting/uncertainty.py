@@ -9,11 +9,10 @@ all targets of a pose together (`noise`); the sandwich is H^-1 (sum J'A V A J) H
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.special import gammaincinv, stdtrit
@@ -103,35 +102,29 @@ def point_share(mu: Array, seen: Array) -> Array:
     return out
 
 
-class Linearised(ABC):
+class Linearised(Protocol):
     """A fit at its solution: p free parameters, r coordinates a pose, of m poses."""
 
     @property
-    @abstractmethod
     def error(self) -> Array:
         """(m, r) errors."""
 
     @property
-    @abstractmethod
     def jacobian(self) -> Array:
         """(m, r, p) derivative by the free parameters."""
 
     @property
-    @abstractmethod
     def seen(self) -> Array:
         """(k, m) which points were measured."""
 
     @property
-    @abstractmethod
     def prior(self) -> Array:
         """(p,) weights of a prior."""
 
     @property
-    @abstractmethod
     def off(self) -> Array:
         """(p,) how far the parameters are from the prior's mean."""
 
-    @abstractmethod
     def sums_of(self, part: Array) -> tuple[Array, Array]:
         """J'A J (p, p) and J'A e (p,) of some poses, A the weights.  part: mask (m,)."""
 
@@ -173,11 +166,6 @@ class Poses(Linearised):
 
     estimator: Estimator
     state: State
-
-    @staticmethod
-    def of(estimator: Estimator, state: State) -> Poses:
-        """All poses of an estimator at its solution."""
-        return Poses(estimator, state)
 
     @cached_property
     def every(self) -> tuple[Array, Array]:
@@ -415,7 +403,7 @@ def noise_of(estimator: Estimator, state: State) -> Noise:
 
     The instrument's alone where the poses do not determine the parameters.
     """
-    poses = Poses.of(estimator, state)
+    poses = Poses(estimator, state)
     rows, dof = poses.rows(), poses.freedom
     if dof >= LEAST_DOF:
         return restricted(rows, np.zeros((len(rows.error), 0)))
@@ -441,11 +429,8 @@ def by_poses(poses: Poses, group: Array) -> Array:
     NaN where the fit needs one of the poses.
     """
     member, sizes = np.unique(group, return_inverse=True, return_counts=True)[1:]
-    order, count, p = (
-        np.argsort(member.reshape(-1), kind="stable"),
-        len(sizes),
-        len(poses.normal_matrix),
-    )
+    order = np.argsort(member.reshape(-1), kind="stable")
+    count, p = len(sizes), len(poses.normal_matrix)
     cover, ends = solve_normal(poses.normal_matrix, np.eye(p)), np.cumsum(sizes)
     total = np.zeros((p, p))
     for size in np.unique(sizes):  # groups of as many rows at once
@@ -485,7 +470,7 @@ def uncertainty_of(
     the worst point, which always needs a few.  group: (m,) as `data.groups`.  units: of effects.
     """
     few, rows = estimator.thinned(group, MAX_DRAWN_POSES)
-    poses = Poses.of(few, state)
+    poses = Poses(few, state)
     dof = poses.freedom
     found, source = np.full(poses.normal_matrix.shape, np.nan), "poses"
     if dof >= 1.0 and estimator.share.ndim == 1:

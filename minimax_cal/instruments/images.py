@@ -265,16 +265,9 @@ class Images(Instrument):
             return np.zeros(by.shape[:2]), by, np.zeros((LENS, *by.shape[:2]))
         if self.sight is not None:
             focal = self.intrinsic[self.pixels.camera, :2].T / self.sight.depth
-            by = (
-                np.concatenate(
-                    [
-                        np.tile(np.eye(2)[:, None], (1, len(point), 1)),
-                        -self.sight.direction[..., None],
-                    ],
-                    axis=2,
-                )
-                * focal[..., None]
-            )
+            by = np.tile(np.eye(2, 3)[:, None], (1, len(point), 1))
+            by[..., 2] = -self.sight.direction
+            by *= focal[..., None]
             return -np.einsum("rnp,np->rn", by, point), by, np.zeros((LENS, *focal.shape))
         flat = point[:, :2] / point[:, 2:]
         pixel, across, lens = slopes(self.lenses(own), *flat.T)

@@ -15,7 +15,7 @@ from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.opened import Opened, open_result
 from minimax_cal.fitting.opened import Result as Given
 from minimax_cal.fitting.set_aside import aside_sentence, errors_of, with_them
-from minimax_cal.fitting.several.fit import Train, allowed_of, stack_of, start_of
+from minimax_cal.fitting.several.fit import allowed_of, stack_of, start_of
 from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.fitting.spans import Span, narrow, outside, spans_in_words
 from minimax_cal.fitting.uncertainty import Uncertainty
@@ -195,7 +195,7 @@ def of_instrument(source: Given, one: Instrument, rung: int | None) -> Evaluatio
             "without them (step 1)"
         )
     one, options = replace(one, at=check_joints(robot, one.at)), RelativeOptions()
-    stack = stack_of(robot, [Train("", one)], options)
+    stack = stack_of(robot, {"": one}, options)
     x, block = start_of(robot, stack, allowed_of(stack, options)[0]), stack.blocks[0]
     error = block.instrument.errors(*block.at(x), np.zeros(one.poses, dtype=bool))
     found, data = accuracy(error), one.at

@@ -210,7 +210,7 @@ def linear(study: Study, *terms: Term, at: float = 0.0) -> tuple[Poses, Array]:
     model, state = extended(base, study.robot, study.data, state, terms)
     state = replace(state, effects=state.effects + at)
     model, state = extended(base, study.robot, study.data, state, terms)
-    return Poses.of(Estimator(model, np.ones(len(model.y))), state), state.effects
+    return Poses(Estimator(model, np.ones(len(model.y))), state), state.effects
 
 
 @pytest.mark.parametrize("at", [0.0, 4e-5])

@@ -108,7 +108,7 @@ def test_parts_that_effects_alone_need_are_judged_as_a_calibration_of_the_rest_w
     """Without one end of joint 6 its gear's harmonics are not told: the rest gives them up."""
     data, gear = one_end(robot), ("gear_error:J6:orders=3",)
     fit = mc.calibrate(robot, data, "sum", effects=gear)
-    lost = Poses.of(fit.estimator, fit.cell.state)
+    lost = Poses(fit.estimator, fit.cell.state)
     every = {part.name: part.rows for part in parts(fit.data)}
     assert [fold.where for fold in fit.beyond.folds] == list(every)
     assert fit.beyond.missed == ()
@@ -452,7 +452,7 @@ def test_the_search_goes_on_where_one_step_does_not_arrive(robot):
     effects = ("gear_error:J5:orders=3", "gear_error:J6:orders=3")
     fit = mc.calibrate(robot, data, "sum", effects=effects)
     estimator, state = fit.estimator, fit.cell.state
-    poses, far = Poses.of(estimator, state), 0
+    poses, far = Poses(estimator, state), 0
     effects_of = np.flatnonzero(estimator.model.active) >= estimator.model.names.geometric
     for part in (part.rows[~fit.held] for part in parts(fit.data)):
         near = moved(estimator.model, state, step_without(poses, part))
@@ -464,8 +464,8 @@ def test_the_search_goes_on_where_one_step_does_not_arrive(robot):
         far += 1
         (found,) = without(estimator, state, [part], 0)
         assert found is not None
-        there = Poses.of(estimator, found)
-        step, more = step_without(there, part), step_without(Poses.of(estimator, near), part)
+        there = Poses(estimator, found)
+        step, more = step_without(there, part), step_without(Poses(estimator, near), part)
         motion, left = (float(one @ there.normal_matrix @ one) for one in (step, more))
         assert motion < 1e-6 * left  # a further step leads nowhere
     assert far

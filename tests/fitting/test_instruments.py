@@ -35,7 +35,7 @@ from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.robust import LOSSES
 from minimax_cal.fitting.several import RelativeCalibration, relative
-from minimax_cal.fitting.several.fit import InstrumentFit, Train, fit_instruments
+from minimax_cal.fitting.several.fit import InstrumentFit, fit_instruments
 from minimax_cal.fitting.several.options import RelativeOptions, check_options, silent, with_others
 from minimax_cal.fitting.several.stack import Block, Stack, own_state
 from minimax_cal.ground.arrays import Array
@@ -824,8 +824,8 @@ def test_the_worst_part_is_as_good_as_slsqp_makes_it(kind: str) -> None:
     """By another solver over the same parameters."""
     arm, seen = measured("irb2600", kind, 1, NOISE)
     found = relative(arm.robot, seen.data, objective="minimax")
-    train = Train("", seen.data.take(~seen.data.held_back(RelativeOptions())[0]))
-    fit = fit_instruments(arm.robot, [train], RelativeOptions(), silent)
+    train = {"": seen.data.take(~seen.data.held_back(RelativeOptions())[0])}
+    fit = fit_instruments(arm.robot, train, RelativeOptions(), silent)
     problem, start = fit.problem, fit.state
     label = problem.stack.blocks[0].read(start).part
     size = np.linalg.norm(problem.stack.rows(start, problem.active)[1], axis=1) / NOISE
@@ -898,7 +898,7 @@ def fit_by(kind: str, loss: str, *, dirty: bool) -> InstrumentFit:
     arm, seen = measured("irb2600", kind, 1, NOISE)
     data = wrong(kind, seen.data, np.random.default_rng(3)) if dirty else seen.data
     options = RelativeOptions(loss=loss, known_distances=seen.known)
-    return fit_instruments(arm.robot, [Train("", data)], options, silent)
+    return fit_instruments(arm.robot, {"": data}, options, silent)
 
 
 def off(fit: InstrumentFit, other: InstrumentFit) -> Array:
@@ -937,7 +937,7 @@ def test_a_loss_of_lengths_is_that_of_scipy() -> None:
     arm, seen = measured("irb2600", "wires_3", 1, NOISE)
     data = wrong("wires_3", seen.data, np.random.default_rng(3))
     options = RelativeOptions(loss="huber", fix=("theta*", "alpha*", "beta*"))
-    fit = fit_instruments(arm.robot, [Train("", data)], options, silent)
+    fit = fit_instruments(arm.robot, {"": data}, options, silent)
     problem, edge = fit.problem, fit.problem.scale[0] * LOSSES["huber"].tuned(np.ones(1))[0]
 
     def rows(x: Array, at: int) -> Array:
@@ -996,7 +996,7 @@ def tracked() -> tuple[Arm, mc.Measurements, InstrumentFit]:
 
 def by_huber(arm: Arm, data: mc.Measurements, **others: Instrument) -> InstrumentFit:
     points = Points(data).take(data.columns["split"] == "train")
-    trains = [Train("points", points), *(Train(name, one) for name, one in others.items())]
+    trains = {"points": points, **others}
     return fit_instruments(arm.robot, trains, RelativeOptions(loss="huber"), silent)
 
 
@@ -1030,7 +1030,7 @@ def test_effects_are_found_and_fitted_beside_gross_errors() -> None:
     data = SIMULATORS["wires_3"](arm, np.random.default_rng([1, 5]), 60, NOISE).data
     bad = wrong("wires_3", data, np.random.default_rng(3))
     clean, found = (
-        fit_instruments(arm.robot, [Train("", each)], RelativeOptions(**how), silent)
+        fit_instruments(arm.robot, {"": each}, RelativeOptions(**how), silent)
         for each, how in ((data, EFFECT), (bad, {**EFFECT, "loss": "huber"}))
     )
     assert found.stack.laws.names == clean.stack.laws.names

@@ -132,7 +132,7 @@ def test_nothing_near_is_better(small, name):
         psi = np.append(u[:points] * LOSSES[name].weight(u[:points]), u[points:])
         return slopes(small, x, unit).T @ psi
 
-    values = [small.model.values(state_of(one)) for one in (found.fit, small.found)]
+    values = [small.model.values(state_of(one)) for one in (found.found, small.found)]
     ours = (values[0] - values[1])[small.model.active] / 1e-4
     beside = ours + 0.05 * np.random.default_rng(0).normal(size=len(ours))
     other = optimize.minimize(
@@ -152,9 +152,9 @@ def test_nothing_near_is_better(small, name):
 def test_a_fifth_of_wrong_points_does_no_harm(robot, loss, trim, size):
     case = shifted(robot, 0.2, size)
     found = case.robust(loss, trim)
-    assert found.fit.status[0] == "converged"
+    assert found.found.status[0] == "converged"
     knowing = case.miss(case.without())
-    assert case.miss(state_of(found.fit)) < 1.25 * knowing
+    assert case.miss(state_of(found.found)) < 1.25 * knowing
     assert case.miss(state_of(case.found)) > 5.0 * knowing
     assert_allclose(found.scale, NOISE, rtol=0.15)
     assert (case.listed(found) >= case.bad).all()
@@ -167,7 +167,7 @@ def test_a_fifth_of_wrong_points_does_no_harm(robot, loss, trim, size):
 def test_without_noise_the_truth_is_found(robot, loss, trim, most):
     case = shifted(robot, 0.2, 1e-3, truth=EXACT)
     found = case.robust(loss, trim)
-    assert case.miss(state_of(found.fit)) < most
+    assert case.miss(state_of(found.found)) < most
     assert (case.listed(found) == case.bad).all()
 
 
@@ -175,7 +175,7 @@ def test_without_noise_the_truth_is_found(robot, loss, trim, most):
 def test_clean_points_are_fitted_as_by_least_squares(robot, loss):
     case = shifted(robot, 0.0, 0.0, poses=80)
     found = case.robust(loss)
-    off = np.linalg.norm(case.model.error(state_of(found.fit))
+    off = np.linalg.norm(case.model.error(state_of(found.found))
                          - case.model.error(state_of(case.found)), axis=-1)  # fmt: skip
     assert np.sqrt(np.mean(off**2)) < 0.3 * NOISE
     assert_allclose(found.scale, NOISE, rtol=0.1)
@@ -187,7 +187,7 @@ def test_one_target(robot):
     case = shifted(robot, 0.1, 1e-3, poses=60, targets=1)
     for found in (case.robust("tukey"), case.robust(trim=0.15)):
         assert (case.listed(found) == case.bad).all()
-        assert case.miss(state_of(found.fit)) < 1.3 * case.miss(case.without())
+        assert case.miss(state_of(found.found)) < 1.3 * case.miss(case.without())
         assert not any(one.together for one in found.suspects)
 
 
@@ -225,7 +225,7 @@ def test_weights_of_the_instrument_stay(robot):
     assert (told.listed(found) == told.bad).all()
     assert_allclose(found.model.weight, told.model.weight * found.weights)
     assert_allclose(found.scale, NOISE, rtol=0.1)  # of a point with the typical u95
-    assert told.miss(state_of(found.fit)) < 1.3 * told.miss(told.without())
+    assert told.miss(state_of(found.found)) < 1.3 * told.miss(told.without())
 
 
 def few_that_tell_the_wrist(
@@ -253,8 +253,8 @@ def test_a_bad_pose_that_draws_the_fit_to_itself(robot, seed):
     found = case.robust("tukey")
     assert (case.listed(found) == case.bad).all()
     assert found.weights[0, 0] == 0.0
-    assert distances(case.model, state_of(found.fit))[0, 0] > 20.0 * plain[0]
-    assert case.miss(state_of(found.fit)) < 0.3 * case.miss(state_of(case.found))
+    assert distances(case.model, state_of(found.found))[0, 0] > 20.0 * plain[0]
+    assert case.miss(state_of(found.found)) < 0.3 * case.miss(state_of(case.found))
 
 
 def test_parameters_that_only_suspects_tell_are_named(robot):
@@ -286,13 +286,13 @@ def test_what_is_set_aside_is_a_fixed_point(robot):
     """The final fit itself finds just these points to stand out, and comes out again the same."""
     case = shifted(robot, 0.1, 3e-4, seed=4)
     found = case.robust(trim=0.2)
-    last = Weighted(FITTER, found.plain, found.fit, found.weights, np.ones(3, dtype=bool))
+    last = Weighted(FITTER, found.plain, found.found, found.weights, np.ones(3, dtype=bool))
     judged = last.scores()
     far = unlikely(last.spread(judged).p_value(judged))
     assert (far == (found.weights == 0.0)).all()
     again = case.robust(trim=0.2)
     assert_allclose(again.weights, found.weights, rtol=0)
-    assert_allclose(state_of(again.fit).mdh, state_of(found.fit).mdh, rtol=0)
+    assert_allclose(state_of(again.found).mdh, state_of(found.found).mdh, rtol=0)
 
 
 @pytest.mark.parametrize("per", ["target", "point"])
@@ -303,7 +303,7 @@ def test_minimax_on_the_trimmed_model_is_that_without_the_points(robot, per):
     deleted = case_of(robot, case.made, case.data.with_y(y), case.bad.T)
     worst = []
     for model, state in (
-        (found.model, state_of(found.fit)),
+        (found.model, state_of(found.found)),
         (deleted.model.only(found.model.active), state_of(deleted.found)),
     ):
         assert_allclose(model.counts, (found.weights > 0.0).sum(axis=1))
@@ -338,7 +338,7 @@ def test_a_pose_has_the_least_weight_of_its_targets(robot):
 def test_rounds_that_do_not_settle_are_told(robot, monkeypatch):
     monkeypatch.setattr(robust, "MAX_ROUNDS", 1)
     found = shifted(robot, 0.1, 1e-3, poses=30).robust("huber")
-    assert found.fit.status == ("iteration_limit",)
+    assert found.found.status == ("iteration_limit",)
 
 
 def test_a_plain_fit_that_diverged_stays_what_it_is(robot):
@@ -349,7 +349,7 @@ def test_a_plain_fit_that_diverged_stays_what_it_is(robot):
     )
     failed = replace(case.found, x=lost.batch(), cost=np.array([np.nan]), status=(Status.FAILED,))
     found = replace(case, found=failed).robust("tukey", 0.1)
-    assert found.fit.status == ("failed",)
+    assert found.found.status == ("failed",)
     assert not found.suspects
     assert found.weights.all()
 

@@ -16,7 +16,7 @@ from experiments.relative import NOISE, SIMULATORS, Arm
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.fitting.several import RelativeCalibration, relative
-from minimax_cal.fitting.several.fit import InstrumentFit, Train, fit_instruments, laws_of
+from minimax_cal.fitting.several.fit import InstrumentFit, fit_instruments, laws_of
 from minimax_cal.fitting.several.linear import rows_of_all, scene_of_all
 from minimax_cal.fitting.several.options import RelativeOptions, silent
 from minimax_cal.instruments import (
@@ -267,7 +267,7 @@ def measured(seed: int, kinds: tuple[str, ...]) -> tuple[Arm, tuple[Instrument, 
 def fitted(kinds: tuple[str, ...], effects: tuple[str, ...] = ()) -> tuple[Arm, InstrumentFit]:
     arm, data, known = measured(0, kinds)
     every = [replace(each, at=with_history(each.at)) for each in data]
-    trains = [Train(f"file{i}", each) for i, each in enumerate(every)]
+    trains = {f"file{i}": each for i, each in enumerate(every)}
     options = RelativeOptions(known_distances=known, effects=effects)
     return arm, fit_instruments(arm.robot, trains, options, silent)
 
@@ -281,12 +281,10 @@ def test_the_rows_of_an_arm_that_gives_way_have_its_derivative(kind):
     arm, rng = arm_of(1), np.random.default_rng(3)
     if kind == "contacts":
         data = [replace(plates(arm, rng, 30), at=with_history(plates(arm, rng, 30).at))]
-        train = Train("plates", data[0])
         options = RelativeOptions(fix=("*",))
-        fit = fit_instruments(arm.robot, [train], options, silent)
+        fit = fit_instruments(arm.robot, {"plates": data[0]}, options, silent)
     else:
         arm, fit = fitted((kind,))
-        train = fit.trains[0]
     laws = laws_of(arm.robot, fit, SEVERAL)
     stack, x = fit.stack.bent(arm.robot, laws, fit.state)
     first = stack.names.geometric
@@ -308,7 +306,7 @@ def test_an_arm_at_other_poses_gives_way_by_the_same_laws():
     """At the training poses `at_rows_of` predicts what the rows do."""
     for kind in KINDS:
         arm, fit = fitted((kind,), ASKED)
-        data = fit.trains[0].data
+        data = next(iter(fit.trains.values()))
         stack, x = fit.stack, fit.stack.part(fit.state, 0)
         block = stack.blocks[0].at_rows_of(arm.robot, data, stack.laws, x)
         held = np.zeros(data.poses, dtype=bool)

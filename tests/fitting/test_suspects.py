@@ -201,7 +201,7 @@ def test_a_list_tells_where_and_how_far(robot):
         case, data=case.data.with_y(y), model=replace(case.model, y=np.moveaxis(y, 0, 2))
     )
     found = case.robust("tukey")
-    state = state_of(found.fit)
+    state = state_of(found.found)
     distance = np.linalg.norm(found.plain.error(state), axis=-1)
     line = case.data.line
     by_pose = {pose: [s for s in found.suspects if s.line == line[pose]] for pose in range(50)}

@@ -126,7 +126,7 @@ def test_the_sandwich_is_the_dense_one(kind, robot, noisy, rng):
     inverse = np.where(weight > 0.0, 1.0 / np.where(weight > 0.0, weight, 1.0), 0.0)
     V = NOISE.variance * np.eye(9) * inverse[:, None]
     V = V + NOISE.jitter**2 * S @ np.swapaxes(S, 1, 2)
-    found_covariance = by_noise(Poses.of(estimator, found.state), NOISE)
+    found_covariance = by_noise(Poses(estimator, found.state), NOISE)
     alike(found_covariance, sandwich(J, A, V, np.zeros(J.shape[-1])), SLOPES)
 
 
@@ -149,7 +149,7 @@ def test_leaving_out_each_pose_is_the_jackknife(robot, noisy, fit):
         part = np.linalg.lstsq(J[kept].reshape(-1, p), error[kept].reshape(-1), rcond=None)[0]
         change.append(part - whole)
     expected = (m - 1) / m * np.array(change).T @ np.array(change)
-    found = by_poses(Poses.of(fit.estimator, fit.state), np.arange(m))
+    found = by_poses(Poses(fit.estimator, fit.state), np.arange(m))
     alike(found, expected, 1e-5)
 
 
@@ -161,7 +161,7 @@ def test_a_pose_measured_twice_is_one_pose(robot, noisy):
     assert both.uncertainty.source == "poses"
     inside = np.ix_(once.identification.active, once.identification.active)
     alike(both.uncertainty.covariance[inside], once.uncertainty.covariance[inside], 1e-6)
-    halves = [by_noise(Poses.of(f.estimator, f.state), Noise(0.0, 1.0, 0.0)) for f in (once, both)]
+    halves = [by_noise(Poses(f.estimator, f.state), Noise(0.0, 1.0, 0.0)) for f in (once, both)]
     alike(2.0 * halves[1], halves[0], 1e-6)
 
 
@@ -172,7 +172,7 @@ def test_a_prior_is_knowledge(robot, noisy, fit):
     at = [model.names.index(name) for name in ("a2", "theta3")]
     weight[at] = 1e3
     told = model.with_prior(Prior(model.prior.mean, weight))
-    poses = Poses.of(Estimator(told, np.ones(3)), fit.state)
+    poses = Poses(Estimator(told, np.ones(3)), fit.state)
     s = np.sqrt(poses.mean_square)
     J, _, error = dense(robot, noisy.data, fit)
     assert s == pytest.approx(np.sqrt((error**2).mean()), rel=0.05)  # but for degrees of freedom
@@ -181,7 +181,7 @@ def test_a_prior_is_knowledge(robot, noisy, fit):
     bayes = np.linalg.inv(flat.T @ flat / s**2 + np.diag(1.0 / sigma[model.active] ** 2))
     alike(by_noise(poses, Noise(0.0, s**2, 0.0)), bayes, SLOPES)
     group = np.arange(len(poses.error))
-    wide = by_poses(Poses.of(Estimator(model, np.ones(3)), fit.state), group)
+    wide = by_poses(Poses(Estimator(model, np.ones(3)), fit.state), group)
     held = by_poses(poses, group)
     place = [list(np.flatnonzero(model.active)).index(i) for i in at]
     assert np.all(np.diag(held)[place] < 0.5 * np.diag(wide)[place])
@@ -231,7 +231,7 @@ def test_jitter_raises_sigma_as_it_raises_the_scatter(robot, objective, runs):
         y = y + truth.noise * rng.normal(size=y.shape)
         one = fitted(robot, made.data.with_y(y), objective=objective)
         off = step_between(exact.state, one.state)[active]
-        poses = Poses.of(one.estimator, one.state)
+        poses = Poses(one.estimator, one.state)
         known = np.sqrt(np.diag(by_noise(poses, one.uncertainty.noise)))
         scores["poses"].append(off / one.uncertainty.sigma[active])
         scores["noise"].append(off / known)

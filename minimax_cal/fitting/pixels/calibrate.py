@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.fitting.accuracy import accuracy
+from minimax_cal.fitting.accuracy import accuracy, by_key
 from minimax_cal.fitting.pixels.beside import FittedImages, as_instrument, fitted_on
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.pixels.judge import (
@@ -24,7 +24,7 @@ from minimax_cal.fitting.pixels.judge import (
 from minimax_cal.fitting.pixels.options import FIELDS, WORST_CAMERA, PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import contradiction, file_notices, outlier_notices
 from minimax_cal.fitting.several.fit import at_worst
-from minimax_cal.fitting.several.kinds import READ, Asked, assembled, by_key, extremes, measured_by
+from minimax_cal.fitting.several.kinds import READ, Asked, assembled, extremes, measured_by
 from minimax_cal.fitting.several.options import SUM
 from minimax_cal.fitting.several.result import Claim, PixelCalibration
 from minimax_cal.fitting.several.stack import Block, Stack
@@ -123,11 +123,6 @@ class Determined:
     sure: Uncertainty
     notices: tuple[str, ...]
 
-    @property
-    def train(self) -> PixelData:
-        """The pixels that were fitted."""
-        return self.data.some(~self.held[self.data.pose])
-
 
 def determined(
     robot: Robot, data: PixelData, options: PixelOptions, progress: Progress = silent
@@ -184,8 +179,8 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
     )
     arm = robot.with_mdh(fit.state.mdh)
     claim = claimed(robot, arm, sure, drawing.share)
-    reason, status = contradiction(robot, one.train, fit, scale, options), fit.found.status[0]
-    told = () if reason else file_notices(one.train, fit, scale)
+    reason, status = contradiction(robot, fit, scale, options), fit.found.status[0]
+    told = () if reason else file_notices(fit, scale)
     fits_links = fit.problem.active[: 5 * robot.joints].any()
     if reason:
         status = Status.FAILED

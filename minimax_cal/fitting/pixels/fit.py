@@ -51,9 +51,8 @@ class PixelSquares(Squares):
     @staticmethod
     def of(robot: Robot, images: Images) -> PixelSquares:
         """Every parameter free and nothing known."""
-        stack, links = Stack.of(robot, [images], [""]), links_of(robot.mdh)
-        known = Known(links, np.full(len(links), np.inf))
-        return PixelSquares(stack, np.ones(stack.names.count, dtype=bool), known)
+        stack = Stack.of(robot, [images], [""])
+        return PixelSquares(stack, np.ones(stack.names.count, dtype=bool))
 
     @property
     def block(self) -> Block:
@@ -82,7 +81,7 @@ class PixelSquares(Squares):
         """The same of other images; noise: beside which files and drawing count [px]."""
         block = replace(self.block, instrument=replace(self.images, **changes))
         out = replace(self, stack=replace(self.stack, blocks=(block,)))
-        if "noise" not in changes or self.known is None:
+        if "noise" not in changes:
             return out
         return replace(out, weight=self.known.weights(changes["noise"] ** 2, self.names.count))
 
@@ -238,7 +237,7 @@ def fit_pixels(
                   for one in (x, nominal))  # fmt: skip
     return PixelFit(
         problem=problem.changed(turn=turn), nominal=nominal, state=x, identification=told,
-        found=found, covariance=np.zeros((0, 0)), noise=np.array([noise]), trains=(), alone=(),
+        found=found, covariance=np.zeros((0, 0)), noise=np.array([noise]), trains={}, alone=(),
         lens_sigma=sigma, held=held, by_drawing=by_drawing, lens=lenses, doubt=doubt,
         share=images.weight, squares=x,
     )  # fmt: skip
@@ -272,9 +271,8 @@ def with_lenses(problem: PixelSquares, x: State) -> State:
     """
     error, doubt = problem.errors(x), LOOSE * problem.images.doubt
     free = replace(problem, active=problem.active | problem.lenses)
-    return free.changed(noise=sigma_of(error), doubt=doubt, weight=softly(error)).solved(x, COARSE)[
-        0
-    ]
+    loose = free.changed(noise=sigma_of(error), doubt=doubt, weight=softly(error))
+    return loose.solved(x, COARSE)[0]
 
 
 def reprojected(problem: PixelSquares, x: State) -> tuple[PixelSquares, State, LeastSquares[State]]:

@@ -134,9 +134,7 @@ def extent_of(data: PixelData, camera: int) -> tuple[float, float]:
     return float(width), float(height)
 
 
-def contradiction(
-    robot: Robot, data: PixelData, fit: PixelFit, scale: Scale | None, options: PixelOptions
-) -> str:
+def contradiction(robot: Robot, fit: PixelFit, scale: Scale | None, options: PixelOptions) -> str:
     """Why a fit contradicts its own data; empty where it does not."""
     (arm, own), images = fit.problem.at(fit.state), fit.images
     focal = images.intrinsic[images.pixels.camera, 0]
@@ -152,21 +150,15 @@ def contradiction(
             f"{said}: check that joints, detections, board and camera files belong together, and "
             "what the cameras are fixed to (camera_on)"
         )
-    links = fit.problem.active[: 5 * robot.joints]
-    return (
-        other_lens(data, fit)
-        or other_size(scale, OTHER_SIZE, LEAST_SIZE)
-        or (
-            ""
-            if options.allow_large_changes
-            else too_changed(robot, robot.with_mdh(fit.state.mdh), links)
-        )
-    )
+    wrong = other_lens(fit) or other_size(scale, OTHER_SIZE, LEAST_SIZE)
+    if wrong or options.allow_large_changes:
+        return wrong
+    return too_changed(robot, fit.state.mdh, fit.problem.active[: 5 * robot.joints])
 
 
-def other_lens(data: PixelData, fit: PixelFit) -> str:
+def other_lens(fit: PixelFit) -> str:
     """Which camera's file is of another lens; empty where none is."""
-    for camera, lens in zip(data.cameras, fit.lens, strict=True):
+    for camera, lens in zip(fit.images.pixels.cameras, fit.lens, strict=True):
         file = camera.intrinsic[:2]
         if (np.abs(lens[:2] / file - 1.0) > OTHER_LENS).any():
             return (
@@ -194,12 +186,12 @@ def other_size(scale: Scale | None, limit: float, least: float = 0.0) -> str:
     )
 
 
-def file_notices(data: PixelData, fit: PixelFit, scale: Scale | None) -> list[str]:
+def file_notices(fit: PixelFit, scale: Scale | None) -> list[str]:
     """Notices of lenses that are far from their files, and of a board of another size."""
     file = fit.images.intrinsic[:, : len(INTRINSICS)]
     off = np.abs(fit.lens - file) / fit.doubt
     out = []
-    for i, camera in enumerate(data.cameras):
+    for i, camera in enumerate(fit.images.pixels.cameras):
         far = [j for j in range(len(INTRINSICS)) if off[i, j] > FAR_LENS]
         if far:
             named = ", ".join(

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.several.stack import own_state
+from minimax_cal.fitting.stations import moving
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
 from minimax_cal.instruments.camera import undistorted
@@ -95,7 +96,7 @@ def from_far(robot: Robot, data: PixelData, started: Started) -> Started:
     rows, pose = image[int(np.bincount(data.camera).argmax())]
     if len(rows) < IMAGES:
         return started
-    targets = seen_reflectors(data, rows, np.linalg.inv(pose) if on_flange else pose)
+    targets = seen_reflectors(data, on_flange, rows, pose)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CalibrationWarning)
         try:
@@ -229,7 +230,7 @@ def by_pose(
     As a tracker sees whole poses: the still one of camera and board is the tracker.  rows, pose:
     as `Shown`.
     """
-    targets = seen_reflectors(data, rows, np.linalg.inv(pose) if on_flange else pose)
+    targets = seen_reflectors(data, on_flange, rows, pose)
     for _ in range(REWEIGHED):  # images that the arm contradicts are left out
         found = fit_base(model_of(robot, targets), robot.mdh).state
         error = np.linalg.norm(model_of(robot, targets).error(found), axis=-1).max(axis=0)
@@ -243,10 +244,10 @@ def by_pose(
     return place, board, data.board @ board[:3, :3].T + board[:3, 3]
 
 
-def seen_reflectors(data: PixelData, rows: Array, pose: Array) -> Measurements:
-    """Poses (r, 4, 4) at some rows as virtual reflectors, which say the same [m]."""
+def seen_reflectors(data: PixelData, on_flange: bool, rows: Array, pose: Array) -> Measurements:
+    """What cameras saw as virtual reflectors, which say the same [m].  rows, pose: as `Shown`."""
     at = replace(data.at.take(rows), columns={})
-    return reflectors(at, pose)
+    return reflectors(at, np.linalg.inv(pose) if on_flange else pose)
 
 
 # ---- anything else: a search over rotations --------------------------------------------------
@@ -340,7 +341,7 @@ def by_rotations(
     if not len(data.board):
         return camera_pose, np.eye(4), spots
     known = np.isfinite(spots[:, 0])
-    board = rigid(data.board[known], spots[known])
+    board = moving(data.board[known], spots[known])
     return camera_pose, board, np.asarray(data.board @ board[:3, :3].T + board[:3, 3])
 
 
@@ -381,13 +382,6 @@ def crossing(rays: Rays, view: Array, place: Array) -> Array:
         limit = ROBUST * np.median(size) + 1e-12
         weight = np.minimum(1.0, limit / np.maximum(size, 1e-300))
     return np.asarray(spot)
-
-
-def rigid(local: Array, place: Array) -> Array:
-    """Pose (4, 4) that brings points (k, 3) to their places best [Kabsch 1976]."""
-    a, b = local.mean(axis=0), place.mean(axis=0)
-    turn = nearest_rotation((place - b).T @ (local - a))
-    return transform(turn, b - turn @ a)
 
 
 def merged(

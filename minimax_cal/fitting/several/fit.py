@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar, cast
 
@@ -44,23 +44,15 @@ SETTLED = 0.01  # relative change of the noises that ends their weighing
 
 
 @dataclass(frozen=True, eq=False)
-class Train:
-    """What is fitted: each instrument's training measurements and what the file is called."""
-
-    label: str
-    data: Instrument
-
-
-@dataclass(frozen=True, eq=False)
 class InstrumentFit:
     """What the solver found.
 
     problem: as it was solved, its instruments weighed by their noise.  nominal: the arm as drawn
     with the instruments fitted to it.  state: the calibrated one.  covariance: (p, p) [SI], NaN
     where not identified.  noise: (b,) sigma of a row of each instrument [m].  trains: what was
-    fitted.  alone: what each determines by itself, empty where there is one.  stiff: the fit of
-    geometry alone, where this one has laws besides.  worst: what a minimax rests on, None where
-    the sum was minimised; notices: of it.
+    fitted, by what the file is called.  alone: what each determines by itself, empty where there is
+    one.  stiff: the fit of geometry alone, where this one has laws besides.  worst: what a minimax
+    rests on, None where the sum was minimised; notices: of it.
     """
 
     problem: Squares
@@ -70,7 +62,7 @@ class InstrumentFit:
     found: LeastSquares[State]
     covariance: Array
     noise: Array
-    trains: Sequence[Train]
+    trains: Mapping[str, Instrument]
     alone: tuple[Alone, ...]
     stiff: InstrumentFit | None = None
     worst: Worst | None = None
@@ -89,11 +81,11 @@ class InstrumentFit:
 F = TypeVar("F", bound=InstrumentFit)
 
 
-def stack_of(robot: Robot, trains: Sequence[Train], options: RelativeOptions) -> Stack:
+def stack_of(robot: Robot, trains: Mapping[str, Instrument], options: RelativeOptions) -> Stack:
     """The training measurements as a least-squares problem."""
-    alone = [each.data.ready(robot, options) for each in trains]
+    alone = [each.ready(robot, options) for each in trains.values()]
     every = [one.beside([*alone[:i], *alone[i + 1 :]]) for i, one in enumerate(alone)]
-    stack = Stack.of(robot, every, [each.label for each in trains])
+    stack = Stack.of(robot, every, [*trains])
     given = [options.noises.get(label, np.nan) for label in stack.labels]
     of_rows = [sigma * one.row_noise for sigma, one in zip(given, every, strict=True)]
     return replace(stack, given=np.square(of_rows))
@@ -117,11 +109,11 @@ def start_of(robot: Robot, stack: Stack, allowed: Array) -> State:
 
 
 def fit_instruments(
-    robot: Robot, trains: Sequence[Train], options: RelativeOptions, progress: Progress
+    robot: Robot, trains: Mapping[str, Instrument], options: RelativeOptions, progress: Progress
 ) -> InstrumentFit:
     """Fit the identifiable parameters to the training measurements.  Raises DataError."""
     progress("start")
-    trains = [replace(train, data=train.data.in_order()) for train in trains]
+    trains = {label: data.in_order() for label, data in trains.items()}
     stack = stack_of(robot, trains, options)
     allowed, wanted = allowed_of(stack, options)
     known = Known(links_of(robot.mdh), sigmas_of(stack.names, options))
@@ -129,7 +121,9 @@ def fit_instruments(
     nominal = start_of(robot, stack, allowed)
     progress("identifiable parameters")
     reference = stack.reference(robot, nominal)
-    check_count(trains, stack, generic_count(robot, reference, nominal, allowed & ~held))
+    check_count(
+        [*trains.values()], stack, generic_count(robot, reference, nominal, allowed & ~held)
+    )
 
     def identify(stack: Stack, known: Known, x: State) -> Identification:
         more = (0, len(stack.laws.names))
@@ -228,7 +222,7 @@ def solved(
     ended: LeastSquares[State],
     nominal: State,
     told: Identification,
-    trains: Sequence[Train],
+    trains: Mapping[str, Instrument],
 ) -> InstrumentFit:
     """What a solved problem says."""
     state = ended.x.take(np.array(0))
@@ -297,8 +291,7 @@ def weighed(
             return found
         return between(problem, points, problem.whole_room, found)
 
-    priors = problem.known is not None and problem.known.any
-    if len(problem.stack.blocks) == 1 and not priors:
+    if len(problem.stack.blocks) == 1 and not problem.known.any:
         return with_loss(problem, solved(problem), options.loss, solved)
     count = [one.degrees for one in problem.stack.instruments]
     none = np.zeros(problem.stack.names.count, dtype=bool)
@@ -360,9 +353,8 @@ def covariance_of(problem: Squares, x: State, variance: Array, shares: Shares = 
     return covariance
 
 
-def check_count(trains: Sequence[Train], stack: Stack, unknowns: int) -> None:
+def check_count(every: Sequence[Instrument], stack: Stack, unknowns: int) -> None:
     """Raise DataError where the training measurements cannot determine the unknowns."""
-    every = [each.data for each in trains]
     for data in every:
         data.check_training()
     given = sum(one.given for one in stack.instruments)

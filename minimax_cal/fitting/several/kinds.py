@@ -11,13 +11,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from minimax_cal.fitting.accuracy import HELD
+from minimax_cal.fitting.accuracy import HELD, by_key
 from minimax_cal.fitting.claims import lacking, position_sigma, positions_by
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.opened import listed_effects
 from minimax_cal.fitting.options import listed, priors_of, qp_name
 from minimax_cal.fitting.several import fit, plausible
-from minimax_cal.fitting.several.fit import InstrumentFit, Train
+from minimax_cal.fitting.several.fit import InstrumentFit
 from minimax_cal.fitting.several.identify import Alone
 from minimax_cal.fitting.several.options import (
     Progress,
@@ -128,10 +128,10 @@ class Asked:
     splits: Sequence[tuple[Array, tuple[str, ...]]]
 
     @cached_property
-    def trains(self) -> list[Train]:
-        """What fits may see."""
+    def trains(self) -> dict[str, Instrument]:
+        """What fits may see, by what the file is called."""
         named = zip(labels_of(self.every), self.every, self.splits, strict=True)
-        return [Train(label, data.take(~held)) for label, data, (held, _) in named]
+        return {label: data.take(~held) for label, data, (held, _) in named}
 
     def fit(self, progress: Progress) -> InstrumentFit:
         """The fit of the training measurements."""
@@ -296,14 +296,6 @@ def measured_by(
     )  # fmt: skip
 
 
-def by_key(nominal: Array, calibrated: Array, held: Array) -> dict[str, Array]:
-    """Errors (parts, m, ...) of all poses by the keys of a result.  held: (m,)."""
-    return {
-        key: (nominal if key.startswith("nominal") else calibrated)[:, held == is_held]
-        for key, is_held in HELD.items()
-    }
-
-
 def extremes(sizes: Mapping[str, Array]) -> dict[str, tuple[float, float]]:
     """RMS and largest, by the same keys."""
     return {key: (rms(s), float(s.max()) if s.size else np.nan) for key, s in sizes.items()}
@@ -337,7 +329,7 @@ def cell_of(robot: Robot, found: InstrumentFit) -> Cell:
     scene = stack.scenes(robot, found.state)[0]
     effects = fitted(stack.laws.terms, scene, stack.values(found.state))
     amid = scene.target_positions.mean(axis=0, keepdims=True)
-    sessions = Sessions({}, Clock.of(found.trains[0].data.at))
+    sessions = Sessions({}, Clock.of(next(iter(found.trains.values())).at))
     return Cell(scene.robot, np.eye(4), (TARGET,), amid, effects, sessions)
 
 

@@ -115,7 +115,7 @@ def rows_of_all(scene: Scene, fit: InstrumentFit) -> StackRows:
     """The rows of all instruments.  scene: `scene_of_all`; fit: of geometry alone."""
     stack, active = fit.stack, fit.identification.active
     starts = np.cumsum([0, *(len(block.arm.q) for block in stack.blocks)]).tolist()
-    read = [block.read(stack.part(fit.state, i)) for i, block in enumerate(stack.blocks)]
+    read = [block.read(at) for block, at in stack.parted(fit.state)]
     slots = [place_in(rows.pose_of_row) for rows in read]
     width = max(int(slot.max()) + 1 for slot in slots)
     looks, errors, slopes, places = [], [], [], []
@@ -126,10 +126,8 @@ def rows_of_all(scene: Scene, fit: InstrumentFit) -> StackRows:
         one, own = block.instrument, block.own(x)
         flange, middle = block.flange(x), one.targets(own).mean(axis=0)
         shapeless = one.shapeless(flange, own)
-        at, poses = (
-            (start + rows.pose_of_row) * width + slot,
-            slice(start, start + len(block.arm.q)),
-        )
+        at = (start + rows.pose_of_row) * width + slot
+        poses = slice(start, start + len(block.arm.q))
         looks.append(Look(rows, flange, middle, root, poses, at, shapeless))
         error, slope = block.rows(x, active[columns], loose=True)
         whole = np.zeros((len(active), len(root)))
@@ -195,8 +193,8 @@ def assembled(
 def numbered(fit: InstrumentFit) -> Array:
     """(m,) a number, from 0, of each pose; repeats of one in a file have the same."""
     out, count = [], 0
-    for train in fit.trains:
-        number = groups(train.data.at)
+    for data in fit.trains.values():
+        number = groups(data.at)
         out.append(number + count)
         count += int(number.max()) + 1
     return np.concatenate(out)

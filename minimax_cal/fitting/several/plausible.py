@@ -14,7 +14,6 @@ from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
 from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.several.fit import (
     InstrumentFit,
-    Train,
     allowed_of,
     fit_instruments,
     stack_of,
@@ -50,7 +49,7 @@ def check_slips(robot: Robot, data: Instrument, options: RelativeOptions) -> Non
         return
 
     def fitted(one: Instrument) -> tuple[Any, FlangePoses, Array]:
-        stack = stack_of(robot, [Train("", one)], options)
+        stack = stack_of(robot, {"": one}, options)
         x = start_of(robot, stack, allowed_of(stack, options)[0])
         block = stack.blocks[0]
         return block.instrument, *block.at(x)

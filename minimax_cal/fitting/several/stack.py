@@ -219,14 +219,17 @@ class Stack:
         first = self.names.geometric
         return replace(x, effects=x.effects[..., self.columns(i)[first:] - first])
 
+    def parted(self, x: State) -> list[tuple[Block, State]]:
+        """The blocks, each with its state."""
+        return [(block, self.part(x, i)) for i, block in enumerate(self.blocks)]
+
     def values(self, x: State) -> Array:
         """(k,) of the laws."""
         return x.effects[..., self.lawless - self.names.geometric :]
 
     def read_out(self, x: State) -> State:
         """A state as people are told it."""
-        parts = (self.part(x, i) for i in range(len(self.blocks)))
-        own = [b.instrument.read_out(b.own(at)) for b, at in zip(self.blocks, parts, strict=True)]
+        own = [block.instrument.read_out(block.own(at)) for block, at in self.parted(x)]
         return replace(x, effects=np.concatenate([*own, self.values(x)]))
 
     def scenes(self, robot: Robot, x: State, *, about: bool = False) -> list[Scene]:
@@ -234,7 +237,7 @@ class Stack:
 
         about: corners about their middle instead.
         """
-        parts = [(block, self.part(x, i)) for i, block in enumerate(self.blocks)]
+        parts = self.parted(x)
         spots = [block.instrument.targets(block.own(at)) for block, at in parts]
         spots = [corners(each.mean(axis=0)) for each in spots] if about else spots
         return [one.scene(robot, at, k) for (one, at), k in zip(parts, spots, strict=True)]
@@ -249,8 +252,7 @@ class Stack:
         names = replace(self.names, effects=(*stiff, *laws.names), laws=laws.units)
         x = replace(x, effects=np.concatenate([x.effects[: len(stiff)], values]))
         stack = replace(self, names=names, laws=laws)
-        every = enumerate(self.blocks)
-        blocks = tuple(block.bent(robot, laws, stack.part(x, i)) for i, block in every)
+        blocks = tuple(block.bent(robot, laws, at) for block, at in stack.parted(x))
         return replace(stack, blocks=blocks), x
 
     def rows_by_block(self, x: State, active: Array) -> Iterator[tuple[Array, Array]]:
@@ -282,19 +284,18 @@ class Stack:
     @property
     def parts(self) -> tuple[str, ...]:
         """Every part by name, as wire1; of several files with what the file is called."""
-        every = [
-            (label, part)
+        several = len(self.blocks) > 1
+        return tuple(
+            f"{label} {part}" if several else part
             for label, one in zip(self.labels, self.instruments, strict=True)
             for part in one.parts
-        ]
-        several = len(self.blocks) > 1
-        return tuple(f"{label} {part}" if several else part for label, part in every)
+        )
 
     def part_of_rows(self, x: State) -> Array:
         """(rows,) which of all parts each is of, block by block; -2 of rows that are of several."""
         out, first = [], 0
-        for i, block in enumerate(self.blocks):
-            rows, count = block.read(self.part(x, i)), len(block.instrument.parts)
+        for block, at in self.parted(x):
+            rows, count = block.read(at), len(block.instrument.parts)
             part = block.part_of(rows)
             part = np.where(part == OF_NONE, -2, first + part)
             out += [part, np.full(len(rows.short), -2)]
@@ -307,8 +308,7 @@ class Stack:
 
     def weights(self, x: State) -> Array:
         """(rows,) how much more each weighs than its noise says."""
-        every = (block.read(self.part(x, i)) for i, block in enumerate(self.blocks))
-        return np.concatenate([rows.weights for rows in every])
+        return np.concatenate([block.read(at).weights for block, at in self.parted(x)])
 
     def gram(self, x: State) -> Array:
         """The Gram matrix of all parameters at a state: (p, p)."""
@@ -318,16 +318,16 @@ class Stack:
     def reference(self, robot: Robot, x: State) -> Stack:
         """Every instrument at plenty of poses, alike in weight."""
         found = [
-            Block.of(robot, block.instrument.elsewhere(robot, block.own(self.part(x, i))))
-            for i, block in enumerate(self.blocks)
+            Block.of(robot, block.instrument.elsewhere(robot, block.own(at)))
+            for block, at in self.parted(x)
         ]
         return replace(self, blocks=tuple(found), precision=np.ones(len(found)))
 
     def closed(self, robot: Robot, x: State) -> Stack:
         """Every instrument where the arm as drawn itself fits it."""
         found = []
-        for i, block in enumerate(self.blocks):
-            one = block.instrument.fitting(robot, block.own(self.part(x, i)))
+        for block, at in self.parted(x):
+            one = block.instrument.fitting(robot, block.own(at))
             found.append(Block(one, replace(block.arm, q=robot.turned(one.at.q))))
         return replace(self, blocks=tuple(found))
 
@@ -363,9 +363,12 @@ class Known:
         links = np.swapaxes(x.mdh, -1, -2)  # in the order of `parameters.links_of`
         links = links.reshape(*links.shape[:-2], -1)
         out = np.zeros((*links.shape[:-1], count))
-        out[..., : len(self.mean)] = self.mean - links
+        out[..., : len(self.mean)] = self.mean - links[..., : len(self.mean)]
         out[..., count - len(self.laws) :] = -x.effects[..., x.effects.shape[-1] - len(self.laws) :]
         return out
+
+
+NOTHING = Known(np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,7 +382,7 @@ class Squares:
 
     stack: Stack
     active: Array
-    known: Known | None = None
+    known: Known = NOTHING
     weight: Array = field(default_factory=lambda: np.zeros(0))
     room: Array = field(default_factory=lambda: np.zeros((0, 2)))
     loss: str = SQUARE
@@ -413,7 +416,7 @@ class Squares:
         The best instrument weighs 1, so that a step of the rows is one of metres.
         """
         unit = float(variance.min())
-        weight = self.known.weights(unit, self.names.count) if self.known else np.zeros(0)
+        weight = self.known.weights(unit, self.names.count)
         return replace(self, stack=replace(self.stack, precision=unit / variance), weight=weight)
 
     def normal(self, x: State) -> tuple[Array, Array, Array]:
@@ -422,7 +425,7 @@ class Squares:
         cost = np.einsum("...r,...r->...", error, error)
         gradient = (jacobian @ error[..., None])[..., 0]
         gram = jacobian @ np.swapaxes(jacobian, -1, -2)
-        if self.known and len(self.weight):
+        if len(self.weight):
             off = self.known.off(x, len(self.active))[..., self.active]
             weight = self.weight[self.active]
             cost = cost + (weight * off**2).sum(axis=-1)

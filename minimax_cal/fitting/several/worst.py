@@ -95,11 +95,8 @@ class RowMinimax:
 
     def beside(self, x: State) -> tuple[Array, Array]:
         """(free,) how far the parameters are from what is known of them, and the weight of that."""
-        problem, known = self.problem, self.problem.known
-        if known is None or not len(problem.weight):
-            return np.zeros(len(self.scale)), np.zeros(len(self.scale))
-        off = known.off(x, len(problem.active))
-        return off[problem.active], problem.weight[problem.active]
+        problem, active = self.problem, self.problem.active
+        return problem.known.off(x, len(active))[active], np.diag(problem.prior)
 
 
 @dataclass(frozen=True, eq=False)

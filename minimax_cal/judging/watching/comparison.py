@@ -256,7 +256,7 @@ def folds_covariance(fit: Fit) -> Array:
     out = np.zeros((fit.uncertainty.names.count,) * 2)
     if not fit.train.poses:
         return out
-    poses, label = Poses.of(fit.estimator, fit.cell.state), regions(fit.train)
+    poses, label = Poses(fit.estimator, fit.cell.state), regions(fit.train)
     parts = [part for part in (label == one for one in np.unique(label)) if not needed(poses, part)]
     active = np.flatnonzero(fit.estimator.model.active)
     steps = np.array([step_without(poses, part) for part in parts]).reshape(-1, len(active))

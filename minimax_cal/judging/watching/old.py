@@ -65,7 +65,7 @@ def own_poses(fit: Fit) -> Old | None:
     if not train.poses:
         return None
     few, rows = fit.estimator.thinned(groups(train), PLENTY)
-    poses, some = Poses.of(few, fit.cell.state), train.take(rows)
+    poses, some = Poses(few, fit.cell.state), train.take(rows)
     best, least, near = None, np.inf, np.zeros(0)
     for share in SHARES:
         old = old_at(fit, poses, some, share * fit.uncertainty.noise.jitter)

@@ -129,7 +129,7 @@ class Watched:
         """The errors linear about the best fit with some parameters free, by their noises."""
         model, state = self.fitted(active, state)
         every = model.only(np.ones(model.names.count, dtype=bool))
-        poses = Poses.of(Estimator(every, np.ones(len(model.y))), state)
+        poses = Poses(Estimator(every, np.ones(len(model.y))), state)
         m, r, p = poses.jacobian.shape
         half = noise_root(poses, self.variance, self.jitter)
         whole = [poses.error[..., None], poses.jacobian, poses.arm]
