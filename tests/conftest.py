@@ -24,7 +24,7 @@ from minimax_cal.cli import main, progress
 from minimax_cal.cli.options import in_flags
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
-from minimax_cal.planning import outlook, plan
+from minimax_cal.planning import outlook, plan, task
 
 progress.FIRST = 60.0  # tests compare stderr, and a busy machine takes more than a second
 
@@ -93,10 +93,11 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def few_candidates() -> Iterator[None]:
-    """Plans of cameras sooner: what is seen and promised is the same; poses need not be best."""
+    """Plans sooner: what is written, seen and promised is the same; poses need not be best."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "STEPS", (0.05,))
         patch.setattr(plan, "KEPT", 60)
+        patch.setattr(task, "WORK", 250)
         patch.setattr(outlook, "GROWTH", (0.5, 1.0))
         patch.setattr(outlook, "DRAWS", 20)
         yield

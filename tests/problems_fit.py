@@ -1,5 +1,7 @@
 """Fits that several tests start from."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.testing import assert_allclose
 
@@ -13,10 +15,23 @@ from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.model import Model, SumOfSquares
 from minimax_cal.modelling.parameters import State
+from minimax_cal.robots.robot import Robot, load_robot, robot_from_dict
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import METHODS
 
+SPOTS = np.array([[0.1, 0.0, 0.05], [-0.05, 0.09, 0.05], [-0.05, -0.08, 0.06]])
+MASSES = (100.0, 60.0, 45.0, 20.0, 8.0, 3.0)
+CENTRES = ([-60, 90, 5], [-430, 12, -30], [-70, 0, 40], [8, 250, 3], [0, -10, 25], [0, 4, -40])
 ROUNDING = 1e-9  # of products, relative to the largest of their columns
+
+
+def weighty(turned: int, up: Sequence[float] = (0.0, 0.0, 1.0), **more: float) -> Robot:
+    """An IRB 2600 with masses, of which one joint counts the other way."""
+    content = load_robot("irb2600").to_dict() | {"up": list(up)}
+    for joint, mass, com in zip(content["joints"], MASSES, CENTRES, strict=True):
+        joint |= {"mass_kg": mass, "com_mm": com, **more}
+    content["joints"][turned]["sign"] = -1
+    return robot_from_dict(content)
 
 
 def solve(model: Model, begin: State, method: str = "snllm", **kw: object):  # type: ignore[no-untyped-def]

@@ -90,3 +90,14 @@ def any_problem(rng: np.random.Generator) -> Problem:
         l[0] += 3.0
         u[0] = max(u[0], l[0])
     return Problem(root.T @ root, draw(n) * (rng.random() < 0.9), A, l, u)
+
+
+def in_units(
+    problem: Problem, unit: np.ndarray, row: np.ndarray | float = 1.0, size: float = 1.0
+) -> Problem:
+    """The same problem for unit * x, rows and objective times a number."""
+    rows = np.broadcast_to(row, problem.l.shape)
+    return Problem(
+        size * problem.P / np.outer(unit, unit), size * problem.q / unit,
+        rows[:, None] * problem.A / unit, rows * problem.l, rows * problem.u,
+    )  # fmt: skip

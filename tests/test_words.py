@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -89,41 +89,31 @@ def shown(path: Path) -> Iterator[tuple[int, str]]:
 # ---- the tests ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("folder", CODE)
-def test_strings_of_the_code_are_in_plain_words(folder):
-    found = [
-        fault
-        for path in sorted((ROOT / folder).rglob("*.py"))
-        for line, text in shown(path)
-        for fault in faults(text, str(path.relative_to(ROOT)), line)
-    ]
-    assert not found, "\n".join(found)
+def files(folders: Iterable[str], *endings: str) -> list[Path]:
+    every = (path for folder in folders for path in sorted((ROOT / folder).rglob("*")))
+    return [path for path in every if path.suffix in endings]
 
 
-def pages() -> Iterator[Path]:
-    yield from (ROOT / name for name in PAGES)
-    for folder in ("docs", "examples"):
-        for kind in ("*.md", "*.rst"):
-            yield from sorted((ROOT / folder).rglob(kind))
+PAPERS = [*(ROOT / name for name in PAGES), *files(("docs", "examples"), ".md", ".rst")]
 
 
-def test_pages_are_in_plain_words():
-    found = [
-        fault
-        for path in pages()
-        for fault in faults(prose(path.read_text()), str(path.relative_to(ROOT)))
-    ]
-    assert not found, "\n".join(found)
-
-
-def test_texts_of_web_pages_are_in_plain_words():
-    paths = [path for folder in CODE for path in sorted((ROOT / folder).rglob("*.jinja"))]
-    assert len(paths) > 4
+@pytest.mark.parametrize(
+    ("paths", "texts"),
+    [
+        *((files([folder], ".py"), shown) for folder in CODE),
+        (PAPERS, lambda path: [(1, prose(path.read_text()))]),
+        (files(CODE, ".jinja"), lambda path: [(1, HIDDEN.sub(lines_only, path.read_text()))]),
+    ],
+    ids=[*CODE, "pages", "web pages"],
+)
+def test_what_people_read_is_in_plain_words(paths, texts):
     found = [
         fault
         for path in paths
-        for fault in faults(HIDDEN.sub(lines_only, path.read_text()), str(path.relative_to(ROOT)))
+        for line, text in texts(path)
+        for fault in faults(text, str(path.relative_to(ROOT)), line)
     ]
+    assert len(paths) > 4
     assert not found, "\n".join(found)
 
 

@@ -23,22 +23,28 @@ from minimax_cal.robots.sampling import random_poses
 KINDS = {"wires_3": "distances", "closures_known": "closures", "poses": "poses"}
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A file of each kind, of an arm that bends."""
-    folder, arm = tmp_path_factory.mktemp("any"), Arm.of("irb2600", 1, 3e-7)
+def written(folder: Path, compliance: float) -> dict[str, Path]:
+    """A file of each kind, and the known distance of the closures as an option says it."""
+    arm, rng = Arm.of("irb2600", 1, compliance), np.random.default_rng(3)
     out = {}
     for kind in KINDS:
-        out[kind] = folder / f"{kind}.csv"
         seen = SIMULATORS[kind](arm, np.random.default_rng(2), 80, 15e-6)
+        out[kind] = folder / f"{kind}.csv"
         write_relative(out[kind], seen.data)
-    rng = np.random.default_rng(3)
+        for first, second, length in seen.known:
+            out["known"] = Path(f"{first},{second},{1e3 * length:.4f}")
     q = random_poses(arm.robot, 80, rng)
-    out["tracker"] = folder / "tracker.csv"
-    mc.write_measurements(
-        out["tracker"], mc.measurements(q, arm.place(q) + 15e-6 * rng.normal(size=(80, 3)))
-    )
+    y = arm.place(q) + 15e-6 * rng.normal(size=(80, 3))
+    for name, unit in (("tracker", 1.0), ("tracker_m", 1e-3)):
+        out[name] = folder / f"{name}.csv"
+        mc.write_measurements(out[name], mc.measurements(q, unit * y))
     return out
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Of an arm that bends."""
+    return written(tmp_path_factory.mktemp("any"), 3e-7)
 
 
 def answered(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[Any, list[str]]:
@@ -156,14 +162,8 @@ def test_detections_are_data_where_cameras_are_given(cell, cell_files, tmp_path,
     alike(found, answered(capsys, "calibrate", "ur5", pixels, detections, *rest)[0])
     beside = tmp_path / "tracker.csv"
     mc.write_measurements(beside, mc.simulate(cell.drawn, 30, 1, seed=1).data)
-    refuses(
-        "--drawn-prior is for pixels alone",
-        "calibrate ur5",
-        beside,
-        detections,
-        *rest,
-        "--drawn-prior",
-    )
+    given = ("calibrate ur5", beside, detections, *rest, "--drawn-prior")
+    refuses("--drawn-prior is for pixels alone", *given)
     refuses("cameras need all three of --pixels", "calibrate ur5", detections)
 
 
@@ -172,20 +172,7 @@ def test_detections_are_data_where_cameras_are_given(cell, cell_files, tmp_path,
 
 @pytest.fixture(scope="module")
 def stiff_files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A file of each kind, and the known distance of the closures as an option says it."""
-    folder, arm = tmp_path_factory.mktemp("relative"), Arm.of("irb2600", 1, 0.0)
-    out = {}
-    for kind in ("wires_3", "closures_known", "poses"):
-        seen = SIMULATORS[kind](arm, np.random.default_rng(2), 80, 15e-6)
-        out[kind] = folder / f"{kind}.csv"
-        write_relative(out[kind], seen.data)
-        for first, second, length in seen.known:
-            out["known"] = Path(f"{first},{second},{1e3 * length:.4f}")
-    q = random_poses(arm.robot, 80, np.random.default_rng(3))
-    for name, unit in (("tracker", 1.0), ("tracker_m", 1e-3)):
-        out[name] = folder / f"{name}.csv"
-        mc.write_measurements(out[name], mc.measurements(q, unit * arm.place(q)))
-    return out
+    return written(tmp_path_factory.mktemp("relative"), 0.0)
 
 
 @pytest.mark.parametrize(
@@ -240,20 +227,12 @@ def test_options_reach_the_fit(stiff_files, answered, says):
     assert set(content["instrument"]["offsets_mm"]) == {"wire1", "wire2", "wire3"}
     assert content["accuracy"]["holdout"]["poses"] == 24
     assert content["provenance"]["settings"]["seed"] == 7
-    content = answered(
-        "relative",
-        "irb2600",
-        stiff_files["closures_known"],
-        "--known-distance",
-        stiff_files["known"],
-        "--method",
-        "nlgn",
-    )
+    known = ("--known-distance", stiff_files["known"], "--method", "nlgn")
+    content = answered("relative irb2600", stiff_files["closures_known"], *known)
     assert content["identified"] == 21
     assert content["instrument"]["scale"] == "known distance"
-    assert answered("relative", "irb2600", stiff_files["poses"], "--lever", 250, "-q")[
-        "instrument"
-    ]["lever_mm"] == pytest.approx(250.0)
+    content = answered("relative irb2600", stiff_files["poses"], "--lever", 250, "-q")
+    assert content["instrument"]["lever_mm"] == pytest.approx(250.0)
 
 
 @pytest.mark.parametrize(
@@ -289,14 +268,8 @@ def test_numbers_that_do_not_work_out_are_exit_code_1(stiff_files, tmp_path, say
 
 def test_a_diagnosis_of_two_files_is_reported(stiff_files, tmp_path, says):
     result, page = tmp_path / "relative.json", tmp_path / "relative.html"
-    given = (
-        "relative",
-        "irb2600",
-        stiff_files["wires_3"],
-        stiff_files["tracker"],
-        "--diagnose",
-    )
-    said = says(*given, "-o", result, "--quiet").out
+    given = (stiff_files["wires_3"], stiff_files["tracker"], "--diagnose", "-o", result, "-q")
+    said = says("relative irb2600", *given).out
     assert "No cause beyond geometry was found." in said
     assert "wires_3 RMS mm" in said
     assert json.loads(result.read_text())["diagnosis"]["verdict"] == "none"
@@ -406,11 +379,5 @@ def test_wrong_input_is_one_line(given, said, refuses):
 
 @pytest.mark.parametrize("command", ["calibrate", "relative"])
 def test_options_of_cameras_without_any(command, tmp_path, refuses):
-    refuses(
-        "--camera-prior is about what cameras see, with --pixels",
-        command,
-        "irb120",
-        tmp_path / "data.csv",
-        "--camera-prior",
-        "f 1%",
-    )
+    given = (command, "irb120", tmp_path / "data.csv", "--camera-prior", "f 1%")
+    refuses("--camera-prior is about what cameras see, with --pixels", *given)

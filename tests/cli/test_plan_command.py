@@ -3,7 +3,6 @@
 import csv
 import json
 import shlex
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -16,26 +15,14 @@ import minimax_cal as mc
 from minimax_cal.cli.compensate import read_targets
 from minimax_cal.cli.plan import plan_command
 from minimax_cal.modelling.simulate import Simulation
-from minimax_cal.planning import outlook, task
-from minimax_cal.planning import plan as module
 from minimax_cal.planning.route import ANGLES
 
 FEW = ("--candidates", 80, "-q")
 WIDE = ("--acceptance", 180)
 
 
+pytestmark = pytest.mark.usefixtures("few_candidates")
 run = partial(invoked, plan_command)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _few_candidates() -> Iterator[None]:
-    """The files and messages are the same; the poses need not be the best."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "STEPS", (0.1,))
-        patch.setattr(module, "KEPT", 40)
-        patch.setattr(task, "WORK", 200)
-        patch.setattr(outlook, "GROWTH", (0.5, 1.0))
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +45,7 @@ def fit(folder: Path, poses: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def planned(folder: Path) -> Path:
+def planned(folder: Path, few_candidates: None) -> Path:
     """A file of stops, with revisits from the other side."""
     path, picture = folder / "plan.csv", folder / "plan.svg"
     code, out, err = run("irb2600", "--poses", 10, "-o", path, "--figure", picture, "--revisit", 2,

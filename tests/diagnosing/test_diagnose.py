@@ -188,9 +188,7 @@ def test_the_ladder_is_of_poses_that_no_fit_has_seen(plain: mc.Diagnosis) -> Non
     )
     assert [f.values for f in again.effects][-1:] != [] or again.effects == ()
     assert_allclose(again.ladder[1].train.rms_mm, plain.ladder[1].train.rms_mm, rtol=1e-6)
-
-
-def test_the_split_column_is_kept(plain: mc.Diagnosis) -> None:
+    # and the split column is kept
     assert (plain.data.columns["split"][plain.held] == "holdout").all()
     assert (plain.data.columns["split"][~plain.held] == "train").all()
 
@@ -268,25 +266,25 @@ def test_one_target_is_enough() -> None:
 # ---- real arms ---------------------------------------------------------------------------------
 
 
-def test_qkm_gravity_is_named() -> None:
-    found = mc.diagnose(*shared("qkm_hl6"), quick=True)
+def in_rows(name: str) -> mc.Diagnosis:
+    """Of a real arm whose rows stand in the order of the visits."""
+    robot, file = shared(name)
+    return mc.diagnose(robot, mc.read_measurements(file).in_visit_order(), quick=True)
+
+
+def test_gravity_is_named() -> None:
     gravity = {"joint_compliance", "link_bending"}
-    first = found.effects[0]
+    qkm, fanuc = mc.diagnose(*shared("qkm_hl6"), quick=True), in_rows("fanuc_r2000")
+    first = qkm.effects[0]
     assert {first.term.effect, *(a.effect for a in first.alternatives)} >= gravity
-    assert found.ladder[-1].holdout.rms_mm < 0.7 * found.ladder[1].holdout.rms_mm
-
-
-def test_fanuc_gravity_is_named() -> None:
-    robot, file = shared("fanuc_r2000")
-    found = mc.diagnose(robot, mc.read_measurements(file).in_visit_order(), quick=True)
-    assert found.effects[0].term.effect in ("joint_compliance", "link_bending")
-    assert found.ladder[-1].holdout.rms_mm < 0.7 * found.ladder[1].holdout.rms_mm
+    assert fanuc.effects[0].term.effect in gravity
+    for found in (qkm, fanuc):
+        assert found.ladder[-1].holdout.rms_mm < 0.7 * found.ladder[1].holdout.rms_mm
 
 
 @pytest.mark.slow
 def test_meca_has_no_gravity() -> None:
-    robot, file = shared("meca500_r")
-    found = mc.diagnose(robot, mc.read_measurements(file).in_visit_order(), quick=True)
+    found = in_rows("meca500_r")
     gravity = {"joint_compliance", "link_bending", "base_flex", "gravity_compensator", "tool_flex"}
     assert not gravity & {f.term.effect for f in found.effects}
     assert ("backlash", "J6") in {(f.term.effect, f.term.place) for f in found.effects}

@@ -1,6 +1,8 @@
 """Curves of joints that no law has, and fits without a part of the poses."""
 
 import json
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +28,8 @@ from minimax_cal.modelling.effects.table import EFFECTS, Term, terms
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 from minimax_cal.robots.robot import Robot
 
-NODES = np.arange(-2.0, 3.0, 0.15)
+Curve = Callable[[Array], Array]
+NODES, FAR = np.arange(-2.0, 3.0, 0.15), np.arange(-7.0, 7.0, 0.15)
 HEIGHTS = 3e-4 * np.random.default_rng(2).normal(size=len(NODES))
 
 
@@ -49,10 +52,7 @@ def test_the_sines_are_a_matern_process(length: float) -> None:
 
 
 def test_curves_of_two_joints_are_found_and_hold_at_new_poses(robot: Robot) -> None:
-    sim = rigid(robot, 260, 2, 3)
-    turn = np.zeros_like(sim.data.q)
-    turn[:, 1], turn[:, 2] = saw(sim.data.q[:, 1]), saw(sim.data.q[:, 2])
-    whole = geometric(robot, sim, turn).study
+    whole = geometric(robot, rigid(robot, 260, 2, 3), {1: saw, 2: saw}).study
     old, new = whole.data.take(np.arange(200)), whole.data.take(np.arange(200, 260))
     bare = joint(studied(robot, old, fit_cell(robot, old, SUM, silent)), ())
     found = error_maps(bare)
@@ -65,29 +65,21 @@ def test_curves_of_two_joints_are_found_and_hold_at_new_poses(robot: Robot) -> N
 
 
 def test_a_single_wave_is_told_as_one(robot: Robot) -> None:
-    sim = rigid(robot, 220, 2, 4)
-    turn = np.zeros_like(sim.data.q)
-    turn[:, 0] = 2e-4 * np.sin(17.0 * sim.data.q[:, 0])
-    (term,) = error_maps(geometric(robot, sim, turn)).terms
+    bare = geometric(robot, rigid(robot, 220, 2, 4), {0: lambda q: 2e-4 * np.sin(17.0 * q)})
+    (term,) = error_maps(bare).terms
     assert term.label == "gear_ripple:J1"
     assert abs(term.choice["turns"] - 17.0) < 0.2
-    (curve,) = error_maps(geometric(robot, sim, turn), exclude=["gear_ripple"]).terms
+    (curve,) = error_maps(bare, exclude=["gear_ripple"]).terms
     assert curve.label == "joint_error_map:J1"
 
 
 def test_slow_laws_of_the_same_angle_need_no_map(robot: Robot) -> None:
-    sim = rigid(robot, 120, 2, 5)
-    q = sim.data.q
-    turn = np.zeros_like(q)
-    turn[:, 2] = 1e-3 * q[:, 2] + 3e-4 * np.cos(2.0 * q[:, 2])
-    assert error_maps(geometric(robot, sim, turn)).terms == ()
+    slow = {2: lambda q: 1e-3 * q + 3e-4 * np.cos(2.0 * q)}
+    assert error_maps(geometric(robot, rigid(robot, 120, 2, 5), slow)).terms == ()
 
 
 def test_lines_that_a_map_makes_needless_leave(robot: Robot) -> None:
-    sim = rigid(robot, 220, 2, 6)
-    turn = np.zeros_like(sim.data.q)
-    turn[:, 1] = bumps(sim.data.q[:, 1])
-    bare = geometric(robot, sim, turn)
+    bare = geometric(robot, rigid(robot, 220, 2, 6), {1: bumps})
     line, _ = strongest_wave(NODES, HEIGHTS)
     named = joint(bare.study, [Term("gear_ripple", "J2", {"turns": line})])
     found = error_maps(named)
@@ -96,11 +88,8 @@ def test_lines_that_a_map_makes_needless_leave(robot: Robot) -> None:
 
 
 def test_a_fine_wave_is_found_at_a_ratio_that_another_joint_shows(robot: Robot) -> None:
-    sim = rigid(robot, 240, 3, 8)
-    turn = np.zeros_like(sim.data.q)
-    turn[:, 0] = 1e-4 * np.sin(200.0 * sim.data.q[:, 0])
-    turn[:, 1] = 2e-5 * np.cos(199.6 * sim.data.q[:, 1] + 1.0)
-    bare = geometric(robot, sim, turn)
+    waves = {0: lambda q: 1e-4 * np.sin(200.0 * q), 1: lambda q: 2e-5 * np.cos(199.6 * q + 1.0)}
+    bare = geometric(robot, rigid(robot, 240, 3, 8), waves)
     heard = joint(bare.study, [Term("gear_ripple", "J1", {"turns": 200.0})])
     found = error_maps(heard)
     assert [term.label for term in found.terms] == ["gear_ripple:J2"]
@@ -122,10 +111,7 @@ def test_the_strongest_wave_of_a_curve() -> None:
 
 def test_a_diagnosis_tells_the_curve_and_a_fit_compensates_it(robot: Robot, tmp_path: Path) -> None:
     sim = rigid(robot, 220, 1, 3)
-    q = sim.data.q
-    turn = np.zeros_like(q)
-    turn[:, 1] = bumps(q[:, 1])
-    data = sim.data.with_y(sim.data.y + sim.cell.predict(q + turn) - sim.cell.predict(q))
+    q, data = sim.data.q, turned(sim, {1: bumps})
     told = mc.diagnose(robot, data, quick=True)
     (found,) = [f for f in told.effects if f.term.label == "joint_error_map:J2"]
     x, y, band = found.curve
@@ -151,14 +137,9 @@ def test_a_diagnosis_tells_the_curve_and_a_fit_compensates_it(robot: Robot, tmp_
 def test_what_stood_in_for_curves_is_named_no_more() -> None:
     """Names sought beside the maps: before them a series of waves of all joints passed for some."""
     robot = mc.load_robot("ur10")
-    sim = rigid(robot, 220, 1, 2)
-    q, rng = sim.data.q, np.random.default_rng(2)
-    nodes, turn = np.arange(-7.0, 7.0, 0.15), np.zeros_like(q)
-    for joint_number in range(2):
-        heights = 3e-4 * rng.normal(size=len(nodes))
-        turn[:, joint_number] = np.interp(q[:, joint_number], nodes, heights)
-    data = sim.data.with_y(sim.data.y + sim.cell.predict(q + turn) - sim.cell.predict(q))
-    told = mc.diagnose(robot, data, quick=True)
+    heights = 3e-4 * np.random.default_rng(2).normal(size=(2, len(FAR)))
+    curves = {i: partial(np.interp, xp=FAR, fp=heights[i]) for i in range(2)}
+    told = mc.diagnose(robot, turned(rigid(robot, 220, 1, 2), curves), quick=True)
     found = [f.term.label for f in told.effects]
     assert sorted(found) == [f"joint_error_map:J{number}" for number in (1, 2)]
     assert told.ladder[-1].holdout.rms_mm < 0.25 * told.ladder[1].holdout.rms_mm
@@ -167,10 +148,7 @@ def test_what_stood_in_for_curves_is_named_no_more() -> None:
 @pytest.fixture(scope="module")
 def bumpy(robot: Robot) -> tuple[Study, Causes]:
     """An arm with a curve in joint 2, and what is found of it without maps."""
-    sim = rigid(robot, 220, 2, 6)
-    turn = np.zeros_like(sim.data.q)
-    turn[:, 1] = bumps(sim.data.q[:, 1])
-    study = geometric(robot, sim, turn).study
+    study = geometric(robot, rigid(robot, 220, 2, 6), {1: bumps}).study
     return study, causes_of(study, (), (), silent)[1]
 
 
@@ -206,14 +184,10 @@ def test_what_was_found_first_stays_where_the_new_model_is_worse(
 
 def test_a_law_and_a_curve_much_smaller_are_both_told() -> None:
     """The law first, whose errors are too large for the prior of the curve."""
-    robot, place = mc.load_robot("ur10"), 2
-    sim = simulate(robot, 150, 1, seed=1, truth=Truth(compliance=2e-6))
-    q, nodes = sim.data.q, np.arange(-7.0, 7.0, 0.15)
-    turn = np.zeros_like(q)
-    heights = 1e-4 * np.random.default_rng(1).normal(size=len(nodes))
-    turn[:, place] = np.interp(q[:, place], nodes, heights)
-    data = sim.data.with_y(sim.data.y + sim.cell.predict(q + turn) - sim.cell.predict(q))
-    told = mc.diagnose(robot, data, quick=True)
+    sim = simulate("ur10", 150, 1, seed=1, truth=Truth(compliance=2e-6))
+    heights = 1e-4 * np.random.default_rng(1).normal(size=len(FAR))
+    data = turned(sim, {2: partial(np.interp, xp=FAR, fp=heights)})
+    told = mc.diagnose("ur10", data, quick=True)
     first, second = (f.term.label for f in told.effects[:2])
     assert (first, second) == ("joint_compliance:all", "joint_error_map:J3")
     steps = [step.name for step in told.ladder[2:]]
@@ -228,9 +202,7 @@ def test_a_ladder_keeps_a_map_whatever_its_place_among_the_effects(
 ) -> None:
     robot = mc.load_robot("ur10")
     sim = simulate(robot, 150, 1, seed=1, truth=Truth(compliance=2e-6))
-    turn = np.zeros_like(sim.data.q)
-    turn[:, 2] = 0.3 * bumps(sim.data.q[:, 2])
-    study = geometric(robot, sim, turn).study
+    study = geometric(robot, sim, {2: lambda q: 0.3 * bumps(q)}).study
     plain, *_ = EFFECTS["joint_compliance"].choices(study.scene, "all")
     law = Term("joint_compliance", "all", plain)
     (curve,) = terms(study.scene, ["joint_error_map:J3:size=0.0001"])
@@ -242,10 +214,8 @@ def test_a_ladder_keeps_a_map_whatever_its_place_among_the_effects(
     assert no_worse(ladder, bare)
     assert not no_worse(bare, ladder)
     monkeypatch.setattr(gap, "by_size", lambda trials, study, effects: list(range(len(effects))))
-    again = climbed(
-        study, effects, [True] * len(effects)
-    )  # the curve by itself is refused, and tried again
-    assert again.taken == ladder.taken
+    # the curve by itself is refused, and tried again
+    assert climbed(study, effects, [True] * len(effects)).taken == ladder.taken
 
 
 # ---- left out ------------------------------------------------------------------------------------
@@ -255,11 +225,16 @@ def rigid(robot: Robot, poses: int, targets: int, seed: int) -> Simulation:
     return simulate(robot, poses, targets, seed=seed, truth=Truth(compliance=0.0))
 
 
-def geometric(robot: Robot, sim: Simulation, turn: Array | float) -> Joint:
-    """The geometric fit of an arm whose joints turn by so much more: (m, n) [rad]."""
-    data = with_history(sim.data)
-    moved = sim.cell.predict(data.q + turn) - sim.cell.predict(data.q)
-    data = data.with_y(data.y + moved)
+def turned(sim: Simulation, curves: dict[int, Curve]) -> mc.Measurements:
+    """The same of an arm whose joints turn by so much more [rad], by their own values."""
+    q, turn = sim.data.q, np.zeros_like(sim.data.q)
+    for number, curve in curves.items():
+        turn[:, number] = curve(q[:, number])
+    return sim.data.with_y(sim.data.y + sim.cell.predict(q + turn) - sim.cell.predict(q))
+
+
+def geometric(robot: Robot, sim: Simulation, curves: dict[int, Curve]) -> Joint:
+    data = with_history(turned(sim, curves))
     return joint(studied(robot, data, fit_cell(robot, data, SUM, silent)), ())
 
 
@@ -289,10 +264,7 @@ def test_the_prior_that_meets_the_parts_best_is_taken(rng: np.random.Generator) 
 
 def test_what_holds_a_fit_holds_it_without_a_part(robot: Robot) -> None:
     """Left out, each part is met as the fit with its priors meets it: a map has many columns."""
-    sim = rigid(robot, 60, 2, 3)
-    turn = np.zeros_like(sim.data.q)
-    turn[:, 1] = 3e-4 * np.sin(9.0 * sim.data.q[:, 1])
-    bare = geometric(robot, sim, turn)
+    bare = geometric(robot, rigid(robot, 60, 2, 3), {1: lambda q: 3e-4 * np.sin(9.0 * q)})
     choice = {"low": -1.6, "high": 2.4, "length": 0.35, "size": 3e-4}
     fit = joint(bare.study, [Term("joint_error_map", "J2", choice)])
     left = Left.of(fit)

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from measuring.test_faults import reseated
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -167,22 +168,11 @@ ROW = 30
 NOISE_MM = 1e3 * np.sqrt(3.0) * NOISY.noise
 
 
-def reseated(sim: Simulation, by: tuple[float, float, float]) -> Measurements:
-    """From the row ROW on smr2 sits elsewhere on the flange; the file tells no visits."""
-    spots = sim.cell.target_positions.copy()
-    spots[1] += by
-    y = sim.data.y.copy()
-    q = sim.data.q[ROW:]
-    y[ROW:, 1] += replace(sim.cell, target_positions=spots).predict(q)[:, 1]
-    y[ROW:, 1] -= sim.cell.predict(q)[:, 1]
-    return replace(sim.data.with_y(y), columns={})
-
-
 @cache
 def reseat_of(targets: int) -> tuple[Simulation, Measurements, mc.Diagnosis]:
-    """A reflector that was re-seated by 5 mm."""
+    """A reflector that was re-seated by 5 mm; the file tells no visits."""
     sim = simulate("irb120", 60, targets, seed=1, truth=NOISY)
-    data = reseated(sim, (3e-3, 0.0, 4e-3))
+    data = reseated(sim, replace(sim.data, columns={}), ROW, 1, np.array([3e-3, 0.0, 4e-3]))
     return sim, data, mc.diagnose("irb120", data, quick=True)
 
 

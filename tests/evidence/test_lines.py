@@ -152,26 +152,14 @@ def test_one_law_of_another_course_is_one_name(law, place, key):
     assert {c.key for c in choice.chosen} == {key}
 
 
-def test_what_other_weights_chose_is_dropped_where_it_is_not_needed():
-    made = opened("irb120", Cause("backlash", "J2", 500.0))
-    choice = chosen(made, ())
+def test_what_other_weights_chose_is_dropped_where_not_needed_and_alone_compared_anew():
+    choice = chosen(opened("irb120", Cause("backlash", "J2", 500.0)), ())
     lib = choice.library
-    (right,) = choice.found
-    idle = bench(lib, ()).added(next(c for c in lib.candidates if c.key == ("gear_error", "J4")))
-    again = select(lib, first=(idle, right))
-    assert [c.key for c in again.chosen] == [("backlash", "J2")]
-
-
-def test_the_only_one_that_other_weights_chose_is_compared_anew():
-    made = opened("irb120", Cause("backlash", "J2", 500.0))
-    lib = chosen(made, ()).library
-    alike = bench(lib, ()).added(next(c for c in lib.candidates if c.key == ("settling", "J2")))
-    again = select(lib, first=(alike,))
-    assert [c.key for c in again.chosen] == [("backlash", "J2")]
-
-
-def test_a_moment_that_is_sought_costs_as_a_parameter_does():
-    lib = chosen(opened("irb120", Cause("backlash", "J2", 500.0)), ()).library
+    for key, beside in ((("gear_error", "J4"), choice.found), (("settling", "J2"), ())):
+        idle = bench(lib, ()).added(next(c for c in lib.candidates if c.key == key))
+        assert [c.key for c in select(lib, first=(idle, *beside)).chosen] == [("backlash", "J2")]
+    assert len(choice.found) == 1
+    # a moment that is sought costs as a parameter does
     seats = [c for c in lib.candidates if c.term.effect == "target_reseat"]
     assert {c.shapes for c in seats} == {1}
 

@@ -74,17 +74,20 @@ def test_polynomials_of_a_decade_give_every_weight(decade):
     assert_allclose(found, weights(ratios), rtol=1e-9)
 
 
-def test_products_are_the_sums_over_rows(rough):
+def check_sums(products: Any, ratios: Array, variance_ratio: Array, kept: Array | float) -> None:
     """Of what weighted least squares on the geometry leave of the columns."""
-    products = arm_library(rough.scene, rough.rows).products
     index, sets = np.array([3, 17, 18]), np.array([[0, 5], [7, 30]])
-    clear, raw = products.columns.clear, products.columns.raw
-    p = products.columns.fixed - 1
-    found = products.at(TRIED, index)
-    for i, ratio in enumerate(TRIED):
-        weight = 1.0 / (1.0 + ratio * rough.rows.variance_ratio)
+    columns = products.columns
+    clear, found = columns.clear[columns.fixed - 1 :], products.at(ratios, index)
+    for i, ratio in enumerate(ratios):
+        weight = kept / (1.0 + ratio * variance_ratio)
         geometry = products.geometry * np.sqrt(weight)
-        check_products(found, i, index, sets, clear[p:], geometry, weight, raw)
+        check_products(found, i, index, sets, clear, geometry, weight, columns.raw)
+
+
+def test_products_are_the_sums_over_rows(rough):
+    products = arm_library(rough.scene, rough.rows).products
+    check_sums(products, TRIED, rough.rows.variance_ratio, 1.0)
 
 
 def test_columns_are_stored_without_what_geometry_imitates(lib, rough):
@@ -197,16 +200,7 @@ def some_rows(rows: Problem, kept: Array) -> Problem:
 
 
 def test_products_of_a_part_are_sums_over_its_rows(swept, rough, kept):
-    """Of what weighted least squares on the geometry leave of the columns."""
-    index, sets = np.array([3, 17, 18]), np.array([[0, 5], [7, 30]])
-    columns = swept.columns
-    p = columns.fixed - 1
-    ratios = swept.ratios[[0, 3, 1]]
-    found = swept.at(ratios, index)
-    for i, ratio in enumerate(ratios):
-        weight = kept / (1.0 + ratio * rough.rows.variance_ratio)
-        geometry = swept.geometry * np.sqrt(weight)
-        check_products(found, i, index, sets, columns.clear[p:], geometry, weight, columns.raw)
+    check_sums(swept, swept.ratios[[0, 3, 1]], rough.rows.variance_ratio, kept)
     span, basis = swept.swept.span, rough.rows.basis[kept]
     assert_allclose(span.T @ basis.T @ basis @ span, np.eye(span.shape[1]), rtol=0, atol=ROUNDING)
 

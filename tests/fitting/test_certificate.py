@@ -130,9 +130,13 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_derivatives(name, robot, noisy):
-    here = CASES[name](robot, noisy)
+@pytest.fixture(scope="module", params=CASES.values(), ids=CASES)
+def here(request: pytest.FixtureRequest, robot: mc.Robot, noisy: Simulation) -> Setup:
+    found: Setup = request.param(robot, noisy)
+    return found
+
+
+def test_derivatives(here):
     problem, rng = PointCones.of(here.worst), np.random.default_rng(0)
     at = problem.step(here.start, rng.normal(size=len(problem.white)))
     rows, step = problem.linearise(at), 1e-4
@@ -146,16 +150,9 @@ def test_derivatives(name, robot, noisy):
         assert_allclose(rows.C @ e, (plus.c - minus.c) / (2 * step), rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_cone_programs_end_at_the_same_value(name, robot, noisy):
-    here = CASES[name](robot, noisy)
-    assert_allclose(here.value(), by_cones(here), rtol=1e-8)
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_the_certificate_closes_at_an_optimum(name, robot, noisy):
-    here = CASES[name](robot, noisy)
+def test_the_certificate_closes_at_an_optimum(here, request):
     best = here.sqp()
+    assert_allclose(here.value(), by_cones(here), rtol=1e-8)
     proof = certify(here.worst, best, here.data.line)
     assert best.status is Status.CONVERGED
     assert abs(proof.gap) < 1e-8
@@ -168,14 +165,10 @@ def test_the_certificate_closes_at_an_optimum(name, robot, noisy):
     assert_allclose(proof.bound, optimum * np.sqrt(here.worst.size), rtol=1e-7)
     assert_allclose(sum(one.multiplier for one in proof.points), 1.0, rtol=1e-6)
     # distances that bind do so with a multiplier
-    if name == "bound_by_distances":
+    if "bound_by_distances" in request.node.name:
         assert np.abs(best.lam).max() > 0.0
         assert np.abs(rows.c).max() > 1.0 - 1e-7
 
-
-@pytest.mark.parametrize("name", CASES)
-def test_the_certificate_is_open_elsewhere(name, robot, noisy):
-    here = CASES[name](robot, noisy)
     early = here.sqp(iterations=1)
     proof = certify(here.worst, early, here.data.line)
     assert early.status is Status.ITERATION_LIMIT

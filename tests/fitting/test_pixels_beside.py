@@ -27,7 +27,7 @@ from minimax_cal.fitting.pixels.calibrate import fitted
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments.camera import read_camera
-from minimax_cal.instruments.pixels import read_pixels
+from minimax_cal.instruments.pixels import PixelData, read_pixels
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.gravity import masses_of, torques
@@ -147,6 +147,8 @@ def test_the_worst_of_pixels_is_a_target_of_a_camera():
     assert {"pixels c0", "pixels c29"} < {*both.worst.functions}
     with pytest.raises(mc.OptionError, match="camera_on='roof': give flange or ground"):
         mc.relative(cell.drawn, given, camera_on="roof")
+    with pytest.raises(mc.DataError, match="pixels alone: give it to calibrate"):
+        mc.relative(cell.drawn, given[1:])
 
 
 @pytest.mark.parametrize("board", [True, False], ids=["board", "tags"])
@@ -160,12 +162,6 @@ def test_lenses_that_are_held_stay(board):
     assert len(lens) == 2
     assert not any(p.identifiable for p in lens)
     assert lens[0].value == lens[0].nominal == 2500.0
-
-
-def test_pixels_alone_have_a_command_of_their_own():
-    cell = cell_of(2)
-    with pytest.raises(mc.DataError, match="pixels alone: give it to calibrate"):
-        mc.relative(cell.drawn, [as_instrument(data_of(cell))])
 
 
 # ---- effects of the arm --------------------------------------------------------------------------
@@ -207,14 +203,10 @@ def test_an_effect_of_the_arm_is_found_by_cameras(on_flange):
 
 def test_from_files_to_a_report(tmp_path, answered, refuses):
     cell = cell_of(1)
-    files, points, result = (
-        write_cell(cell, tmp_path),
-        tmp_path / "tracker.csv",
-        tmp_path / "r.json",
-    )
+    files, points, result = write_cell(cell, tmp_path), tmp_path / "t.csv", tmp_path / "r.json"
     mc.write_measurements(points, tracked(cell, 1, 24, 3e-5))
     content = answered("relative ur5", points, *files, "-o", result)
-    assert [one["name"] for one in content["instruments"]] == ["tracker", "detections"]
+    assert [one["name"] for one in content["instruments"]] == ["t", "detections"]
     assert [one["kind"] for one in content["instruments"]] == ["points", "pixels"]
     assert {"alone", "directions_alone", "file", "noise", "unit"} <= set(content["instruments"][1])
     assert arm_error(cell, mc.load_robot(result)) < 0.03
@@ -282,9 +274,9 @@ def folder_of(
     return path
 
 
-def read(path: Path, names: tuple[str, ...] = ("left",), board: bool = True) -> None:
+def read(path: Path, names: tuple[str, ...] = ("left",), board: bool = True) -> PixelData:
     cameras = [read_camera(name, path / "left.yaml") for name in names]
-    read_pixels(
+    return read_pixels(
         path / "detections.csv", path / "joints.csv", cameras, path / "board.csv" if board else None
     )
 
@@ -295,14 +287,8 @@ def test_files_of_a_cell_in_german(tmp_path):
         "joints": ["Pose;" + ";".join(f"Achse {i} [rad]" for i in range(1, 7)), *JOINTS[1:]],
         "board": ["Ziel;X [mm];Y [mm];Z [mm]", *BOARD[1:]],
     }
-    there = folder_of(
-        tmp_path, **{k: [row.replace(",", ";").replace(".", ",") for row in v]
-                     for k, v in german.items()}
-    )  # fmt: skip
-    camera = read_camera("left", there / "left.yaml")
-    data = read_pixels(
-        there / "detections.csv", there / "joints.csv", [camera], there / "board.csv"
-    )
+    told = {k: [row.replace(",", ";").replace(".", ",") for row in v] for k, v in german.items()}
+    data = read(folder_of(tmp_path, **told))
     assert data.pixel[1].tolist() == [150.0, 201.0]
     assert data.at.q[3].tolist() == [0.1, 0.3, 0.3, 0.4, 0.5, 0.6]
     assert data.board[1].tolist() == [0.05, 0.0, 0.0]
@@ -389,11 +375,8 @@ def test_wrong_joints_cameras_and_boards_are_refused(tmp_path):
 
 
 def test_tags_seen_once_are_left_out(tmp_path):
-    path = folder_of(tmp_path, [*ROWS, "P1,left,t9,1,2"])
-    cameras = [read_camera("left", path / "left.yaml")]
-    data = read_pixels(path / "detections.csv", path / "joints.csv", cameras)
+    data = read(folder_of(tmp_path, [*ROWS, "P1,left,t9,1,2"]), board=False)
     assert data.targets == ("t0", "t1", "t2", "t3")
     assert any("seen once only and left out: t9" in notice for notice in data.notices)
-    folder_of(tmp_path)
-    same = read_pixels(path / "detections.csv", path / "joints.csv", cameras)
+    same = read(folder_of(tmp_path), board=False)
     assert (same.targets, same.notices) == (data.targets, ())

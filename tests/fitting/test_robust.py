@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from problems_robust import EVEN, EXACT, FITTER, NOISE, Case, case_of, shifted, state_of
+from problems_robust import EVEN, EXACT, FITTER, NOISE, Case, case_of, directions, shifted, state_of
 from scipy import integrate, optimize, stats
 
 import minimax_cal as mc
@@ -379,8 +379,7 @@ def spoilt(made: Simulation, share: float = 0.05, size: float = 1e-3) -> mc.Meas
     y = made.data.y.copy()
     points = y.reshape(-1, 3)
     chosen = rng.permutation(len(points))[: round(share * len(points))]
-    way = rng.normal(size=(len(chosen), 3))
-    points[chosen] += size * way / np.linalg.norm(way, axis=1, keepdims=True)
+    points[chosen] += size * directions(rng, len(chosen))
     return made.data.with_y(y)
 
 

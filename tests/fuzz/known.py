@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -19,20 +20,14 @@ Array = np.ndarray[Any, np.dtype[np.float64]]
 
 def degrees(rows: list[list[str]], rng: Rng) -> None:
     """Joints in degrees, and so named."""
-    for i, name in enumerate(rows[0]):
-        if name.startswith("q"):
-            rows[0][i] = name.replace("rad", "deg")
-            for row in rows[1:]:
-                row[i] = repr(math.degrees(float(row[i])))
+    degrees_called_radians(rows, rng)
+    rows[0] = [name.replace("rad", "deg") for name in rows[0]]
 
 
 def metres(rows: list[list[str]], rng: Rng) -> None:
     """Points in metres, and so named."""
-    for i, name in enumerate(rows[0]):
-        if name.startswith("smr"):
-            rows[0][i] = name.replace("_mm", "_m")
-            for row in rows[1:]:
-                row[i] = repr(float(row[i]) / 1e3)
+    metres_called_millimetres(rows, rng)
+    rows[0] = [re.sub("^(smr.*)_mm$", r"\1_m", name) for name in rows[0]]
 
 
 def other_order(rows: list[list[str]], rng: Rng) -> None:

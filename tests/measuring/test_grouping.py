@@ -1,6 +1,7 @@
 """Rows as poses, parts and regions; the order of visits, and a file that tells none."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -280,54 +281,39 @@ def test_moves_follow_the_visit_order_not_the_rows(rng):
         assert_array_equal(mixed[name], straight[name][shuffled])
 
 
-def test_a_gap_hides_the_pose_before():
-    columns = with_history(walk([0.0, 1.0, 3.0, 3.0, 2.0], order=[0, 1, 4, 5, 6])).columns
-    assert_array_equal(columns["followed"], [0, 1, 0, 1, 1])
-    assert_array_equal(columns["approach1"], [0, 1, 0, 0, -1])  # nothing carries over the gap
-    assert_array_equal(columns["move1"], [0, 1, 0, 0, -1])
-    assert_allclose(columns["clock"], np.array([0, 1, 4, 5, 6]) / 6)
+SIXTH, THIRD = 1.0 / 6.0, 1.0 / 3.0
+WALKS: dict[str, tuple[list[float], dict[str, Any], dict[str, list[float]]]] = {
+    "a gap hides the pose before, and nothing carries over it": (
+        [0, 1, 3, 3, 2], {"order": [0, 1, 4, 5, 6]},
+        {"followed": [0, 1, 0, 1, 1], "approach1": [0, 1, 0, 0, -1], "move1": [0, 1, 0, 0, -1],
+         "clock": [0, SIXTH, 4 * SIXTH, 5 * SIXTH, 1]}),
+    "tens are no gaps": ([0, 1, 2], {"order": [10, 20, 30]}, {"followed": [0, 1, 1]}),
+    "a pose squeezed in": (
+        [0, 2, 1, 5], {"order": [1, 2, 1.5, 4]},
+        {"followed": [0, 1, 1, 0], "move1": [0, 1, 1, 0]}),
+    "a session breaks the chain and may count anew": (
+        [0, 1, 5, 4], {"order": [0, 1, 0, 1], "session": ["b", "b", "a", "a"]},
+        {"visit": [0, 1, 2, 3], "followed": [0, 1, 0, 1], "approach1": [0, 1, 0, -1],
+         "clock": [0, THIRD, 2 * THIRD, 1]}),
+    "repeated numbers side by side are sorted stably": (
+        [0, 1, 3, 2], {"order": [0, 1, 1, 2]},
+        {"followed": [0, 1, 1, 1], "move1": [0, 1, 2, -1]}),
+    "numbers that begin again without a session say nothing of the pose before": (
+        [0, 1, 2, 7, 8, 9], {"order": [0, 1, 2, 0, 1, 2]},
+        {"followed": [0] * 6, "approach1": [0] * 6}),
+    "rows without a number come last and follow nothing": (
+        [0, 9, 1], {"order": [0, np.nan, 1]}, {"visit": [0, 2, 1], "followed": [0, 0, 1]}),
+    "time sets the clock": ([0, 1, 2], {"time": [100, np.nan, 500]}, {"clock": [0, 0.5, 1]}),
+    "one row": ([1], {"order": [5]}, {"clock": [0], "followed": [0]}),
+}  # fmt: skip
 
 
-def test_orders_that_count_in_tens_or_squeeze_a_pose_in_have_no_gaps():
-    tens = with_history(walk([0.0, 1.0, 2.0], order=[10, 20, 30])).columns
-    assert_array_equal(tens["followed"], [0, 1, 1])
-    halves = with_history(walk([0.0, 2.0, 1.0, 5.0], order=[1, 2, 1.5, 4])).columns
-    assert_array_equal(halves["followed"], [0, 1, 1, 0])
-    assert_array_equal(halves["move1"], [0, 1, 1, 0])
-
-
-def test_a_session_breaks_the_chain_and_may_count_anew():
-    data = walk([0.0, 1.0, 5.0, 4.0], order=[0, 1, 0, 1], session=["b", "b", "a", "a"])
-    columns = with_history(data).columns
-    assert_array_equal(history.visits(data), [0, 1, 2, 3])
-    assert_array_equal(columns["followed"], [0, 1, 0, 1])
-    assert_array_equal(columns["approach1"], [0, 1, 0, -1])
-    assert_allclose(columns["clock"], [0, 1 / 3, 2 / 3, 1])
-
-
-def test_repeated_numbers_side_by_side_are_sorted_stably():
-    columns = with_history(walk([0.0, 1.0, 3.0, 2.0], order=[0, 1, 1, 2])).columns
-    assert_array_equal(columns["followed"], [0, 1, 1, 1])
-    assert_array_equal(columns["move1"], [0, 1, 2, -1])
-
-
-def test_numbers_that_begin_again_without_a_session_say_nothing_of_the_pose_before():
-    data = walk([0.0, 1.0, 2.0, 7.0, 8.0, 9.0], order=[0, 1, 2, 0, 1, 2])
-    columns = with_history(data).columns
-    assert not columns["followed"].any()
-    assert not columns["approach1"].any()
-
-
-def test_rows_without_a_number_come_last_and_follow_nothing():
-    data = walk([0.0, 9.0, 1.0], order=[0.0, np.nan, 1.0])
-    columns = with_history(data).columns
-    assert_array_equal(history.visits(data), [0, 2, 1])
-    assert_array_equal(columns["followed"], [0, 0, 1])
-
-
-def test_time_sets_the_clock():
-    columns = with_history(walk([0.0, 1.0, 2.0], time=[100.0, np.nan, 500.0])).columns
-    assert_allclose(columns["clock"], [0, 0.5, 1])
+@pytest.mark.parametrize(("q", "told", "expected"), WALKS.values(), ids=WALKS)
+def test_what_an_order_tells(q, told, expected):
+    data = walk(q, **told)
+    columns = {**with_history(data).columns, "visit": history.visits(data)}
+    for name, values in expected.items():
+        assert_allclose(columns[name], values, rtol=0, atol=1e-15)
 
 
 def test_columns_of_the_file_are_kept():
@@ -338,12 +324,6 @@ def test_columns_of_the_file_are_kept():
     part = with_history(data).take(np.array([0, 2]))  # a split does not change the moves
     assert_array_equal(with_history(part).columns["move1"], [0, 1])
     assert_array_equal(moves(part), [[0], [1]])
-
-
-def test_one_row():
-    columns = with_history(walk([1.0], order=[5])).columns
-    assert_array_equal(columns["clock"], [0])
-    assert_array_equal(columns["followed"], [0])
 
 
 def test_irb120_keeps_the_moves_whose_start_is_in_the_file():

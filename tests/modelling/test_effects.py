@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from numpy.testing import assert_allclose
+from problems_fit import MASSES, SPOTS, weighty
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
@@ -26,18 +27,8 @@ from minimax_cal.robots.sampling import random_poses
 DOCS = ROOT / "docs" / "effects.md"
 EXACT = 1e-12  # relative: the same arithmetic by another way
 BASE = (Rotation.from_rotvec([0.3, -0.2, 1.1]).as_matrix(), np.array([2.5, -1.0, 0.4]))
-SPOTS = np.array([[0.1, 0.0, 0.05], [-0.05, 0.09, 0.05], [-0.05, -0.08, 0.06]])
-MASSES = (100.0, 60.0, 45.0, 20.0, 8.0, 3.0)
-CENTRES = ([-60, 90, 5], [-430, 12, -30], [-70, 0, 40], [8, 250, 3], [0, -10, 25], [0, 4, -40])
-
-
-def weighty(**changes: object) -> mc.Robot:
-    """An IRB 2600 with masses, gear ratios, one reversed joint and a base that is not level."""
-    content = mc.load_robot("irb2600").to_dict() | {"up": [0.1, -0.05, 1.0]}
-    for joint, mass, com in zip(content["joints"], MASSES, CENTRES, strict=True):
-        joint |= {"mass_kg": mass, "com_mm": com, "ratio": 101.0}
-    content["joints"][2]["sign"] = -1
-    return replace(robot_from_dict(content), **changes)
+# with gear ratios, one reversed joint and a base that is not level
+ROBOT = weighty(2, [0.1, -0.05, 1.0], ratio=101.0)
 
 
 def visited(robot: mc.Robot, poses: int = 40, seed: int = 0) -> mc.Measurements:
@@ -68,7 +59,6 @@ def all_terms(scene: Scene) -> list[Term]:
     return [*out, Term("session_jump", "frame", {"since": 0.4})]  # a moment that errors show
 
 
-ROBOT = weighty()
 DATA = visited(ROBOT)
 SCENE = scene_of(ROBOT, DATA)
 NO_MASSES = replace(ROBOT, mass=np.full(6, np.nan), com=np.full((6, 3), np.nan))
@@ -618,11 +608,15 @@ def test_the_base_drifts_as_one_body():
     assert_allclose(found.shift[5], expected, rtol=0, atol=EXACT)
 
 
+def in_sessions(names: str) -> tuple[Array, Scene]:
+    """Rows of sessions by turns, of which three have frames."""
+    columns = {**DATA.columns, "session": np.array([*names])[np.arange(40) % 4]}
+    data = replace(DATA, frames={name: np.eye(4) for name in "abc"}, columns=columns)
+    return columns["session"], scene_of(ROBOT, data)
+
+
 def test_a_jump_is_the_base_elsewhere_in_each_further_session():
-    session = np.array(["a", "b", "c", "b"])[np.arange(40) % 4]
-    frames = {name: np.eye(4) for name in "abc"}
-    scene = scene_of(ROBOT, replace(DATA, frames=frames, columns={**DATA.columns,
-                                                                  "session": session}))  # fmt: skip
+    session, scene = in_sessions("abcb")
     found = columns("session_jump", "frame", scene, sessions=3.0)
     assert found.names == tuple(f"{n}{i}" for i in "23" for n in ("x", "y", "z", "rx", "ry", "rz"))
     p = scene.points
@@ -635,10 +629,7 @@ def test_a_jump_is_the_base_elsewhere_in_each_further_session():
 
 def test_a_zero_is_otherwise_before_the_last_rows():
     """The geometry is that of the last session; rows of no known session are as the last ones."""
-    session = np.array(["a", "b", "c", "x"])[np.arange(40) % 4]
-    frames = {name: np.eye(4) for name in "abc"}
-    scene = scene_of(ROBOT, replace(DATA, frames=frames, columns={**DATA.columns,
-                                                                  "session": session}))  # fmt: skip
+    session, scene = in_sessions("abcx")
     since = columns("encoder_zero", "J3", scene, session=2.0).turn[0]
     assert_allclose(since[2], np.where(session == "a", -1.0, 0.0), rtol=0, atol=0)
     assert not np.delete(since, 2, axis=0).any()

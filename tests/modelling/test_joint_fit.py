@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from numpy.testing import assert_allclose
+from problems_fit import MASSES, SPOTS, weighty
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
@@ -22,27 +23,12 @@ from minimax_cal.modelling.joint_fit import extended, fitted, scene_of
 from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.robot import robot_from_dict
 from minimax_cal.robots.sampling import random_poses
 
 EXAMPLE = ROOT / "examples" / "own_effect.py"
 NOISE = 15e-6  # standard deviation of a coordinate [m]
 FLOOR_MM = 1e3 * NOISE * np.sqrt(3.0)  # RMS distance that noise alone leaves
-MASSES = (100.0, 60.0, 45.0, 20.0, 8.0, 3.0)
-CENTRES = ([-60, 90, 5], [-430, 12, -30], [-70, 0, 40], [8, 250, 3], [0, -10, 25], [0, 4, -40])
-SPOTS = np.array([[0.1, 0.0, 0.05], [-0.05, 0.09, 0.05], [-0.05, -0.08, 0.06]])
-
-
-def weighty() -> mc.Robot:
-    """An IRB 2600 with masses and one reversed joint."""
-    content = mc.load_robot("irb2600").to_dict()
-    for joint, mass, com in zip(content["joints"], MASSES, CENTRES, strict=True):
-        joint |= {"mass_kg": mass, "com_mm": com}
-    content["joints"][3]["sign"] = -1
-    return robot_from_dict(content)
-
-
-ROBOT = weighty()
+ROBOT = weighty(3)
 
 
 def visited(poses: int = 90, seed: int = 1) -> mc.Measurements:
@@ -79,6 +65,12 @@ def measured(cell: mc.Cell, data: mc.Measurements, seed: int = 3) -> mc.Measurem
     """The data as an instrument with noise sees the cell."""
     y = cell.follow(data)
     return data.with_y(y + np.random.default_rng(seed).normal(scale=NOISE, size=y.shape))
+
+
+def seen(put: dict[str, list[float]]) -> mc.Measurements:
+    """What an instrument sees of the true cell with effects."""
+    data = visited()
+    return measured(with_effects(true_cell(), data, put), data)
 
 
 def values(fit: mc.Fit, text: str) -> list[tuple[float, float]]:
@@ -135,8 +127,7 @@ def test_every_effect_is_put_in():
 @pytest.mark.parametrize("text", CASES)
 def test_an_effect_that_is_put_in_is_found(text):
     put = {text: CASES[text]}
-    data = visited()
-    data = measured(with_effects(true_cell(), data, put), data)
+    data = seen(put)
     fit = mc.calibrate(ROBOT, data, objective="sum", effects=[text])
     assert str(fit.status) == "converged"
     check_found(fit, put)
@@ -178,10 +169,8 @@ def test_finite_turns_are_taken_in_the_second_pass():
 def test_priors_are_weighed_against_the_noise_that_effects_leave():
     """The effect would pass for noise of a millimetre, and the priors then win over the data."""
     put = {"joint_compliance:J2": [2e-6]}
-    data = visited()
-    data = measured(with_effects(true_cell(), data, put), data)
     priors = {"a*": 1e-3, "d*": 1e-3, "theta*": 1e-3, "alpha*": 1e-3}
-    fit = mc.calibrate(ROBOT, data, objective="sum", effects=list(put), priors=priors)
+    fit = mc.calibrate(ROBOT, seen(put), objective="sum", effects=list(put), priors=priors)
     check_found(fit, put)
     assert fit.accuracy["holdout"].rms_mm < 1.15 * FLOOR_MM
 
@@ -189,9 +178,7 @@ def test_priors_are_weighed_against_the_noise_that_effects_leave():
 def test_each_of_several_lines_of_a_gear_has_a_name(tmp_path: Path):
     """The waves a turn tell one from another; a lone line goes without."""
     lines = {"gear_ripple:J3:turns=17": [2e-4, 1e-4], "gear_ripple:J3:turns=31.5": [-1e-4, 3e-4]}
-    data = visited()
-    data = measured(with_effects(true_cell(), data, lines), data)
-    fit = mc.calibrate(ROBOT, data, objective="sum", effects=[*lines, "backlash:J2"])
+    fit = mc.calibrate(ROBOT, seen(lines), objective="sum", effects=[*lines, "backlash:J2"])
     names = [p.name for p in fit.parameters if p.of_effect]
     assert names == [
         "gear_ripple:J3.cos 17/turn", "gear_ripple:J3.sin 17/turn",
@@ -226,9 +213,7 @@ def test_an_effect_that_is_geometry_is_not_identified():
 
 
 def test_the_same_effect_twice_is_told_once():
-    put = {"encoder_gain:J1": [4e-4]}
-    data = visited()
-    data = measured(with_effects(true_cell(), data, put), data)
+    data = seen({"encoder_gain:J1": [4e-4]})
     fit = mc.calibrate(ROBOT, data, objective="sum", effects=["encoder_gain:J1", "encoder_gain:J1"])
     found = [p for p in fit.parameters if p.name == "encoder_gain:J1.g1"]
     assert sorted(p.identifiable for p in found) == [False, True]
@@ -396,8 +381,7 @@ def test_effects_may_be_terms_too():
 
 def test_targets_may_be_missing_at_some_poses():
     put = {"joint_compliance:J2": [6e-7], "target_offset:smr1": [3e-4]}
-    data = visited()
-    data = measured(with_effects(true_cell(), data, put), data)
+    data = seen(put)
     y = data.y.copy()
     gone = np.random.default_rng(5).uniform(size=(90, 3)) < 0.3
     gone[gone.all(axis=1), 0] = False

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -21,8 +21,7 @@ from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import gravity
-from minimax_cal.planning import plan as module
-from minimax_cal.planning import separating, task
+from minimax_cal.planning import separating
 from minimax_cal.planning.candidates import free_poses
 from minimax_cal.planning.designs.criteria import (
     Criterion,
@@ -56,6 +55,7 @@ from minimax_cal.robots.sampling import random_poses
 ROUNDING = 1e-9  # relative: the same numbers by other algebra
 NEAR = {"D": 0.01, "A": 0.01, "I": 0.01, "G": 0.1, "E": 0.1}  # of the largest, a soft mean serves
 NOISE = Instrument(10e-6, 2.5e-6, 10e-6)
+pytestmark = pytest.mark.usefixtures("few_candidates")
 
 
 def silent(message: str) -> None:
@@ -382,18 +382,8 @@ def test_effects_are_unknowns_too(robot):
     assert sigma[1] > sigma[0]  # what is not known costs accuracy
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _few_candidates() -> Iterator[None]:
-    """Plans are as good with fewer poses to choose from, against random ones of the same."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "STEPS", (0.1, 0.03))
-        patch.setattr(module, "KEPT", 80)
-        patch.setattr(task, "WORK", 300)
-        yield
-
-
 @pytest.fixture(scope="module")
-def planned(robot: mc.Robot) -> Plan:
+def planned(robot: mc.Robot, few_candidates: None) -> Plan:
     return plan(robot, 12, targets=1, candidates=150, revisit=3, approach="both", seed=2)
 
 

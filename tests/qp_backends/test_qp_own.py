@@ -92,27 +92,21 @@ def test_a_process_of_its_own_gives_the_same_answer():
 
 
 @pytest.mark.parametrize(
-    ("solver", "seconds", "says"),
+    ("solver", "more", "says"),
     [
-        (endless, 1.0, "stopped after 1 s"),
-        (killed, 120.0, "process ended with -9"),
-        (leaving, 120.0, "raised"),
+        (endless, {"seconds": 1.0}, "stopped after 1 s"),
+        (killed, {"seconds": 120.0}, "process ended with -9"),
+        (leaving, {"seconds": 120.0}, "raised"),
+        (no_status, {}, "no qp_backends.Status"),
     ],
 )
-def test_what_never_ends_or_dies_is_replaced(solver, seconds, says):
+def test_what_never_ends_or_dies_or_has_a_status_of_its_own_is_replaced(solver, more, says):
     """The two that die get time to start: a busy machine may need seconds for that."""
-    registry.register("mine", solver, seconds=seconds)
+    registry.register("mine", solver, **more)
     found = solve(problem(), "mine")
     assert found.status is Status.SOLVED
     assert found.backend != "mine"
     assert says in found.notes[0]
-
-
-def test_a_status_of_its_own_making_is_no_answer():
-    registry.register("mine", no_status)
-    found = solve(problem(), "mine")
-    assert found.status is Status.SOLVED
-    assert "no qp_backends.Status" in found.notes[0]
 
 
 def test_a_process_needs_what_can_be_imported():
@@ -173,8 +167,7 @@ def test_the_fallback_order_depends_on_how_the_problem_is_stored():
     assert sorted(DENSE_ORDER) == sorted(SPARSE_ORDER)
 
 
-def test_a_registered_solver_gets_the_keywords_that_it_takes(monkeypatch):
-    monkeypatch.setattr(registry, "_registered", {})
+def test_a_registered_solver_gets_the_keywords_that_it_takes():
     seen = {}
 
     def all_of_them(problem, **keywords):

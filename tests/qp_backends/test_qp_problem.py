@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from problems_qp import epigraph, random_problem
+from problems_qp import epigraph, in_units, random_problem
 from qpsolvers import solve_qp
 from scipy import sparse
 
@@ -175,13 +175,7 @@ def test_relative_numbers_do_not_depend_on_units(factor):
     x, y = rng.normal(size=46), np.abs(rng.normal(size=9))
     row = np.where(np.arange(9) % 2, factor, 1.0)
     unit = 10.0 ** rng.uniform(-8.0, 8.0, 46)
-    other = Problem(
-        factor * problem.P / np.outer(unit, unit),
-        factor * problem.q / unit,
-        row[:, None] * problem.A / unit,
-        row * problem.l,
-        row * problem.u,
-    )
+    other = in_units(problem, unit, row, factor)
     before, after = (
         accuracy(problem, answer(x, y)),
         accuracy(other, answer(unit * x, factor * y / row)),

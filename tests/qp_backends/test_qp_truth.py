@@ -6,7 +6,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from problems_qp import MAROS_MESZAROS, epigraph, maros_meszaros
+from problems_qp import MAROS_MESZAROS, epigraph, in_units, maros_meszaros
 
 from qp_backends import Problem, Status, accuracy, available, solve, via_cvxpy
 from qp_backends.child import call
@@ -17,18 +17,6 @@ BACKENDS = [*available(), *(["daqp:direct"] if "daqp" in available() else [])]
 INF = np.inf
 every_backend = pytest.mark.parametrize("name", BACKENDS)
 NEGATIVE = (Status.INFEASIBLE, Status.UNBOUNDED)
-
-
-def in_units(problem, unit, row=1.0, objective=1.0):
-    """The same problem for unit * x, rows and objective times a number."""
-    row = np.broadcast_to(row, problem.l.shape)
-    return Problem(
-        objective * problem.P / np.outer(unit, unit),
-        objective * problem.q / unit,
-        row[:, None] * problem.A / unit,
-        row * problem.l,
-        row * problem.u,
-    )
 
 
 @every_backend

@@ -62,15 +62,21 @@ def test_a_chain_of_every_joint():
 
 
 @pytest.mark.dev
-def test_pinocchio_reads_the_same_poses():
+@pytest.mark.parametrize("fixed", [{}, {1: 0.3, 3: -0.2}])
+def test_pinocchio_reads_the_same_poses(fixed):
+    """A joint whose limits are one number is fixed there."""
     pinocchio = pytest.importorskip("pinocchio")
-    text = urdf_of([row for row in ARM if row[0] != "continuous"])
+    rows = [row for row in ARM if row[0] != "continuous"]
+    for i, at in fixed.items():
+        rows[i] = (*rows[i][:4], f'lower="{at}" upper="{at}"')
+    text = urdf_of(tuple(rows))
     model = to_robot(parse_urdf(text.encode()))
     robot = robot_from_dict(model.content)
     theirs = pinocchio.buildModelFromXML(text)
     data, frame = theirs.createData(), theirs.getFrameId(model.chain[-1].child)
+    assert robot.joints == theirs.nq - len(fixed) == 4 - len(fixed)
     for q in random_joints(robot.lower, robot.upper, 20):
-        pinocchio.framesForwardKinematics(theirs, data, q)
+        pinocchio.framesForwardKinematics(theirs, data, np.array([*fixed.values(), *q]))
         ours = model.base @ robot.pose(q) @ model.tool
         assert_allclose(ours, data.oMf[frame].homogeneous, **EXACT)
 
@@ -210,24 +216,6 @@ def test_a_chain_between_two_links_and_grippers_left_out():
         if root == "torso":
             assert_allclose(up, there["torso"][:3, :3].T @ [0, 0, 1], **EXACT)
     assert to_robot(urdf, "right_link0:").chain[-1].child == "right_flange"
-
-
-@pytest.mark.dev
-def test_a_joint_whose_limits_are_one_number_is_fixed_there():
-    pinocchio = pytest.importorskip("pinocchio")
-    rows = [row for row in ARM if row[0] != "continuous"]
-    rows[1] = (*rows[1][:4], 'lower="0.3" upper="0.3"')
-    rows[3] = (*rows[3][:4], 'lower="-0.2" upper="-0.2"')
-    text = urdf_of(tuple(rows))
-    model = to_robot(parse_urdf(text.encode()))
-    robot = robot_from_dict(model.content)
-    theirs = pinocchio.buildModelFromXML(text)
-    data, frame = theirs.createData(), theirs.getFrameId(model.chain[-1].child)
-    assert robot.joints == theirs.nq - 2 == 2
-    for q in random_joints(robot.lower, robot.upper, 20):
-        pinocchio.framesForwardKinematics(theirs, data, np.array([0.3, -0.2, *q]))
-        ours = model.base @ robot.pose(q) @ model.tool
-        assert_allclose(ours, data.oMf[frame].homogeneous, **EXACT)
 
 
 ENDS = '<parent link="a"/><child link="b"/>'

@@ -25,21 +25,31 @@ TOO_LARGE = str(2 << 30)
 STARTING = ("waiting for a free core", "diagnose")  # what a job says before its process does
 
 
-@pytest.fixture(scope="module")
-def poses(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """A synthetic cell."""
-    path = tmp_path_factory.mktemp("cell") / "poses.csv"
-    data = mc.simulate("irb120", POSES, TARGETS, seed=4).data
+def measured(folder: Path, poses: int) -> bytes:
+    """A file of a synthetic cell."""
+    path = folder / "poses.csv"
+    data = mc.simulate("irb120", poses, TARGETS, seed=4).data
     mc.write_measurements(path, replace(data, simulated=False))
     return path.read_bytes()
 
 
 @pytest.fixture(scope="module")
+def poses(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return measured(tmp_path_factory.mktemp("cell"), POSES)
+
+
+def begun(server: Served, name: str, content: bytes, *named: str, **choices: Any) -> str:
+    """A session about an IRB 120 and one file of measurements; its address."""
+    home = server.begin(*named, robot="irb120", **choices)
+    server.put(home, name, content)
+    server.choose(home, measured=[name])
+    return home
+
+
+@pytest.fixture(scope="module")
 def fitted(server: Served, poses: bytes) -> str:
     """A session that is read and calibrated; its address."""
-    home = server.begin(robot="irb120", objective="sum")
-    server.put(home, "tracker.csv", poses)
-    server.choose(home, measured=["tracker.csv"])
+    home = begun(server, "tracker.csv", poses, objective="sum")
     for step in ("read", "fit"):
         found = server.run(home, step)["steps"][step]
         assert found["state"] == "done", found
@@ -111,9 +121,7 @@ def test_a_point_that_is_unticked_is_out_of_the_next_fit(server, fitted):
 
 
 def test_an_error_is_the_line_of_the_command(server):
-    home = server.begin(robot="irb120")
-    server.put(home, "points.csv", b"a,b\n1,2\n")
-    server.choose(home, measured=["points.csv"])
+    home = begun(server, "points.csv", b"a,b\n1,2\n")
     found = server.run(home, "read")["steps"]["read"]
     assert found["state"] == "failed"
     assert found["error"].startswith("given/points.csv:1: columns a, b are not known; say what")
@@ -195,11 +203,10 @@ def test_a_diagnosis_is_said_in_paragraphs(server, results):
 
 def test_names_from_files_are_only_text(server, poses):
     """Of a file and of its columns, wherever they are shown."""
-    home = server.begin(robot="irb120")
     header, _, rows = poses.partition(b"\n")
     lines = [line + b",1" for line in rows.splitlines()]
-    server.put(home, "a(b).csv", b"\n".join([header + b",<img src=x onerror=alert(1)>", *lines]))
-    server.choose(home, measured=["a(b).csv"])
+    text = b"\n".join([header + b",<img src=x onerror=alert(1)>", *lines])
+    home = begun(server, "a(b).csv", text)
     state = server.run(home, "read")
     assert state["steps"]["read"]["state"] == "done"
     shown = "".join(state["panels"].values())
@@ -347,9 +354,7 @@ def test_steps_that_are_none_or_cannot_be_done(server):
 
 @pytest.mark.slow
 def test_two_sessions_work_at_once_and_one_waits_for_itself(server, fitted, poses):
-    other = server.begin("other", robot="irb120", objective="sum")
-    server.put(other, "t.csv", poses)
-    server.choose(other, measured=["t.csv"])
+    other = begun(server, "t.csv", poses, "other", objective="sum")
     server.run(other, "read")
     for home in (fitted, other):
         assert server.ask("POST", f"{home}/run/fit").status == 200
@@ -364,10 +369,7 @@ def test_two_sessions_work_at_once_and_one_waits_for_itself(server, fitted, pose
 @pytest.fixture(scope="module")
 def many(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A cell whose diagnosis takes far longer than to cancel it."""
-    path = tmp_path_factory.mktemp("cell") / "poses.csv"
-    data = mc.simulate("irb120", 300, TARGETS, seed=4).data
-    mc.write_measurements(path, replace(data, simulated=False))
-    return path.read_bytes()
+    return measured(tmp_path_factory.mktemp("cell"), 300)
 
 
 def waited_for(server: Served, home: str) -> Any:
@@ -382,9 +384,7 @@ def waited_for(server: Served, home: str) -> Any:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells whose folder is where")
 def test_work_that_is_cancelled_leaves_nothing(server, many):
-    home = server.begin(robot="irb120", objective="sum")
-    server.put(home, "t.csv", many)
-    server.choose(home, measured=["t.csv"])
+    home = begun(server, "t.csv", many, objective="sum")
     server.run(home, "read")
     folder = folder_of(server, home)
     before = sorted(folder.rglob("*"))
@@ -399,9 +399,7 @@ def test_work_that_is_cancelled_leaves_nothing(server, many):
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells whose folder is where")
 def test_a_killed_server_loses_no_finished_result(tmp_path, many):
     with serving(tmp_path) as first:
-        home = first.begin(robot="irb120", objective="sum")
-        first.put(home, "t.csv", many)
-        first.choose(home, measured=["t.csv"])
+        home = begun(first, "t.csv", many, objective="sum")
         before = first.run(home, "read")
         waited_for(first, home)
         first.process.kill()

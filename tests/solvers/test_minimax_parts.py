@@ -346,35 +346,23 @@ def judged(at: Iterate[Array], *kkt: float) -> Iterate[Array]:
 
 
 @pytest.mark.parametrize(
-    ("residual", "violation", "idle", "ended"),
+    ("residual", "violation", "state", "ended", "rough"),
     [
-        (1e-8, 0.0, 0, Status.CONVERGED),
-        (1.1e-8, 0.0, 9, None),
-        (1.1e-8, 1e-8, 10, Status.STALLED),
-        (1e-6, 1.1e-8, 99, None),
+        (1e-8, 0.0, {"idle": 0}, Status.CONVERGED, Status.CONVERGED),
+        (1.1e-8, 0.0, {"idle": 9}, None, None),
+        (1.1e-8, 1e-8, {"idle": 10}, Status.STALLED, Status.STALLED),
+        (1e-6, 1.1e-8, {"idle": 99}, None, Status.STALLED),  # of a violation that rough QPs leave
+        (1e-8, 0.0, {"damping": 1e9}, Status.CONVERGED, Status.CONVERGED),
+        (1.0, 0.0, {"damping": 1e8}, None, None),
+        (1.0, 1e-8, {"damping": 1.1e8}, Status.STALLED, Status.STALLED),
+        (1.0, 1.1e-8, {"damping": 1.1e8}, Status.INFEASIBLE, Status.STALLED),
     ],
 )
-def test_patience_has_an_end(residual, violation, idle, ended):
-    at = judged(replace(begun(parabola(), 1.0), idle=idle), residual, 0.0, violation)
-    assert at.patience(1e-8) is ended
-    rough = Status.STALLED if idle == 99 else ended  # such QPs may not get rid of a violation
-    assert at.patience(1e-8, exact=False) is rough
-
-
-@pytest.mark.parametrize(
-    ("residual", "violation", "damping", "ended"),
-    [
-        (1e-8, 0.0, 1e9, Status.CONVERGED),
-        (1.0, 0.0, 1e8, None),
-        (1.0, 1e-8, 1.1e8, Status.STALLED),
-        (1.0, 1.1e-8, 1.1e8, Status.INFEASIBLE),
-    ],
-)
-def test_damping_has_an_end(residual, violation, damping, ended):
-    at = judged(replace(begun(parabola(), 1.0), damping=damping), residual, 0.0, violation)
-    assert at.arrived(1e-8) is ended
-    rough = Status.STALLED if ended is Status.INFEASIBLE else ended
-    assert at.arrived(1e-8, exact=False) is rough
+def test_patience_and_damping_have_an_end(residual, violation, state, ended, rough):
+    at = judged(replace(begun(parabola(), 1.0), **state), residual, 0.0, violation)
+    end = at.patience if "idle" in state else at.arrived
+    assert end(1e-8) is ended
+    assert end(1e-8, exact=False) is rough
 
 
 def test_damping_grows_and_falls_tenfold():
