@@ -339,7 +339,8 @@ def test_the_minimax_is_that_of_slsqp(objective, count):
     assert found.worst is not None
     assert len(found.worst.functions) == count
     problem, kept = plain.fit.problem, plain.fit.images.counted
-    label = (plain.train.part if objective == "minimax" else plain.train.camera)[kept]
+    seen = plain.fit.images.pixels
+    label = (seen.part if objective == "minimax" else seen.camera)[kept]
     slopes = problem.rows(plain.fit.state, problem.active)[1]
     scale = np.sqrt(len(kept)) / np.linalg.norm(slopes, axis=1)
 
