@@ -26,10 +26,9 @@ from minimax_cal.cli.options import (
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options
-from minimax_cal.fitting.pixels.options import FIELDS, PixelFiles, PixelOptions
+from minimax_cal.fitting.pixels.options import FIELDS, OF_CAMERAS, PixelFiles, PixelOptions
 from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.ground.files import json_text, plain
-from minimax_cal.instruments.images import Images
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.reporting.plots.figures import save_errors
 from minimax_cal.robots.kernels.choice import work
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
     from minimax_cal.judging.bootstrap import Bootstrap
 
 OPTIONS = {f.name for kind in (Options, RelativeOptions) for f in fields(kind)}
-CAMERAS = (*Images.options, "drawn_prior")
 BRIEF = 1000  # poses that one fit needs no compiled kernels for
 
 
@@ -49,7 +47,7 @@ BRIEF = 1000  # poses that one fit needs no compiled kernels for
 @options_from(Options)
 @options_from(RelativeOptions, "offset", "known_distances", "noises")
 @options_from(PixelFiles)
-@options_from(PixelOptions, *CAMERAS)
+@options_from(PixelOptions, *OF_CAMERAS)
 @ROWS
 @plain_option(
     "What is known",

@@ -506,8 +506,7 @@ def among(data: Sequence[Path], chosen: dict[str, Any]) -> tuple[PixelFiles, lis
 
     chosen: options of a command, which `PixelFiles` are taken from.  Raises OptionError.
     """
-    from minimax_cal.fitting.pixels.options import PixelFiles
-    from minimax_cal.instruments.images import Images
+    from minimax_cal.fitting.pixels.options import OF_CAMERAS, PixelFiles
     from minimax_cal.reading.rows import read_rows
 
     files = record_of(PixelFiles, chosen)
@@ -516,8 +515,7 @@ def among(data: Sequence[Path], chosen: dict[str, Any]) -> tuple[PixelFiles, lis
             "Missing argument 'DATA...', or --pixels with --joints and --camera."
         )
     if not files.given:
-        what = "is about what cameras see, with pixels=, joints= and camera="
-        refuse((*Images.options, "drawn_prior"), what)
+        refuse(OF_CAMERAS, "is about what cameras see, with pixels=, joints= and camera=")
     return files.among([read_rows(path) for path in data])
 
 

@@ -89,7 +89,8 @@ class Instrument:
     moves fits anything.  refines: whether its starts are to be refined.  row_noise: sigma of a row
     over that of a number.  costless: parameters that cost no number.  on_arm: whether a point on
     the flange is among its own.  noise_given: whether the user may say its noise.  alone: what to
-    do instead where nothing else is given, empty where it needs nothing else.  unmoved: why a link
+    do instead where nothing else is given, empty where it needs nothing else; alone_bends: whether
+    effects of the arm are fitted, and sought, in it alone all the same.  unmoved: why a link
     tells nothing that moves nothing.  scale: what it lacks where it has no length standard, and
     what gives it.  lone_names: of its unknowns from the targets on, as people read them, those of
     `lone` first.  first_column: the beginning of its first column, for messages.

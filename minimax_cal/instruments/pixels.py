@@ -66,6 +66,11 @@ class PixelData:
         return np.asarray(self.camera * len(self.targets) + self.target)
 
     @property
+    def image(self) -> Array:
+        """(N,) number of the image that each pixel is of: of a pose, in a camera."""
+        return np.asarray(self.pose * len(self.cameras) + self.camera)
+
+    @property
     def parts(self) -> tuple[str, ...]:
         """Every target in every camera."""
         several = len(self.cameras) > 1

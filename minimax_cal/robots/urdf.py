@@ -334,7 +334,7 @@ def both_ends(tip: str, known: Iterable[str]) -> tuple[str, str]:
     names = {*known}
     ways = [(tip[:at], tip[at + 1 :]) for at, mark in enumerate(tip) if mark == ":"]
     whole = [("", tip)] if tip in names or not ways else []
-    return next(iter([*whole, *(way for way in ways if {*way} <= names), *ways[::-1]]))
+    return [*whole, *(way for way in ways if {*way} <= names), *ways[::-1]][0]
 
 
 def ends_of(source: Path | str) -> tuple[str, str]:

@@ -140,9 +140,7 @@ def of_other_poses(images: Images, arm: FlangePoses, own: Array, rows: Array, fa
     many images do.  far: at the target [m].
     """
     size = np.linalg.norm(images.at_targets(arm, own), axis=0)[rows]
-    pixels = images.pixels
-    place = (pixels.pose * len(pixels.cameras) + pixels.camera)[rows]
-    image = np.unique(place, return_inverse=True)[1].reshape(-1)
+    image = np.unique(images.pixels.image[rows], return_inverse=True)[1].reshape(-1)
     astray = np.bincount(image, size > far) > WHOLE_IMAGE * np.bincount(image)
     return np.asarray(astray[image] & (astray.mean() <= MOST_ASIDE if len(astray) else False))
 
@@ -158,8 +156,7 @@ def standing_out(problem: PixelSquares, x: State, rows: Array, size: Array) -> A
     camera = number - problem.names.geometric
     error, slope = problem.rows(x, (camera >= 0) & (camera < 6 * count))
     error, slope = error.reshape(2, -1), slope.reshape(6 * count, 2, -1)
-    image = pixels.pose * count + pixels.camera
-    out = np.zeros(pixels.count, dtype=bool)
+    image, out = pixels.image, np.zeros(pixels.count, dtype=bool)
     for each in np.unique(image[rows]):
         mine = rows[image[rows] == each]
         first = 6 * int(pixels.camera[mine[0]])

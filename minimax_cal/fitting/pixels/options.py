@@ -14,6 +14,7 @@ from minimax_cal.fitting.several.options import SUM, WORST_TARGET, RelativeOptio
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.instruments.camera import FLANGE, GROUND, INTRINSICS
+from minimax_cal.instruments.images import Images
 from minimax_cal.reading.rows import Rows
 
 WORST_CAMERA = "camera"
@@ -106,9 +107,10 @@ class PixelFiles:
         return self.pixels, self.joints, cameras_of(self.camera), self.board
 
 
+OF_CAMERAS = (*Images.options, "drawn_prior")
 FIELDS = (  # that are of pixels
-    "objective", "qp", "camera_on", "fix_camera", "camera_prior", "drawn_prior", "holdout", "seed",
-    "fix", "free", "resolution", "allow_large_changes",
+    "objective", "qp", *OF_CAMERAS, "holdout", "seed", "fix", "free", "resolution",
+    "allow_large_changes",
 )  # fmt: skip
 
 

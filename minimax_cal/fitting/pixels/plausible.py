@@ -210,8 +210,7 @@ def outlier_notices(data: PixelData, rows: Array) -> list[str]:
     """Notices of pixels that were set aside, and of images most of whose pixels were."""
     if not len(rows):
         return []
-    images = np.stack([data.pose, data.camera], axis=1)
-    _, image, count = np.unique(images, axis=0, return_inverse=True, return_counts=True)
+    _, image, count = np.unique(data.image, return_inverse=True, return_counts=True)
     image = image.reshape(-1)
     lost = np.bincount(image[rows], minlength=len(count)) > WHOLE_IMAGE * count
     single = rows[~lost[image[rows]]]

@@ -16,7 +16,7 @@ from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.fitting.several.fit import InstrumentFit
 from minimax_cal.fitting.several.stack import place_in
 from minimax_cal.ground.arrays import Array
-from minimax_cal.instruments.protocol import FlangePoses, Given, ResidualRows, by_arm
+from minimax_cal.instruments.protocol import FlangePoses, Given, ResidualRows, by_arm, corners
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.scene import Scene
@@ -46,8 +46,8 @@ class Look:
 
     def of(self, fields: Array) -> Array:
         """(d, rows) motions (d, 4, 3, m) of its corners as its rows."""
-        none = np.zeros(len(fields))
-        given = Given.of(self.flange, self.middle, fields, 0.0 * fields.sum(axis=0), none)
+        still, none = np.zeros(fields.shape[1:]), np.zeros(len(fields))
+        given = Given.of(self.flange, self.middle, fields, still, none)
         moved = self.flange._replace(angular=given.angular, linear=given.linear)
         slopes = by_arm(moved, self.rows)
         return np.asarray(self.rows.settled(slopes, loose=True)[1] * self.root)
@@ -77,7 +77,7 @@ class StackRows(Posed):
 def scene_of_all(robot: Robot, fit: InstrumentFit) -> Scene:
     """All poses that any instrument saw, each with its corners, in the frame of the base."""
     stack, x = fit.stack, fit.state
-    every = stack.scenes(robot, x, about=True)
+    every = [one.scene(robot, at, corners(one.middle(at))) for one, at in stack.parted(x)]
     points = np.concatenate([one.points for one in every], axis=-1)
     q = np.concatenate([block.arm.q for block in stack.blocks])
     links = kinematics.chain(x.mdh, q, robot.prismatic)
@@ -123,12 +123,11 @@ def rows_of_all(scene: Scene, fit: InstrumentFit) -> StackRows:
     for i, (block, rows, slot, precise, start) in enumerate(every):
         x, columns = stack.part(fit.state, i), stack.columns(i)
         root = precise * block.weight / np.sqrt(rows.weights)  # no error beyond the loss's bound
-        one, own = block.instrument, block.own(x)
-        flange, middle = block.flange(x), one.targets(own).mean(axis=0)
-        shapeless = one.shapeless(flange, own)
+        flange, own = block.at(x)
+        shapeless = block.instrument.shapeless(flange, own)
         at = (start + rows.pose_of_row) * width + slot
         poses = slice(start, start + len(block.arm.q))
-        looks.append(Look(rows, flange, middle, root, poses, at, shapeless))
+        looks.append(Look(rows, flange, block.middle(x), root, poses, at, shapeless))
         error, slope = block.rows(x, active[columns], loose=True)
         whole = np.zeros((len(active), len(root)))
         whole[columns[active[columns]]] = slope * root

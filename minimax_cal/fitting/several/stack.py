@@ -91,6 +91,10 @@ class Block:
         """What the instrument says at a state."""
         return self.instrument.read(*self.at(x))
 
+    def middle(self, x: State) -> Array:
+        """(3,) amid the instrument's points on the flange, about which laws are asked [m]."""
+        return np.asarray(self.instrument.targets(self.own(x)).mean(axis=0))
+
     def rows(self, x: State, active: Array, *, loose: bool = False) -> tuple[Array, Array]:
         """Measured minus predicted (..., rows) [m], derivative of the latter (..., active, rows).
 
@@ -135,8 +139,7 @@ class Block:
         """The same looking at an arm that gives way, linear at a state with the laws' values."""
         if not laws.terms:
             return self
-        own, values = np.split(x.effects, [len(self.instrument.names)])
-        middle = self.instrument.targets(own).mean(axis=0)
+        middle, values = self.middle(x), x.effects[len(self.instrument.names) :]
         scene = self.scene(robot, x, corners(middle))
         given = Given.of(self.arm.at(x.mdh), middle, *laws.fields(scene, values), values)
         return replace(self, arm=replace(self.arm, given=given))
@@ -232,15 +235,10 @@ class Stack:
         own = [block.instrument.read_out(block.own(at)) for block, at in self.parted(x)]
         return replace(x, effects=np.concatenate([*own, self.values(x)]))
 
-    def scenes(self, robot: Robot, x: State, *, about: bool = False) -> list[Scene]:
-        """What laws look at, block by block, with the geometry of a state and the targets.
-
-        about: corners about their middle instead.
-        """
-        parts = self.parted(x)
-        spots = [block.instrument.targets(block.own(at)) for block, at in parts]
-        spots = [corners(each.mean(axis=0)) for each in spots] if about else spots
-        return [one.scene(robot, at, k) for (one, at), k in zip(parts, spots, strict=True)]
+    def scenes(self, robot: Robot, x: State) -> list[Scene]:
+        """What laws look at, block by block, with the geometry of a state and the targets."""
+        return [block.scene(robot, at, block.instrument.targets(block.own(at)))
+                for block, at in self.parted(x)]  # fmt: skip
 
     def bent(self, robot: Robot, laws: Laws, x: State) -> tuple[Stack, State]:
         """The same instruments looking at an arm that gives way, linear at a state; that state.
