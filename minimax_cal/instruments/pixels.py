@@ -158,7 +158,8 @@ def header_of(file: Rows, needed: Sequence[str], what: str) -> None:
         raise DataError(f"{file.path}:1: column {twice[0]} stands twice")
     for name in needed:
         if name not in file.header:
-            near = difflib.get_close_matches(name, file.header, 1, cutoff=0.4)
+            others = [each for each in file.header if each not in needed]
+            near = difflib.get_close_matches(name, others, 1, cutoff=0.4)
             hint = f"; rename {near[0]!r}?" if near else ""
             raise DataError(
                 f"{file.path}:1: column {name} is missing; {what} have the columns "

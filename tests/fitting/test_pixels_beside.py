@@ -346,6 +346,8 @@ def test_a_file_that_is_no_camera_is_refused(text, said, tmp_path):
         ([*ROWS[:-1], "P5,left,t3,,2"], r":25: column u_px: is empty"),
         ([*ROWS[:-1], "P5,left,t3,2500,2"], r":25: \(2500, 2\) px is outside the image of camera"),
         (ROWS[:9], r"camera 'left' has 2 images with detections; take at least 4"),
+        ([ROWS[0].replace("u_px", "uu"), *ROWS[1:]], r"column u_px is missing; .* u_px, v_px$"),
+        ([ROWS[0].replace("u_px", "u_pix"), *ROWS[1:]], r"u_px, v_px; rename 'u_pix'\?$"),
     ],
 )
 def test_wrong_detections_are_refused(rows, said, tmp_path):
