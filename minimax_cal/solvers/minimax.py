@@ -23,7 +23,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.status import Status
-from qp_backends import Problem, Solution
+from qp_backends import Problem, ProblemError, Solution
 from qp_backends import Status as QpStatus
 from qp_backends.problem import COLD
 
@@ -45,11 +45,26 @@ ENDLESS = 1e72  # times that: a value so large belongs to what falls without end
 CANCELLED = 1e-7  # a value below this share of the terms that make it is known no better
 MOST_DAMPING = 1e8  # of the Hessian's diagonal
 RELENTLESS = 1e6  # price of a violation, in slopes of f, beyond which it is there to stay
+MIN_FALLING_SLOPE = 0.25  # at the end of a step, relative to its start: worth going on
+MAX_LENGTHENING = 1e15  # times a step
 NEARLY = 100.0  # times the tolerance: optimal as far as rounding lets one see
 
 # P_vv of the epigraph variable: makes P definite for solvers that ask for it.  v is the decrease
 # that is still to be had, so the term vanishes at the solution and does not move it.
 EPIGRAPH = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class StartScales:
+    """Scales of a problem at the start.
+
+    lengths: (p,) over which a variable alone changes the functions by their size.
+    largest_level: with what changes of the value are compared at most; less than the value where
+    that holds a number which is added to all functions.
+    """
+
+    lengths: Array
+    largest_level: float = np.inf
 
 
 class Solver(Protocol):
@@ -255,12 +270,14 @@ def solve(
     settings: Sqp = Sqp(),
     progress: Callable[[Step], None] = lambda step: None,
     mu: Array = EVEN,
+    scales: StartScales | None = None,
 ) -> Optimum[X]:
     """Minimise max f from x.  qp: a QP solver; it is given each answer as the next one's start.
 
     mu: (k,) multipliers of a similar problem, to begin with.
+    scales: of variables and value, where they are known; else the derivatives at x give them.
     """
-    at, ask = Iterate.begin(problem, x, settings, mu), Asking(qp)
+    at, ask = Iterate.begin(problem, x, settings, mu, scales), Asking(qp)
     status, tolerance = Status.ITERATION_LIMIT, settings.tolerance
     trace: list[Step] = []
     notes: list[str] = []
@@ -270,7 +287,11 @@ def solve(
             status = Status.FAILED
             break
         hessian = at.hessian(settings.floor)
-        plan = at.subproblem(hessian, ask)
+        try:
+            plan = at.subproblem(hessian, ask)
+        except ProblemError:  # values so large that the QP's numbers overflow
+            status = Status.FAILED
+            break
         notes += plan.notes
         if not plan.usable:  # the point may be optimal all the same
             best, status = at.balanced(), Status.FAILED
@@ -329,8 +350,9 @@ class Iterate(Generic[X]):
     here: the problem at x.  mu, lam: multipliers of the latest QP.  quasi: the Hessian where the
     problem has none of its own.  gone: (p,) from the start.  reach: (p,) the farthest of it, at
     least as far as the start's derivatives suggest.  price: (l,) of a violation.  least: a value
-    that is as good as none.  damping: of the Hessian's diagonal.  best, lowest: least residual and
-    value so far.  idle: iterations since either fell.  step: QPs so far.
+    that is as good as none.  largest_level: as `StartScales` has it.  damping: of the Hessian's
+    diagonal.  best, lowest: least residual and value so far.  idle: iterations since either fell.
+    step: QPs so far.
     """
 
     problem: Minimax[X]
@@ -343,6 +365,7 @@ class Iterate(Generic[X]):
     reach: Array
     price: Array
     least: float
+    largest_level: float = np.inf
     damping: float = 0.0
     best: float = np.inf
     lowest: float = np.inf
@@ -350,18 +373,21 @@ class Iterate(Generic[X]):
     step: int = 0
 
     @staticmethod
-    def begin(problem: Minimax[X], x: X, settings: Sqp, mu: Array) -> Iterate[X]:
+    def begin(
+        problem: Minimax[X], x: X, settings: Sqp, mu: Array, scales: StartScales | None = None
+    ) -> Iterate[X]:
         """The start; without mu all functions share the multipliers evenly."""
         here = problem.linearise(x)
         (k, p), none = here.jacobian.shape, np.zeros(len(here.c))
         f, slope = np.abs(here.f), np.abs(here.jacobian)
         level = float(max(abs(here.f.max()), CANCELLED * f.mean()) or slope.max() or 1.0)
-        bent = level / here.lengths(level) ** 2
+        bent = level / (scales.lengths if scales else here.lengths(level)) ** 2
         bfgs = Bfgs.start(here, bent)
         reach = np.sqrt(level / np.maximum(bent, np.diag(bfgs.matrix)))
         quasi = None if settings.hessian == "gauss-newton" else bfgs
         mu, least = mu if len(mu) else np.full(k, 1.0 / k), NOTHING * level
-        return Iterate(problem, x, here, mu, none, quasi, np.zeros(p), reach, none, least)
+        cap = scales.largest_level if scales else np.inf
+        return Iterate(problem, x, here, mu, none, quasi, np.zeros(p), reach, none, least, cap)
 
     @cached_property
     def terms(self) -> float:
@@ -375,7 +401,8 @@ class Iterate(Generic[X]):
     @cached_property
     def units(self) -> Units:
         """Of the value as large as it is, of variables as far as they go."""
-        level = max(abs(float(self.here.f.max())), CANCELLED * self.terms, self.least)
+        size = min(abs(float(self.here.f.max())), self.largest_level)
+        level = max(size, CANCELLED * self.terms, min(self.least, self.largest_level))
         return Units.of(self.here, level, self.reach, self.problem.lower, self.problem.upper)
 
     @cached_property
@@ -398,7 +425,8 @@ class Iterate(Generic[X]):
 
     def hessian(self, floor: float) -> Array:
         """(p, p) of the Lagrangian, damped.  floor: as `Sqp.floor`."""
-        least = EPIGRAPH * np.diag(self.units.value / self.lengths**2)
+        with np.errstate(over="ignore"):
+            least = EPIGRAPH * np.diag(self.units.value / self.lengths**2)
         if self.quasi is None:
             matrix = self.here.curvature(np.maximum(self.mu, floor / len(self.mu)))
         else:
@@ -689,7 +717,15 @@ def search(at: Iterate[X], plan: Plan, resolve: Resolve) -> tuple[float, Array, 
     there = problem.linearise(trial)
     value = merit(there.f, there.c)
     if value <= start - 1e-4 * decrease + slack:
-        return 1.0, plan.d, trial, there
+        falls_on = value - merit(there.f + there.jacobian @ plan.d, there.c + there.normal @ plan.d)
+        length = 1.0
+        if at.quasi is not None and falls_on > MIN_FALLING_SLOPE * decrease > slack:
+            length = lengthen(at, plan.d, merit, start, value)
+        if length == 1.0:
+            return 1.0, plan.d, trial, there
+        move = length * plan.d
+        trial = problem.step(x, move)
+        return length, move, trial, problem.linearise(trial)
     if np.isfinite(value):
         # what the linear model missed at the full step goes into the constants
         bent = resolve(there.f - here.jacobian @ plan.d, there.c - here.normal @ plan.d)
@@ -711,6 +747,27 @@ def search(at: Iterate[X], plan: Plan, resolve: Resolve) -> tuple[float, Array, 
         if value <= start - 1e-4 * length * decrease + slack:
             return length, move, trial, problem.linearise(trial)
     return 0.0, np.zeros_like(plan.d), x, here
+
+
+def lengthen(
+    at: Iterate[X], d: Array, merit: Callable[[Array, Array], float], start: float, value: float
+) -> float:
+    """How many times the step d to go, doubled while the merit falls well.
+
+    Where an estimated Hessian is far too large, as after steps through functions that grow fast.
+    start, value: merits here and after d.  A step ends where a linearised constraint does.
+    """
+    here, lower, upper = at.here, at.problem.lower, at.problem.upper
+    length = 1.0
+    while length < MAX_LENGTHENING:
+        ends = here.c + 2.0 * length * (here.normal @ d)
+        if np.any(excess(ends, lower, upper) > excess(here.c, lower, upper)):
+            break
+        farther = merit(*at.problem.evaluate(at.problem.step(at.x, 2.0 * length * d)))
+        if not value - farther > min(0.1 * (start - value), 0.5 * abs(value)):
+            break
+        length, value = 2.0 * length, farther
+    return length
 
 
 @dataclass(frozen=True, eq=False)
@@ -745,5 +802,18 @@ class Bfgs:
         if float(q @ s) < 0.2 * curve:
             share = 0.8 * curve / (curve - float(q @ s))
             q = share * q + (1.0 - share) * bs
-        new = matrix - np.outer(bs, bs) / curve + np.outer(q, q) / float(q @ s)
-        return Bfgs(0.5 * (new + new.T), fresh=False)
+        bs, q = bs / np.sqrt(curve), q / np.sqrt(float(q @ s))  # first, against overflow
+        new = matrix - np.outer(bs, bs) + np.outer(q, q)
+        new = 0.5 * (new + new.T)
+        if not is_positive_definite(new):  # by rounding, of entries of many sizes
+            new = np.diag(np.maximum(np.diag(new), EPS * np.diag(matrix)))
+        return Bfgs(new, fresh=False)
+
+
+def is_positive_definite(matrix: Array) -> bool:
+    """Whether a symmetric matrix has a Cholesky factor; also where it holds no numbers."""
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return not bool(np.all(np.isfinite(matrix)))
+    return True
