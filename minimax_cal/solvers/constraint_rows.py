@@ -13,6 +13,7 @@ from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.solvers.derivatives import (
+    EPS,
     CountedFunction,
     CountedJacobian,
     Function,
@@ -33,7 +34,7 @@ class ConstraintRows:
 
     linear: Array
     bound_count: int
-    parts: tuple[tuple[Function, Function], ...]
+    parts: tuple[tuple[Function, CountedJacobian], ...]
     lower: Array
     upper: Array
 
@@ -59,7 +60,10 @@ class ConstraintRows:
                 kind = constraint.jac
                 kind = kind if callable(kind) or kind in ("cs", "3-point") else "2-point"
                 parts.append((function, CountedJacobian(function, kind, lengths)))
-                ends.append(spread_ends(constraint, len(function(x))))
+                values = function(x)
+                if not np.all(np.isfinite(values)):
+                    raise OptionError("minimize_max: a constraint at x0 is no finite number")
+                ends.append(spread_ends(constraint, len(values)))
             else:
                 raise OptionError(
                     "minimize_max: constraints are scipy.optimize's LinearConstraint and "
@@ -80,6 +84,16 @@ class ConstraintRows:
     def jacobian(self, x: Array) -> Array:
         """c'(x): (l, n)."""
         return np.concatenate([self.linear, *(jacobian(x) for _, jacobian in self.parts)])
+
+    def best_jacobian(self, x: Array) -> Array:
+        """c'(x): (l, n), by central differences in place of forward ones."""
+        return np.concatenate([self.linear, *(jacobian.best(x) for _, jacobian in self.parts)])
+
+    def slope_rounding(self, x: Array) -> Array:
+        """(l,) relative error of each row's derivative."""
+        linear = np.full(len(self.linear), EPS)
+        curved = (np.full(len(fun(x)), jacobian.rounding) for fun, jacobian in self.parts)
+        return np.concatenate([linear, *curved])
 
     def take_bounds(self) -> ConstraintRows:
         """The bounds alone."""

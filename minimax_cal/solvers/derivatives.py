@@ -65,8 +65,21 @@ class CountedJacobian:
             return to_dense_matrix(self.scheme(x.copy()))
         if self.scheme == "cs":
             return complex_step_jacobian(self.function, x, self.lengths)
+        return self.differences(x, self.scheme == "3-point")
+
+    def best(self, x: Array) -> Array:
+        """(m, n) at x, by central differences in place of forward ones."""
+        return self.differences(x, True) if self.scheme == "2-point" else self(x)
+
+    def differences(self, x: Array, central: bool) -> Array:
+        """(m, n) at x by central or forward differences."""
         steps = np.maximum(np.abs(x), self.lengths)
-        return difference_jacobian(self.function, x, steps, self.scheme == "3-point")
+        return difference_jacobian(self.function, x, steps, central)
+
+    @property
+    def rounding(self) -> float:
+        """Relative error of slopes: that of numbers, or that of central differences."""
+        return EPS ** (2.0 / 3.0) if self.scheme in ("2-point", "3-point") else EPS
 
 
 def to_dense_matrix(matrix: Any) -> Array:
@@ -116,7 +129,7 @@ def measure_lengths(
     """(n,) over which a variable alone takes some function above the largest by `level`.
 
     By slopes and curvatures, since either may vanish at x; at most the width of its bounds.
-    first: (n,) a guess, which is kept where no function depends on the variable.
+    first: (n,) a guess; it, or |x|, is kept where no function depends on the variable.
     """
     f = function(x)
     room = level + (f.max(initial=0.0) - f if len(f) else f)
@@ -130,8 +143,12 @@ def measure_lengths(
             back_steps = np.diag(np.where(no_room_below, 0.0, steps))
             ahead = np.array([function(x + step) - f for step in ahead_steps]) / room
             back = np.array([function(x - step) - f for step in back_steps]) / room
-            ahead = np.where(no_room_above[:, None], -back, ahead)
-            back = np.where(no_room_below[:, None] | ~np.isfinite(back), -ahead, back)
+            is_open_above = ~no_room_above[:, None] & np.isfinite(ahead)
+            is_open_below = ~no_room_below[:, None] & np.isfinite(back)
+            ahead, back = (
+                np.where(is_open_above, ahead, -back),
+                np.where(is_open_below, back, -ahead),
+            )
             change = np.maximum(np.abs(ahead - back) / 2.0, np.sqrt(np.abs(ahead + back)))
             seen = change.max(axis=1, initial=0.0)
             seen = np.where(np.isfinite(seen), seen, 1.0)
@@ -139,7 +156,7 @@ def measure_lengths(
             if np.all((found >= 0.1 * lengths) & (found <= 10.0 * lengths)):
                 break
             lengths = np.where(found < lengths, found, np.sqrt(found * lengths))
-    return np.where(seen > 0.0, found, first)
+    return np.where(seen > 0.0, found, np.minimum(np.maximum(first, np.abs(x)), width))
 
 
 def find_wrong_function(

@@ -47,7 +47,7 @@ def find_feasible_point(problem: MaxOfFunctions, x: Array, search: Search) -> Ar
     function = CountedFunction(violations)
     phase_one = MaxOfFunctions(
         function, CountedJacobian(function, slopes, problem.lengths), rows.take_bounds(),
-        problem.low, problem.high, 0, problem.lengths,
+        problem.low, problem.high, 0, problem.lengths, problem.first_lengths,
     )  # fmt: skip
     bounded = np.clip(x, problem.low, problem.high)
     answer = replace(search, callback=None).find_optimum(

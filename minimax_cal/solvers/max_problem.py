@@ -32,6 +32,7 @@ class MaxOfFunctions:
     low, high: (n,) bounds of the variables, infinite where open.
     exponent: values are divided by 2 to this power, exactly.
     lengths: (n,) over which a variable alone changes the functions by their size.
+    first_lengths: (n,) those at the start.
     """
 
     function: CountedFunction
@@ -41,6 +42,7 @@ class MaxOfFunctions:
     high: Array
     exponent: int
     lengths: Array
+    first_lengths: Array
 
     @staticmethod
     def describe(
@@ -66,7 +68,9 @@ class MaxOfFunctions:
                 f"{len(x)} variables need {(len(values), len(x))}"
             )
         rows = ConstraintRows.collect(x, lengths, bounds, constraints)
-        return MaxOfFunctions(function, jacobian, rows, low, high, int(np.frexp(level)[1]), lengths)
+        return MaxOfFunctions(
+            function, jacobian, rows, low, high, int(np.frexp(level)[1]), lengths, lengths
+        )
 
     def rescale(self, x: Array) -> MaxOfFunctions:
         """The same problem with the units of values and variables as they are at x."""
@@ -76,8 +80,7 @@ class MaxOfFunctions:
         lengths = measure_lengths(self.function, x, self.low, self.high, level, self.lengths)
         self.jacobian.lengths = lengths
         for _, jacobian in self.rows.parts:
-            if isinstance(jacobian, CountedJacobian):
-                jacobian.lengths = lengths
+            jacobian.lengths = lengths
         return replace(self, exponent=int(np.frexp(level)[1]), lengths=lengths)
 
     @property
@@ -106,6 +109,12 @@ class MaxOfFunctions:
         slopes = np.ldexp(self.jacobian(x), -self.exponent)
         return Linear(f, slopes, c, self.rows.jacobian(x), no_curvature)
 
+    def linearise_best(self, x: Array) -> Linear:
+        """The same with central differences in place of forward ones."""
+        slopes = np.ldexp(self.jacobian.best(x), -self.exponent)
+        f, c = self.evaluate(x)
+        return Linear(f, slopes, c, self.rows.best_jacobian(x), no_curvature)
+
     def step(self, x: Array, d: Array) -> Array:
         """The point moved."""
         return x + d
@@ -119,7 +128,8 @@ class MaxOfFunctions:
         met by an x that is large enough.
         """
         end = np.where(c > self.upper, self.upper, np.where(c < self.lower, self.lower, c))
-        reach = np.abs(normal) @ np.maximum(self.lengths, np.abs(x))
+        reach = np.abs(normal) @ np.minimum(self.lengths, self.first_lengths)
+        reach = np.where(end == 0.0, np.abs(normal) @ np.maximum(self.lengths, np.abs(x)), reach)
         left = np.maximum(np.abs(end), np.abs(c))
         size = np.maximum(left, np.minimum(np.abs(normal) @ np.abs(x), MAX_CANCELLING * left))
         size = size + np.where(end == 0.0, 1.0, ROW_ROUNDING) * reach

@@ -41,7 +41,7 @@ SHARE = 3  # times the unknowns: of more functions than twice that, so many make
 PATIENCE = 10  # iterations without progress in value or optimality before giving up
 WORTH = 1e-8  # relative: a fall by less is no progress where QP answers are used as they are
 NOTHING = 1e-12  # of the value at the start: what is as good as zero
-ENDLESS = 1e72  # times that: a value so large belongs to what falls without end
+ENDLESS = 1e32  # times that: a value so large belongs to what falls without end
 CANCELLED = 1e-7  # a value below this share of the terms that make it is known no better
 MOST_DAMPING = 1e8  # of the Hessian's diagonal
 RELENTLESS = 1e6  # price of a violation, in slopes of f, beyond which it is there to stay
@@ -670,6 +670,8 @@ def multipliers_at(here: Linear, lower: Array, upper: Array) -> tuple[Array, Arr
         (np.flatnonzero(upper < np.inf), np.flatnonzero(lower > -np.inf)),
     )
     columns = np.concatenate([here.jacobian, here.normal[above], -here.normal[below]]).T
+    if not np.all(np.isfinite(columns)):
+        return np.full(k, 1.0 / k), np.zeros(len(here.c))
     rooms = (here.f.max() - here.f, (upper - here.c)[above], (here.c - lower)[below])
     room = np.maximum(np.concatenate(rooms), 0.0)
     one = 1e3 * (np.arange(len(room)) < k)  # heavy: the sum is then one but for a millionth

@@ -35,6 +35,7 @@ Scheme = Literal["2-point", "3-point", "cs"]
 QP_TOLERANCE = 1e-9
 MAX_ESCAPES = 3  # from points where every gradient vanishes but better ones are near
 MIN_PROGRESS = 1e-3  # of the tolerance: a search that gains less ends
+UNBOUNDED = "unbounded"
 MESSAGES = {
     "converged": "optimal to the tolerance",
     "iteration_limit": "the iteration limit was reached; raise maxiter, or give an exact jac",
@@ -43,7 +44,7 @@ MESSAGES = {
     "infeasible": "the constraints could not be met and may contradict each other; loosen them",
     "failed": "fun or jac gave no finite numbers, or the QP backend no answer; try another x0, or "
     "another qp",
-    "unbounded": "the largest function falls without end; add bounds or constraints",
+    UNBOUNDED: "the largest function falls without end; add bounds or constraints",
     "wrong_gradient": "jac is not the derivative of fun (function {}); mend it, or leave it out",
 }
 
@@ -137,7 +138,7 @@ def minimize_max(
     if box is not None:
         x = np.clip(x, box.lb, box.ub)
     function = CountedFunction(lambda z: fun(z, *args))
-    described = problem = MaxOfFunctions.describe(x, function, scheme, box, rows)
+    problem = MaxOfFunctions.describe(x, function, scheme, box, rows)
     solver: Solver = (
         partial(solve_qp, name=qp, tolerance=QP_TOLERANCE)
         if isinstance(qp, str)
@@ -151,11 +152,11 @@ def minimize_max(
     answer = search.find_optimum(problem, x)
     problem, optimum = answer.problem, answer.optimum
     status = str(answer.status)
-    if answer.status not in (Status.CONVERGED, Status.INFEASIBLE) and (
-        search.falls_without_end(described, x, optimum.x)
+    if (
+        status != UNBOUNDED
+        and is_exact
+        and (wrong := find_wrong_gradient(problem, optimum.x)) is not None
     ):
-        status = "unbounded"
-    elif is_exact and (wrong := find_wrong_gradient(problem, optimum.x)) is not None:
         return report_wrong_gradient(problem, optimum.x, wrong)
     values = problem.function(optimum.x)
     violation = excess(optimum.c, problem.lower, problem.upper).max(initial=0.0)
@@ -180,7 +181,7 @@ class SearchAnswer:
     problem: MaxOfFunctions
     optimum: Optimum[Array]
     check: AnswerCheck
-    status: Status
+    status: str
 
 
 @dataclass
@@ -209,7 +210,7 @@ class Search:
 
         with_feasibility: whether to look for a feasible point where none was found on the way.
         """
-        start, start_value = x, float(problem.function(x).max())
+        start, described, start_value = x, problem, float(problem.function(x).max())
         last_value, last_violation = start_value, np.inf
         escape_count, mu, largest_level = 0, minimax.EVEN, np.inf
         while True:
@@ -219,42 +220,53 @@ class Search:
             lam = np.ldexp(optimum.lam, last_exponent - problem.exponent)
             optimum = replace(optimum, f=problem.values(x), lam=lam)
             check = check_answer(problem, x, optimum.mu, optimum.lam, start, self.tolerance)
-            value = float(problem.function(x).max())
+            value, violation = float(problem.function(x).max()), check.kkt.violation
             self.gained = start_value - value
             answer = SearchAnswer(problem, optimum, check, Status.CONVERGED)
+
             if check.kkt.residual <= self.tolerance:
                 lower = find_descent_from_stationary_point(problem, x)
                 if lower is None or escape_count == MAX_ESCAPES:
                     return answer
                 x, mu, escape_count = lower, minimax.EVEN, escape_count + 1
                 continue
-            if self.iteration_count >= self.max_iterations:
+            has_ended = self.iteration_count >= self.max_iterations
+            if (has_ended or optimum.status is Status.FAILED) and (
+                self.falls_without_end(described, start, x)
+            ):
+                return replace(answer, status=UNBOUNDED)
+            if has_ended:
                 return replace(answer, status=Status.ITERATION_LIMIT)
-            violation = check.kkt.violation
-            is_finer = check.level < 0.5 * largest_level
-            largest_level = check.level
+
+            # No optimum can be told from a point that breaks constraints: first one that does not.
+            if violation > self.tolerance and with_feasibility:
+                nearer = min((x, start), key=lambda place: largest_violation(problem, place))
+                nearest = find_feasible_point(problem, nearer, self)
+                if nearest is None:
+                    return replace(answer, status=Status.INFEASIBLE)
+                x, mu, with_feasibility = nearest, minimax.EVEN, False
+                problem = problem.rescale(x)
+                last_value, last_violation = np.inf, np.inf
+                continue
+
+            # From here again, as long as that gains anything.
             gain = (last_value - value) / np.ldexp(check.level, problem.exponent)
             has_gained = gain > MIN_PROGRESS * self.tolerance and violation <= max(
                 last_violation, self.tolerance
             )
-            is_nearer = violation < 0.9 * last_violation and violation > self.tolerance
-            last_value, last_violation = value, violation
+            is_nearer = self.tolerance < violation < 0.9 * last_violation
+            is_finer = check.level < 0.5 * largest_level
+            last_value, last_violation, largest_level = value, violation, check.level
             if np.isfinite(value) and (has_gained or is_nearer or is_finer):
                 mu = optimum.mu
                 continue
             if problem.jacobian.scheme == "2-point":  # too coarse
                 problem.jacobian.scheme = "3-point"
                 continue
-            if violation <= self.tolerance or not with_feasibility:
-                ended = optimum.status
-                ended = Status.STALLED if ended is Status.CONVERGED else ended
-                return replace(answer, status=ended)
-            nearer = min((x, start), key=lambda place: largest_violation(problem, place))
-            nearest = find_feasible_point(problem, nearer, self)
-            if nearest is None:
-                return replace(answer, status=Status.INFEASIBLE)
-            x, mu, with_feasibility = nearest, minimax.EVEN, False
-            last_value = last_violation = np.inf
+            if self.falls_without_end(described, start, x):
+                return replace(answer, status=UNBOUNDED)
+            ended = optimum.status
+            return replace(answer, status=Status.STALLED if ended is Status.CONVERGED else ended)
 
     def falls_without_end(self, problem: MaxOfFunctions, start: Array, end: Array) -> bool:
         """Whether the functions fall on and on from a feasible point near a start to an end."""

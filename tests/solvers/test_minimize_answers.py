@@ -261,3 +261,50 @@ def test_the_result_has_one_entry_of_history_a_qp():
     assert found.history[0].value == pytest.approx(pair([3.0, 1.0]).max(), rel=1e-12)
     assert found.history[-1].value == pytest.approx(found.fun, rel=1e-6)
     assert {"value", "violation", "kkt", "step"} == set(found.history[0])
+
+
+@pytest.mark.parametrize("stiffness", [1e5, 1e10, 1e20, 1e200])
+def test_the_end_of_a_stiff_curved_valley_is_no_optimum(stiffness):
+    """max(s (x^2 + y^2 - 1), ((x - 3)^2 + y^2) / 1000): the least is .004 at (1, 0), all along a
+    circle on which each function alone changes s times as fast as both together."""
+    found = mc.minimize_max(
+        lambda x: np.array([stiffness * (x @ x - 1.0), 1e-3 * ((x[0] - 3.0) ** 2 + x[1] ** 2)]),
+        [2.0, 2.0],
+        jac=lambda x: np.array([2.0 * stiffness * x, 2e-3 * np.array([x[0] - 3.0, x[1]])]),
+    )
+    assert found.success == (abs(found.fun - 0.004) < 1e-8)
+    assert found.success or stiffness > 1e5
+
+
+@pytest.mark.parametrize("jac", ["2-point", "3-point", "cs"])
+@pytest.mark.parametrize("edge", [np.nan, np.inf])
+def test_a_start_at_the_edge_of_the_domain_is_left(edge, jac):
+    """(x + 2)^2 + 1 without a value beyond 1, where the search begins."""
+    found = mc.minimize_max(
+        lambda x: np.array([(x[0] + 2.0) ** 2 + 1.0 if x[0].real <= 1.0 else edge]), [1.0], jac=jac
+    )
+    assert found.success
+    assert_allclose(found.fun, 1.0, rtol=1e-6)
+
+
+def test_rows_that_are_nearly_equal_show_no_optimum():
+    """x + y on a circle that is given twice, by differences of two kinds: multipliers of 1e7
+    balance any gradient by the differences of the rows' rounding."""
+    circles = [
+        NonlinearConstraint(lambda x: x @ x * np.array([1.0, 2.0]), [1.0, 2.0], [1.0, 2.0], jac=jac)
+        for jac in ("2-point", "3-point")
+    ]
+    found = mc.minimize_max(
+        lambda x: np.array([x.sum()]), [-3.0, 1.0], jac=lambda x: np.ones((1, 2)),
+        constraints=circles,
+    )  # fmt: skip
+    assert found.success == (abs(found.fun + np.sqrt(2.0)) < 1e-6)
+
+
+def test_what_meets_a_far_bound_or_falls_ever_less_is_not_unbounded():
+    disc = NonlinearConstraint(lambda x: x @ x, -np.inf, 1e16)
+    found = mc.minimize_max(lambda x: np.array([-x[0]]), [1.0, 1.0], jac="cs", constraints=disc)
+    assert found.status != "unbounded"
+    found = mc.minimize_max(lambda x: np.array([1.0 / x[0]]), [1.0], bounds=[(1.0, None)])
+    assert found.status != "unbounded"
+    assert found.fun >= 0.0
