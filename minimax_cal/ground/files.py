@@ -8,9 +8,11 @@ import io
 import json
 import math
 import os
-import tempfile
+import shutil
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -39,16 +41,73 @@ def write_whole(path: Path | str, content: str | bytes) -> None:
     if path.exists() and not path.is_file():
         write_into(path, raw)
         return
-    handle, name = beside(path)
+    with hidden_part(path) as (handle, part):
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                stream.write(raw)
+                put_on_disk(stream)
+            os.chmod(part, mode_of(path))
+            keep_old(path)
+            replace_on_disk(part, path)
+        except OSError as error:
+            raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+# Of each file that was written since `all_or_none` began: its path, a hidden link to the file
+# before it, and whether there was one.
+Journal = list[tuple[Path, Path, bool]]
+JOURNAL: ContextVar[Journal | None] = ContextVar("JOURNAL", default=None)
+
+
+@contextmanager
+def all_or_none() -> Iterator[None]:
+    """Take back all that `write_whole` wrote inside, where that ends by an error or a signal.
+
+    Old files are as they were then.  Not by an OSError, as of a reader of stdout that has ended:
+    results are whole and asked for.
+    """
+    journal: Journal = []
+    token = JOURNAL.set(journal)
     try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(raw)
-            put_on_disk(stream)
-        os.chmod(name, mode_of(path))
-        replace_on_disk(name, path)
-    except OSError as error:
-        Path(name).unlink(missing_ok=True)
-        raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+        yield
+    except OSError:
+        raise
+    except BaseException:
+        for path, old, existed in reversed(journal):
+            with suppress(OSError):
+                if not existed:
+                    path.unlink(missing_ok=True)
+                elif old.exists():
+                    os.replace(old, path)
+        raise
+    finally:
+        JOURNAL.reset(token)
+        try:
+            forget_old(journal)
+        except BaseException:  # a signal that came in between
+            forget_old(journal)
+            raise
+
+
+def forget_old(journal: Journal) -> None:
+    """Remove the hidden links to old files."""
+    for _, old, _ in journal:
+        with suppress(OSError):
+            old.unlink(missing_ok=True)
+
+
+def keep_old(path: Path) -> None:
+    """Keep the file at a path by another link, for `all_or_none` to put it back."""
+    journal = JOURNAL.get()
+    if journal is None:
+        return
+    old, existed = hidden_name(path), path.exists()
+    journal.append((path, old, existed))
+    if existed:
+        try:
+            os.link(path, old)
+        except OSError:  # a file system without links
+            shutil.copy2(path, old)
 
 
 def put_on_disk(stream: IO[bytes]) -> None:
@@ -82,12 +141,28 @@ def replace_on_disk(source: Path | str, path: Path) -> None:
         os.close(folder)
 
 
-def beside(path: Path) -> tuple[int, str]:
-    """A new file in the folder of a path, open, and its name.  Raises CalibrationError."""
+def hidden_name(path: Path) -> Path:
+    """A name in the folder of a path that no other file has."""
+    return path.with_name(f".{path.name[:SHORT]}.{os.urandom(4).hex()}")
+
+
+@contextmanager
+def hidden_part(path: Path) -> Iterator[tuple[int, Path]]:
+    """A new private file in the folder of a path, open, and its name.  Raises CalibrationError.
+
+    In the end it is gone, unless it has another name by then: the name is known before the file is
+    there, so that no signal can leave it behind.
+    """
+    part = hidden_name(path)
+    flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
     try:
-        return tempfile.mkstemp(prefix=f".{path.name[:SHORT]}.", dir=path.parent)
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+        try:
+            handle = os.open(part, flags, 0o600)
+        except OSError as error:
+            raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+        yield handle, part
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def resolved(path: Path | str) -> Path:
@@ -134,9 +209,8 @@ def check_writable(path: Path | str, suffixes: tuple[str, ...] = ()) -> None:
     if not there.parent.is_dir():
         raise CalibrationError(f"{path}: cannot be written (there is no such folder)")
     if there.is_file() or not there.exists():  # no pipe and no device
-        handle, name = beside(there)
-        os.close(handle)
-        os.unlink(name)
+        with hidden_part(there) as (handle, _):
+            os.close(handle)
 
 
 def made_folder(path: Path) -> Path:
