@@ -162,7 +162,8 @@ def hidden_part(path: Path) -> Iterator[tuple[int, Path]]:
             raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
         yield handle, part
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):  # a folder that cannot be written holds no part
+            part.unlink(missing_ok=True)
 
 
 def resolved(path: Path | str) -> Path:
