@@ -17,6 +17,7 @@ from minimax_cal.serving.work import module_command
 MAX_READERS = 6  # processes that read at once
 IDLE_READERS = 2  # that wait for work, since one takes a second or more to start
 READ_SECONDS = 300.0  # in which any file is read
+DEATH_SECONDS = 0.2  # in which the deaths of other processes are known, too
 READER = "minimax_cal.serving.reader"
 
 
@@ -80,12 +81,22 @@ class ReaderPool:
         key = question, at.stamp()  # of files as they are now
         task = self.pending.get(key)
         if task is None:
-            task = self.pending[key] = asyncio.create_task(self.answer(folder, question))
+            task = self.pending[key] = asyncio.create_task(self.answer_again(folder, question))
             task.add_done_callback(lambda _: self.pending.pop(key, None))
         return await asyncio.shield(task)
 
+    async def answer_again(self, folder: str, question: bytes) -> Answer:
+        """Have a process answer, and another where that died, as perhaps before it was asked."""
+        for _ in range(2):
+            with suppress(asyncio.IncompleteReadError, ConnectionError):
+                return await self.answer(folder, question)
+            await asyncio.sleep(DEATH_SECONDS)
+        raise CalibrationError(
+            "a file of this session takes more memory than there is; remove the largest"
+        )
+
     async def answer(self, folder: str, question: bytes) -> Answer:
-        """Have a process answer.  Raises CalibrationError where none can."""
+        """Have a process answer.  Raises IncompleteReadError where it dies; CalibrationError."""
         async with self.room:
             reader = await self.take_reader(folder)
             try:
@@ -93,10 +104,6 @@ class ReaderPool:
             except TimeoutError:
                 raise CalibrationError(
                     f"a file of this session takes more than {READ_SECONDS:g} s to read; remove it"
-                ) from None
-            except (asyncio.IncompleteReadError, ConnectionError):
-                raise CalibrationError(
-                    "a file of this session takes more memory than there is; remove the largest"
                 ) from None
             else:
                 self.idle.append(reader)
@@ -118,14 +125,13 @@ class ReaderPool:
             self.idle.remove(reader)
         reader.folder = folder
         if not self.idle and self.starting is None and len(self.readers) < MAX_READERS:
-            self.starting = asyncio.create_task(self.fill(1))
+            self.starting = asyncio.create_task(self.fill())
         return reader
 
-    async def fill(self, count: int) -> None:
-        """Start processes that wait for work."""
+    async def fill(self) -> None:
+        """Start a process that waits for work."""
         try:
-            for _ in range(count):
-                self.idle.append(await self.start_reader())
+            self.idle.append(await self.start_reader())
         finally:
             self.starting = None
 

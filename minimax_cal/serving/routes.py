@@ -21,7 +21,7 @@ from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import json_of, put_on_disk, replace_on_disk
 from minimax_cal.reporting.html.charts import PALETTE
 from minimax_cal.reporting.html.page import needed, part, template
-from minimax_cal.serving.reader_pool import IDLE_READERS, Answer, ReaderPool
+from minimax_cal.serving.reader_pool import Answer, ReaderPool
 from minimax_cal.serving.sessions import (
     GIVEN,
     MOST_BYTES,
@@ -48,7 +48,7 @@ def application(root: Path) -> Starlette:
     async def living(app: Starlette) -> AsyncIterator[None]:
         app.state.work, app.state.readers = Work(), ReaderPool()
         app.state.changing = asyncio.Lock()  # choices are read, changed and written
-        await app.state.readers.fill(IDLE_READERS)
+        await app.state.readers.fill()
         yield
         await asyncio.gather(app.state.work.close(), app.state.readers.close())
 

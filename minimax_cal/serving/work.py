@@ -16,7 +16,7 @@ from typing import Annotated, Any, cast
 
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.facts import Fact
-from minimax_cal.ground.files import json_of, json_text, plain, write_whole
+from minimax_cal.ground.files import json_of, json_text, made_folder, plain, write_whole
 from minimax_cal.ground.records import read
 from minimax_cal.ground.stages import clock
 from minimax_cal.ground.words import one_line
@@ -235,7 +235,7 @@ def kept(job: Job, code: int, told: str, inputs: dict[str, str]) -> None:
     seconds = round(time.monotonic() - job.began, 1)
     commands = tuple(command.line() for command in job.commands)
     record = Record(commands, code, seconds, told, tuple(job.notices), job.error, inputs, job.more)
-    write_whole(job.at.folder / LOG / f"{job.step}.json", json_text(plain(record)))
+    write_whole(made_folder(job.at.folder / LOG) / f"{job.step}.json", json_text(plain(record)))
     script = job.at.folder / SCRIPT
     text = script.read_text("utf-8") if script.exists() else start_of(job.at.folder)
     when = time.strftime("%Y-%m-%d %H:%M:%S")

@@ -1,7 +1,10 @@
 """What the page refuses changes nothing, and what it reads keeps nobody waiting."""
 
 import json
+import os
+import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -301,3 +304,21 @@ def test_a_connection_that_asks_stays(impatient):
 def test_the_large_file_is_one_that_is_read(large, tmp_path):
     (tmp_path / "large.csv").write_bytes(large[: 1 << 20].rpartition(b"\n")[0])
     assert read_any(tmp_path / "large.csv", Given()).joints
+
+
+# ---- processes that die --------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells who is whose child")
+def test_readers_that_were_killed_are_replaced(busy):
+    """As by a system that runs out of memory."""
+    made = busy.begin("killed", robot="irb120")
+    before = busy.state(made)
+    number = busy.process.pid
+    children = Path(f"/proc/{number}/task/{number}/children").read_text().split()
+    readers = [pid for pid in children if b"serving.reader" in
+               Path(f"/proc/{pid}/cmdline").read_bytes()]  # fmt: skip
+    assert readers
+    for pid in readers:
+        os.kill(int(pid), signal.SIGKILL)
+    assert busy.state(made) == before
