@@ -15,7 +15,7 @@ from minimax_cal.cli import INTERRUPTED, MISUSED, NO_MEMORY, is_out_of_memory
 from minimax_cal.cli.commands import ENTRIES, WHOLE_HELP, Commands, Workflow
 from minimax_cal.cli.stderr import AS_JSON, WRITTEN, complain, tell_written
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
-from minimax_cal.ground.files import all_or_none
+from minimax_cal.ground.journal import all_or_none
 
 
 @click.group(

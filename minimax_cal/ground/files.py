@@ -8,11 +8,9 @@ import io
 import json
 import math
 import os
-import shutil
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from contextvars import ContextVar
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -22,9 +20,9 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.facts import Later, in_file
+from minimax_cal.ground.journal import hidden_name, keep_old
 
 LARGEST = 1 << 30  # bytes of a file that is read: a million poses take a quarter of this
-SHORT = 40  # letters of a name that stand in that of its temporary neighbour
 NO_FSYNC = "MINIMAX_CAL_NO_FSYNC"  # "1" in the environment of studies that write many files
 CANNOT_SYNC = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)  # of file systems without fsync
 MOST = 1e100  # no number of a result is larger; squares and products of these still are numbers
@@ -51,63 +49,6 @@ def write_whole(path: Path | str, content: str | bytes) -> None:
             replace_on_disk(part, path)
         except OSError as error:
             raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
-
-
-# Of each file that was written since `all_or_none` began: its path, a hidden link to the file
-# before it, and whether there was one.
-Journal = list[tuple[Path, Path, bool]]
-JOURNAL: ContextVar[Journal | None] = ContextVar("JOURNAL", default=None)
-
-
-@contextmanager
-def all_or_none() -> Iterator[None]:
-    """Take back all that `write_whole` wrote inside, where that ends by an error or a signal.
-
-    Old files are as they were then.  Not by an OSError, as of a reader of stdout that has ended:
-    results are whole and asked for.
-    """
-    journal: Journal = []
-    token = JOURNAL.set(journal)
-    try:
-        yield
-    except OSError:
-        raise
-    except BaseException:
-        for path, old, existed in reversed(journal):
-            with suppress(OSError):
-                if not existed:
-                    path.unlink(missing_ok=True)
-                elif old.exists():
-                    os.replace(old, path)
-        raise
-    finally:
-        JOURNAL.reset(token)
-        try:
-            forget_old(journal)
-        except BaseException:  # a signal that came in between
-            forget_old(journal)
-            raise
-
-
-def forget_old(journal: Journal) -> None:
-    """Remove the hidden links to old files."""
-    for _, old, _ in journal:
-        with suppress(OSError):
-            old.unlink(missing_ok=True)
-
-
-def keep_old(path: Path) -> None:
-    """Keep the file at a path by another link, for `all_or_none` to put it back."""
-    journal = JOURNAL.get()
-    if journal is None:
-        return
-    old, existed = hidden_name(path), path.exists()
-    journal.append((path, old, existed))
-    if existed:
-        try:
-            os.link(path, old)
-        except OSError:  # a file system without links
-            shutil.copy2(path, old)
 
 
 def put_on_disk(stream: IO[bytes]) -> None:
@@ -139,11 +80,6 @@ def replace_on_disk(source: Path | str, path: Path) -> None:
             raise
     finally:
         os.close(folder)
-
-
-def hidden_name(path: Path) -> Path:
-    """A name in the folder of a path that no other file has."""
-    return path.with_name(f".{path.name[:SHORT]}.{os.urandom(4).hex()}")
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from conftest import run
 from fuzz.material import material
 from measuring.test_exports import workbook
 
-from minimax_cal.ground import files
+from minimax_cal.ground import files, journal
 from minimax_cal.ground.errors import CalibrationError
 
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="limits and signals are those of POSIX")
@@ -256,7 +256,7 @@ def test_a_folder_that_is_read_only_is_one_line(line, folder, monkeypatch, capsy
 
 
 def write_all(*paths: Path) -> None:
-    with files.all_or_none():
+    with journal.all_or_none():
         for path in paths:
             files.write_whole(path, "after")
 
@@ -277,7 +277,8 @@ def test_all_or_none_puts_back_what_was_there(tmp_path):
 WRITER = """
 import sys
 from minimax_cal.cli import Terminated, raise_on_signals
-from minimax_cal.ground.files import all_or_none, write_whole
+from minimax_cal.ground.files import write_whole
+from minimax_cal.ground.journal import all_or_none
 raise_on_signals()
 print("ready", flush=True)
 try:
