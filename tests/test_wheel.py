@@ -128,4 +128,4 @@ def test_every_command_runs_or_names_its_extra(installed):
         assert extra in line
     assert known - {"--version"} == set(ENTRIES)
     missing = run("calibrate", "irb120", "poses.csv", "--qp", "piqp").stderr
-    assert "pip install minimax-cal[piqp]; daqp is used" in missing
+    assert "pip install piqp; daqp is used" in missing
