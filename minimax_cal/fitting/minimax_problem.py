@@ -184,6 +184,7 @@ class MinimaxProblem:
             off = (model.prior.mean - model.values(x))[model.active]
             slope, held = slope - 2.0 * weight * off / total, prior_of(model, x)
         c, normal = self.deviation(x)
+
         def curvature(weights: Array) -> Array:
             both = at.curvature(weights)
             if known:
