@@ -49,9 +49,14 @@ MIN_FALLING_SLOPE = 0.25  # at the end of a step, relative to its start: worth g
 MAX_LENGTHENING = 1e15  # times a step
 NEARLY = 100.0  # times the tolerance: optimal as far as rounding lets one see
 
-# P_vv of the epigraph variable: makes P definite for solvers that ask for it.  v is the decrease
-# that is still to be had, so the term vanishes at the solution and does not move it.
+# Curvature of a direction that has none, for solvers that ask for a definite P.
 EPIGRAPH = 1e-8
+# P_vv of the epigraph variable v: a force that changes the sum of the multipliers by a part of
+# NEGLIGIBLE_FORCE at the decrease that is still to be had, but no more curvature than this.  Active
+# set methods work with A P^-1 A', whose entries are of size one beside 1 / P_vv: from 1e8 on the
+# rounding of the sum exceeds a QP's tolerance.
+NEGLIGIBLE_FORCE = 1e-9
+MAX_DECREASE_CURVATURE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -451,10 +456,13 @@ class Iterate(Generic[X]):
             hessian / units.value * np.outer(units.x, units.x),
             self.problem.upper / units.c,
         )
+        # What weak duality leaves at the last multipliers, the Hessian taken as its diagonal.
+        slope = self.mu @ here.jacobian + (self.lam * units.c / units.value) @ here.normal
+        decrease = self.kkt.complementarity + 0.5 * float(slope @ slope)
         missed = rows = self.likely(here)
         while len(missed):
             some = here if len(rows) == len(here.f) else here.of(rows)
-            plain = epigraph(some, here.f.max(), bent, lower, upper)
+            plain = epigraph(some, here.f.max(), bent, lower, upper, decrease)
             solution = qp(plain)
             missed = forgotten(here, rows, solution)
             rows = np.concatenate([rows, missed])
@@ -590,14 +598,19 @@ def forgotten(here: Linear, rows: Array, solution: Solution) -> Array:
     return found[np.argsort(-over[found])[:p]]
 
 
-def epigraph(here: Linear, largest: float, hessian: Array, lower: Array, upper: Array) -> Problem:
-    """min 1/2 d'Hd + v with rows f - largest + f'd <= v and lower - c <= c'd <= upper - c."""
+def epigraph(
+    here: Linear, largest: float, hessian: Array, lower: Array, upper: Array, decrease: float
+) -> Problem:
+    """min 1/2 d'Hd + v with rows f - largest + f'd <= v and lower - c <= c'd <= upper - c.
+
+    decrease: about how far v may fall.
+    """
     k, p = here.jacobian.shape
     rows = np.zeros((k + len(here.c), p + 1))
     rows[:k, :p], rows[:k, p], rows[k:, :p] = here.jacobian, -1.0, here.normal
     quadratic = np.zeros((p + 1, p + 1))
     quadratic[:p, :p] = hessian
-    quadratic[p, p] = EPIGRAPH
+    quadratic[p, p] = min(MAX_DECREASE_CURVATURE, NEGLIGIBLE_FORCE / max(decrease, EPIGRAPH))
     linear = np.zeros(p + 1)
     linear[p] = 1.0
     low = np.concatenate([np.full(k, -np.inf), lower - here.c])
