@@ -3,9 +3,9 @@
     python -m experiments papers [--quick] [--out FOLDER] [--json FILE] [--seed N] ...
 
 Runs the studies that the papers need, each into a folder of its own, and writes verdicts.csv: item,
-command, paper's figure, ours, verdict, remark.  A verdict follows from the figures of this run by
-the rule that ends its remark; a quick run says "too few to say" where fewer than 20 cases are
-behind it.
+command, paper's figure, ours, verdict, remark, and which of its claims held and failed.  All hold:
+reproduced; more than half: in part; else not.  A quick run says "too few to say" where fewer than
+20 cases are behind it.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ from experiments import (
     splits,
     verdicts_m,
     verdicts_s,
+    warm_start,
 )
 from experiments.sweep import Study, study_options
-from experiments.verdicts import HEADER, MISSING, Verdict, of_quick, table_of
+from experiments.verdicts import HEADER, MISSING, Verdict, table_of
 from minimax_cal.ground.files import write_whole
 
 Judged = Callable[[Any], Iterable[Verdict]]
@@ -57,12 +58,13 @@ def study_of(study: Study) -> list[Verdict]:
         *of(methods, verdicts_m.tables_1_4),
         *of(conditions, verdicts_m.conditions),
         *of(splits, verdicts_m.many_splits),
+        *of(warm_start, verdicts_m.warm_starts),
         *of(algorithm_1, verdicts_m.to_the_letter),
         *verdicts_m.subproblems(study.quick),
         *verdicts_m.own_cell(),
         *of(errata, verdicts_m.slips),
     ]
-    return [of_quick(verdict) for verdict in verdicts] if study.quick else verdicts
+    return [replace(verdict, quick=study.quick) for verdict in verdicts]
 
 
 @study_options("papers")
