@@ -32,7 +32,7 @@ from minimax_cal.ground.tables import Table
 DOCS = ROOT / "docs"
 FIGURES, IMAGES = DOCS / "figures", DOCS / "images"
 PAGES = ("solver_accuracy", "trust", "papers", "relative", "watch", "speed")
-BLOCK = re.compile(r"(<!-- figures: ([\w/]+) -->\n).*?(\n<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- figures: ([\w/]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 NAN = "-"
 
 
@@ -58,14 +58,14 @@ RUNS = {
     ),
     "coverage": Run("experiments coverage --runs 100", {"coverage.png": "coverage"}),
     "external": Run("experiments external", {}),
-    "machine_gap": Run("experiments machine_gap --seed 7001 --every 8", {}),
+    "machine_gap": Run("experiments machine_gap --seed 7001 --every 16", {}),
     "blind_gap": Run(
-        "experiments blind_gap --seed 2028 --every 20",
+        "experiments blind_gap --seed 2028 --every 40",
         {"blind_detectability.png": "blind_gap_detectability"},
     ),
-    "fuzz": Run("tests.fuzz --cases 400 --seed 20261211", {}),
+    "fuzz": Run("tests.fuzz --cases 200 --seed 20261211", {}),
     "papers": Run(
-        "experiments papers",
+        "experiments papers --every 5",
         {
             "papers_s_fig3.png": "convergence/rms_all_mm",
             "papers_s_fig4.png": "courses/s_fig4",
@@ -78,8 +78,9 @@ RUNS = {
         },
     ),
     "algorithm_1": Run("experiments algorithm_1", {}),
+    "warm_start": Run("experiments warm_start", {}),
     "relative": Run("experiments relative --seeds 8", {"relative.png": "relative"}),
-    "one_session": Run("experiments one_session --arms 54", {}),
+    "one_session": Run("experiments one_session --arms 24", {}),
     "speed": Run("experiments speed", {}),
 }
 
@@ -253,9 +254,18 @@ BLOCKS = {
     ),
     "papers/counts": Block("papers", "the two papers", verdict_counts),
     "papers/items": Block(
-        "papers", "the two papers", columns("item | paper | ours | claims | verdict")
+        "papers", "the two papers", columns("item | paper | ours | claims | verdict | failed")
     ),
     "algorithm_1/steps": Block("algorithm_1", "Algorithm 1", body),
+    "warm_start/starts": Block("warm_start", "eq. 32", body),
+    "relative/identified": Block(
+        "relative",
+        "what is identifiable",
+        columns(
+            "measured | numbers in training | parameters | identified | rank by differences",
+            lambda row: bool(row["robot"] == "IRB 2600"),
+        ),
+    ),
     "relative/stiff": Block("relative", "100 poses, 15 um, stiff", columns(RELATIVE)),
     "relative/bending": Block("relative", "100 poses, 15 um, joints bend", columns(RELATIVE)),
     "relative/real": Block("relative", "real arms", body),
@@ -318,7 +328,8 @@ def written_page(text: str) -> str:
 
     def write(found: re.Match[str]) -> str:
         name = found[2]
-        return found[1] + (made_text(runs) if name == "made" else block_text(name)) + found[3]
+        shown = made_text(runs) if name == "made" else block_text(name)
+        return f"{found[1]}\n{shown}\n\n{found[3]}"
 
     return BLOCK.sub(write, text)
 

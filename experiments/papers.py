@@ -37,21 +37,23 @@ from minimax_cal.ground.files import write_whole
 Judged = Callable[[Any], Iterable[Verdict]]
 
 
-def verdicts_of(study: Study, module: ModuleType, judged: Judged) -> Iterable[Verdict]:
+def verdicts_of(
+    study: Study, module: ModuleType, judged: Judged, **options: int
+) -> Iterable[Verdict]:
     """Run one of the studies into a folder of its own, and judge what it found."""
     name = module.__name__.rpartition(".")[2]
     own = replace(study, name=name, out=study.out / name, json=None)
-    found = module.study_of(own)
+    found = module.study_of(own, **options)
     module.save(own, found)
     return judged(found)
 
 
-def study_of(study: Study) -> list[Verdict]:
-    """All verdicts, paper S first."""
+def study_of(study: Study, every: int = 1) -> list[Verdict]:
+    """All verdicts, paper S first.  every: of the starts of Table 2."""
     of = partial(verdicts_of, study)
     verdicts = [
         *verdicts_s.model(),
-        *of(convergence, verdicts_s.table_2),
+        *of(convergence, verdicts_s.table_2, every=every),
         *of(courses, verdicts_s.courses),
         *of(any_base, verdicts_s.anywhere),
         *verdicts_s.own_cell(),
@@ -68,9 +70,10 @@ def study_of(study: Study) -> list[Verdict]:
 
 
 @study_options("papers")
-def main(study: Study) -> None:
+@convergence.every_start
+def main(study: Study, every: int) -> None:
     """Every table and figure of the two papers, and a table of verdicts."""
-    verdicts = study_of(study)
+    verdicts = study_of(study, every)
     table = table_of(verdicts)
     content = {
         "verdicts": table.records(*HEADER),
