@@ -40,6 +40,7 @@ from rich.progress import track
 import minimax_cal
 import qp_backends
 from experiments.record import (
+    commit,
     environment,
     run_record,
     save_figure,
@@ -358,6 +359,7 @@ def study_options(name: str) -> Callable[[Callable[..., None]], click.Command]:
 
         @functools.wraps(function)
         def command(**given: Any) -> None:
+            commit()  # as it is now: a long run may see the next one
             words = command_of(name, click.get_current_context())
             study = Study(name, **{field: given.pop(field) for field in fields}, command=words)
             try:
