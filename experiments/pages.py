@@ -57,7 +57,9 @@ RUNS = {
         },
     ),
     "coverage": Run("experiments coverage --runs 100", {"coverage.png": "coverage"}),
-    "external": Run("experiments external", {}),
+    "external": Run(
+        "experiments external --arms irb120,ur10_b,meca500_r,fanuc_r2000,qkm_hl6 --halves 4", {}
+    ),
     "machine_gap": Run("experiments machine_gap --seed 7001 --every 16", {}),
     "blind_gap": Run(
         "experiments blind_gap --seed 2028 --every 40",
@@ -80,7 +82,10 @@ RUNS = {
     "algorithm_1": Run("experiments algorithm_1", {}),
     "warm_start": Run("experiments warm_start", {}),
     "relative": Run("experiments relative --seeds 8", {"relative.png": "relative"}),
-    "one_session": Run("experiments one_session --arms 24", {}),
+    "one_session": Run(
+        "experiments one_session --arms 24 --command compare --command check --command calibrate",
+        {},
+    ),
     "speed": Run("experiments speed", {}),
 }
 
