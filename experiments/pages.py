@@ -67,7 +67,7 @@ RUNS = {
     ),
     "fuzz": Run("tests.fuzz --cases 200 --seed 20261211", {}),
     "papers": Run(
-        "experiments papers --every 5",
+        "experiments papers --every 7",
         {
             "papers_s_fig3.png": "convergence/rms_all_mm",
             "papers_s_fig4.png": "courses/s_fig4",
