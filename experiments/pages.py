@@ -109,7 +109,8 @@ def columns(
 
     text: headers between bars, each as the page has it and, after "=", as the table has it.
     """
-    pairs = [part.strip().partition("=") for part in text.split("|")]
+    pairs = [(shown.strip(), name.strip() or shown.strip()) for shown, _, name in
+             (part.partition("=") for part in text.split("|"))]  # fmt: skip
 
     def write(table: Table) -> str:
         rows = [
@@ -117,9 +118,9 @@ def columns(
             for row in table.rows
             if keep is None or keep(dict(zip(table.header, row, strict=True)))
         ]
-        chosen = [table.header.index(name or shown) for shown, _, name in pairs]
+        chosen = [table.header.index(name) for _, name in pairs]
         some = replace(table, rows=tuple(rows)).only(*chosen)
-        return body(replace(some, header=tuple(shown for shown, _, _ in pairs)))
+        return body(replace(some, header=tuple(shown for shown, _ in pairs)))
 
     return write
 
