@@ -62,10 +62,10 @@ RUNS = {
     ),
     "machine_gap": Run("experiments machine_gap --seed 7001 --every 16", {}),
     "blind_gap": Run(
-        "experiments blind_gap --seed 2028 --every 40",
+        "experiments blind_gap --seed 2028 --every 60",
         {"blind_detectability.png": "blind_gap_detectability"},
     ),
-    "fuzz": Run("tests.fuzz --cases 200 --seed 20261211", {}),
+    "fuzz": Run("tests.fuzz --cases 100 --seed 20261211", {}),
     "papers": Run(
         "experiments papers --every 7",
         {
