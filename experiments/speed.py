@@ -387,8 +387,8 @@ KINDS = (  # of times whose names have a size
     (r"point_(\d+)", r"worst of \1 points, from the least squares"),
     (r"point_(\d+)_cvxpy", r"worst of \1 points by cvxpy"),
     (r"bootstrap_500_(\w+)", r"bootstrap of 500, \1"),
-    (r"calibrate_(\d+)x(\d+)", r"`mc.calibrate`, \1 poses x \2 targets"),
-    (r"diagnose_(\d+)x(\d+)", r"a diagnosis with its folds, \1 poses x \2 targets"),
+    (r"calibrate_(\d+)x(\d+)", r"`mc.calibrate`, poses x targets: \1 x \2"),
+    (r"diagnose_(\d+)x(\d+)", r"a diagnosis with its folds, poses x targets: \1 x \2"),
 )
 
 
