@@ -2,7 +2,7 @@
 
 Without a name those of the program itself, in some minutes (the report's needs Chromium, Chrome or
 Edge, the page's Chromium with its chromedriver); a picture of a study by its name, as coverage.png,
-by running that study in full.
+by running that study as its page has it.
 """
 
 import shutil
@@ -16,23 +16,14 @@ from minimax_cal.reporting.plots.diagnosis import save_diagnosis
 
 DOCS = Path(__file__).resolve().parent
 ROOT, IMAGES = DOCS.parent, DOCS / "images"
-sys.path += [str(DOCS), str(ROOT / "examples")]
+sys.path += [str(DOCS), str(ROOT), str(ROOT / "examples")]
+
+from experiments.pages import RUNS  # noqa: E402
+
 STUDIES = {  # picture: the study, and what it calls the picture in its folder
-    "blind_detectability.png": ("blind_gap", "blind_gap_detectability"),
-    "coverage.png": ("coverage", "coverage"),
-    "relative.png": ("relative", "relative"),
     "simulator_gap.png": ("simulator_gap", "simulator_gap_ladder"),
-    "subgradient.png": ("solver_accuracy", "subgradient"),
-    "profile_maros_meszaros.png": ("solver_accuracy", "profile_Maros-Meszaros"),
-    "papers_s_fig3.png": ("papers", "convergence/rms_all_mm"),
-    "papers_s_fig4.png": ("papers", "courses/s_fig4"),
-    "papers_s_fig5.png": ("papers", "courses/s_fig5"),
-    "papers_s_fig6.png": ("papers", "courses/s_fig6"),
-    "papers_m_fig2.png": ("papers", "conditions/by_pose_irb120"),
-    "papers_m_fig5.png": ("papers", "conditions/sums_irb120"),
-    "papers_m_fig6.png": ("papers", "conditions/accuracy_irb120"),
-    "papers_splits.png": ("papers", "splits/splits"),
 }
+OF_PAGES = {picture for run in RUNS.values() for picture in run.pictures}
 
 
 def example() -> None:
@@ -83,6 +74,9 @@ def from_studies(names: list[str]) -> None:
 
 def main(names: list[str]) -> None:
     """Make the pictures of these names, or those of the program itself."""
+    for name in OF_PAGES.intersection(names):
+        study = next(study for study, run in RUNS.items() if name in run.pictures)
+        sys.exit(f"{name}: python -m experiments pages --run {study}")
     unknown = [name for name in names if name not in OWN and name not in STUDIES]
     if unknown:
         sys.exit(f"no picture {unknown[0]!r}; choose {', '.join((*OWN, *STUDIES))}")

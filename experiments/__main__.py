@@ -2,6 +2,7 @@
 
 python -m experiments all --quick [--out FOLDER] [--json FILE] [--seed N] [--jobs N]
                                   [--cluster tcp://host:port] [--fresh]
+python -m experiments pages [--run NAME ...]    # the figures of the documentation's pages
 """
 
 from __future__ import annotations
@@ -20,14 +21,15 @@ from pathlib import Path
 import click
 
 from experiments.index import Outcome, write_index
+from experiments.pages import main as pages
 from experiments.record import environment, save_json
 from experiments.sweep import Study, needed, study_options
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.parallel import look_for
 
 STUDIES = (
-    "papers", "convergence", "any_base", "algorithm_1", "conditions", "splits", "methods",
-    "courses", "solver_accuracy", "external", "blind_gap", "machine_gap", "relative",
+    "papers", "convergence", "any_base", "algorithm_1", "warm_start", "conditions", "splits",
+    "methods", "courses", "solver_accuracy", "external", "blind_gap", "machine_gap", "relative",
     "relative_gap", "pixels", "coverage", "one_session", "errata", "simulator_gap", "motion_real",
     "motion_gap", "servos", "motion_blind", "speed",
 )  # fmt: skip
@@ -51,6 +53,7 @@ def listing() -> str:
     """Names of the studies and what they answer."""
     lines = [f"  {name:16} {about(name)}" for name in STUDIES]
     lines.append(f"  {'all':16} Every study, into one folder with an index.html")
+    lines.append(f"  {'pages':16} {about('pages')}")
     return "\n".join(["Usage: python -m experiments NAME [--help]", "", *lines])
 
 
@@ -155,7 +158,7 @@ def main(arguments: Sequence[str]) -> None:
     if "--quick" in rest:  # half a minute of compiling, in each process, for seconds of loops
         os.environ.setdefault("MINIMAX_CAL_LOOPS", "plain")
     try:
-        command = everything if name == "all" else study_command(name)
+        command = everything if name == "all" else pages if name == "pages" else study_command(name)
     except OptionError as error:
         click.echo(f"error: {error}", err=True)
         sys.exit(2)

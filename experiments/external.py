@@ -213,9 +213,10 @@ def middle(of: Array) -> float:
 
 @study_options("external")
 @click.option("--arms", default=",".join((*REAL, *SIMULATED)), show_default=True)
-def main(study: Study, arms: str) -> None:
+@click.option("--halves", type=int, default=HALVES, show_default=True, help="Of each arm.")
+def main(study: Study, arms: str, halves: int) -> None:
     """Claimed accuracy beside that on poses set aside."""
-    named, halves = ([SIMULATED[0]], 1) if study.quick else (asked_for(arms), HALVES)
+    named, halves = ([SIMULATED[0]], 1) if study.quick else (asked_for(arms), halves)
     jobs = [
         Job(arm, split, way, study.seed + seed)
         for arm in named

@@ -9,7 +9,9 @@ from scipy import sparse
 from scipy.io import loadmat
 
 from experiments import real
+from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
+from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.robots.robot import load_robot
@@ -47,6 +49,18 @@ def recorded(per: str, poses: int, seed: int) -> list[Case]:
     minimax.solve(problem, state, minimax.from_nothing(listen))
     rows = len(seen[0].l)
     return [Case(f"{per} {rows} rows, seed {seed}, QP {i + 1}", p) for i, p in enumerate(seen)]
+
+
+def calibration_qps(seed: int) -> list[Problem]:
+    """Every QP that `mc.calibrate` puts to its backend: IRB 2600, 100 poses, three targets."""
+    asked: list[Problem] = []
+
+    def listen(problem: Problem) -> Solution:
+        asked.append(problem)
+        return solve_qp(problem, "daqp", tolerance=QP_TOLERANCE)
+
+    calibrate("irb2600", simulate(load_robot("irb2600"), 100, 3, seed).data, qp=listen)
+    return asked
 
 
 def calibration_small(quick: bool) -> list[Case]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import platform
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from scipy.stats import beta
@@ -21,6 +23,8 @@ from minimax_cal.reporting.plots.figures import save
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+ROOT = Path(__file__).resolve().parent.parent
+CODE = ("minimax_cal", "qp_backends", "experiments", "tests/fuzz")  # what decides a figure
 PACKAGES = ("minimax-cal", "numpy", "scipy", "qpsolvers")
 
 
@@ -44,12 +48,22 @@ def environment(packages: Iterable[str] = ()) -> Table:
 
 @functools.cache
 def commit() -> str:
-    """The version of this checkout, with -dirty if files differ from it; nothing without git."""
-    command = ("git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty")
+    """The version of the code that computes, with -dirty if it differs; nothing without git.
+
+    What studies write (figures of the pages, pictures) does not count as a difference.
+    """
     try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        head = git("rev-parse", "--short=8", "HEAD")
+        changed = git("status", "--porcelain", "--", *CODE)
     except (OSError, subprocess.CalledProcessError):
         return ""
+    return head + ("-dirty" if changed else "")
+
+
+def git(*words: str) -> str:
+    """What git says of this checkout.  Raises OSError, CalledProcessError."""
+    command = ("git", "-C", str(ROOT), *words)
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def processor() -> str:
@@ -103,3 +117,32 @@ def save_json(path: Path, content: Mapping[str, object]) -> None:
     """Write the figures of a study for other programs: null for what is not known (NaN)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, json_text({"schema": 1, **plain(content)}))
+
+
+def run_record(command: str, packages: Iterable[str] = ()) -> dict[str, str]:
+    """What a run was: its command, the day, and the machine and versions of `environment`."""
+    made = {str(name): str(value) for name, value in environment(packages).rows}
+    return {"command": command, "date": datetime.now(UTC).date().isoformat(), **made}
+
+
+def table_record(table: Table) -> dict[str, Any]:
+    """A table for JSON: its title, header, format of each column and rows; null for NaN."""
+    rows = [
+        [str(cell) if isinstance(cell, float) and math.isinf(cell) else cell for cell in row]
+        for row in table.rows
+    ]
+    return {
+        "title": table.title,
+        "header": table.header,
+        "formats": table.formats or [""] * len(table.header),
+        "rows": rows,
+    }
+
+
+def read_table(record: Mapping[str, Any]) -> Table:
+    """The table that `table_record` wrote."""
+    columns = [
+        f"{name} {spec}".rstrip()
+        for name, spec in zip(record["header"], record["formats"], strict=True)
+    ]
+    return Table.made(record["title"], record["rows"], *columns)

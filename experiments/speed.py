@@ -11,7 +11,9 @@ pip install ".[peers]".
 
 from __future__ import annotations
 
+import math
 import multiprocessing
+import re
 import resource
 import statistics
 import subprocess
@@ -347,23 +349,62 @@ def diagnosis_like_real(seed: int) -> dict[str, float]:
     return out
 
 
+RATIOS = {  # name: the peer, ours, in words
+    "whole_over_slsqp": (
+        "minimax_slsqp", "whole", "`mc.calibrate` as a whole against SLSQP's minimax alone"),
+    "minimax_over_slsqp": (
+        "minimax_slsqp", "minimax", "minimax from the nominal robot, least squares included"),
+    "minimax_over_ipopt": ("minimax_ipopt", "minimax", "the same against IPOPT"),
+    "squares_over_numpy_gn": (
+        "squares_numpy_gn", "squares", "least squares against plain Gauss-Newton in NumPy"),
+    "point_over_cvxpy": (
+        "point_300_cvxpy", "point_300", "the least worst of 300 points against cvxpy's cones"),
+    "point_3000_over_cvxpy": ("point_3000_cvxpy", "point_3000", "of 3,000"),
+    "point_30000_over_cvxpy": ("point_30000_cvxpy", "point_30000", "of 30,000"),
+    "squares_over_scipy": (
+        "squares_scipy", "squares", "least squares against SciPy's by finite differences"),
+    "squares_without_numba_over_with": (
+        "squares_without_numba", "squares", "our least squares without numba"),
+    "whole_without_numba_over_with": (
+        "whole_without_numba", "whole", "`mc.calibrate` without numba"),
+}  # fmt: skip
+WORDS = {  # of times by name
+    "squares": "least squares",
+    "squares_without_numba": "the same without numba",
+    "squares_numpy_gn": "plain Gauss-Newton in NumPy",
+    "squares_scipy": "SciPy's least_squares, finite differences",
+    "minimax": "minimax from the nominal robot",
+    "minimax_slsqp": "the same by SLSQP",
+    "minimax_ipopt": "the same by IPOPT",
+    "whole": "`mc.calibrate`",
+    "whole_beyond": "`mc.calibrate` and `fit.beyond`",
+    "whole_without_numba": "`mc.calibrate` without numba",
+    "command": "`minimax-cal calibrate`, from the start of the process",
+    "diagnose_like_real": "a diagnosis of an arm with seven laws, 600 poses x 3 targets",
+    "diagnose_like_real_quick": "the same, quick",
+}
+KINDS = (  # of times whose names have a size
+    (r"point_(\d+)", r"worst of \1 points, from the least squares"),
+    (r"point_(\d+)_cvxpy", r"worst of \1 points by cvxpy"),
+    (r"bootstrap_500_(\w+)", r"bootstrap of 500, \1"),
+    (r"calibrate_(\d+)x(\d+)", r"`mc.calibrate`, poses x targets: \1 x \2"),
+    (r"diagnose_(\d+)x(\d+)", r"a diagnosis with its folds, poses x targets: \1 x \2"),
+)
+
+
+def words_of(name: str) -> str:
+    """What a time is of."""
+    for pattern, words in KINDS:
+        if found := re.fullmatch(pattern, name):
+            return found.expand(words)
+    return WORDS[name]
+
+
 def ratios(seconds: Mapping[str, float]) -> dict[str, float | None]:
     """The peers' times over ours; None for a peer that is not there."""
-    pairs = {
-        "whole_over_slsqp": ("minimax_slsqp", "whole"),
-        "minimax_over_slsqp": ("minimax_slsqp", "minimax"),
-        "minimax_over_ipopt": ("minimax_ipopt", "minimax"),
-        "squares_over_numpy_gn": ("squares_numpy_gn", "squares"),
-        "point_over_cvxpy": ("point_300_cvxpy", "point_300"),
-        "point_3000_over_cvxpy": ("point_3000_cvxpy", "point_3000"),
-        "point_30000_over_cvxpy": ("point_30000_cvxpy", "point_30000"),
-        "squares_over_scipy": ("squares_scipy", "squares"),
-        "squares_without_numba_over_with": ("squares_without_numba", "squares"),
-        "whole_without_numba_over_with": ("whole_without_numba", "whole"),
-    }
     return {
         name: seconds[peer] / seconds[ours] if peer in seconds else None
-        for name, (peer, ours) in pairs.items()
+        for name, (peer, ours, _) in RATIOS.items()
         if ours in seconds
     }
 
@@ -406,10 +447,10 @@ def main(study: Study, repeats: int, part: tuple[str, ...]) -> None:
     over = ratios(seconds)
     machine = f"{processor()}, kernels: {choice.kernels().__name__}"
     numba = choice.kernels() is not plain
-    shown = tuple((k, "absent" if v is None else f"{v:.1f}") for k, v in over.items())
-    spent = tuple((name, 1e3 * value) for name, value in seconds.items())
+    shown = tuple((f"`{k}`", math.nan if v is None else v, RATIOS[k][2]) for k, v in over.items())
+    spent = tuple((words_of(name), 1e3 * value) for name, value in seconds.items())
     tables = [
-        Table.made("the peer's time over ours", shown, "ratio | times"),
+        Table.made("the peer's time over ours", shown, "ratio | times .1f | of what"),
         Table.made(f"processor time ({machine})", spent, "what | ms .2f"),
         Table.made(
             "peak memory of a whole calibration", memory.items(), "poses x targets | GB .2f"

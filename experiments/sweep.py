@@ -21,6 +21,7 @@ import inspect
 import io
 import itertools
 import pickle
+import shlex
 import sys
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
@@ -32,12 +33,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.core import ParameterSource
 from rich.console import Console
 from rich.progress import track
 
 import minimax_cal
 import qp_backends
-from experiments.record import environment, save_figure, save_json, save_tables
+from experiments.record import (
+    commit,
+    environment,
+    run_record,
+    save_figure,
+    save_json,
+    save_tables,
+    table_record,
+)
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.optional import optional
@@ -61,7 +71,8 @@ OF_ARRAYS = {
     *itertools.product(("numpy",), ("ndarray", "dtype")),
     *itertools.product(("pathlib",), ("PosixPath", "WindowsPath")),
 }
-OUTPUT = {"__init__", "__main__", "index", "record", "sweep"}  # files that shape no result
+NO_FIGURE = ("out", "json", "jobs", "cluster", "fresh")  # options that decide no figure
+OUTPUT = {"__init__", "__main__", "index", "pages", "record", "sweep"}  # files that shape no result
 
 
 def sweep(
@@ -258,7 +269,10 @@ def versions() -> list[str]:
 
 @dataclass(frozen=True)
 class Study:
-    """What the options of every study say."""
+    """What the options of every study say.
+
+    command: the words that start it, without those that decide no figure.
+    """
 
     name: str
     quick: bool
@@ -268,6 +282,7 @@ class Study:
     jobs: int
     cluster: str
     fresh: bool
+    command: str = ""
 
     def sweep(
         self, function: Callable[[J], R], jobs: Sequence[J], description: str = ""
@@ -294,11 +309,14 @@ class Study:
 
         packages: whose versions matter besides the usual ones.
         """
+        packages = tuple(packages)
         save_tables(self.out, self.name, [*tables, environment(packages)])
         for name, figure in (figures or {}).items():
             save_figure(self.out, name, figure)
         if self.json:
-            save_json(self.json, content)
+            made = run_record(self.command, packages)
+            records = [table_record(table) for table in tables]
+            save_json(self.json, {**content, "made": made, "tables": records})
 
 
 class Misuse(click.ClickException):
@@ -333,7 +351,7 @@ def study_options(name: str) -> Callable[[Callable[..., None]], click.Command]:
         click.option("--cluster", default="", help="Dask scheduler to run on: tcp://host:port."),
         click.option("--fresh", is_flag=True, help=f"Use no results kept in {CACHE}."),
     )
-    fields = tuple(field.name for field in dataclasses.fields(Study))[1:]
+    fields = tuple(field.name for field in dataclasses.fields(Study))[1:-1]
 
     def decorate(function: Callable[..., None]) -> click.Command:
         if function.__module__ == "__main__" and Path(inspect.getfile(function)).stem == name:
@@ -341,7 +359,9 @@ def study_options(name: str) -> Callable[[Callable[..., None]], click.Command]:
 
         @functools.wraps(function)
         def command(**given: Any) -> None:
-            study = Study(name, **{field: given.pop(field) for field in fields})
+            commit()  # as it is now: a long run may see the next one
+            words = command_of(name, click.get_current_context())
+            study = Study(name, **{field: given.pop(field) for field in fields}, command=words)
             try:
                 function(study, **given)
             except (CalibrationError, qp_backends.BackendError) as error:
@@ -352,6 +372,22 @@ def study_options(name: str) -> Callable[[Callable[..., None]], click.Command]:
         return click.command(name)(command)
 
     return decorate
+
+
+def command_of(name: str, context: click.Context) -> str:
+    """The words that run a study again to the same figures, from the options that were given."""
+    words = ["python", "-m", "experiments", name]
+    for option in context.command.params:
+        source = context.get_parameter_source(option.name or "")
+        if source != ParameterSource.COMMANDLINE or option.name in NO_FIGURE:
+            continue
+        value = context.params[option.name]
+        if getattr(option, "is_flag", False):
+            words += [option.opts[0] if value else option.secondary_opts[0]]
+            continue
+        for one in value if option.multiple else (value,):
+            words += [option.opts[0], str(one)]
+    return shlex.join(words)
 
 
 def start(file: str) -> None:

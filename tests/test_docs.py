@@ -14,6 +14,8 @@ import pytest
 from conftest import ROOT, run
 from test_folders import FOLDERS
 
+from experiments.pages import PAGES as GENERATED
+from experiments.pages import RUNS, figures_of
 from minimax_cal.instruments.table import INSTRUMENTS
 from minimax_cal.modelling.effects import EFFECTS
 from qp_backends import registry
@@ -257,8 +259,10 @@ def test_every_picture_is_made_by_a_command():
     scope = runpy.run_path(str(DOCS / "pictures.py"), run_name="pictures")
     pages = "".join(page.read_text() for page in (*PAGES, ROOT / "README.md"))
     shown = re.findall(r"!\[[^]]*\]\((?:[\w./]*/)?([\w.]+)\)", pages)
-    assert set(shown) == {*scope["OWN"], *scope["STUDIES"]}
-    for study, figure in scope["STUDIES"].values():
+    of_pages = {name: (study, figure) for study, run in RUNS.items()
+                for name, figure in run.pictures.items()}  # fmt: skip
+    assert set(shown) == {*scope["OWN"], *scope["STUDIES"], *of_pages}
+    for study, figure in (*scope["STUDIES"].values(), *of_pages.values()):
         folder = figure.rpartition("/")[0]  # `papers` runs others, each in a folder of its name
         for name in filter(None, (study, folder)):
             assert (ROOT / "experiments" / f"{name}.py").exists(), name
@@ -267,16 +271,17 @@ def test_every_picture_is_made_by_a_command():
 STAMP = re.compile(r"^Figures: (version|several versions up to) `([0-9a-f]{7})`\.$", re.MULTILINE)
 # Pages whose tables came from runs of several versions; one that is made again leaves the list.
 SEVERAL = {
-    "relative", "simulator", "speed", "torques", "trust",
+    "simulator", "torques",
 }  # fmt: skip
 
 
 def figured_pages() -> dict[str, str]:
-    """Text of each page by name whose figures a study prints."""
+    """Text of each page by name whose figures a study prints, but for those of `pages`."""
     texts = {page.stem: page.read_text(encoding="utf-8") for page in DOCS.glob("*.md")}
     shown = (name for name, text in texts.items() if re.search(r"-m experiments[ .][a-z]", text))
     # the list is compared with what the command writes; mathematics and data have no figures
-    return {name: texts[name] for name in shown if name not in ("errata", "mathematics", "data")}
+    others = ("errata", "mathematics", "data", *GENERATED)
+    return {name: texts[name] for name in shown if name not in others}
 
 
 def test_every_page_of_figures_is_of_one_version():
@@ -289,8 +294,9 @@ def test_the_versions_of_figures_are_commits():
     if not (ROOT / ".git").exists():
         pytest.skip("no git repository here")
     stamps = {stamp for text in figured_pages().values() for _, stamp in STAMP.findall(text)}
+    stamps |= {figures_of(run)["made"]["commit"] for run in RUNS}
     known = subprocess.run(
-        ["git", "-C", str(ROOT), "rev-list", "--all", "--abbrev-commit", "--abbrev=7"],
+        ["git", "-C", str(ROOT), "rev-list", "--all"],
         capture_output=True, text=True, check=True,
     ).stdout.split()  # fmt: skip
     if len(known) < 100:

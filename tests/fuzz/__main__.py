@@ -1,6 +1,6 @@
 """Hostile runs of every command, and a table of how they ended.
 
-python -m tests.fuzz --cases 10000 --seed 7          # the table; docs/trust.md has its last row
+python -m tests.fuzz --cases 10000 --seed 7          # the table; docs/trust.md has a last row
 python -m tests.fuzz --seed 7 --only 4711            # one of them again, with its files
 python -m tests.fuzz --each-option                   # every option with every odd value
 """
@@ -18,22 +18,24 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from experiments.record import run_record, save_json, table_record
+from minimax_cal.ground.tables import Table
+
 from .cases import EACH, case, each_option
 from .running import GOOD, KINDS, Outcome, outcome, outcomes
 
 
-def lines(found: list[Outcome]) -> list[str]:
-    """The table as Markdown: a row a command, a column a kind."""
+def table_of(found: list[Outcome]) -> Table:
+    """A row a command, a column a kind; the last row is of all."""
     count = Counter((each.command, each.kind) for each in found)
     commands = sorted({each.command for each in found})
-    head = ("command", "cases", *KINDS)
     rows = [
         (name, sum(count[name, kind] for kind in KINDS), *(count[name, kind] for kind in KINDS))
         for name in commands
     ]
     total = ("all", len(found), *(sum(count[n, kind] for n in commands) for kind in KINDS))
-    cells = [head, ["---", *["---:"] * (len(head) - 1)], *rows, total]
-    return ["| " + " | ".join(map(str, row)) + " |" for row in cells]
+    return Table.made("hostile runs of every command", [*rows, total],
+                      "command | cases d", *(f"{kind} d" for kind in KINDS))  # fmt: skip
 
 
 def show(seed: int, number: int) -> None:
@@ -56,6 +58,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", type=int)
+    parser.add_argument("--json", type=Path, help="write the table here, for the pages")
     parser.add_argument("--each-option", dest="seed", action="store_const", const=EACH)
     chosen = parser.parse_args()
     whole = len(each_option()) - chosen.first if chosen.seed == EACH else 300
@@ -71,7 +74,12 @@ def main() -> int:
             if each.kind not in GOOD:
                 what = f"{each.kind}; {each.broke}; {each.detail}"
                 print(f"{each.number} {each.command}: {what}", flush=True)
-    print("\n".join(lines(found)))
+    table = table_of(found)
+    print(table.markdown())
+    if chosen.json:
+        words = f"python -m tests.fuzz --cases {count} --seed {chosen.seed}"
+        made = run_record(words)
+        save_json(chosen.json, {"made": made, "tables": [table_record(table)]})
     slowest = max(found, key=lambda each: each.seconds)
     print(f"seed {chosen.seed}, {time.perf_counter() - began:.0f} s; the slowest took "
           f"{slowest.seconds:.1f} s ({slowest.number} {slowest.command})")  # fmt: skip
