@@ -160,17 +160,6 @@ def stacked(*decorators: Decorator) -> Decorator:
 QUIET = stacked(NO_NOTICES, PROGRESS)
 
 
-def workers(default: int, shown: str) -> Decorator:
-    """The options --jobs and --cluster.  shown: the default in words."""
-    group = "Who does the work"
-    counted = f"The number of processes; -1: one a core [default: {shown}]."
-    cluster = "Let a Dask cluster do it instead."
-    return stacked(
-        plain_option(group, "--jobs", type=int, default=default, help=counted),
-        plain_option(group, "--cluster", default="", metavar="tcp://HOST:PORT", help=cluster),
-    )
-
-
 def option_of(name: str, default: Any, told: Option) -> Decorator:
     """The click option of a field or argument, which is its default where it is not given."""
     spelt = told.flag or "--" + name.replace("_", "-")

@@ -21,7 +21,6 @@ from minimax_cal.diagnosing.causes import (
     left_beside,
     merged,
     whole,
-    with_jumps,
 )
 from minimax_cal.diagnosing.error_maps import error_maps
 from minimax_cal.diagnosing.established import often
@@ -46,7 +45,6 @@ from minimax_cal.diagnosing.trial import session_notices
 from minimax_cal.diagnosing.verdict import ABOVE_NOISE, down_to, explanation, known_noise
 from minimax_cal.diagnosing.what_remains import remaining_of
 from minimax_cal.diagnosing.where import where
-from minimax_cal.evidence.stability import resemblances
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
 from minimax_cal.fitting.claims import too_far
@@ -73,11 +71,10 @@ from minimax_cal.measuring.faults import find_faults, in_lines, mended, standing
 from minimax_cal.measuring.faults.fault import Fault
 from minimax_cal.measuring.faults.nests import RESEAT
 from minimax_cal.measuring.faults.sessions import session_jumps
-from minimax_cal.measuring.grouping import clusters, held_out, split, with_groups
+from minimax_cal.measuring.grouping import clusters, held_out, with_groups
 from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.modelling.effects.time import TARGET_SHIFT
 from minimax_cal.modelling.effects.words import name_step
@@ -88,7 +85,6 @@ PARTS, REMAINING = "regions held out", "remaining error"
 STEPS = (FAULTY, CAUSES, BUDGET, PARTS, REMAINING)
 NOT_ASKED = Beyond(reason="not asked for")
 ROBUST = replace(SUM, trim=0.3)  # a fit that up to so many wrong points do not pull
-EARLIEST = 5  # visits before a jump that a study takes for possible, and after it
 sought = grouped("What is sought")
 
 
@@ -499,23 +495,3 @@ def in_order(robot: Robot, data: Measurements) -> tuple[Measurements, tuple[Faul
     text = f"{data.source}: rows hold each other's points: {data.list_rows(rows)}"
     fault = Fault("swapped_rows", "all", text, data.line[rows])
     return put_right(data, rows, source), (fault,)
-
-
-def resemblance(
-    robot: Robot | str | Path, data: Measurements | str | Path, displacement: Array
-) -> dict[tuple[str, str], float]:
-    """rho^2 between a known displacement and every effect that the data can test.
-
-    displacement: (k, m, 3) of the points of all rows in the measurement frame [m].  Both are seen
-    by the training poses, after projection on what geometry cannot imitate.  For studies.
-    """
-    robot = load_robot(robot)
-    data = with_history(read_measurements(data))
-    train, _, _ = split(data, 0.2, 0)
-    study = studied(robot, train, fit_cell(robot, train, SUM, silent))
-    rows = np.isin(data.line, train.line)
-    moved = np.einsum("ab,kma->kbm", study.fit.state.rotation, displacement[:, rows])
-    clock = np.unique(study.scene.column("clock"))  # a jump may be at any moment
-    study = replace(study, moments=clock[EARLIEST : len(clock) - EARLIEST])
-    lib = with_jumps(arm_library(study.scene, study.rows), study)
-    return resemblances(lib, study.rows.of(moved[None]))
