@@ -16,6 +16,7 @@ from minimax_cal.ground.facts import Fact, derived
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
+from minimax_cal.ground.words import capitalise
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.solvers.status import Status
 
@@ -246,7 +247,7 @@ class MotionGap(Result):
             )
         first, last = self.rungs[0], self.rungs[-1]
         if not first.torque_rms:
-            return f"{self.driven().capitalize()}."
+            return f"{capitalise(self.driven())}."
         share = np.array(last.torque_rms_moving) / np.maximum(first.torque_rms_moving, 1e-300)
         worst = int(np.argmax(share))
         said = (

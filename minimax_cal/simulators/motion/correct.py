@@ -223,7 +223,8 @@ def left_out(found: MotionDiagnosis, whole: Asked) -> Iterator[str]:
         if not held:
             joint, (without, with_it) = one.best
             cost = f"{joint} {without:.3g} in place of {with_it:.3g} {found.unit}"
-            yield f"{one.words}: {law.why} (costs {cost})"
+            small = f"{without:.3g}" == f"{with_it:.3g}"
+            yield f"{one.words}: {law.why}" + ("" if small else f" (costs {cost})")
     yield from (one.sentence(found.unit) for one in found.unexplained if one.share > MATTERS)
 
 
