@@ -76,7 +76,7 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import EFFECTS
-from minimax_cal.modelling.effects.time import TARGET_SHIFT
+from minimax_cal.modelling.effects.time import SESSION_JUMP, TARGET_SHIFT
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.robots.robot import Robot, load_robot
 
@@ -309,6 +309,8 @@ def notices_of(
     late: outliers that the gap had hidden.  effects: with the values of the last fit.
     """
     yield from clean.remarks
+    if not any(one.term.effect == SESSION_JUMP.name for one in effects):  # its size is the fit's
+        yield from clean.jumps
     yield from filter(None, [study.scene.unused_torques])
     if late:
         yield f"outliers that no effect found explains: {name_first(late)}"
@@ -430,7 +432,8 @@ class Clean:
     given: as measured, but for points that stood in each other's rows.  left: points that no fit
     counts, by lines of the file.  faults: their rows as lines
     of the file.  remarks: on them, for people.  fit: the geometric fit of the training poses, where
-    it is that of the clean data.  moments: as `Study` has them.
+    it is that of the clean data.  moments: as `Study` has them.  jumps: what is said of these,
+    where no effect says it.
     """
 
     data: Measurements
@@ -440,6 +443,7 @@ class Clean:
     remarks: tuple[str, ...]
     fit: Solved | None
     moments: Array
+    jumps: tuple[str, ...]
 
 
 def cleaned(asked: Asked, progress: Progress) -> Clean:
@@ -479,12 +483,15 @@ def cleaned(asked: Asked, progress: Progress) -> Clean:
     sound = mended(sound, more)
     sound = sound.take(np.asarray(sound.seen.any(axis=1)))
     jumped = session_jumps(cell.placed(sound), cell.error(sound))
-    told = (*found, *more, *jumped)
+    told = (*found, *more)
     remarks = tuple(fault.text for fault in told if fault.effect != TARGET_SHIFT.name)
     rows = np.concatenate([NO_ROWS, *(fault.rows for fault in jumped)])
     moments = sound.columns["clock"][rows]
     left = tuple(in_lines(data, (*found, *more), "outliers", RESEAT))
-    return Clean(sound, data, left, faults, remarks, None if more else fit, moments)
+    return Clean(
+        sound, data, left, faults, remarks, None if more else fit, moments,
+        tuple(fault.text for fault in jumped),
+    )  # fmt: skip
 
 
 def in_order(robot: Robot, data: Measurements) -> tuple[Measurements, tuple[Fault, ...]]:

@@ -105,7 +105,7 @@ def left_out_by(data: Measurements, rows: Array) -> str:
     """The command that sets rows aside: all of the file that holds the first."""
     lines = data.line[rows]
     origin = data.origin(lines[0])
-    mine = [str(line - origin.begin) for line in lines if data.origin(line) is origin]
+    mine = [str(line - origin.begin) for line in lines if data.origin(line) == origin]
     return origin.import_command(f"--leave-out {','.join(mine)}")
 
 
