@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.dynamics.given import MotionKnown, Payload, read_logs
 from minimax_cal.dynamics.logs import runs_text
-from minimax_cal.dynamics.logs.table import Run
+from minimax_cal.dynamics.logs.table import NOTHING, Run
 from minimax_cal.dynamics.regressor import link_parameters
 from tests.conftest import run
 from tests.dynamics.motions import run_of, three_joints
@@ -297,6 +297,31 @@ def test_a_delayed_servo_at_its_command_stays_there(tmp_path):
     still = np.broadcast_to(q, (len(time), 3))
     log = run_of("still", time, still, 0.0 * still)
     assert_allclose(follow_commands(chain, log, still, str(path)), still, atol=1e-9)
+
+
+FILTERED = (
+    '<general dyntype="filter" dynprm="0.05" gainprm="2000" biastype="affine" '
+    'biasprm="0 -2000 -200" '
+)
+
+
+@pytest.mark.parametrize("servo", [FILTERED, '<position kp="2000" kv="200" timeconst="0.05" '])
+def test_servos_with_a_filter_are_read_and_named(servo, tmp_path):
+    """They begin where the log does, not at 0; what is not corrected of them is said."""
+    path, q = tmp_path / "filtered.xml", np.array([0.4, -0.3, 0.5])
+    path.write_text(with_motors(three_joints()).decode().replace("<motor ", servo))
+    chain, time = open_model(path, 3).chain, np.arange(0.0, 4.0, 0.01)
+    chain.model.opt.gravity[:] = 0.0
+    still = np.broadcast_to(q, (len(time), 3))
+    log = run_of("still", time, still, 0.0 * still)
+    assert_allclose(follow_commands(chain, log, still, str(path)), still, atol=1e-9)
+    shake = np.sin(np.outer(time, [2.0, 3.0, 5.0]))
+    log = replace(run_of("run", time, shake, 5.0 * shake), command=shake)
+    silent = replace(log, torque=0.0 * shake, unit=NOTHING)
+    with pytest.raises(
+        mc.OptionError, match=r"servos of joint1, joint2, joint3 filter their commands"
+    ):
+        mc.motion_gap(path, [silent, replace(silent, name="two")])
 
 
 def test_no_link_grows_in_place_of_a_rotor(tmp_path):

@@ -335,6 +335,12 @@ def write_share(root: ET.Element, chain: Chain, share: float) -> None:
         joint.set("actuatorgravcomp", "true" if share else "false")
 
 
+def filtered_servos(chain: Chain) -> str:
+    """The joints whose servos filter their commands, in words; empty where none does."""
+    filtered = chain.model.actuator_dyntype[chain.servos] * (chain.servos >= 0)
+    return ", ".join(np.array(chain.names)[filtered > 0])
+
+
 def can_write(opened: Opened) -> bool:
     """Whether every joint has a servo of its own that can be given other numbers."""
     chain, root = opened.chain, opened.given.document.root
@@ -518,6 +524,12 @@ def by_positions(judge: Judge, opened: Opened, *, plain: bool) -> Answer:
 
     Raises OptionError without servos to correct.
     """
+    if filtered := filtered_servos(opened.chain):
+        raise OptionError(
+            f"{opened.given.source}: the servos of {filtered} filter their commands (dyntype or "
+            "timeconst): positions alone do not correct them; leave the filter out of the model, "
+            "or log torques or currents"
+        )
     if judge.drives != OWN_SERVOS or not can_write(opened):
         raise OptionError(
             f"{judge.runs[0].source}: no column of torque or current: then every run needs "

@@ -75,8 +75,10 @@ def follow_commands(chain: Chain, run: Run, commands: Array, source: str) -> Arr
     def drive(data: Any, now: int) -> None:
         data.ctrl[servos] = path[now]
         data.ctrl[list(speeds)] = rates[now, list(speeds.values())]
-        if not now:
+        if not now:  # delayed and filtered commands begin as if they had been there all the time
             fill_history(chain.model, data)
+            states = chain.model.actuator_actadr[servos]
+            data.act[states[states >= 0]] = path[0][states >= 0]
 
     path = at_times(steps_of(run.time, chain), run.time, commands)
     rates = np.gradient(path, chain.step, axis=0)

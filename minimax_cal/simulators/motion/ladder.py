@@ -153,6 +153,9 @@ def by_torques(bench: Bench, found: MotionDiagnosis, progress: Progress) -> driv
     bench, served, rungs, effects = by_commands(bench, found, progress)
     made = correct(bench, found, progress)
     more = {"rungs": (*rungs, *made.rungs), "lost": (*made.lost, *drives.lost_late(effects))}
+    if bench.judge.drives == OWN_SERVOS and (names := drives.filtered_servos(bench.opened.chain)):
+        said = f"the servos of {names} filter their commands: gains and delay stay as they are"
+        more["notices"] = (*made.notices, said)
     return drives.Answer(**vars(made) | more, served=served, effects=effects)
 
 
