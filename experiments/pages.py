@@ -265,7 +265,9 @@ BLOCKS = {
     ),
     "papers/counts": Block("papers", "the two papers", verdict_counts),
     "papers/items": Block(
-        "papers", "the two papers", columns("item | paper | ours | claims | verdict | claims that failed=failed")
+        "papers",
+        "the two papers",
+        columns("item | paper | ours | claims | verdict | claims that failed=failed"),
     ),
     "algorithm_1/steps": Block("algorithm_1", "Algorithm 1", body),
     "warm_start/starts": Block("warm_start", "eq. 32", body),
