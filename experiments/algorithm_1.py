@@ -39,7 +39,7 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers import minimax
-from minimax_cal.solvers.minimax import Linear
+from minimax_cal.solvers.linearisation import Linearisation
 from qp_backends import solve as solve_qp
 
 ARMS = ("irb2600", "irb120", "ur10e", "meca500")  # simulated
@@ -92,7 +92,7 @@ def problem_of(job: Job, form: str) -> tuple[MinimaxProblem, State]:
     return minimax_problem(model, start, measured_distances(data), form, "target"), start
 
 
-def rows_of(at: Linear) -> tuple[Array, Array, Array]:
+def rows_of(at: Linearisation) -> tuple[Array, Array, Array]:
     """∇F_I (p,), and the rows C (r,) and G (r, p) of M eq. 17 and 27."""
     active = int(at.f.argmax())
     C = np.concatenate([at.f - at.f.max(), at.c - 1.0])  # c_l = rt² - ε, over ε

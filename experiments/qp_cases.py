@@ -16,6 +16,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.robots.robot import load_robot
 from minimax_cal.solvers import minimax
+from minimax_cal.solvers.epigraph_qp import ignore_warm_start
 from qp_backends import Problem, Solution
 from qp_backends import solve as solve_qp
 
@@ -46,7 +47,7 @@ def recorded(per: str, poses: int, seed: int) -> list[Case]:
         seen.append(qp)
         return solve_qp(qp, "daqp", tolerance=1e-9)
 
-    minimax.solve(problem, state, minimax.from_nothing(listen))
+    minimax.solve(problem, state, ignore_warm_start(listen))
     rows = len(seen[0].l)
     return [Case(f"{per} {rows} rows, seed {seed}, QP {i + 1}", p) for i, p in enumerate(seen)]
 

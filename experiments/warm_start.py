@@ -33,10 +33,11 @@ from minimax_cal.measuring.grouping import split
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers import minimax
-from minimax_cal.solvers.minimax import Linear
+from minimax_cal.solvers.epigraph_qp import ignore_warm_start
+from minimax_cal.solvers.linearisation import Linearisation
 from qp_backends import solve as solve_qp
 
-SOLVE = minimax.from_nothing(partial(solve_qp, name="daqp", tolerance=QP_TOLERANCE))
+SOLVE = ignore_warm_start(partial(solve_qp, name="daqp", tolerance=QP_TOLERANCE))
 STEPS = 10  # of Algorithm 1
 FREE, BOUND = "without", "c(x) <= 0"
 
@@ -67,10 +68,10 @@ class SumProblem:
         f, c = self.problem.evaluate(x)
         return np.array([self.share @ f]), c
 
-    def linearise(self, x: State) -> Linear:
+    def linearise(self, x: State) -> Linearisation:
         """The same with derivatives."""
         at = self.problem.linearise(x)
-        return Linear(
+        return Linearisation(
             f=np.array([self.share @ at.f]),
             jacobian=(self.share @ at.jacobian)[None],
             c=at.c,

@@ -57,7 +57,8 @@ from minimax_cal.modelling.model import NO_MIX, model_of, pose_weights
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import CONVENTION, Frame, frames_tables
-from minimax_cal.solvers.minimax import Kkt, Step
+from minimax_cal.solvers.linearisation import Kkt
+from minimax_cal.solvers.minimax import Step
 from minimax_cal.solvers.status import Status
 
 POSE_BY_POSE = ("weights", "share", "crossed", "drawn crossed")  # arrays of a file

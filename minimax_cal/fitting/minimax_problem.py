@@ -27,7 +27,8 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import Model, moved
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.dual_bound import Rows, gap_of, lower_bound, of_squares
-from minimax_cal.solvers.minimax import Kkt, Linear, Optimum, optimality
+from minimax_cal.solvers.linearisation import Kkt, Linearisation, measure_kkt
+from minimax_cal.solvers.minimax import Optimum
 
 DISTANCE_FORMS = ("two-sided", "squared", "off")
 MIN_TRUSTED_WEIGHT = 0.5  # a point of less weight tells no distance between targets
@@ -174,7 +175,7 @@ class MinimaxProblem:
         value, _ = PER[self.per]
         return (value(self.model, x) + prior_of(self.model, x)) / self.size, self.deviation(x)[0]
 
-    def linearise(self, x: State) -> Linear:
+    def linearise(self, x: State) -> Linearisation:
         """f, c and their derivatives; the curvature is Gauss-Newton's 2 J'J."""
         model = self.model
         at = self.first if x is self.start else PER[self.per][1](model, x)
@@ -191,7 +192,7 @@ class MinimaxProblem:
                 both = both + 2.0 * weights.sum() * np.diag(weight) / total
             return np.asarray(both / self.divisor)
 
-        return Linear(
+        return Linearisation(
             f=(at.f + held) / self.size,
             jacobian=slope / (self.size * self.scale),
             c=c,
@@ -361,7 +362,7 @@ class Certificate:
     multipliers alone [m].  The problem itself is not convex: this is no statement about far ones,
     and near ones may be better by second-order terms, the size of the curvature times the step
     squared.
-    kkt: residuals of the optimality conditions, of the problem scaled to about one.
+    kkt: residuals of the measure_kkt conditions, of the problem scaled to about one.
     points: that decide, the weightiest first; the multipliers sum to one over all points.
     """
 
@@ -405,15 +406,15 @@ def certify(problem: MinimaxProblem, best: Optimum[State], line: Array) -> Certi
     return Certificate(
         value=float(size * norms.max()),
         bound=float(size * lower_bound(rows, problem.lower, problem.upper, given)),
-        kkt=optimality(gradients(rows), mu, given.lam, problem.lower, problem.upper),
+        kkt=measure_kkt(gradients(rows), mu, given.lam, problem.lower, problem.upper),
         points=tuple(starmap(DecidingPoint, zip(names, *numbers, strict=True))),
     )
 
 
-def gradients(rows: Rows) -> Linear:
+def gradients(rows: Rows) -> Linearisation:
     """The norms as plain functions; a norm of zero has no gradient."""
     norms = rows.norms
     unit = rows.r / np.where(norms > 0.0, norms, 1.0)[:, None]
     jacobian = np.einsum("nw,nwp->np", unit, rows.J)
     unknown: Callable[[Array], Array] = lambda weights: np.zeros((0, 0))  # noqa: E731
-    return Linear(norms, jacobian, rows.c, rows.C, unknown)
+    return Linearisation(norms, jacobian, rows.c, rows.C, unknown)

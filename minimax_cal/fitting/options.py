@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
@@ -26,9 +26,10 @@ from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.solvers import minimax
+from minimax_cal.solvers.epigraph_qp import VerifiedQpSolver
 from minimax_cal.solvers.least_squares import AUTO, JOINT, METHODS
-from minimax_cal.solvers.minimax import Solver, from_nothing
-from qp_backends import BackendError, Problem, Solution
+from minimax_cal.solvers.own_qp import QpFunction, adapt_qp_function
+from qp_backends import BackendError
 from qp_backends import solve as solve_qp
 from qp_backends.registry import backend
 
@@ -40,7 +41,6 @@ UNITS = {"mm": 1e-3, "um": 1e-6, "m": 1.0, "mrad": 1e-3, "rad": 1.0, "deg": 0.01
 LENGTHS = ("mm", "um", "m")
 
 
-QpFunction = Callable[[Problem], Solution]
 QpSolver = str | QpFunction
 T = TypeVar("T")
 
@@ -298,29 +298,14 @@ def qp_name(qp: QpSolver) -> str:
     return qp if isinstance(qp, str) else f"{FUNCTION}{getattr(qp, '__name__', 'unnamed')}"
 
 
-def solver_of(qp: QpSolver, tolerance: float) -> tuple[Solver, tuple[str, ...]]:
+def solver_of(qp: QpSolver, tolerance: float) -> tuple[VerifiedQpSolver, tuple[str, ...]]:
     """The QP solver, and a notice where it is not the one that was named.  Raises OptionError."""
     if not (isinstance(qp, str) or callable(qp)):
         raise OptionError(f"qp={qp!r}: give the name of a backend, or a function")
     if not isinstance(qp, str):
-        return from_nothing(named_answers(qp)), ()
+        return adapt_qp_function(qp, tolerance, qp_name(qp)), ()
     name, notices = usable(qp)
     return partial(solve_qp, name=name, tolerance=tolerance), notices
-
-
-def named_answers(qp: QpFunction) -> QpFunction:
-    """A user's solver whose answers say whose they are."""
-
-    def run(problem: Problem) -> Solution:
-        answer = qp(problem)
-        if not isinstance(answer, Solution):
-            raise OptionError(
-                f"qp=: {qp_name(qp)} returned {type(answer).__name__}; return a "
-                "qp_backends.Solution"
-            )
-        return answer if answer.backend else replace(answer, backend=qp_name(qp))
-
-    return run
 
 
 def usable(qp: str) -> tuple[str, tuple[str, ...]]:

@@ -31,6 +31,7 @@ from minimax_cal.modelling.model import Model, SumOfSquares, with_poses
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.kinematics import rotation_vector
 from minimax_cal.solvers import minimax
+from minimax_cal.solvers.iterate import NO_MULTIPLIERS
 from minimax_cal.solvers.least_squares import solve_normal
 from minimax_cal.solvers.minimax import Sqp
 from minimax_cal.solvers.status import Status
@@ -248,7 +249,7 @@ def solved_again(fit: Fit, draws: Draws, progress: Progress) -> tuple[Array, Arr
     options, estimator, state, train = fit.options, fit.estimator, fit.cell.state, fit.train
     qp, _ = solver_of(options.qp, QP_TOLERANCE)
     settings, active = Sqp(hessian=options.hessian), estimator.model.active
-    mu = fit.minimax.multiplier if fit.minimax else minimax.EVEN
+    mu = fit.minimax.multiplier if fit.minimax else NO_MULTIPLIERS
     part, _ = normal_parts(estimator.model, state, draws)
     good = determined(draws, part, estimator.model.prior.weight[active])
     change = np.zeros((len(good), int(active.sum())))

@@ -8,16 +8,16 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.derivatives import measure_lengths
-from minimax_cal.solvers.max_problem import EPS, MaxOfFunctions
-from minimax_cal.solvers.minimax import (
-    CANCELLED,
+from minimax_cal.solvers.iterate import MIN_VALUE_OF_TERMS
+from minimax_cal.solvers.linearisation import (
     Kkt,
-    Linear,
-    Units,
-    excess,
-    multipliers_at,
-    optimality,
+    Linearisation,
+    Scaling,
+    balance_multipliers,
+    constraint_excess,
+    measure_kkt,
 )
+from minimax_cal.solvers.max_problem import EPS, MaxOfFunctions
 
 FLAT = 1e-6  # gradients below, relative to the lengths and the level, count as none
 NEARBY = 1e-3  # distance, in lengths, at which a better point is looked for
@@ -51,12 +51,13 @@ def check_answer(
     """
     here = problem.linearise_best(x)
     size = min(abs(float(here.f.max())), find_variation(problem, here.f, mu, x, start))
-    terms = float(mu @ (np.abs(here.f) + np.abs(here.jacobian) @ np.abs(x)))
-    level = max(size, CANCELLED * terms) or 1.0
+    weights = np.where(mu > EPS, mu, 0.0)  # less is the rounding of a QP's answer
+    terms = float(weights @ (np.abs(here.f) + np.abs(here.jacobian) @ np.abs(x)))
+    level = max(size, MIN_VALUE_OF_TERMS * terms) or 1.0
     check = measure_optimality(problem, here, x, mu, lam, level)
     if check.kkt.residual <= tolerance:
         return check
-    check = min(check, balance_multipliers(problem, here, x, level), key=residual_of)
+    check = min(check, balance_at_answer(problem, here, x, level), key=residual_of)
     if check.kkt.residual <= tolerance or check.kkt.violation > tolerance:
         return check
     zero_level = find_zero_level(problem, here.f, check.mu, x, start)
@@ -66,7 +67,7 @@ def check_answer(
     trials = (
         check,
         measure_optimality(problem, here, x, check.mu, check.lam, level),
-        balance_multipliers(problem, here, x, level),
+        balance_at_answer(problem, here, x, level),
     )
     return min(trials, key=residual_of)
 
@@ -77,13 +78,13 @@ def residual_of(check: AnswerCheck) -> float:
 
 
 def measure_optimality(
-    problem: MaxOfFunctions, here: Linear, x: Array, mu: Array, lam: Array, level: float
+    problem: MaxOfFunctions, here: Linearisation, x: Array, mu: Array, lam: Array, level: float
 ) -> AnswerCheck:
     """The residuals for given multipliers, where a change of the value by `level` matters."""
-    units = find_local_units(problem, here, x, mu, level)
-    scaled, lower, upper = units.scaled(here), problem.lower / units.c, problem.upper / units.c
-    scaled_lam = lam * units.c / level
-    kkt = optimality(scaled, mu, scaled_lam, lower, upper)
+    scaling = find_local_scaling(problem, here, x, mu, level)
+    scaled, lower, upper = scaling.apply(here), problem.lower / scaling.c, problem.upper / scaling.c
+    scaled_lam = lam * scaling.c / level
+    kkt = measure_kkt(scaled, mu, scaled_lam, lower, upper)
     # Multipliers of nearly equal rows may be huge: what cancels then shows nothing beyond the
     # rounding of the rows' entries.
     uncertain = (problem.rows.slope_rounding(x) * np.abs(scaled_lam)) @ np.abs(scaled.normal)
@@ -100,21 +101,21 @@ def measure_optimality(
     return AnswerCheck(kkt, mu, lam, level)
 
 
-def balance_multipliers(
-    problem: MaxOfFunctions, here: Linear, x: Array, level: float
+def balance_at_answer(
+    problem: MaxOfFunctions, here: Linearisation, x: Array, level: float
 ) -> AnswerCheck:
     """The residuals for the multipliers that balance the gradients best."""
     even = np.full(len(here.f), 1.0 / len(here.f))
-    units = find_local_units(problem, here, x, even, level)
-    scaled, lower, upper = units.scaled(here), problem.lower / units.c, problem.upper / units.c
-    mu, lam = multipliers_at(scaled, lower, upper)
-    return measure_optimality(problem, here, x, mu, lam * level / units.c, level)
+    scaling = find_local_scaling(problem, here, x, even, level)
+    scaled, lower, upper = scaling.apply(here), problem.lower / scaling.c, problem.upper / scaling.c
+    mu, lam = balance_multipliers(scaled, lower, upper)
+    return measure_optimality(problem, here, x, mu, lam * level / scaling.c, level)
 
 
-def find_local_units(
-    problem: MaxOfFunctions, here: Linear, x: Array, mu: Array, level: float
-) -> Units:
-    """Units of value, variables and rows at x, for a level of the value.
+def find_local_scaling(
+    problem: MaxOfFunctions, here: Linearisation, x: Array, mu: Array, level: float
+) -> Scaling:
+    """Scaling of value, variables and rows at x, for a level of the value.
 
     A variable's is where it changes the functions by the level, weighted by mu: of functions that
     balance each other, as in a curved valley, each alone changes much faster.  Where their
@@ -128,7 +129,7 @@ def find_local_units(
     alone = measure_lengths(problem.values, x, low, high, level, problem.lengths)
     weighted = measure_lengths(weigh, x, low, high, level, problem.lengths)
     lengths = np.maximum(np.minimum(weighted, np.maximum(alone, np.abs(x))), alone)
-    return Units.of(here, level, lengths, problem.lower, problem.upper)
+    return Scaling.from_lengths(here, level, lengths, problem.lower, problem.upper)
 
 
 def find_variation(problem: MaxOfFunctions, f: Array, mu: Array, x: Array, start: Array) -> float:
@@ -163,7 +164,7 @@ def find_largest_change(
     f: (m,) at x.  mu: (m,) of sum one.  steps: (n,), each gone either way.  is_second_order: what
     the changes both ways have in common.
     """
-    active, largest = mu > 0.0, 0.0
+    active, largest = mu > EPS, 0.0  # less is the rounding of a multiplier
     for step in np.diag(steps):
         both = np.array([x + step, x - step])
         ends = np.clip(both, problem.low, problem.high)
@@ -213,7 +214,7 @@ def falls_without_end(problem: MaxOfFunctions, start: Array, end: Array, toleran
         x = start + share * way
         f, c = problem.evaluate(x)
         reach = np.abs(problem.rows.jacobian(x)) @ np.maximum(np.abs(x), problem.lengths)
-        is_inside = np.all(excess(c, problem.lower, problem.upper) <= tolerance * reach)
+        is_inside = np.all(constraint_excess(c, problem.lower, problem.upper) <= tolerance * reach)
         drop = last_value - float(f.max())
         if not (is_inside and drop > MIN_DROP_RATIO * last_drop):
             return False

@@ -11,7 +11,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.solvers.constraint_rows import ConstraintRows
 from minimax_cal.solvers.derivatives import CountedFunction, CountedJacobian, measure_lengths
-from minimax_cal.solvers.minimax import Linear, excess
+from minimax_cal.solvers.linearisation import Linearisation, constraint_excess
 
 ROW_ROUNDING = 1e-6  # of what a row's variables could reach: so much of its size is always there
 MAX_CANCELLING = 1e2  # times the sum of terms: so much of terms that cancel counts
@@ -103,17 +103,17 @@ class MaxOfFunctions:
         """f and c."""
         return self.values(x), self.rows.values(x)
 
-    def linearise(self, x: Array) -> Linear:
+    def linearise(self, x: Array) -> Linearisation:
         """f, c and their derivatives; the curvature is left to BFGS."""
         f, c = self.evaluate(x)
         slopes = np.ldexp(self.jacobian(x), -self.exponent)
-        return Linear(f, slopes, c, self.rows.jacobian(x), no_curvature)
+        return Linearisation(f, slopes, c, self.rows.jacobian(x), no_curvature)
 
-    def linearise_best(self, x: Array) -> Linear:
+    def linearise_best(self, x: Array) -> Linearisation:
         """The same with central differences in place of forward ones."""
         slopes = np.ldexp(self.jacobian.best(x), -self.exponent)
         f, c = self.evaluate(x)
-        return Linear(f, slopes, c, self.rows.best_jacobian(x), no_curvature)
+        return Linearisation(f, slopes, c, self.rows.best_jacobian(x), no_curvature)
 
     def step(self, x: Array, d: Array) -> Array:
         """The point moved."""
@@ -133,4 +133,4 @@ class MaxOfFunctions:
         left = np.maximum(np.abs(end), np.abs(c))
         size = np.maximum(left, np.minimum(np.abs(normal) @ np.abs(x), MAX_CANCELLING * left))
         size = size + np.where(end == 0.0, 1.0, ROW_ROUNDING) * reach
-        return excess(c, self.lower, self.upper) / np.where(size > 0.0, size, 1.0)
+        return constraint_excess(c, self.lower, self.upper) / np.where(size > 0.0, size, 1.0)

@@ -21,9 +21,12 @@ from minimax_cal.solvers.answer_check import (
 )
 from minimax_cal.solvers.constraint_rows import read_bounds, split_values_and_jacobian
 from minimax_cal.solvers.derivatives import CountedFunction, find_wrong_function
+from minimax_cal.solvers.epigraph_qp import VerifiedQpSolver
 from minimax_cal.solvers.feasibility import find_feasible_point
+from minimax_cal.solvers.iterate import NO_MULTIPLIERS, StartScales
+from minimax_cal.solvers.linearisation import constraint_excess
 from minimax_cal.solvers.max_problem import EPS, MaxOfFunctions
-from minimax_cal.solvers.minimax import Optimum, Solver, Sqp, Step, excess
+from minimax_cal.solvers.minimax import Optimum, Sqp, Step
 from minimax_cal.solvers.own_qp import QpFunction, adapt_qp_function
 from minimax_cal.solvers.status import Status
 from qp_backends import solve as solve_qp
@@ -139,7 +142,7 @@ def minimize_max(
         x = np.clip(x, box.lb, box.ub)
     function = CountedFunction(lambda z: fun(z, *args))
     problem = MaxOfFunctions.describe(x, function, scheme, box, rows)
-    solver: Solver = (
+    solver: VerifiedQpSolver = (
         partial(solve_qp, name=qp, tolerance=QP_TOLERANCE)
         if isinstance(qp, str)
         else adapt_qp_function(qp, QP_TOLERANCE)
@@ -159,7 +162,7 @@ def minimize_max(
     ):
         return report_wrong_gradient(problem, optimum.x, wrong)
     values = problem.function(optimum.x)
-    violation = excess(optimum.c, problem.lower, problem.upper).max(initial=0.0)
+    violation = constraint_excess(optimum.c, problem.lower, problem.upper).max(initial=0.0)
     message = MESSAGES[status]
     rounding = EPS * float(np.abs(values).max())
     if status == Status.CONVERGED and rounding > tol * search.gained:
@@ -195,7 +198,7 @@ class Search:
     gained: by how much the largest function fell.  history: one entry a QP.
     """
 
-    solver: Solver
+    solver: VerifiedQpSolver
     tolerance: float
     max_iterations: int
     callback: Callable[[OptimizeResult], None] | None = None
@@ -212,7 +215,7 @@ class Search:
         """
         start, described, start_value = x, problem, float(problem.function(x).max())
         last_value, last_violation = start_value, np.inf
-        escape_count, mu, largest_level = 0, minimax.EVEN, np.inf
+        escape_count, mu, largest_level = 0, NO_MULTIPLIERS, np.inf
         while True:
             optimum = self.run_sqp(problem, x, mu, largest_level)
             x, last_exponent = optimum.x, problem.exponent
@@ -228,7 +231,7 @@ class Search:
                 lower = find_descent_from_stationary_point(problem, x)
                 if lower is None or escape_count == MAX_ESCAPES:
                     return answer
-                x, mu, escape_count = lower, minimax.EVEN, escape_count + 1
+                x, mu, escape_count = lower, NO_MULTIPLIERS, escape_count + 1
                 continue
             has_ended = self.iteration_count >= self.max_iterations
             if (has_ended or optimum.status is Status.FAILED) and (
@@ -244,7 +247,7 @@ class Search:
                 nearest = find_feasible_point(problem, nearer, self)
                 if nearest is None:
                     return replace(answer, status=Status.INFEASIBLE)
-                x, mu, with_feasibility = nearest, minimax.EVEN, False
+                x, mu, with_feasibility = nearest, NO_MULTIPLIERS, False
                 problem = problem.rescale(x)
                 last_value, last_violation = np.inf, np.inf
                 continue
@@ -295,7 +298,7 @@ class Search:
                 self.callback(build_result(fun=value, nit=self.iteration_count, kkt=step.kkt))
 
         settings = Sqp(self.tolerance, self.max_iterations - before, hessian="bfgs")
-        scales = minimax.StartScales(problem.lengths, largest_level)
+        scales = StartScales(problem.lengths, largest_level)
         return minimax.solve(problem, x, self.solver, settings, report, mu, scales)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.solvers.minimax import Solver
+from minimax_cal.solvers.epigraph_qp import VerifiedQpSolver
 from qp_backends import Problem, Solution, accuracy
 from qp_backends import Status as QpStatus
 from qp_backends.multipliers import estimate_multipliers
@@ -20,14 +20,16 @@ QpFunction = Callable[[Problem], Any]  # to x (n,), (x, y) or a Solution
 WRONG = 1e-2  # relative violation above which an answer is none
 
 
-def adapt_qp_function(qp: QpFunction, tolerance: float) -> Solver:
+def adapt_qp_function(qp: QpFunction, tolerance: float, name: str = "qp") -> VerifiedQpSolver:
     """A solver from a function of the problem alone; its answers are judged by `accuracy`.
 
-    tolerance: up to which relative residual an answer counts as solved.
+    tolerance: up to which relative residual an answer counts as solved.  name: of the backend,
+    where the answer gives none.
     """
 
     def run(problem: Problem, /, *, warm_start: Solution = COLD) -> Solution:
         answer = read_answer(problem, qp(problem))
+        answer = answer if answer.backend else replace(answer, backend=name)
         judged = accuracy(problem, answer)
         if not answer.y.size and answer.x.size:
             return answer
@@ -49,17 +51,17 @@ def read_answer(problem: Problem, answer: Any) -> Solution:
         return answer
     n, m = problem.q.shape, problem.l.shape
     if answer is None:
-        return Solution(np.full(n, np.nan), np.full(m, np.nan), QpStatus.FAILED, 0.0, "qp")
+        return Solution(np.full(n, np.nan), np.full(m, np.nan), QpStatus.FAILED, 0.0)
     try:
         x, y = answer if isinstance(answer, tuple) and len(answer) == 2 else (answer, None)
         x = read_vector(x, n)
         y = estimate_multipliers(problem, x) if y is None else read_vector(y, m)
     except (TypeError, ValueError):
         raise OptionError(
-            f"minimize_max: qp is to return x ({n[0]},), (x, y) with y ({m[0]},), or a Solution, "
+            f"qp is to return x ({n[0]},), (x, y) with y ({m[0]},), or a Solution, "
             f"not {type(answer).__name__}"
         ) from None
-    return Solution(x, y, QpStatus.SOLVED, 0.0, "qp")
+    return Solution(x, y, QpStatus.SOLVED, 0.0)
 
 
 def read_vector(numbers: Any, shape: tuple[int, ...]) -> Array:

@@ -21,7 +21,7 @@ from minimax_cal.fitting.minimax_problem import (
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
-from minimax_cal.solvers import dual_bound, minimax
+from minimax_cal.solvers import dual_bound, iterate, minimax
 from minimax_cal.solvers.dual_bound import (
     Multipliers,
     Rows,
@@ -32,6 +32,7 @@ from minimax_cal.solvers.dual_bound import (
     lower_bound,
     of_squares,
 )
+from minimax_cal.solvers.epigraph_qp import ignore_warm_start
 from minimax_cal.solvers.minimax import Sqp
 from minimax_cal.solvers.status import Status
 from qp_backends import solve as solve_qp
@@ -149,8 +150,8 @@ def test_qps_of_some_functions_are_those_of_all(robot, noisy, monkeypatch):
     qp = partial(solve_qp, name="daqp", tolerance=1e-10)
     few = minimax.solve(problem, x, qp)
     asked = []
-    monkeypatch.setattr(minimax, "SHARE", len(few.f))
-    counted = minimax.from_nothing(lambda one: (asked.append(len(one.l)), qp(one))[1])
+    monkeypatch.setattr(iterate, "WORKING_SET_SIZE", len(few.f))
+    counted = ignore_warm_start(lambda one: (asked.append(len(one.l)), qp(one))[1])
     whole = minimax.solve(problem, x, counted)
     assert len(few.f) > 4 * int(model.active.sum())
     assert min(asked) == len(few.f) + len(few.c)

@@ -11,27 +11,27 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.solvers.minimax import (
-    Bfgs,
-    Iterate,
-    Kkt,
-    Linear,
-    Plan,
-    Sqp,
-    Units,
-    elastic,
-    epigraph,
-    excess,
-    forgotten,
-    from_nothing,
-    hopeless,
-    optimality,
-    priced,
-    read,
-    search,
-    solve,
-    told_once,
+from minimax_cal.solvers.bfgs import Bfgs
+from minimax_cal.solvers.epigraph_qp import (
+    SearchStep,
+    elastic_qp,
+    epigraph_qp,
+    find_functions_above,
+    ignore_warm_start,
+    lowers_violation,
+    solve_subproblem,
+    update_penalties,
 )
+from minimax_cal.solvers.iterate import Iterate
+from minimax_cal.solvers.line_search import search_along_step
+from minimax_cal.solvers.linearisation import (
+    Kkt,
+    Linearisation,
+    Scaling,
+    constraint_excess,
+    measure_kkt,
+)
+from minimax_cal.solvers.minimax import Sqp, merge_notes, solve
 from minimax_cal.solvers.status import Status
 from qp_backends import Problem, Solution
 from qp_backends import Status as QpStatus
@@ -49,10 +49,10 @@ def linear(
     jacobian: list[list[float]],
     c: list[float] | None = None,
     normal: list[list[float]] | None = None,
-) -> Linear:
+) -> Linearisation:
     p = len(jacobian[0])
     rows = np.array(normal or [], dtype=float).reshape(-1, p)
-    return Linear(np.array(f), np.array(jacobian), np.array(c or []), rows, none)
+    return Linearisation(np.array(f), np.array(jacobian), np.array(c or []), rows, none)
 
 
 @dataclass(frozen=True)
@@ -67,9 +67,9 @@ class Curve:
     def evaluate(self, x: Array) -> tuple[Array, Array]:
         return np.array([self.value(x[0])]), x[: len(self.lower)]
 
-    def linearise(self, x: Array) -> Linear:
+    def linearise(self, x: Array) -> Linearisation:
         f, c = self.evaluate(x)
-        return Linear(f, np.array([[self.slope(x[0])]]), c, np.ones((len(c), 1)), none)
+        return Linearisation(f, np.array([[self.slope(x[0])]]), c, np.ones((len(c), 1)), none)
 
     def step(self, x: Array, d: Array) -> Array:
         return x + d
@@ -82,19 +82,21 @@ def parabola(lower: float = -INF, upper: float = INF) -> Curve:
 
 
 def begun(problem: Curve, x: float, hessian: str = "bfgs") -> Iterate[Array]:
-    return Iterate.begin(problem, np.array([x]), Sqp(hessian=hessian), np.zeros(0))
+    return Iterate.start(problem, np.array([x]), hessian, np.zeros(0))
 
 
-def standing(here: Linear, mu: Array, lower: Array, upper: Array) -> Iterate[Array]:
+def standing(here: Linearisation, mu: Array, lower: Array, upper: Array) -> Iterate[Array]:
     """An iterate at given derivatives."""
     problem = Curve(lambda x: x, lambda x: 1.0, lower, upper)
     none, p = np.zeros(len(here.c)), here.jacobian.shape[1]
     return Iterate(problem, np.zeros(1), here, mu, none, None, np.zeros(p), np.ones(p), none, 1e-12)
 
 
-def plan(d: list[float], mu: list[float], lam: list[float] | None = None, **more: object) -> Plan:
+def plan(
+    d: list[float], mu: list[float], lam: list[float] | None = None, **more: object
+) -> SearchStep:
     said = {"usable": True, "backend": "", "notes": ()} | more
-    return Plan(np.array(d), np.array(mu), np.array(lam or []), **said)
+    return SearchStep(np.array(d), np.array(mu), np.array(lam or []), **said)
 
 
 # ---- how far from optimal ----------------------------------------------------------------------
@@ -110,12 +112,12 @@ BENT = linear(
 
 def test_the_distance_from_optimal_is_its_formula():
     mu, lam = np.array([0.5, 0.2, 0.3]), np.array([0.4, -0.3, 0.0])
-    found = optimality(BENT, mu, lam, LOWER, UPPER)
+    found = measure_kkt(BENT, mu, lam, LOWER, UPPER)
     assert_allclose(found.stationarity, 0.6)  # of (0.5 - 0.3 + 0.4, 0.2 + 0.6 + 0.4 - 0.6)
     assert_allclose(found.complementarity, 0.2 * 2.0 + 0.4 * 0.2 + 0.3 * 0.5)
     assert_allclose(found.violation, 0.8)
     free = linear([3.0, 1.0], [[1.0, -4.0], [0.0, 1.0]])
-    found = optimality(free, np.array([0.5, 0.5]), np.zeros(0), np.zeros(0), np.zeros(0))
+    found = measure_kkt(free, np.array([0.5, 0.5]), np.zeros(0), np.zeros(0), np.zeros(0))
     assert (found.stationarity, found.complementarity, found.violation) == (1.5, 1.0, 0.0)
 
 
@@ -127,12 +129,14 @@ def test_the_residual_is_the_largest(three):
 def test_a_violation_that_no_step_lessens_is_hopeless():
     here = linear([0.0], [[1.0]], [2.0, 0.0], [[1.0], [1.0]])
     lower, upper = np.array([-INF, 1.0]), np.array([1.0, INF])
-    assert_array_equal(excess(here.c, lower, upper), [1.0, 1.0])
-    assert hopeless(here, np.array([0.7]), lower, upper, 1e-8)  # one gains what the other loses
-    assert not hopeless(here, np.array([0.7]), lower, upper, 3.0)  # not violated, so large
+    assert_array_equal(constraint_excess(here.c, lower, upper), [1.0, 1.0])
+    assert not lowers_violation(
+        here, np.array([0.7]), lower, upper, 1e-8
+    )  # one gains what the other loses
+    assert lowers_violation(here, np.array([0.7]), lower, upper, 3.0)  # not violated, so large
     only = replace(here, c=here.c[:1], normal=here.normal[:1])
-    assert not hopeless(only, np.array([-0.1]), lower[:1], upper[:1], 1e-8)
-    assert hopeless(only, np.array([0.1]), lower[:1], upper[:1], 1e-8)
+    assert lowers_violation(only, np.array([-0.1]), lower[:1], upper[:1], 1e-8)
+    assert not lowers_violation(only, np.array([0.1]), lower[:1], upper[:1], 1e-8)
 
 
 # ---- quadratic programs ------------------------------------------------------------------------
@@ -140,7 +144,7 @@ def test_a_violation_that_no_step_lessens_is_hopeless():
 
 def test_the_epigraph_problem_is_its_formula(rng):
     hessian = np.array([[2.0, 0.5], [0.5, 1.0]])
-    made = epigraph(BENT, 3.5, hessian, LOWER, UPPER, 4.0)
+    made = epigraph_qp(BENT, 3.5, hessian, LOWER, UPPER, 4.0)
     d, v = rng.normal(size=2), rng.normal()
     x = np.append(d, v)
     bent = 0.5 * d @ hessian @ d
@@ -161,7 +165,7 @@ def test_a_relaxed_constraint_is_kept_if_its_price_is_high(price, there, sign):
     rows = np.array([[0.0, -1.0], [1.0, 0.0]])
     made = Problem(np.diag([1.0, 1e-8]), np.array([0.0, 1.0]), rows, np.array([-INF, low]),
                    np.array([0.0, high]))  # fmt: skip
-    found = solve_qp(elastic(made, 1, np.array([price])), name="daqp", tolerance=1e-9)
+    found = solve_qp(elastic_qp(made, 1, np.array([price])), name="daqp", tolerance=1e-9)
     assert_allclose(found.x[0], sign * there, rtol=1e-6)
     assert_allclose(found.x[2:].sum(), 2.0 - there, atol=1e-6)
 
@@ -170,8 +174,8 @@ def test_multipliers_are_put_in_their_places():
     here = linear([0.0] * 5, [[1.0, 2.0]] * 5, [1.0], [[0.0, 1.0]])
     answer = Solution(np.array([7.0, 8.0, 9.0]), np.array([-1e-9, 0.5, 1.5, -0.25]),
                       QpStatus.SOLVED, 0.0, "daqp", notes=("slow",))  # fmt: skip
-    units = Units(2.0, np.array([3.0, 0.5]), np.array([4.0]))
-    found = read(answer, here, np.array([4, 1, 3]), units)
+    units = Scaling(2.0, np.array([3.0, 0.5]), np.array([4.0]))
+    found = SearchStep.from_qp(answer, here, np.array([4, 1, 3]), units)
     assert_array_equal(found.d, [21.0, 4.0])
     assert_array_equal(found.mu, [0.0, 0.25, 0.0, 0.75, 0.0])
     assert_array_equal(found.lam, [-0.125])
@@ -181,11 +185,13 @@ def test_multipliers_are_put_in_their_places():
         "daqp",
         ("slow",),
     )
-    rough = read(replace(answer, status=QpStatus.INACCURATE), here, np.array([4, 1, 3]), units)
+    rough = SearchStep.from_qp(
+        replace(answer, status=QpStatus.INACCURATE), here, np.array([4, 1, 3]), units
+    )
     assert_array_equal(rough.d, found.d)
     assert (rough.usable, rough.exact) == (True, False)
     for lost in (replace(answer, status=QpStatus.FAILED), replace(answer, y=np.zeros(4))):
-        found = read(lost, here, np.array([4, 1, 3]), units)
+        found = SearchStep.from_qp(lost, here, np.array([4, 1, 3]), units)
         assert_allclose(found.mu, 0.2)
         assert_array_equal(found.lam, [0.0])
         assert found.usable == lost.solved
@@ -198,13 +204,13 @@ def test_functions_that_were_forgotten_are_the_worst_beyond():
     here = linear([1.0, 0.0, 1.0, 1.0, 0.0, 0.0], slopes)
     answer = Solution(np.array([1.0, 1.0, 0.5]), np.zeros(1), QpStatus.SOLVED, 0.0)
     # f + f'd - max f - v of all: 0.5, -0.5, 2.5, -0.5, 0.5, 2.5; of equals the first comes first
-    assert set(forgotten(here, np.array([0]), answer).tolist()) == {2, 5}
-    assert_array_equal(forgotten(here, np.array([0, 2]), answer), [5, 4])
-    assert_array_equal(forgotten(here, np.array([0, 2, 5]), answer), [4])
-    assert not len(forgotten(here, np.array([4, 0, 2, 5]), answer))
-    assert not len(forgotten(here, np.arange(6), answer))
+    assert set(find_functions_above(here, np.array([0]), answer).tolist()) == {2, 5}
+    assert_array_equal(find_functions_above(here, np.array([0, 2]), answer), [5, 4])
+    assert_array_equal(find_functions_above(here, np.array([0, 2, 5]), answer), [4])
+    assert not len(find_functions_above(here, np.array([4, 0, 2, 5]), answer))
+    assert not len(find_functions_above(here, np.arange(6), answer))
     lost = replace(answer, status=QpStatus.FAILED)
-    assert_array_equal(forgotten(here, np.array([0, 2]), lost), [1, 3, 4, 5])
+    assert_array_equal(find_functions_above(here, np.array([0, 2]), lost), [1, 3, 4, 5])
 
 
 def test_of_many_functions_the_largest_come_first():
@@ -212,10 +218,12 @@ def test_of_many_functions_the_largest_come_first():
     mu = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
     nothing = np.zeros(0)
     seven = standing(linear(values, [[1.0]] * 7), mu, nothing, nothing)
-    assert_array_equal(seven.likely(seven.here), [1, 3, 5])
-    assert_array_equal(replace(seven, step=1).likely(seven.here), [1, 2, 3, 5])
+    assert_array_equal(seven.select_largest_functions(seven.here), [1, 3, 5])
+    assert_array_equal(
+        replace(seven, qp_count=1).select_largest_functions(seven.here), [1, 2, 3, 5]
+    )
     six = linear(values[:6], [[1.0]] * 6)
-    assert_array_equal(seven.likely(six), range(6))
+    assert_array_equal(seven.select_largest_functions(six), range(6))
 
 
 def test_contradicting_constraints_are_relaxed_at_a_price():
@@ -224,16 +232,16 @@ def test_contradicting_constraints_are_relaxed_at_a_price():
     at = standing(here, np.ones(1), np.array([2.0, -INF]), np.array([INF, 1.0]))
     qp = partial(solve_qp, name="daqp", tolerance=1e-9)
     for before, price in ((0.0, [150.0, 300.0]), (1e4, [1e4, 1e4])):
-        found = replace(at, price=np.full(2, before)).subproblem(np.eye(1), qp)
+        found = solve_subproblem(replace(at, penalties=np.full(2, before)), np.eye(1), qp)
         assert found.usable
-        assert found.relaxed is not None
-        assert_allclose(found.relaxed, price)
+        assert found.elastic_penalties is not None
+        assert_allclose(found.elastic_penalties, price)
         assert 1.0 - 1e-6 <= found.d[0] <= 2.0 + 1e-6
     agreed = standing(here, np.ones(1), np.array([0.5, -INF]), np.array([INF, 1.0]))
-    plain = agreed.subproblem(np.eye(1), qp)
-    assert plain.relaxed is None
+    plain = solve_subproblem(agreed, np.eye(1), qp)
+    assert plain.elastic_penalties is None
     assert_allclose(plain.d, 1.0, atol=1e-8)
-    moved = agreed.subproblem(np.eye(1), qp, here.f, here.c + 0.25)
+    moved = solve_subproblem(agreed, np.eye(1), qp, here.f, here.c + 0.25)
     assert_allclose(moved.d, 0.75, atol=1e-8)
 
 
@@ -242,14 +250,14 @@ def test_contradicting_constraints_are_relaxed_at_a_price():
 
 def test_it_begins_with_even_multipliers_or_those_given():
     problem = Plane(np.array([1.0, 2.0, 4.0, 0.0]))
-    at = Iterate.begin(problem, np.zeros(1), Sqp(), np.zeros(0))
+    at = Iterate.start(problem, np.zeros(1), "gauss-newton", np.zeros(0))
     assert_array_equal(at.mu, 0.25)
     assert_array_equal(at.lam, [0.0])
-    assert at.quasi is None
+    assert at.quasi_newton is None
     assert at.kkt.residual == at.kkt.complementarity == (4.0 - 7.0 / 4.0) / 4.0
     given = np.array([0.0, 0.5, 0.5, 0.0])
-    assert_array_equal(Iterate.begin(problem, np.zeros(1), Sqp(), given).mu, given)
-    assert begun(parabola(), 1.0).quasi is not None
+    assert_array_equal(Iterate.start(problem, np.zeros(1), "gauss-newton", given).mu, given)
+    assert begun(parabola(), 1.0).quasi_newton is not None
 
 
 @dataclass(frozen=True)
@@ -264,9 +272,9 @@ class Plane:
     def evaluate(self, x: Array) -> tuple[Array, Array]:
         return self.f, x
 
-    def linearise(self, x: Array) -> Linear:
+    def linearise(self, x: Array) -> Linearisation:
         slopes = np.full((len(self.f), 1), self.slope)
-        return Linear(self.f, slopes, x, np.ones((1, 1)), lambda mu: np.eye(1))
+        return Linearisation(self.f, slopes, x, np.ones((1, 1)), lambda mu: np.eye(1))
 
     def step(self, x: Array, d: Array) -> Array:
         return x + d
@@ -283,7 +291,7 @@ class Plane:
 )
 def test_what_is_no_number_ends_in_a_status(problem):
     asked: list[Problem] = []
-    found = solve(problem, np.zeros(1), from_nothing(asked.append))
+    found = solve(problem, np.zeros(1), ignore_warm_start(asked.append))
     assert found.status is Status.FAILED
     assert asked == []
 
@@ -298,7 +306,7 @@ def test_the_notes_of_backends_are_told_once():
     told = []
     hill = Curve(lambda x: np.exp(x) + np.exp(-2 * x), lambda x: np.exp(x) - 2 * np.exp(-2 * x))
     settings = Sqp(hessian="bfgs", iterations=4)
-    found = solve(hill, np.array([3.0]), from_nothing(qp), settings, told.append)
+    found = solve(hill, np.array([3.0]), ignore_warm_start(qp), settings, told.append)
     assert found.notes == ("slow (the first of 2 alike)", "lost (the first of 2 alike)")
     assert found.status is Status.ITERATION_LIMIT
     assert found.iterations == len(found.trace) == len(told) == 4
@@ -309,34 +317,56 @@ def test_the_notes_of_backends_are_told_once():
 
 def test_notes_that_differ_in_their_numbers_are_one():
     notes = [f"daqp said infeasible, its relative residual is {r}" for r in ("1.2e-08", "4", "inf")]
-    first, other = told_once([*notes[:2], "slow", notes[1]])
+    first, other = merge_notes([*notes[:2], "slow", notes[1]])
     assert first == f"{notes[0]} (the first of 3 alike)"
     assert other == "slow"
-    assert told_once(notes[1:]) == tuple(notes[1:])
+    assert merge_notes(notes[1:]) == tuple(notes[1:])
 
 
 def test_the_hessian_has_a_floor_and_is_damped():
     here = replace(linear([1.0, 2.0], [[1.0, 0.0], [0.0, 1.0]]), curvature=np.diag)
     at = standing(here, np.array([1.0, 0.0]), np.zeros(0), np.zeros(0))
-    assert_array_equal(at.hessian(0.1), np.diag([1.0, 0.05]))
-    assert_allclose(replace(at, damping=3.0).hessian(0.1), np.diag([4.0, 0.2]))
+    assert_array_equal(at.damped_hessian(0.1), np.diag([1.0, 0.05]))
+    assert_allclose(replace(at, damping=3.0).damped_hessian(0.1), np.diag([4.0, 0.2]))
     # the floor: 1e-8 of what bends by the level 2 over the length 2 at which f reaches twice 2
-    assert_allclose(replace(at, damping=3.0).hessian(0.0), np.diag([4.0, 1.5e-8]))
+    assert_allclose(replace(at, damping=3.0).damped_hessian(0.0), np.diag([4.0, 1.5e-8]))
 
 
 def test_idle_is_who_falls_neither_in_value_nor_in_residual():
     """f is 1 with the slope 2, which is all of it over the length 1/2: the residual is 1."""
-    at = replace(begun(parabola(), 1.0), best=10.0, lowest=5.0, idle=4)
+    at = replace(begun(parabola(), 1.0), least_residual=10.0, least_value=5.0, stalled_count=4)
     one, none = plan([0.0], [1.0]), np.zeros(0)
-    fell = at.after(one, none)
-    assert (fell.best, fell.lowest, fell.idle, fell.step) == (1.0, 1.0, 0, 1)
+    fell = at.with_multipliers(one.mu, one.lam, none, one.exact)
+    assert (fell.least_residual, fell.least_value, fell.stalled_count, fell.qp_count) == (
+        1.0,
+        1.0,
+        0,
+        1,
+    )
     assert fell.kkt.residual == 1.0
-    still = fell.after(one, none)
-    assert (still.best, still.lowest, still.idle, still.step) == (1.0, 1.0, 1, 2)
-    assert replace(at, best=1.05, lowest=1.0).after(one, none).idle == 5  # less than a tenth
-    assert replace(at, best=1.15, lowest=1.0).after(one, none).idle == 0
-    value = replace(at, best=0.5, lowest=1.0 + 1e-6).after(one, none)
-    assert (value.best, value.idle) == (0.5, 0)
+    still = fell.with_multipliers(one.mu, one.lam, none, one.exact)
+    assert (still.least_residual, still.least_value, still.stalled_count, still.qp_count) == (
+        1.0,
+        1.0,
+        1,
+        2,
+    )
+    assert (
+        replace(at, least_residual=1.05, least_value=1.0)
+        .with_multipliers(one.mu, one.lam, none, one.exact)
+        .stalled_count
+        == 5
+    )  # less than a tenth
+    assert (
+        replace(at, least_residual=1.15, least_value=1.0)
+        .with_multipliers(one.mu, one.lam, none, one.exact)
+        .stalled_count
+        == 0
+    )
+    value = replace(at, least_residual=0.5, least_value=1.0 + 1e-6).with_multipliers(
+        one.mu, one.lam, none, one.exact
+    )
+    assert (value.least_residual, value.stalled_count) == (0.5, 0)
 
 
 def judged(at: Iterate[Array], *kkt: float) -> Iterate[Array]:
@@ -348,10 +378,16 @@ def judged(at: Iterate[Array], *kkt: float) -> Iterate[Array]:
 @pytest.mark.parametrize(
     ("residual", "violation", "state", "ended", "rough"),
     [
-        (1e-8, 0.0, {"idle": 0}, Status.CONVERGED, Status.CONVERGED),
-        (1.1e-8, 0.0, {"idle": 9}, None, None),
-        (1.1e-8, 1e-8, {"idle": 10}, Status.STALLED, Status.STALLED),
-        (1e-6, 1.1e-8, {"idle": 99}, None, Status.STALLED),  # of a violation that rough QPs leave
+        (1e-8, 0.0, {"stalled_count": 0}, Status.CONVERGED, Status.CONVERGED),
+        (1.1e-8, 0.0, {"stalled_count": 9}, None, None),
+        (1.1e-8, 1e-8, {"stalled_count": 10}, Status.STALLED, Status.STALLED),
+        (
+            1e-6,
+            1.1e-8,
+            {"stalled_count": 99},
+            None,
+            Status.STALLED,
+        ),  # of a violation that rough QPs leave
         (1e-8, 0.0, {"damping": 1e9}, Status.CONVERGED, Status.CONVERGED),
         (1.0, 0.0, {"damping": 1e8}, None, None),
         (1.0, 1e-8, {"damping": 1.1e8}, Status.STALLED, Status.STALLED),
@@ -360,23 +396,23 @@ def judged(at: Iterate[Array], *kkt: float) -> Iterate[Array]:
 )
 def test_patience_and_damping_have_an_end(residual, violation, state, ended, rough):
     at = judged(replace(begun(parabola(), 1.0), **state), residual, 0.0, violation)
-    end = at.patience if "idle" in state else at.arrived
+    end = at.status_in_place if "stalled_count" in state else at.status_after_step
     assert end(1e-8) is ended
-    assert end(1e-8, exact=False) is rough
+    assert end(1e-8, is_exact=False) is rough
 
 
 def test_damping_grows_and_falls_tenfold():
     at = begun(parabola(), 1.0)
-    assert at.damped().damping == 1e-3
-    assert replace(at, damping=2.0).damped().damping == 20.0
+    assert at.damp().damping == 1e-3
+    assert replace(at, damping=2.0).damp().damping == 20.0
     there = at.problem.linearise(np.array([0.25]))
     for before, after in ((2.0, 0.2), (2e-6, 2e-7), (1e-6, 0.0), (0.0, 0.0)):
         move = np.array([-0.75])
-        moved = replace(at, damping=before).moved(move, np.array([0.25]), there)
+        moved = replace(at, damping=before).move(move, np.array([0.25]), there)
         assert_allclose(moved.damping, after, rtol=1e-12)
-    assert_allclose(moved.gone, -0.75)
+    assert_allclose(moved.displacement, -0.75)
     assert_allclose(moved.kkt.stationarity, 0.5 * 0.75 / 0.25**2)  # slope by way over value
-    assert_allclose(moved.quasi.matrix, [[2.0]])  # what the two slopes tell
+    assert_allclose(moved.quasi_newton.matrix, [[2.0]])  # what the two slopes tell
 
 
 @pytest.mark.parametrize(
@@ -394,20 +430,20 @@ def test_damping_grows_and_falls_tenfold():
 def test_the_price_of_a_violation(relaxed, d, penalty, expected):
     here = linear([0.0], [[-3.0]], [2.0], [[1.0]])
     at = standing(here, np.ones(1), np.array([-INF]), np.array([1.0]))
-    one = plan([d], [1.0], [-2.0], relaxed=np.array([5.0]) if relaxed else None)
-    found = priced(replace(at, price=np.array([penalty])), one, 1e-8)
+    one = plan([d], [1.0], [-2.0], elastic_penalties=np.array([5.0]) if relaxed else None)
+    found = update_penalties(replace(at, penalties=np.array([penalty])), one, 1e-8)
     assert (None if found is None else found[0]) == pytest.approx(expected)
 
 
 # ---- the search along a step -------------------------------------------------------------------
 
 
-def lost(f: Array, c: Array) -> Plan:
+def lost(f: Array, c: Array) -> SearchStep:
     return plan([0.0], [1.0], usable=False)
 
 
 def test_a_full_step_that_helps_is_taken():
-    length, move, end, there = search(begun(parabola(), 1.0), plan([-0.9], [1.0]), lost)
+    length, move, end, there = search_along_step(begun(parabola(), 1.0), plan([-0.9], [1.0]), lost)
     assert (length, move[0], there.jacobian[0, 0]) == (1.0, -0.9, 2.0 * end[0])
     assert_allclose(end, 0.1)
 
@@ -422,7 +458,7 @@ def test_a_full_step_that_helps_is_taken():
     ],
 )
 def test_a_step_too_long_is_shortened_to_the_vertex(d, length):
-    found, move, end, there = search(begun(parabola(), 1.0), plan([d], [1.0]), lost)
+    found, move, end, there = search_along_step(begun(parabola(), 1.0), plan([d], [1.0]), lost)
     assert_allclose(found, length, rtol=1e-12)
     assert_allclose(move, length * d, rtol=1e-12)
     assert_allclose([end[0], there.f[0]], 0.0, atol=1e-12)
@@ -431,50 +467,59 @@ def test_a_step_too_long_is_shortened_to_the_vertex(d, length):
 def test_a_step_is_never_shortened_to_more_than_half_nor_less_than_a_tenth():
     """Beyond a kink nothing is known (NaN); before it a wall leaves the vertex at the start."""
     wall = Curve(lambda x: -x if x < 0.3 else INF, lambda x: -1.0)
-    assert search(begun(wall, 0.0), plan([1.0], [1.0]), lost)[0] == 0.1
+    assert search_along_step(begun(wall, 0.0), plan([1.0], [1.0]), lost)[0] == 0.1
     steep = Curve(lambda x: -x if x < 0.3 else 1e9, lambda x: -1.0)
-    assert search(begun(steep, 0.0), plan([1.0], [1.0]), lost)[0] == 0.1
+    assert search_along_step(begun(steep, 0.0), plan([1.0], [1.0]), lost)[0] == 0.1
     flat = Curve(lambda x: -x if x < 0.3 else -5e-5 * x, lambda x: -1.0)
-    assert search(begun(flat, 0.0), plan([1.0], [1.0]), lost)[0] == 0.25  # half of a half
+    assert (
+        search_along_step(begun(flat, 0.0), plan([1.0], [1.0]), lost)[0] == 0.25
+    )  # half of a half
 
 
 def test_no_step_up_a_hill():
     uphill = Curve(lambda x: x, lambda x: -1.0)  # whose slope is told wrong
-    length, move, end, _ = search(begun(uphill, 0.0), plan([1.0], [1.0]), lost)
+    length, move, end, _ = search_along_step(begun(uphill, 0.0), plan([1.0], [1.0]), lost)
     assert (length, move[0], end[0]) == (0.0, 0.0, 0.0)
 
 
 def test_a_violation_counts_at_its_price():
     """From 1 to 0.5 x^2 falls by 0.75, and x is short of its bound 1 by 0.5."""
     at = begun(parabola(lower=1.0), 1.0)
-    assert search(replace(at, price=np.array([1.0])), plan([-0.5], [1.0], [0.0]), lost)[0] == 1.0
-    dear = search(replace(at, price=np.array([10.0])), plan([-0.5], [1.0], [0.0]), lost)
+    assert (
+        search_along_step(replace(at, penalties=np.array([1.0])), plan([-0.5], [1.0], [0.0]), lost)[
+            0
+        ]
+        == 1.0
+    )
+    dear = search_along_step(
+        replace(at, penalties=np.array([10.0])), plan([-0.5], [1.0], [0.0]), lost
+    )
     assert dear[0] == 0.0
 
 
 def test_the_second_order_correction_is_asked_what_the_step_missed():
     asked = []
 
-    def bent(f: Array, c: Array, usable: bool = True, d: float = -1.0) -> Plan:
+    def bent(f: Array, c: Array, usable: bool = True, d: float = -1.0) -> SearchStep:
         asked.append((f, c))
         return plan([d], [1.0], usable=usable)
 
     at = begun(parabola(lower=-9.0), 1.0)
-    length, move, end, there = search(at, plan([-4.0], [1.0], [0.0]), bent)
+    length, move, end, there = search_along_step(at, plan([-4.0], [1.0], [0.0]), bent)
     assert_array_equal(asked[0], [[9.0 + 8.0], [-3.0 + 4.0]])
     assert (length, move[0], end[0], there.f[0]) == (1.0, -1.0, 0.0, 0.0)
     for other in ({"usable": False}, {"d": -8.1}, {"d": -2.0}):  # the last is as high as the start
-        found = search(at, plan([-4.0], [1.0], [0.0]), partial(bent, **other))
+        found = search_along_step(at, plan([-4.0], [1.0], [0.0]), partial(bent, **other))
         assert_allclose(found[0], 0.25)  # the vertex
     far = Curve(lambda x: abs(x + 7.0), lambda x: 1.0)  # at -3 it helps, but not a correction
-    twice = search(begun(far, 1.0), plan([-16.0], [1.0]), partial(bent, d=-8.0))
+    twice = search_along_step(begun(far, 1.0), plan([-16.0], [1.0]), partial(bent, d=-8.0))
     assert (twice[0], twice[1][0]) == (1.0, -8.0)
 
 
 # ---- a Hessian from gradients ------------------------------------------------------------------
 
 
-def changed(q: list[float]) -> tuple[Linear, Linear]:
+def changed(q: list[float]) -> tuple[Linearisation, Linearisation]:
     """Before and after a step along which the Lagrangian's gradient changes by q.
 
     A third of it by f, with the multiplier 1, the rest by c, with the multiplier 2.

@@ -22,7 +22,8 @@ from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import list_counts
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers import minimax
-from minimax_cal.solvers.minimax import Kkt, Linear, Optimum
+from minimax_cal.solvers.linearisation import Kkt, Linearisation
+from minimax_cal.solvers.minimax import Optimum
 from minimax_cal.solvers.status import Status
 
 ACTIVE = 1e-6  # relative to the largest: functions so near to it decide
@@ -74,7 +75,7 @@ class RowMinimax:
         f = self.member @ error**2 + self.known * float(weight @ off**2)
         return f / self.size, NO_LIMITS
 
-    def linearise(self, x: State) -> Linear:
+    def linearise(self, x: State) -> Linearisation:
         """f and its derivatives; the curvature is Gauss-Newton's 2 J'J."""
         error, jacobian = self.problem.stack.rows(x, self.problem.active)
         off, weight = self.beside(x)
@@ -87,7 +88,9 @@ class RowMinimax:
             return np.asarray(2.0 * (gram + self.known * share.sum() * np.diag(weight)) / divisor)
 
         none = np.zeros((0, len(self.scale)))
-        return Linear(f / self.size, slope / (self.size * self.scale), NO_LIMITS, none, curvature)
+        return Linearisation(
+            f / self.size, slope / (self.size * self.scale), NO_LIMITS, none, curvature
+        )
 
     def step(self, x: State, d: Array) -> State:
         """The state moved by a scaled step in the free parameters."""

@@ -1,0 +1,63 @@
+"""A damped BFGS estimate of the Hessian of the Lagrangian [Powell 1978]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.solvers.linearisation import Linearisation
+
+EPS = float(np.finfo(float).eps)
+
+
+@dataclass(frozen=True, eq=False)
+class Bfgs:
+    """matrix: (p, p) positive definite.  fresh: whether it is a guess that no step has changed."""
+
+    matrix: Array
+    fresh: bool
+
+    @staticmethod
+    def start(here: Linearisation, curvature: Array) -> Bfgs:
+        """The mean Gauss-Newton Hessian where there is one, else a guess of its diagonal (p,)."""
+        mean = here.curvature(np.full(len(here.f), 1.0 / len(here.f)))
+        if len(mean):
+            return Bfgs(mean + 1e-3 * np.diag(np.diag(mean)), fresh=False)
+        return Bfgs(np.diag(curvature), fresh=True)
+
+    def update(
+        self, s: Array, before: Linearisation, after: Linearisation, mu: Array, lam: Array
+    ) -> Bfgs:
+        """With the change of the Lagrangian's gradient over the step s, same multipliers."""
+        q = (after.jacobian - before.jacobian).T @ mu + (after.normal - before.normal).T @ lam
+        length = float(s @ s)
+        if length == 0.0 or not np.all(np.isfinite(q)):
+            return self
+        matrix = self.matrix
+        if self.fresh and q @ s > 0:  # size of the first guess [Nocedal and Wright, eq. 6.20]
+            guess = np.diag(matrix)
+            matrix = float(q @ (q / guess)) / float(q @ s) * matrix
+        bs = matrix @ s
+        curve = float(s @ bs)
+        if curve <= 0.0:
+            return self
+        if float(q @ s) < 0.2 * curve:  # Powell's damping
+            share = 0.8 * curve / (curve - float(q @ s))
+            q = share * q + (1.0 - share) * bs
+        bs, q = bs / np.sqrt(curve), q / np.sqrt(float(q @ s))  # first, against overflow
+        new = matrix - np.outer(bs, bs) + np.outer(q, q)
+        new = 0.5 * (new + new.T)
+        if not is_positive_definite(new):  # by rounding, of entries of many sizes
+            new = np.diag(np.maximum(np.diag(new), EPS * np.diag(matrix)))
+        return Bfgs(new, fresh=False)
+
+
+def is_positive_definite(matrix: Array) -> bool:
+    """Whether a symmetric matrix has a Cholesky factor; also where it holds no numbers."""
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return not bool(np.all(np.isfinite(matrix)))
+    return True

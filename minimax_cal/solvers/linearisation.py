@@ -1,0 +1,163 @@
+"""A minimax problem at a point: values, derivatives, scaling and the optimality conditions.
+
+min over x of  max_i f_i(x)   subject to   lower <= c(x) <= upper
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+
+X = TypeVar("X")
+SUM_WEIGHT = 1e3  # of the row that holds the sum of the multipliers: kept to a millionth
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """Values and first derivatives at a point.
+
+    f: (k,).  jacobian: (k, p) of f.  c: (l,).  normal: (l, p) of c.
+    curvature: from weights (k,) to the weighted sum of the f_i's second derivatives (p, p), or to
+    an empty matrix where only BFGS can estimate them.
+    """
+
+    f: Array
+    jacobian: Array
+    c: Array
+    normal: Array
+    curvature: Callable[[Array], Array]
+
+    def take_functions(self, rows: Array) -> Linearisation:
+        """Some of the functions; the curvature is that of all."""
+        return replace(self, f=self.f[rows], jacobian=self.jacobian[rows])
+
+    def descent_lengths(self, level: float) -> Array:
+        """(p,) how far a variable alone may go until a function is above the largest by level.
+
+        By the derivatives here; 1 where no function depends on it.
+        """
+        room = level + self.f.max() - self.f
+        steepest = np.abs(self.jacobian / room[:, None]).max(axis=0)
+        return np.asarray(1.0 / np.where(steepest > 0.0, steepest, 1.0))
+
+
+class MinimaxProblem(Protocol[X]):
+    """A smooth max-of-functions problem with two-sided constraints."""
+
+    @property
+    def lower(self) -> Array:
+        """(l,) -inf where open."""
+
+    @property
+    def upper(self) -> Array:
+        """(l,) inf where open."""
+
+    def evaluate(self, x: X) -> tuple[Array, Array]:
+        """f (k,) and c (l,)."""
+
+    def linearise(self, x: X) -> Linearisation:
+        """f, c and their derivatives."""
+
+    def step(self, x: X, d: Array) -> X:
+        """The point moved by d (p,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scaling:
+    """Units in which a problem is about one: of the value, the variables (p,), constraints (l,)."""
+
+    value: float
+    x: Array
+    c: Array
+
+    @staticmethod
+    def from_lengths(
+        here: Linearisation, value: float, x: Array, lower: Array, upper: Array
+    ) -> Scaling:
+        """A constraint's is its way to a bound, at least how much it changes along a variable's."""
+        way = np.minimum(np.abs(upper - here.c), np.abs(here.c - lower))
+        c = np.abs(here.normal * x).max(axis=1, initial=0.0)
+        c = np.maximum(c, np.where(np.isfinite(way), way, 0.0))
+        return Scaling(value, x, np.where(c > 0.0, c, 1.0))
+
+    def apply(self, here: Linearisation) -> Linearisation:
+        """A linearisation in these units."""
+        return replace(
+            here, f=here.f / self.value, jacobian=here.jacobian * (self.x / self.value),
+            c=here.c / self.c, normal=here.normal * (self.x / self.c[:, None]),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Kkt:
+    """How far from optimal: all three are zero at a Karush-Kuhn-Tucker point.
+
+    stationarity: largest entry of sum mu_i f_i' + sum lambda_l c_l'.
+    complementarity: sum mu_i (max f - f_i) + sum |lambda_l| (distance of c_l to its bound).
+    violation: largest violation of a constraint.
+
+    In a `Scaling`.  By duality of linear programs the linearised problem then offers no more,
+    within a box of the variables' units, than complementarity + sum of stationarity.
+    """
+
+    stationarity: float
+    complementarity: float
+    violation: float
+
+    @property
+    def residual(self) -> float:
+        """The largest of the three."""
+        return max(self.stationarity, self.complementarity, self.violation)
+
+
+def measure_kkt(here: Linearisation, mu: Array, lam: Array, lower: Array, upper: Array) -> Kkt:
+    """The KKT residuals at a point, for multipliers mu (k,) of sum one and lam (l,)."""
+    stationarity = mu @ here.jacobian + lam @ here.normal
+    complementarity = float(mu @ (here.f.max() - here.f))
+    if lam.any():
+        held = np.flatnonzero(lam)  # elsewhere a bound may be infinitely far
+        room = np.where(lam > 0.0, upper - here.c, here.c - lower)[held]
+        complementarity += float(np.abs(lam[held] * room).sum())
+    return Kkt(
+        float(np.abs(stationarity).max(initial=0.0)),
+        complementarity,
+        float(constraint_excess(here.c, lower, upper).max(initial=0.0)) if len(lam) else 0.0,
+    )
+
+
+def balance_multipliers(here: Linearisation, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """mu and lam that make stationarity and complementarity at a point least, mu of sum one.
+
+    Non-negative least squares, so that nothing of a QP solver is in them.
+    """
+    from scipy.optimize import nnls
+
+    k, (above, below) = (
+        len(here.f),
+        (np.flatnonzero(upper < np.inf), np.flatnonzero(lower > -np.inf)),
+    )
+    columns = np.concatenate([here.jacobian, here.normal[above], -here.normal[below]]).T
+    if not np.all(np.isfinite(columns)):
+        return np.full(k, 1.0 / k), np.zeros(len(here.c))
+    rooms = (here.f.max() - here.f, (upper - here.c)[above], (here.c - lower)[below])
+    room = np.maximum(np.concatenate(rooms), 0.0)
+    sum_row = SUM_WEIGHT * (np.arange(len(room)) < k)
+    found, _ = nnls(
+        np.vstack([columns, np.diag(room), sum_row]),
+        np.append(np.zeros(len(columns) + len(room)), SUM_WEIGHT),
+    )
+    found = found / found[:k].sum()
+    lam = np.zeros(len(here.c))
+    lam[above] += found[k : k + len(above)]
+    lam[below] -= found[k + len(above) :]
+    return found[:k], lam
+
+
+def constraint_excess(c: Array, lower: Array, upper: Array) -> Array:
+    """(l,) by how much each constraint is violated."""
+    return np.asarray(np.maximum(np.maximum(c - upper, lower - c), 0.0))
