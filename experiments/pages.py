@@ -57,9 +57,7 @@ RUNS = {
         },
     ),
     "coverage": Run("experiments coverage --runs 100", {"coverage.png": "coverage"}),
-    "external": Run(
-        "experiments external --arms irb120,ur10_b,meca500_r,fanuc_r2000,qkm_hl6 --halves 4", {}
-    ),
+    "external": Run("experiments external --arms irb120,fanuc_r2000,qkm_hl6 --halves 4", {}),
     "machine_gap": Run("experiments machine_gap --seed 7001 --every 16", {}),
     "blind_gap": Run(
         "experiments blind_gap --seed 2028 --every 60",
@@ -265,7 +263,9 @@ BLOCKS = {
     ),
     "papers/counts": Block("papers", "the two papers", verdict_counts),
     "papers/items": Block(
-        "papers", "the two papers", columns("item | paper | ours | claims | verdict | claims that failed=failed")
+        "papers",
+        "the two papers",
+        columns("item | paper | ours | claims | verdict | claims that failed=failed"),
     ),
     "algorithm_1/steps": Block("algorithm_1", "Algorithm 1", body),
     "warm_start/starts": Block("warm_start", "eq. 32", body),
