@@ -35,6 +35,7 @@ from experiments.gap_cases import (
     spec,
 )
 from experiments.record import canvas, interval
+from experiments.resemblance import resemblance
 from experiments.scoring import (
     Criterion,
     Name,
@@ -58,7 +59,6 @@ from experiments.scoring import (
     verdicts,
 )
 from experiments.sweep import Study
-from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 

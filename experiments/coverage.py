@@ -29,7 +29,7 @@ from minimax_cal.fitting.uncertainty import (
     Poses,
     Uncertainty,
     by_noise,
-    position_covariance,
+    position_factor,
     quantile,
 )
 from minimax_cal.ground.arrays import Array, rms
@@ -260,6 +260,14 @@ def whole_arm(
     q = random_poses(cell.robot, WORKSPACE, rng)
     real = arm.predict(bent(arm, case, q) + case.jitter * rng.normal(size=q.shape))
     return inside(cell.predict(q) - real, position_covariance(cell, known, q, jitter=True), known)
+
+
+def position_covariance(
+    cell: Cell, known: Uncertainty, q: Array, frame: str = "measurement", *, jitter: bool = False
+) -> Array:
+    """(m, k, 3, 3) of each target's predicted position [m^2]; arguments as `position_factor`."""
+    factor = position_factor(cell, known, q, frame, jitter=jitter)
+    return np.asarray(factor @ np.swapaxes(factor, -1, -2))
 
 
 def inside(error: Array, covariance: Array, known: Uncertainty) -> float:

@@ -35,7 +35,6 @@ NOISE_Q, NOISE_TORQUE = 2e-6, 2e-3  # of the log [rad, m]; of the largest torque
 WAVES, SLOWEST_WAVE = 5, 0.1  # of a trajectory, and its lowest frequency [Hz]
 REACH = {False: 1.5, True: 0.1}  # of a trajectory either side of 0, of a hinge and a slide [rad, m]
 WAVE_SHARE = 1.4  # of the reach, amplitudes together: waves seldom all add up
-BRISTLE = 1e-3  # way after which friction has built up, where it does so by the way [rad, m]
 SOFT = 0.01  # speed over which friction of the load changes its sign [rad/s, m/s]
 
 
@@ -43,8 +42,7 @@ SOFT = 0.01  # speed over which friction of the load changes its sign [rad/s, m/
 class Withheld:
     """What the file does not know.  friction, damping, armature: (n,).  share: (n,) of the load.
 
-    payload: kg at the flange.  delay: of the commands [s].  bristle: way after which friction has
-    built up [rad, m], 0 for MuJoCo's own friction.
+    payload: kg at the flange.  delay: of the commands [s].
     """
 
     friction: Array
@@ -53,7 +51,6 @@ class Withheld:
     share: Array
     payload: float = 0.0
     delay: float = 0.0
-    bristle: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +69,12 @@ class DrivenArm:
         return mujoco().MjModel.from_xml_string(self.xml.decode())
 
     def real(self) -> Any:
-        """The real arm, compiled, without friction of the load or of bristles."""
+        """The real arm, compiled, without friction of the load."""
         mj, lacks = mujoco(), self.withheld
         spec = mj.MjSpec.from_string(self.xml.decode())
         spec.option.timestep = self.step
         model = spec.compile()
-        model.dof_frictionloss[:] = 0.0 if lacks.bristle else lacks.friction
+        model.dof_frictionloss[:] = lacks.friction
         model.dof_damping[:] = lacks.damping
         model.dof_armature[:] += lacks.armature
         if lacks.payload:
@@ -176,7 +173,6 @@ def drawn_arm(name: str, seed: int, effects: tuple[str, ...]) -> DrivenArm:
         share=has["load"] * share,
         payload=float(rng.uniform(0.5, 3.0)) if "payload" in effects else 0.0,
         delay=float(rng.uniform(0.003, 0.008)) if "delay" in effects else 0.0,
-        bristle=BRISTLE if "bristle" in effects else 0.0,
     )
     return DrivenArm(robot, xml, lacks, seed)
 
@@ -231,7 +227,7 @@ def drive_along(
     data.qpos[:n], data.qvel[:n] = wanted[0, 0], wanted[1, 0]
     every, cycle = round(1.0 / LOG_HZ / step), round(CYCLE / step)
     late = 0 if withheld is None else round(withheld.delay / step)
-    torque, load, bent, rows = np.zeros(n), np.zeros(n), np.zeros(n), []
+    torque, load, rows = np.zeros(n), np.zeros(n), []
     waiting: list[Array] = []
     for k in range(wanted.shape[1]):
         if k % cycle == 0:
@@ -248,10 +244,6 @@ def drive_along(
         if withheld is not None and withheld.share.any():
             mj.mj_rne(model, data, 1, load)
             data.qfrc_applied[:n] = -withheld.share * np.abs(load) * np.tanh(data.qvel[:n] / SOFT)
-        if withheld is not None and withheld.bristle:  # [Dahl 1968]
-            way = data.qvel[:n] * step / withheld.bristle
-            bent = np.sign(way) + (bent - np.sign(way)) * np.exp(-np.abs(way))
-            data.qfrc_applied[:n] = -withheld.friction * bent
         mj.mj_step(model, data)
     table = np.array(rows)
     return Course(table[:, 0], table[:, 1 : n + 1], table[:, n + 1 :])

@@ -18,6 +18,7 @@ import numpy as np
 
 from experiments.gap_cases import Cause, Sealed
 from experiments.machines import INSIDE, MAKES, MECHANISMS, OUTSIDE, Asked, make, places
+from experiments.resemblance import resemblance
 from experiments.scoring import (
     Criterion,
     Row,
@@ -38,7 +39,6 @@ from experiments.scoring import (
     verdicts,
 )
 from experiments.sweep import Study
-from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
 

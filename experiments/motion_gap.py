@@ -5,9 +5,8 @@
 Simulated "real" arms in MuJoCo with friction, friction of the load, rotor inertias, a payload and a
 delay that their files do not have: after `gap --write`, model and arm follow commands that no log
 holds, under a controller that knows the first file alone.  What remains of the joint error and of
-the torque error is counted with elements of the file alone, and with the module beside it.  The
-real UR10e, where its logs are on this machine: the corrected model under the measured motion of
-runs that no fit saw.
+the torque error is counted.  The real UR10e, where its logs are on this machine: the corrected
+model under the measured motion of runs that no fit saw.
 """
 
 from __future__ import annotations
@@ -21,15 +20,13 @@ from typing import Any
 import numpy as np
 
 import minimax_cal as mc
-from experiments.driven_arms import ARMS, DrivenArm, commands, drawn_arm, drive_along, logged
+from experiments.driven_arms import ARMS, commands, drawn_arm, drive_along, logged
 from experiments.motion_real import DRIVE_GAIN, RATIO, REAL
 from experiments.real import SHARED, here
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
 from minimax_cal.robots.mjcf import mujoco
-from minimax_cal.simulators.motion.judge import loaded
-from minimax_cal.simulators.motion.ladder import MOTOR
 
 WITHHELD = (  # of the cases of an arm, in turn
     ("friction", "payload"),
@@ -38,34 +35,30 @@ WITHHELD = (  # of the cases of an arm, in turn
     ("friction", "armature"),
     ("friction", "load", "armature", "payload", "delay"),
 )
-REST = ("friction", "bristle")  # of an arm each, with and without motors that hold friction
 RUNS, SECONDS = 4, 10.0  # of the logs
 UNSEEN, UNSEEN_SPEED, UNSEEN_SECONDS = 77, 1.1, 8.0  # the run that judges
 
 
 @dataclass(frozen=True)
 class Case:
-    """A simulated arm, what its file lacks, and what holds friction beside a constraint."""
+    """A simulated arm, and what its file lacks."""
 
     arm: str
     withheld: tuple[str, ...]
     seed: int
-    friction: str | None = None
 
 
 @dataclass(frozen=True)
 class Closed:
     """What remains on the unseen run, over what was: of the joint error, and of each torque.
 
-    before, plain, full: joint error [mrad] of the file as given, corrected, with its module.
-    torque_*: (n,) of what the file as given had.
+    before, after: joint error [mrad] of the file as given, and corrected.
+    torque: (n,) of what the file as given had.
     """
 
     before: float
-    plain: float
-    full: float
-    torque_plain: Array
-    torque_full: Array
+    after: float
+    torque: Array
 
 
 def run(case: Case) -> Closed:
@@ -74,10 +67,8 @@ def run(case: Case) -> Closed:
     with tempfile.TemporaryDirectory() as folder:
         path, out = Path(folder) / "arm.xml", Path(folder) / "corrected.xml"
         path.write_bytes(arm.xml)
-        gap = mc.motion_gap(path, logged(arm, RUNS, SECONDS), write=out,
-                            driven=False, friction=case.friction)  # fmt: skip
-        module = Path(gap.module).read_text() if gap.module else ""
-        first, plain, full = (mujoco().MjModel.from_xml_path(str(one)) for one in (path, out, out))
+        mc.motion_gap(path, logged(arm, RUNS, SECONDS), write=out, driven=False)
+        first, last = (mujoco().MjModel.from_xml_path(str(one)) for one in (path, out))
     at = commands(arm, UNSEEN, UNSEEN_SPEED)
     real = drive_along(arm, arm.real(), at, UNSEEN_SECONDS, arm.withheld)
 
@@ -86,21 +77,8 @@ def run(case: Case) -> Closed:
         off, torque = course.q - real.q, course.torque - real.torque
         return 1e3 * float(np.sqrt((off**2).mean())), np.sqrt((torque**2).mean(axis=0))
 
-    before, after = missed(first), missed(plain)
-    last = with_module(arm, module, full, missed) if module else after
-    return Closed(before[0], after[0], last[0], after[1] / before[1], last[1] / before[1])
-
-
-def with_module(arm: DrivenArm, text: str, model: Any, missed: Any) -> tuple[float, Array]:
-    """What a model misses with the module beside it."""
-    assert arm.known is not None  # MuJoCo compiles no model while a callback is installed
-    module = loaded(text)
-    module.install(model)
-    try:
-        found: tuple[float, Array] = missed(model)
-    finally:
-        module.remove()
-    return found
+    before, after = missed(first), missed(last)
+    return Closed(before[0], after[0], after[1] / before[1])
 
 
 # ---- the real arm ------------------------------------------------------------------------------
@@ -117,59 +95,33 @@ class Left:
 class Judged:
     """RMS current (n,) under the measured motion of the run [A], all rows.
 
-    before: of the URDF.  plain: of the corrected file.  full: with its module.  motor, both: the
-    same with motors that hold friction at rest.
+    before: of the URDF.  after: of the corrected file.
     """
 
     name: str
     before: Array
-    plain: Array
-    full: Array
-    motor: Array
-    both: Array
+    after: Array
 
 
 def judge(left: Left) -> Judged:
     """The corrected model on a run of the real arm that no fit saw."""
     files = sorted((SHARED / REAL).glob("*.csv"))
     name = files[left.run].stem
-    found = []
-    for friction in (None, MOTOR):
-        gap = mc.motion_gap(
-            SHARED / REAL / "ur10e.urdf",
-            files,
-            holdout_run=name,
-            drive_gain=DRIVE_GAIN,
-            ratio=RATIO,
-            driven=False,
-            friction=friction,
-        )
-        inside = [rung for rung in gap.rungs if not rung.name.endswith("(module)")]
-        found += [inside[-1], gap.rungs[-1]]
-    return Judged(name, *(np.array(rung.torque_rms) for rung in (gap.rungs[0], *found)))
+    gap = mc.motion_gap(
+        SHARED / REAL / "ur10e.urdf",
+        files,
+        holdout_run=name,
+        drive_gain=DRIVE_GAIN,
+        ratio=RATIO,
+        driven=False,
+    )
+    return Judged(name, *(np.array(gap.rungs[end].torque_rms) for end in (0, -1)))
 
 
 # ---- tables ------------------------------------------------------------------------------------
 
 
-SAID = {"before": "URDF", "plain": "corrected file", "full": "with its module",
-        "motor": "corrected file, dcmotor", "both": "with its module"}  # fmt: skip
-
-
-def rest_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
-    """What remains where friction is that of bristles, without and with motors that hold it."""
-    rows = []
-    for i in range(0, len(cases), 2):
-        plain, motor = found[i : i + 2]
-        rows.append((cases[i].arm, plain.before, *shares(plain)[:2], *shares(motor)[:2]))
-
-    title = "Friction that builds up over 1 mrad, on a run that no log holds"
-    return Table.made(
-        title,
-        rows,
-        "arm | joint error as given mrad .3g | remains % .3g | worst torque % .3g | "
-        "with dcmotor % .3g | worst torque % .3g",
-    )
+SAID = {"before": "URDF", "after": "corrected file"}
 
 
 def closed_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
@@ -186,19 +138,13 @@ def closed_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
     return Table.made(
         title,
         rows,
-        "withheld | joint error as given mrad .3g | remains % .3g | worst torque % .3g | "
-        "with module % .3g | worst torque % .3g",
+        "withheld | joint error as given mrad .3g | remains % .3g | worst torque % .3g",
     )
 
 
-def shares(one: Closed) -> tuple[float, float, float, float]:
-    """Of joint error and worst torque, by elements and with the module [%]."""
-    return (
-        100.0 * one.plain / one.before,
-        100.0 * float(one.torque_plain.max()),
-        100.0 * one.full / one.before,
-        100.0 * float(one.torque_full.max()),
-    )
+def shares(one: Closed) -> tuple[float, float]:
+    """Of joint error and worst torque [%]."""
+    return 100.0 * one.after / one.before, 100.0 * float(one.torque.max())
 
 
 def real_table(found: Sequence[Judged]) -> Table:
@@ -220,12 +166,10 @@ def main(study: Study) -> None:
     cases = [Case(arm, kind, study.seed + number)
              for arm in arms for number, kind in enumerate(kinds)]  # fmt: skip
     found = study.sweep(run, cases, "simulated arms")
-    resting = [Case(arm, REST, study.seed, friction) for arm in arms for friction in (None, MOTOR)]
-    rested = study.sweep(run, resting, "arms with bristles")
-    tables = [closed_table(cases, found), rest_table(resting, rested)]
+    tables = [closed_table(cases, found)]
     content: dict[str, object] = {
         "cases": [{**vars(case), "before_mrad": one.before, "remains_percent": shares(one)}
-                  for case, one in zip([*cases, *resting], [*found, *rested], strict=True)]
+                  for case, one in zip(cases, found, strict=True)]
     }  # fmt: skip
     if not study.quick and here(REAL):
         count = len(list((SHARED / REAL).glob("*.csv")))

@@ -18,11 +18,8 @@ from scipy.optimize import least_squares
 import minimax_cal as mc
 from experiments.pixel_cells import (
     BOARD,
-    DISTANCE,
     LENS,
-    NOISE,
     SQUARE,
-    TILT,
     Cell,
     View,
     arm_error,
@@ -33,7 +30,6 @@ from experiments.pixel_cells import (
     least_variances,
     make_cell,
     projected,
-    taken,
 )
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.pixels.calibrate import fitted
@@ -41,14 +37,10 @@ from minimax_cal.fitting.pixels.fit import ANY, PixelSquares, by_depths, fit_dra
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import directions, from_far, poses_of_images, start_scene
 from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.stages import silent
 from minimax_cal.ground.tables import Table
 from minimax_cal.instruments import flange_poses
 from minimax_cal.instruments.pixels import PixelData
 from minimax_cal.measuring.grouping import held_out
-from minimax_cal.planning.camera_options import CameraOptions
-from minimax_cal.planning.cameras import planned_images
-from minimax_cal.planning.options import PlanOptions
 from minimax_cal.robots.kinematics import rotation, rotation_vector
 from minimax_cal.robots.transforms import transform
 from minimax_cal.solvers.status import Status
@@ -64,8 +56,6 @@ REACHED = 0.1  # an arm so near to the true one has found its minimum [mm]
 WEAK_FOCAL, WEAK_DISTANCE = 8000.0, (1.8, 2.2)  # a tele lens: 0.25 mm a pixel [px], [m]
 WEAK_NOISES = (0.1, 0.3, 1.0)  # [px]
 WEAK_OFF = ((3e-4, 5e-4), (1e-4, 2e-4), (3e-5, 5e-5))  # of links from their drawing [m, rad]
-ROUGHLY = (0.02, 0.01)  # what is known of where cameras and board are [rad], [m]
-CANDIDATES = 400  # of a plan
 NARROW = 0.25  # tilt of the camera where all poses are to one side [rad]
 SIDE = 0.05  # of the one tag that a tele lens sees [m]
 
@@ -166,27 +156,6 @@ def reprojection(job: Job, *, held: bool, factor: float = 1.0, on_flange: bool =
     return judged(cell, wrong_lens(data_of(cell), factor), fix_camera=held)
 
 
-def planned(job: Job) -> Found:
-    """Poses that are planned with cameras and board roughly where they are."""
-    cell, rng = cell_of(job), np.random.default_rng([job.seed, 2])
-    data = data_of(cell)
-
-    def about(pose: Array) -> Array:
-        off = rng.normal(size=6) * np.repeat(ROUGHLY, 3)
-        return np.asarray(pose @ transform(rotation(off[:3]), off[3:]))
-
-    sees = CameraOptions(
-        camera_on="flange", camera_at=(about(cell.views[0].pose),), board_at=about(cell.place),
-        print_looks="z", distance=DISTANCE, incidence=TILT, pixel_noise=NOISE,
-    )  # fmt: skip
-    options = PlanOptions(candidates=CANDIDATES, jitter=0.0, seed=job.seed, whole=True)
-    plan = planned_images(
-        cell.drawn, len(cell.q), data.cameras, cell.points, options, sees, silent, 0.0
-    )
-    cell = taken(cell, plan.q, rng)
-    return judged(cell, data_of(cell))
-
-
 def two_cameras(job: Job) -> Found:
     """Two cameras on the flange."""
     poses = [
@@ -236,7 +205,6 @@ WAYS: dict[str, Callable[[Job], Found]] = {
     "eye to hand, wrong by 0.1 % and held": partial(
         reprojection, held=True, factor=0.999, on_flange=False
     ),
-    "poses planned, lenses freed": planned,
     "two cameras, lenses freed": two_cameras,
     "tags of unknown place": unknown_tags,
     "5 % outliers, lenses freed": outliers,

@@ -23,6 +23,7 @@ import itertools
 import pickle
 import shlex
 import sys
+import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -48,10 +49,11 @@ from experiments.record import (
     save_tables,
     table_record,
 )
+from minimax_cal.ground import parallel
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.optional import optional
-from minimax_cal.ground.parallel import WorkersLost, in_parallel
+from minimax_cal.ground.parallel import WorkersLost
 from minimax_cal.ground.tables import Table
 
 if TYPE_CHECKING:
@@ -154,6 +156,53 @@ def run(
             yield from progress(work, len(calls), description)
     except WorkersLost as error:
         raise click.ClickException(str(error)) from error
+
+
+def in_parallel(
+    function: Callable[..., Any],
+    calls: Sequence[tuple[Any, ...]],
+    modules: Iterable[str] = (),
+    *,
+    processes: int = -1,
+    cluster: str = "",
+) -> parallel.Numbered:
+    """The number of each call and its result, in the order they finish.
+
+    function: at the top of a module.  calls: the arguments of each.  processes: on this machine,
+    -1 for one a core.  cluster: address of a Dask scheduler, instead, whose workers need modules,
+    too.  Raises OptionError for what a user can mend, WorkersLost, and what a call raises.
+    """
+    if not calls:
+        return
+    work = [(function, number, call) for number, call in enumerate(calls)]
+    needed = {parallel.__name__, function.__module__, *modules}
+    arriving = parallel.on_cluster(work, cluster, needed) if cluster else here(work, processes)
+    with closing(arriving):
+        yield from arriving
+
+
+def here(work: parallel.Work, processes: int) -> parallel.Numbered:
+    """By joblib in processes of one thread each on this machine."""
+    if processes == 0:
+        raise OptionError("0 processes: give their number, or -1 for one a core")
+    joblib = optional("joblib", "work in several processes", parallel.JOBLIB)
+    while parallel.PLAIN:  # joblib would take it for a pool of its own
+        parallel.PLAIN.pop().shutdown(wait=True)
+    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+        pool = joblib.Parallel(n_jobs=processes, return_as="generator_unordered")
+        arriving = pool(joblib.delayed(parallel.numbered)(*each) for each in work)
+        loky = import_module("joblib.externals.loky.process_executor")
+        try:
+            yield from arriving
+        except loky.BrokenProcessPool as error:
+            raise WorkersLost(
+                "a process died: too little memory, or it was killed; start fewer at once "
+                f"({type(error).__name__})"
+            ) from error
+        finally:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # joblib regrets the jobs that are not finished
+                arriving.close()
 
 
 def needed(module: str, extra: str) -> Any:

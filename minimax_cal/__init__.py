@@ -51,10 +51,8 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.modelling.cell import Cell, load_cell
     from minimax_cal.modelling.effects.table import EFFECTS, register
     from minimax_cal.modelling.simulate import Simulation, Truth, simulate
-    from minimax_cal.planning.cameras import plan_cameras
     from minimax_cal.planning.motion_plan import plan_motion
     from minimax_cal.planning.plan import plan
-    from minimax_cal.reporting.fleet.overview import fleet
     from minimax_cal.reporting.plots.figures import plot_errors
     from minimax_cal.reporting.report import report
     from minimax_cal.robots.robot import Robot, builtin_robots, load_robot
@@ -105,7 +103,6 @@ __all__ = [
     "evaluate",
     "evaluate_motion",
     "export",
-    "fleet",
     "import_files",
     "iso9283",
     "load_cell",
@@ -117,7 +114,6 @@ __all__ = [
     "minimize_max",
     "motion_gap",
     "plan",
-    "plan_cameras",
     "plan_motion",
     "plot_errors",
     "read_campaigns",
@@ -183,7 +179,6 @@ MODULES = {  # name: where it is defined
     "diagnose_motion": "dynamics.diagnose",
     "evaluate_motion": "dynamics.budget",
     "plan": "planning.plan",
-    "plan_cameras": "planning.cameras",
     "plan_motion": "planning.motion_plan",
     "Compensation": "correcting.compensate",
     "compensate": "correcting.compensate",
@@ -195,7 +190,6 @@ MODULES = {  # name: where it is defined
     "simulator_gap": "simulators.ladder",
     "MotionGap": "simulators.result",
     "motion_gap": "simulators.motion.ladder",
-    "fleet": "reporting.fleet.overview",
     "plot_errors": "reporting.plots.figures",
     "report": "reporting.report",
 }

@@ -71,7 +71,7 @@ def accuracy(problem: Problem, solution: Solution) -> Accuracy:
 
 def _judged(problem: Problem, x: Array, y: Array) -> Accuracy:
     """The residuals of an x and y of the right shape."""
-    if not (_size(x) < HUGE and _size(y) < HUGE):
+    if not (x @ x < HUGE**2 and y @ y < HUGE**2):  # False for NaN, too
         return NOWHERE
     P, q, A, l, u = problem.P, problem.q, problem.A, problem.l, problem.u  # noqa: E741
     bound = np.where(y > 0, u, l)
@@ -85,19 +85,20 @@ def _judged(problem: Problem, x: Array, y: Array) -> Accuracy:
     gap = abs(xPx + qx + support)
     inside = np.minimum(np.maximum(Ax, l), u)
     outside, slope = np.abs(Ax - inside), np.abs(Px + q + Aty)
-    primal, dual = _size(outside), _size(slope)
+    primal, dual = _largest(outside), _largest(slope)
     if not (math.isfinite(gap) and math.isfinite(primal)):
         return NOWHERE
     energy = max(abs(xPx), abs(qx), abs(support))
     curved, rows = problem.magnitudes
-    parts, moved = curved @ np.abs(x) + np.abs(y) @ rows, rows @ np.abs(x)
-    force = np.maximum(np.maximum(np.abs(Px), np.abs(Aty)), np.abs(q))
+    length, pull = np.abs(x), np.abs(q)
+    parts, moved = curved @ length + np.abs(y) @ rows, rows @ length
+    force = np.maximum(np.maximum(np.abs(Px), np.abs(Aty)), pull)
     goal = np.where(y == 0, inside, bound)
     off = np.maximum(np.abs(Ax - goal), outside)
-    off = _size(off / (np.where(goal == 0, moved, np.abs(goal)) + TINY))
-    found = off, _size(slope / (parts + np.abs(q) + TINY)), max(off, gap / (energy + TINY))
+    off = _largest(off / (np.where(goal == 0, moved, np.abs(goal)) + TINY))
+    found = off, _largest(slope / (parts + pull + TINY)), max(off, gap / (energy + TINY))
     most = CANCELS**2  # times FINE is no more than CANCELS times a tolerance of 1e-8
-    cancels = _size(moved) > most * _size(Ax) or _size(parts) > most * _size(force)
+    cancels = _largest(moved) > most * _size(Ax) or _largest(parts) > most * _largest(force)
     if cancels or not max(found) <= FINE:
         apart = np.where(y == 0, 0.0, Ax - bound)
         residuals = outside, slope, apart, gap
@@ -150,4 +151,9 @@ def _closely(
 
 def _size(vector: Array) -> float:
     """Largest absolute entry; NaN if there is one."""
-    return float(np.abs(vector).max()) if vector.size else 0.0
+    return _largest(np.abs(vector))
+
+
+def _largest(vector: Array) -> float:
+    """Largest entry of what is nowhere negative; NaN if there is one."""
+    return float(vector.max()) if vector.size else 0.0

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from .accuracy import accuracy
+from .accuracy import Accuracy, accuracy
 from .certificates import proof
 from .polish import polish
 from .problem import COLD, Problem, Solution, Status, nothing
@@ -51,7 +51,8 @@ def solve(
     run = backend(name)
     share = time_limit if fallback is False else 0.5 * time_limit
     raw = _call(run, problem, tolerance, share, warm_start)
-    worst = accuracy(problem, raw).worst
+    judged = accuracy(problem, raw)
+    worst = judged.worst
     if worst <= tolerance:  # the usual case, kept short
         return Solution(
             raw.x,
@@ -74,7 +75,7 @@ def solve(
     scaled, s, t = equilibrate(problem)
     to_scaled = partial(in_units, s=1.0 / s, t=1.0 / t)
     job = Job(scaled, tolerance, to_scaled(warm_start), start, start + time_limit)
-    return in_units(_persist(job, queue, to_scaled(raw)), s, t)
+    return in_units(_persist(job, queue, to_scaled(raw), judged), s, t)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,26 +111,30 @@ def _call(
         return nothing(problem, Status.FAILED, f"raised {type(error).__name__}: {error}")
 
 
-def _persist(job: Job, queue: Sequence[str], raw: Solution) -> Solution:
-    """Improve the first answer, then go through the other backends until one is good enough."""
-    best, least, asked = nothing(job.problem, Status.FAILED), math.inf, False
+def _persist(job: Job, queue: Sequence[str], raw: Solution, judged: Accuracy) -> Solution:
+    """Improve the first answer, then go through the other backends until one is good enough.
+
+    judged: the first answer's accuracy, which does not depend on units.
+    """
+    best, asked = nothing(job.problem, Status.FAILED), False
     notes: tuple[str, ...] = ()
     for index, name in enumerate(queue):
         last = index + 1 == len(queue)
         if index:
             share = job.left if last else 0.5 * job.left
             raw = _call(_named(name), job.problem, job.tolerance, share, job.warm_start)
-            if accuracy(job.problem, raw).worst <= job.tolerance:
-                return _closed(job, raw, Status.SOLVED, name, notes)
-        better = _improved(job, name, raw)
-        worst = accuracy(job.problem, better).worst
-        remark = _remark(job, name, raw)
-        if worst <= job.tolerance:
-            notes += (f"{remark}; improved to {worst:.1e}",)
+            judged = accuracy(job.problem, raw)
+        raw = replace(raw, residual=judged.worst)
+        if raw.residual <= job.tolerance:
+            return _closed(job, raw, Status.SOLVED, name, notes)
+        better = _improved(job, name, raw, judged)
+        remark = _remark(name, raw)
+        if better.residual <= job.tolerance:
+            notes += (f"{remark}; improved to {better.residual:.1e}",)
             return _closed(job, better, Status.SOLVED, name, notes)
         notes += (remark,)
-        if worst < least:
-            best, least = replace(better, backend=name), worst
+        if better.residual < best.residual:
+            best = replace(better, backend=name)
         if not asked and job.left > 0 and (raw.status in NO_ANSWER or last):
             asked = True  # once is enough: the answer does not depend on the backend
             status, certificate = proof(job.problem, job.left)
@@ -140,51 +145,48 @@ def _persist(job: Job, queue: Sequence[str], raw: Solution) -> Solution:
             return _closed(job, best, Status.TIME_LIMIT, best.backend or name, notes)
     limits = (Status.ITERATION_LIMIT, Status.TIME_LIMIT)
     end = best.status if best.status in limits else Status.INACCURATE
-    if not math.isfinite(least):
+    if not math.isfinite(best.residual):
         end = Status.FAILED
     return _closed(job, best, end, best.backend or queue[0], notes)
 
 
-def _improved(job: Job, name: str, raw: Solution) -> Solution:
+def _improved(job: Job, name: str, raw: Solution, judged: Accuracy) -> Solution:
     """An answer after polishing and, if that is not enough, after a second, tighter run.
 
-    Our own subgradient method has to stand on its own: its failures are part of what it shows.
+    Its `residual` is that of what is returned.  Our own subgradient method has to stand on its own:
+    its failures are part of what it shows.
     """
     if name.startswith("subgradient"):
         return raw
-    better = _polished(job, raw)
-    done = accuracy(job.problem, better).worst <= job.tolerance
-    if done or raw.status is not Status.SOLVED or job.left <= 0:
+    better = _polished(job, raw, judged)
+    if better.residual <= job.tolerance or raw.status is not Status.SOLVED or job.left <= 0:
         return better
     again = _call(backend(name), job.problem, TIGHTER * job.tolerance, 0.5 * job.left, better)
-    answers = (better, _polished(job, again))
-    return min(answers, key=lambda answer: accuracy(job.problem, answer).worst)
+    judged = accuracy(job.problem, again)
+    tighter = _polished(job, replace(again, residual=judged.worst), judged)
+    return tighter if tighter.residual < better.residual else better
 
 
-def _polished(job: Job, answer: Solution) -> Solution:
-    """An answer, polished if it is nearly right."""
-    judged = accuracy(job.problem, answer)
+def _polished(job: Job, answer: Solution, judged: Accuracy) -> Solution:
+    """An answer, polished if it is nearly right and not right yet."""
     near = max(judged.primal_relative, judged.dual_relative) <= NEAR  # the gap comes last
-    return polish(job.problem, answer, job.tolerance) if near else answer
+    if not near or judged.worst <= job.tolerance:
+        return answer
+    return polish(job.problem, answer, job.tolerance, judged)
 
 
-def _remark(job: Job, name: str, raw: Solution) -> str:
+def _remark(name: str, raw: Solution) -> str:
     """One line on an answer that was not good enough."""
-    worst = accuracy(job.problem, raw).worst
     said = "; ".join(raw.notes) or f"said {raw.status.name.lower()}"
-    size = f"its relative residual is {worst:.1e}" if math.isfinite(worst) else "it gave no x"
-    return f"{name} {said}, {size}"
+    known = math.isfinite(raw.residual)
+    return f"{name} {said}, " + (
+        f"its relative residual is {raw.residual:.1e}" if known else "it gave no x"
+    )
 
 
 def _closed(
     job: Job, answer: Solution, status: Status, name: str, notes: tuple[str, ...]
 ) -> Solution:
-    """The answer with what is known about how it was come by."""
-    return replace(
-        answer,
-        status=status,
-        seconds=time.perf_counter() - job.start,
-        backend=name,
-        residual=accuracy(job.problem, answer).worst,
-        notes=notes,
-    )
+    """The answer, its `residual` known, with what is known about how it was come by."""
+    seconds = time.perf_counter() - job.start
+    return replace(answer, status=status, seconds=seconds, backend=name, notes=notes)

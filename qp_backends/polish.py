@@ -16,40 +16,43 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from .accuracy import Accuracy
     from .problem import Array, Matrix, Problem, Solution
 
 LARGEST_DENSE = 600  # unknowns up to which dense elimination is faster
 
 
-def polish(problem: Problem, solution: Solution, tolerance: float = 0.0) -> Solution:
+def polish(
+    problem: Problem,
+    solution: Solution,
+    tolerance: float = 0.0,
+    judged: Accuracy | None = None,
+) -> Solution:
     """The better of a solution and what the rows it holds with equality make of it.
 
     Which rows these are is read from x and y (a row is active when its multiplier outweighs its
     slack); then P x + q + A_aᵀ y_a = 0, A_a x = b_a is one linear system.  Rows that come out with
     the wrong sign are dropped and rows that are left are added, a few times, and the most accurate
-    answer on the way is returned.  It serves every backend that stops near the solution.
+    answer on the way is returned, with its `residual`.  It serves every backend that stops near
+    the solution.  judged: the solution's accuracy, where it is known.
     """
-    if not np.isfinite(accuracy(problem, solution).worst):
-        return solution
+    worst = (judged or accuracy(problem, solution)).worst
+    best = replace(solution, residual=worst)
+    if not np.isfinite(worst):
+        return best
     with np.errstate(all="ignore"):  # an answer may be infinitely wrong
-        return _polished(problem, solution, tolerance)
-
-
-def _polished(problem: Problem, solution: Solution, tolerance: float) -> Solution:
-    """The most accurate of a few steps from one set of active rows to the next."""
-    best, least = solution, accuracy(problem, solution).worst
-    side = _active(problem, solution)
-    for _ in range(6):
-        trial = _solve_active(problem, solution, side)
-        worst = accuracy(problem, trial).worst
-        if worst < least:
-            best, least = trial, worst
-        if least <= tolerance or not np.isfinite(worst):
-            break
-        changed = _corrected(problem, trial, side)
-        if (changed == side).all():
-            break
-        side = changed
+        side = _active(problem, solution)
+        for _ in range(6):
+            trial = _solve_active(problem, solution, side)
+            worst = accuracy(problem, trial).worst
+            if worst < best.residual:
+                best = replace(trial, residual=worst)
+            if best.residual <= tolerance or not np.isfinite(worst):
+                break
+            changed = _corrected(problem, trial, side)
+            if (changed == side).all():
+                break
+            side = changed
     return best
 
 

@@ -116,7 +116,7 @@ class Problem:
         l, u = _vector(self.l, "l", m), _vector(self.u, "u", m)  # noqa: E741
         if not np.isfinite(q).all():
             raise ProblemError("q holds NaN or infinite entries")
-        if np.isnan(l).any() or np.isnan(u).any():
+        if (l != l).any() or (u != u).any():  # NaN
             raise ProblemError("l or u holds NaN; an open side is -inf or inf")
         l, u = np.where(l > -OPEN, l, -np.inf), np.where(u < OPEN, u, np.inf)  # noqa: E741
         if not symmetric(P):
@@ -126,8 +126,7 @@ class Problem:
                 "P is not positive semidefinite: along some direction the objective curves down, "
                 "and what a solver finds is no minimum; add curvature to the diagonal of P"
             )
-        for name, value in (("P", P), ("q", q), ("A", A), ("l", l), ("u", u)):
-            object.__setattr__(self, name, value)
+        vars(self).update(P=P, q=q, A=A, l=l, u=u)
 
     @staticmethod
     def from_qpsolvers(
@@ -228,7 +227,9 @@ def convex(P: Matrix) -> bool:
         return False
     if lowest == 0.0 and abs(P).sum(axis=0)[diagonal == 0.0].any():
         return False
-    ridged = np.where(diagonal > 0.0, (1.0 + RIDGE) * diagonal, 1.0)
+    ridged = (1.0 + RIDGE) * diagonal
+    if lowest == 0.0:
+        ridged[diagonal == 0.0] = 1.0
     if not is_sparse(P):
         factor = P.copy()
         factor.flat[:: len(P) + 1] = ridged

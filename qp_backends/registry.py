@@ -52,7 +52,6 @@ PACKAGES = {  # where the package is not called like the backend: (module, distr
     "copt": ("coptpy", "coptpy"),
     "hpipm": ("hpipm_python", "hpipm_python"),
 }
-EXTRAS = ("quadprog", "piqp", "highs", "scs")  # optional parts of our own package
 # Who takes over when another fails.  For dense problems the exact and fast ones come first, for
 # sparse ones those that solve most of the 40 Maros-Meszaros problems: 38, 40, 38, 33, 32, ...
 DENSE_ORDER = ("daqp", "quadprog", "piqp", "clarabel", "proxqp", "highs", "osqp", "scs")
@@ -119,8 +118,7 @@ def _imported(family: str, choice: str) -> Solver:
 
 def _pip(name: str) -> str:
     """The command that installs a backend."""
-    extra = f"minimax-cal[{name}]" if name in EXTRAS else _package(name)[1]
-    return f"pip install {extra}"
+    return f"pip install {_package(name)[1]}"
 
 
 def _package(name: str) -> tuple[str, str]:

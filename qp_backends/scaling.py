@@ -75,11 +75,10 @@ def factors(P: Matrix, A: Matrix) -> tuple[Array, Array]:
         K = np.zeros((n + m, n + m))
         K[:n, :n], K[n:, :n], K[:n, n:] = P, A, A.T
     units = np.ones(n + m)
-    for _ in range(PASSES if n else 0):
-        largest = K.max(axis=0)
+    for _ in range(PASSES if n else 0):  # K is symmetric, its entries in these units are u K u
+        largest = (K * units).max(axis=1)
         largest = largest.toarray().ravel() if is_sparse(K) else largest
-        step = 1.0 / np.sqrt(np.where(largest > 0.0, largest, 1.0))
-        units, K = units * step, _scaled(K, step, step)
+        units = units / np.sqrt(np.where(largest > 0.0, largest * units, 1.0))
     units = np.exp2(np.round(np.log2(units)))
     return units[:n], units[n:]
 

@@ -39,6 +39,7 @@ from .problem import COLD, Array, BackendError, Problem, Solution, Status, dense
 
 METHODS = {"restarted": 100_000, "raw": 10_000, "eliminated": 10_000}  # name: iteration limit
 LARGEST = 3000  # variables and rows; whitening costs their third power
+NEARLY_FLAT = 1e-5  # of the largest curvature: less decides nothing about a direction's unit
 COMPILE_AFTER = 2_000  # iterations after which compiling the loop pays
 
 
@@ -141,7 +142,7 @@ def scaled(problem: Problem) -> Scaled:
     P, A = dense(problem.P), dense(problem.A)
     curvature, V = np.linalg.eigh(P)
     largest = float(curvature.max(initial=0.0))
-    bent = curvature > 1e-7 * largest
+    bent = curvature > NEARLY_FLAT * largest
     B = A @ V
     scale = 1.0 / np.sqrt(np.where(bent, curvature, 1.0))
     square = B**2

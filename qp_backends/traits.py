@@ -74,7 +74,10 @@ TRAITS = {
         tolerances=("eps_abs", "eps_rel"),
         clock="time_limit",
         warm="x",
-        fixed={"max_iter": 50_000},
+        # It adapts rho by residuals relative to Ax and to Px, q, A'y: where x is small beside what
+        # pulls at it, as in the last steps of an SQP, it takes rho to its limit and crawls there.
+        fixed={"max_iter": 4_000, "adaptive_rho": False, "rho": 1.0},
+        rescue={"max_iter": 50_000, "adaptive_rho": True, "rho": 0.1},
     ),
     "proxqp": Trait(
         tolerances=("eps_abs",),

@@ -17,7 +17,7 @@ from scipy import sparse
 from .problem import COLD, EMPTY, BackendError, Solution, Status, nothing
 from .quiet import ungreeted
 from .rows import multipliers, split
-from .traits import reason, settings
+from .traits import TRAITS, Trait, reason, settings
 
 if TYPE_CHECKING:
     from .problem import Array, Matrix, Problem
@@ -69,7 +69,12 @@ def solve(
             model = _constant(problem, rows)
         options = settings(chosen.lower(), tolerance, time_limit)
         model.problem.solve(solver=chosen, warm_start=False, **options)
-        status = str(model.problem.status)
+        status, rescue = str(model.problem.status), TRAITS.get(chosen.lower(), Trait()).rescue
+        left = time_limit - (time.perf_counter() - start)
+        if status != cp.OPTIMAL and rescue and left > 0.0:
+            options = settings(chosen.lower(), tolerance, left) | dict(rescue)
+            model.problem.solve(solver=chosen, warm_start=False, **options)
+            status = str(model.problem.status)
         if model.x.value is None:
             return nothing(problem, reason(status), f"said {status}")
         z, y = (EMPTY if part is None else part.dual_value for part in (model.rows, model.equal))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -57,8 +56,7 @@ def solve(
         left = start + time_limit - time.perf_counter()
         if not raw.found and trait.rescue and left > 0:
             raw = _run(qp, method, settings(method, tolerance, left) | dict(trait.rescue))
-    answer = _answer(problem, rows, raw, method, time.perf_counter() - start)
-    return replace(answer, warm=warm)
+    return _answer(problem, rows, raw, method, start, warm)
 
 
 def _model(problem: Problem, rows: Rows, trait: Trait) -> qpsolvers.Problem:
@@ -128,8 +126,10 @@ def _definite(qp: Any, method: str, chosen: dict[str, Any], tolerance: float, un
     return raw
 
 
-def _answer(problem: Problem, rows: Rows, raw: Any, method: str, seconds: float) -> Solution:
-    """A solution of qpsolvers in our terms."""
+def _answer(
+    problem: Problem, rows: Rows, raw: Any, method: str, start: float, warm: bool
+) -> Solution:
+    """A solution of qpsolvers in our terms.  start: when the solve began [s]."""
     info = raw.extras.get("info", raw.extras)
     status = Status.SOLVED if raw.found else reason(str(_told(info, "status", "")))
     if method == "quadprog" and not raw.found:  # it stops early for no other reason
@@ -143,7 +143,8 @@ def _answer(problem: Problem, rows: Rows, raw: Any, method: str, seconds: float)
         y = multipliers(rows, problem.l.size, z[: rows.h.size], equal, bounds)
     steps = _told(info, "iter", 0)
     count = int(steps) if isinstance(steps, (int, np.integer)) else 0
-    return Solution(x, y, status, seconds, method, iterations=count)
+    seconds = time.perf_counter() - start
+    return Solution(x, y, status, seconds, method, iterations=count, warm=warm)
 
 
 def _told(info: Any, name: str, default: object) -> object:

@@ -94,7 +94,6 @@ report plain: report plain.json --date 2026-01-01 --tolerance "rms 0.2, max 0.5"
 compare: compare base.json moved.json --json
 check: check base.json @plain.csv --tolerance "rms 0.5" --json
 check moved: check base.json @moved.csv --tolerance "rms 0.2" -o checked.json
-fleet: fleet @cells.toml --jobs 1 --out cells --page fleet.html --json
 import leica: import @makers/tracker.csv --joints @makers/kalib.dat -o leica.csv
 import sa: import @makers/points.csv --joints @makers/calib.script --json
 import wrong: import @plain.csv --mend reverse --leave-out 12:smr2=bumped -o mended.csv
@@ -104,7 +103,6 @@ calibrate identified: calibrate found.json @sweeps.csv --objective sum --json
 plan: plan ur10 --poses 12 --candidates 80 --json
 plan fit: plan irb2600 --poses 6 --fit effects.json --candidates 60 -o plan.csv
 plan separate: plan irb2600 --poses 4 --fit base.json --candidates 40 --separate joint_compliance:J2 link_bending:L2 --json
-plan camera: plan ur5 --poses 6 --candidates 40 --camera cam0=@cell/cam0.yaml --board @cell/board.csv --camera-at 40,-30,80,9.5,4.2,-13.2 --board-at 596.3,100,50,-10.6,9.6,2.6 --print-looks z --json
 plan motion: plan irb2600 --motion --duration 6 --payload 2 -o motion.csv --waypoints ways.csv
 effects: effects irb2600 @plain.csv --json
 robots: robots --json
@@ -139,7 +137,7 @@ PIXELS = (
 )
 DIAGNOSED = "diagnose {0}: diagnose @arms/{1}.json @arms/{0}.{1}.csv -o {0}.gap.json"
 EXPORTED = "export {0} {1}: export {0}.json --to {1} --experimental -o {0}.as.{1}"
-FORMATS = ("urdf", "ur-yaml", "ros-yaml", "ros2-control", "dh-csv", "json", "moc", "mjcf", "sdf")
+FORMATS = ("urdf", "ur-yaml", "ros-yaml", "ros2-control", "dh-csv", "json", "moc", "mjcf")
 # Real arms, $ being their folder; each by another objective and in another format.
 REAL = {
     "fanuc_r2000": ("sum", "ros-yaml"),

@@ -82,7 +82,7 @@ def test_all_brings_what_every_page_needs():
         return {name}.union(*map(parts, named))
 
     assert set(re.findall(r"pip install --quiet \"\.\[(\w+)\]\"", README)) == {"all"}
-    assert parts("all") >= {"plot", "backends", "report", "fleet", "app", "fast", "mujoco"}
+    assert parts("all") >= {"plot", "backends", "report", "jobs", "app", "fast", "mujoco"}
 
 
 def test_the_example_is_what_its_script_makes(tmp_path, monkeypatch):

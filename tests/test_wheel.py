@@ -15,7 +15,7 @@ import pytest
 from conftest import ROOT
 
 from minimax_cal.cli.commands import ENTRIES
-from tests.fuzz.material import CELLS, material
+from tests.fuzz.material import material
 
 pytestmark = pytest.mark.slow
 Ran = subprocess.CompletedProcess[str]
@@ -60,9 +60,6 @@ def installed(built: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Ca
     (folder / "targets.csv").write_text(f"{header}\n20,30,-10,40,50,60\n-20,10,20,-40,60,10\n")
 
     (folder / "wires.csv").write_bytes(material()["wires.csv"])
-    (folder / "cells.toml").write_text(
-        CELLS.replace("robot.json", "irb120").replace("data.csv", "poses.csv")
-    )
     known.clear()
 
     def run(*arguments: object, code: int = 0) -> Ran:
@@ -103,7 +100,6 @@ def test_every_command_runs_or_names_its_extra(installed):
     run("relative", "irb120", "wires.csv")
     run("check", "fit.json", "poses.csv", "--tolerance", "rms 0.5")
     run("compare", "fit.json", "fit.json")
-    run("fleet", "cells.toml", "--jobs", 1)
     run("compensate", "fit.json", "targets.csv")
     run("iso9283", "fit.json")
     run("map", "fit.json", "--samples", 1000, "--json")
@@ -128,4 +124,4 @@ def test_every_command_runs_or_names_its_extra(installed):
         assert extra in line
     assert known - {"--version"} == set(ENTRIES)
     missing = run("calibrate", "irb120", "poses.csv", "--qp", "piqp").stderr
-    assert "pip install minimax-cal[piqp]; daqp is used" in missing
+    assert "pip install piqp; daqp is used" in missing

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import atexit
+import errno
 import gc
 import os
+import signal
 import sys
 from collections.abc import Sequence
+from types import FrameType
 
 COLLECTED = 500_000  # new objects after which Python looks for garbage: what is imported is none
 FAILED, MISUSED, INTERRUPTED = 1, 2, 130  # exit codes
+OF_SIGNAL = 128  # beside its number, the exit code of a process that a signal ends
+LEAST_ADDRESSES = 1 << 30  # bytes of address space: shared libraries and compiled kernels take it
+NO_MEMORY = "there is not enough memory for this; give fewer poses or samples"
+
+
+class Terminated(BaseException):
+    """The process was asked to end, by the signal of a number."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -21,11 +31,66 @@ def main(arguments: Sequence[str] | None = None) -> None:
         gc.set_threshold(COLLECTED)
         atexit.register(gc.freeze)  # what is left at the end is not looked through
         os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it looks everywhere for them
+        raise_on_signals()
     try:
+        if mapped := limit_of_addresses():
+            print(
+                f"error: this process may map {mapped >> 20} MiB (ulimit -v); it needs "
+                f"{LEAST_ADDRESSES >> 20} MiB", file=sys.stderr,
+            )  # fmt: skip
+            sys.exit(FAILED)
         from minimax_cal.cli.running import outcome  # imports take long enough for a Ctrl-C
 
         code = outcome(arguments)
     except KeyboardInterrupt:
         print("error: interrupted", file=sys.stderr)
         code = INTERRUPTED
+    except Terminated as ended:
+        end_at_once(OF_SIGNAL + ended.args[0])
+    except (MemoryError, ImportError, OSError) as error:
+        if not is_out_of_memory(error):
+            raise
+        print(f"error: {NO_MEMORY}", file=sys.stderr)
+        code = FAILED
     sys.exit(code)
+
+
+def raise_on_signals() -> None:
+    """Let TERM, and the end of the terminal, raise `Terminated`: files are put in order then."""
+    for name in ("SIGTERM", "SIGHUP"):  # Windows has no second
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) == signal.SIG_DFL:  # nohup ignores it
+            signal.signal(number, raise_terminated)
+
+
+def raise_terminated(number: int, _: FrameType | None) -> None:
+    """What a signal does."""
+    raise Terminated(number)
+
+
+def end_at_once(code: int) -> None:
+    """End this process without waiting for threads, which may be at work for long."""
+    print("error: terminated", file=sys.stderr, flush=True)
+    os._exit(code)
+
+
+def limit_of_addresses() -> int:
+    """The bytes that may be mapped, where they are too few; else 0.
+
+    OpenBLAS would wait for ever then, or abort.
+    """
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return most if most != resource.RLIM_INFINITY and most < LEAST_ADDRESSES else 0
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error, as also of a library that cannot be loaded, is of too little memory."""
+    if isinstance(error, OSError):
+        return error.errno in (errno.ENOMEM, errno.EAGAIN)
+    mapped = "failed to map segment", "annot allocate memory"
+    unloaded = isinstance(error, ImportError) and any(text in str(error) for text in mapped)
+    return unloaded or isinstance(error, MemoryError)

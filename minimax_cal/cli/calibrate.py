@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,7 @@ from minimax_cal.cli.options import (
 )
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.opened import listed_effects
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.pixels.options import FIELDS, OF_CAMERAS, PixelFiles, PixelOptions
 from minimax_cal.fitting.several.options import RelativeOptions
@@ -85,6 +86,7 @@ def calibrate_command(
     cameras saw is given with --pixels, --joints and --camera, alone or beside DATA.
     """
     files, rest = among(data, chosen)
+    to.notice(*unconfirmed(chosen["effects"]))
     if not rest and "effects" not in on_command_line():
         return by_cameras(robot, files, to, chosen)
     asked = {name: chosen[name] for name in chosen if name in OPTIONS}
@@ -126,13 +128,20 @@ def by_cameras(robot: str, files: PixelFiles, to: Output, chosen: dict[str, Any]
     return to.finish(fit, status=fit.status, reason=fit.reason)
 
 
+def unconfirmed(effects: Sequence[str]) -> Iterator[str]:
+    """What is said of diagnoses among `--effects` that confirm nothing."""
+    for name in effects:
+        if name.endswith(".json") and not listed_effects(name):
+            yield f"{name}: the diagnosis confirms no effect; nothing of it is fitted"
+
+
 def advice(
     fit: Fit, robot: str, data: tuple[Path, ...], written: Path | None
 ) -> Iterator[tuple[str, str]]:
     """What to do next, and its command.  written: where the result went."""
     from minimax_cal.robots.urdf import ends_of, has_links, is_urdf  # not before it has calibrated
 
-    if not fit.cell.effects.terms:
+    if not (fit.cell.effects.terms or "effects" in on_command_line()):
         left = f"{fit.within.after.rms_mm:.3f} mm"
         diagnose = f"minimax-cal diagnose {robot} {' '.join(map(str, data))}"
         yield f"Next, to find the cause of the remaining {left}", diagnose

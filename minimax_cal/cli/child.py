@@ -6,7 +6,7 @@ import threading
 import time
 from _thread import interrupt_main
 
-from minimax_cal.cli import INTERRUPTED, main
+from minimax_cal.cli import INTERRUPTED, main, raise_on_signals
 
 PATIENCE = 3.0  # seconds from being interrupted to being ended
 
@@ -21,6 +21,7 @@ def end_with_parent() -> None:
 
 
 if __name__ == "__main__":
+    raise_on_signals()
     threading.Thread(target=end_with_parent, daemon=True).start()
     os.chdir(sys.argv[1])  # the session's folder, once all is imported from where the page is
     main(sys.argv[2:])

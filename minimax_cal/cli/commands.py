@@ -22,11 +22,11 @@ MORE = "More"
 COMMANDS = {  # what most people need, in the order of the work, and the rest
     "Commands": "import calibrate diagnose check compare evaluate compensate export gap plan "
     "report serve",
-    MORE: "identify relative torques simulate robots effects backends fleet iso9283 map",
+    MORE: "identify relative torques simulate robots effects backends iso9283 map",
 }
 WHOLE = "--help-all"
 # parameters that name outputs
-WRITTEN = ("output", "figure", "path", "pdf", "truth", "write", "out")
+WRITTEN = ("output", "figure", "path", "pdf", "truth", "write", "waypoints", "randomize")
 SPARED = ("numpy.f2py", "numpy.testing")  # which SciPy would load and no command uses
 LONG = ("relative", "diagnose", "plan", "gap")  # worth compiled kernels
 ELSEWHERE = {"import": "import_", "effects": "diagnose"}  # not in a module of their name

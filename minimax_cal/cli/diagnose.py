@@ -24,10 +24,10 @@ from minimax_cal.cli.options import (
     of_any,
     on_command_line,
     options_from,
+    plain_option,
     refuse,
     result_options,
     together,
-    workers,
 )
 from minimax_cal.diagnosing.diagnose import DiagnosisOptions, diagnose
 from minimax_cal.diagnosing.result import Diagnosis
@@ -52,7 +52,17 @@ from minimax_cal.solvers.status import Status
 @options_from(DiagnosisOptions)
 @options_from(RelativeOptions, "offset", "known_distances", "lever", "noises", *Images.options)
 @options_from(PixelFiles)
-@workers(1, "1")
+@plain_option(
+    "Who does the work",
+    "--jobs",
+    type=int,
+    default=1,
+    help="The number of processes; -1: one a core [default: 1].",
+)
+@plain_option(
+    "Who does the work", "--cluster", default="", metavar="tcp://HOST:PORT",
+    help="Let a Dask cluster do it instead.",
+)  # fmt: skip
 @ROWS
 @result_options("the diagnosis (JSON)", keep="diagnosis.json", figure="the gap and where it lies")
 def diagnose_command(

@@ -73,11 +73,6 @@ def paired(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
         read=Path,
         group=LOGS,
     ),
-    friction=Option(
-        "What holds friction of joints at rest beside `frictionloss`: dcmotor.",
-        metavar="ELEMENT",
-        group=LOGS,
-    ),
 )
 @options_from(MotionKnown, "payload", "drive_gain", "ratio", group=LOGS)
 @options_of(
@@ -104,7 +99,7 @@ def gap_command(model: Path, data: tuple[Path, ...], to: Output, **chosen: Any) 
         del chosen["seed"]
         moved = to.work(motion_gap, model, data, **chosen)
         beside = ((chosen["actuators"] or ("", None))[1], chosen["randomize"])
-        to.wrote(moved.written, moved.module, *(path for path in beside if moved.kept))
+        to.wrote(moved.written, *(path for path in beside if moved.kept))
         said = (*moved.notices, *moved.sentences())
         return to.finish(moved, notices=said, draw=save_motion_gap)
     if len(data) > 1:

@@ -160,17 +160,6 @@ def stacked(*decorators: Decorator) -> Decorator:
 QUIET = stacked(NO_NOTICES, PROGRESS)
 
 
-def workers(default: int, shown: str) -> Decorator:
-    """The options --jobs and --cluster.  shown: the default in words."""
-    group = "Who does the work"
-    counted = f"The number of processes; -1: one a core [default: {shown}]."
-    cluster = "Let a Dask cluster do it instead."
-    return stacked(
-        plain_option(group, "--jobs", type=int, default=default, help=counted),
-        plain_option(group, "--cluster", default="", metavar="tcp://HOST:PORT", help=cluster),
-    )
-
-
 def option_of(name: str, default: Any, told: Option) -> Decorator:
     """The click option of a field or argument, which is its default where it is not given."""
     spelt = told.flag or "--" + name.replace("_", "-")
@@ -400,8 +389,11 @@ class Output:
         """Say, write, show and draw a `Result` as it was asked for; the exit code.
 
         status, reason: how it ended and why.  notices, json, show: its own unless given.
-        file, rows: as of `deliver`.  draw: saves its picture.  screen: as of `present`.
+        file, rows: as of `deliver`.  draw: saves its picture.  screen: as of `present`; after a
+        failure nothing is advised but its mend, which the sentences hold.
         """
+        if status is Status.FAILED:
+            screen["advice"] = ()
         said = found.notices if notices is None else notices
         self.notice(*(text for text in said if text != reason))
         if self.deliver(json or found.json, status, file, rows):
@@ -425,7 +417,7 @@ class Output:
         Every table alone where it has no first screen.
         sentences, tables, advice: other than its own, and how to keep it.  more: tables beside it.
         """
-        sentences = sentences or [found.headline()]
+        sentences = [flagged(text) for text in sentences or [found.headline()]]
         if self.details:
             terminal().print(Text(visible(" ".join(sentences))))
             click.echo()
@@ -497,7 +489,11 @@ def of_any(
     if isinstance(data, list):
         to.took(*((one.at.source, f"{one.kind} at {one.poses} poses") for one in data))
         return data
-    to.took((data.source, f"points at {data.poses} poses"))
+    seen, joints = f"points at {data.poses} poses", data.origins[0].joints if data.origins else ""
+    if joints:
+        to.took((" + ".join(data.origins[0].points), seen), (joints, "their joint values"))
+    else:
+        to.took((data.source, seen))
     return visited(data, in_rows)
 
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import io
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from contextvars import copy_context
 
 import click
 
-from minimax_cal.cli import INTERRUPTED, MISUSED
+from minimax_cal.cli import INTERRUPTED, MISUSED, NO_MEMORY, is_out_of_memory
 from minimax_cal.cli.commands import ENTRIES, WHOLE_HELP, Commands, Workflow
-from minimax_cal.cli.stderr import AS_JSON, complain
+from minimax_cal.cli.stderr import AS_JSON, WRITTEN, complain, tell_written
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
+from minimax_cal.ground.journal import all_or_none
 
 
 @click.group(
@@ -35,6 +37,7 @@ def outcome(arguments: Sequence[str] | None) -> int:
 def run_command(arguments: Sequence[str] | None) -> int:
     """As `outcome`, which forgets what an option said about stderr."""
     AS_JSON.set(False)
+    WRITTEN.set([])
     if sys.stdout is None:  # a file that is opened next would take its place
         return complain(
             "stdout is closed and the result would be lost; end with >/dev/null", MISUSED
@@ -46,7 +49,8 @@ def run_command(arguments: Sequence[str] | None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CalibrationWarning)  # the notices say the same
-            code = cli.main(args=arguments, prog_name="minimax-cal", standalone_mode=False)
+            with whole_outputs():
+                code = cli.main(args=arguments, prog_name="minimax-cal", standalone_mode=False)
     except CalibrationError as error:
         code = complain(said_by(error, arguments), MISUSED)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -58,13 +62,28 @@ def run_command(arguments: Sequence[str] | None) -> int:
         code = complain(error.format_message() + hint, MISUSED)
     except (KeyboardInterrupt, click.Abort):
         code = complain("interrupted", INTERRUPTED)
-    except OSError as error:
-        code = complain(f"the output cannot be written ({error.strerror})")
-    except MemoryError:
-        code = complain("there is not enough memory for this; give fewer poses or samples")
     except Exception as error:
-        code = numerical(error)
+        if is_out_of_memory(error):
+            code = complain(NO_MEMORY)
+        elif isinstance(error, OSError):
+            code = complain(f"the output cannot be written ({error.strerror})")
+        else:
+            code = numerical(error)
     return code or 0
+
+
+@contextmanager
+def whole_outputs() -> Iterator[None]:
+    """Keep the files of a command that ends, and say so; else none, but for a lost stdout."""
+    try:
+        with all_or_none():
+            yield
+    except OSError:
+        raise
+    except BaseException:
+        WRITTEN.set([])
+        raise
+    tell_written()
 
 
 def said_by(error: CalibrationError, arguments: Sequence[str] | None) -> str:

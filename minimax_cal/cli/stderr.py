@@ -12,18 +12,34 @@ from minimax_cal.cli import FAILED
 from minimax_cal.ground.words import one_line
 
 AS_JSON: ContextVar[bool] = ContextVar("AS_JSON", default=False)  # of the command that is at work
+WRITTEN: ContextVar[list[tuple[str, dict[str, Any]]]] = ContextVar("WRITTEN")  # not told yet
 TAKEN: ContextVar[list[str]] = ContextVar("TAKEN")  # what files were taken for, not told yet
 
 
 def tell(event: str, text: str, **more: Any) -> None:
     """Say what happened on stderr, what files were taken for before it; an error stands alone.
 
+    Files that were written are named once the command has ended, or before an error of numbers:
+    until then any other error takes them back.
     event: "progress", "notice", "written", "error" or "summary".  more: what else the JSON holds.
     """
+    if event == "written" and (written := WRITTEN.get(None)) is not None:
+        tell_taken()
+        written.append((text, more))
+        return
     if event == "error":
         TAKEN.set([])
+        tell_written()
     tell_taken()
     say(event, text, **more)
+
+
+def tell_written() -> None:
+    """Say which files were written, unless stderr says so already."""
+    every = WRITTEN.get([])
+    while every:
+        text, more = every.pop(0)
+        say("written", text, **more)
 
 
 def tell_taken() -> None:

@@ -84,7 +84,7 @@ def torques_command(
                               progress=progress, **vars(known))  # fmt: skip
     to.notice(*found.notices)
     if made:
-        to.wrote(write, made.module)
+        to.wrote(write)
     return to.finish(
         found,
         notices=[f"{made.written}: {text}" for text in made.sentences()] if made else (),

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.correcting.exporters.job import Export, job_of
-from minimax_cal.correcting.exporters.table import EXPORTERS
+from minimax_cal.correcting.exporters.table import EXPORTERS, FORMATS, export
 from minimax_cal.fitting.accuracy import Accuracy, accuracy
 from minimax_cal.fitting.calibrate import fit_split
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.opened import GEOMETRIC, Opened, Result, open_result
 from minimax_cal.fitting.options import OFFSETS, Progress, silent
-from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import finite
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
@@ -103,7 +103,8 @@ class Delivered:
     joint_compliance:all.  cell: the arm as fitted for exactly that.
     nominal: before the calibration, None where the result does not tell it.  figures: its own;
     whole: those of the full model.  fit: the calibration that `cell` is of, None where there is
-    none.  reason: why it was not fitted again though it does not hold all; else empty.
+    none.  reason: why it was not fitted again though it does not hold all; else empty.  unmade: why
+    the file cannot be made; else empty.
     missed: the held-out poses by the formulas of the fit and by the file, where they may differ.
     """
 
@@ -118,6 +119,7 @@ class Delivered:
     fit: Fit | None = None
     rest: str = ""
     reason: str = ""
+    unmade: str = ""
     missed: tuple[Accuracy, Accuracy] | None = None
 
     def rms_of_file(self, size: float) -> float:
@@ -149,6 +151,8 @@ class Delivered:
 
     def sentence(self) -> str:
         """What it holds and how well it does, beside the full model."""
+        if self.unmade:
+            return f"{self.format} cannot be made: {self.unmade}"
         if self.reason:
             return (
                 f"{self.format} does not hold {self.lacks}, and how well the rest does without is "
@@ -218,14 +222,38 @@ def deliver(
     --------
     >>> mc.deliver(fit, "urdf").to_dict()
     """
-    if to not in DELIVERABLES:
-        raise OptionError(f"{to}: no such format; choose one of {', '.join(DELIVERABLES)}")
+    check_format(to)
     known = open_result(fit, rung)
     made = delivered(known, to, clock, progress)
     if not (to in EXPORTERS and EXPORTERS[to].simulated and known.held.any()):
         return made
     job = job_of(known.source, made.cell, made.nominal, known.train.q)
     return as_written(made, known, EXPORTERS[to].write(job))
+
+
+def deliver_or_explain(fit: Result, to: str, rung: int | None = None) -> Delivered:
+    """As `deliver`; where the file cannot be made, what says why.
+
+    Raises OptionError for a format that does not exist.
+    """
+    check_format(to)
+    try:
+        made = deliver(fit, to, rung=rung)
+        if to in FORMATS and not EXPORTERS[to].simulated:  # that of a simulator was written already
+            export(job_of(made.format, made.cell, made.nominal), to)
+        return made
+    except (CalibrationError, np.linalg.LinAlgError) as error:
+        known = open_result(fit, rung)
+        whole, why = Figures.at_rung(known), " ".join(str(error).split()).removeprefix(f"{to}: ")
+        return Delivered(
+            to, PARTS[""], (), (), known.cell, known.nominal, Figures(), whole, unmade=why
+        )
+
+
+def check_format(to: str) -> None:
+    """Raise OptionError for a deliverable that does not exist."""
+    if to not in DELIVERABLES:
+        raise OptionError(f"{to}: no such format; choose one of {', '.join(DELIVERABLES)}")
 
 
 def check_kept(known: Opened, keep_anyway: bool) -> None:

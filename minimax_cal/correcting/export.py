@@ -95,9 +95,9 @@ def export(
     ----------
     fit
         A calibration, its cell, a diagnosis, a relative calibration or a robot, or the file
-        or name of one; an MJCF is converted to sdf as it is.
+        or name of one.
     to
-        urdf, ur-yaml, ros-yaml, ros2-control, dh-csv, json, mjcf or sdf.
+        urdf, ur-yaml, ros-yaml, ros2-control, dh-csv, json or mjcf.
     path
         Written to as well, where given.
     options
@@ -137,8 +137,6 @@ def exported(
 ) -> Exported:
     """The bytes of the file, its notices, and what it delivers; arguments as of `export`."""
     table.exporter(to)
-    if isinstance(fit, Path | str) and Path(fit).suffix.lower() in table.CONVERTERS.get(to, ()):
-        return Exported(to, table.convert(Path(fit)))
     source, found = read_source(fit, options.rung), None
     if isinstance(source, Job):
         job = source

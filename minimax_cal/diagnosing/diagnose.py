@@ -21,7 +21,6 @@ from minimax_cal.diagnosing.causes import (
     left_beside,
     merged,
     whole,
-    with_jumps,
 )
 from minimax_cal.diagnosing.error_maps import error_maps
 from minimax_cal.diagnosing.established import often
@@ -46,7 +45,6 @@ from minimax_cal.diagnosing.trial import session_notices
 from minimax_cal.diagnosing.verdict import ABOVE_NOISE, down_to, explanation, known_noise
 from minimax_cal.diagnosing.what_remains import remaining_of
 from minimax_cal.diagnosing.where import where
-from minimax_cal.evidence.stability import resemblances
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
 from minimax_cal.fitting.claims import too_far
@@ -73,13 +71,12 @@ from minimax_cal.measuring.faults import find_faults, in_lines, mended, standing
 from minimax_cal.measuring.faults.fault import Fault
 from minimax_cal.measuring.faults.nests import RESEAT
 from minimax_cal.measuring.faults.sessions import session_jumps
-from minimax_cal.measuring.grouping import clusters, held_out, split, with_groups
+from minimax_cal.measuring.grouping import clusters, held_out, with_groups
 from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.table import EFFECTS
-from minimax_cal.modelling.effects.time import TARGET_SHIFT
+from minimax_cal.modelling.effects.time import SESSION_JUMP, TARGET_SHIFT
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.robots.robot import Robot, load_robot
 
@@ -88,7 +85,6 @@ PARTS, REMAINING = "regions held out", "remaining error"
 STEPS = (FAULTY, CAUSES, BUDGET, PARTS, REMAINING)
 NOT_ASKED = Beyond(reason="not asked for")
 ROBUST = replace(SUM, trim=0.3)  # a fit that up to so many wrong points do not pull
-EARLIEST = 5  # visits before a jump that a study takes for possible, and after it
 sought = grouped("What is sought")
 
 
@@ -313,6 +309,8 @@ def notices_of(
     late: outliers that the gap had hidden.  effects: with the values of the last fit.
     """
     yield from clean.remarks
+    if not any(one.term.effect == SESSION_JUMP.name for one in effects):  # its size is the fit's
+        yield from clean.jumps
     yield from filter(None, [study.scene.unused_torques])
     if late:
         yield f"outliers that no effect found explains: {name_first(late)}"
@@ -434,7 +432,8 @@ class Clean:
     given: as measured, but for points that stood in each other's rows.  left: points that no fit
     counts, by lines of the file.  faults: their rows as lines
     of the file.  remarks: on them, for people.  fit: the geometric fit of the training poses, where
-    it is that of the clean data.  moments: as `Study` has them.
+    it is that of the clean data.  moments: as `Study` has them.  jumps: what is said of these,
+    where no effect says it.
     """
 
     data: Measurements
@@ -444,6 +443,7 @@ class Clean:
     remarks: tuple[str, ...]
     fit: Solved | None
     moments: Array
+    jumps: tuple[str, ...]
 
 
 def cleaned(asked: Asked, progress: Progress) -> Clean:
@@ -483,12 +483,15 @@ def cleaned(asked: Asked, progress: Progress) -> Clean:
     sound = mended(sound, more)
     sound = sound.take(np.asarray(sound.seen.any(axis=1)))
     jumped = session_jumps(cell.placed(sound), cell.error(sound))
-    told = (*found, *more, *jumped)
+    told = (*found, *more)
     remarks = tuple(fault.text for fault in told if fault.effect != TARGET_SHIFT.name)
     rows = np.concatenate([NO_ROWS, *(fault.rows for fault in jumped)])
     moments = sound.columns["clock"][rows]
     left = tuple(in_lines(data, (*found, *more), "outliers", RESEAT))
-    return Clean(sound, data, left, faults, remarks, None if more else fit, moments)
+    return Clean(
+        sound, data, left, faults, remarks, None if more else fit, moments,
+        tuple(fault.text for fault in jumped),
+    )  # fmt: skip
 
 
 def in_order(robot: Robot, data: Measurements) -> tuple[Measurements, tuple[Fault, ...]]:
@@ -499,23 +502,3 @@ def in_order(robot: Robot, data: Measurements) -> tuple[Measurements, tuple[Faul
     text = f"{data.source}: rows hold each other's points: {data.list_rows(rows)}"
     fault = Fault("swapped_rows", "all", text, data.line[rows])
     return put_right(data, rows, source), (fault,)
-
-
-def resemblance(
-    robot: Robot | str | Path, data: Measurements | str | Path, displacement: Array
-) -> dict[tuple[str, str], float]:
-    """rho^2 between a known displacement and every effect that the data can test.
-
-    displacement: (k, m, 3) of the points of all rows in the measurement frame [m].  Both are seen
-    by the training poses, after projection on what geometry cannot imitate.  For studies.
-    """
-    robot = load_robot(robot)
-    data = with_history(read_measurements(data))
-    train, _, _ = split(data, 0.2, 0)
-    study = studied(robot, train, fit_cell(robot, train, SUM, silent))
-    rows = np.isin(data.line, train.line)
-    moved = np.einsum("ab,kma->kbm", study.fit.state.rotation, displacement[:, rows])
-    clock = np.unique(study.scene.column("clock"))  # a jump may be at any moment
-    study = replace(study, moments=clock[EARLIEST : len(clock) - EARLIEST])
-    lib = with_jumps(arm_library(study.scene, study.rows), study)
-    return resemblances(lib, study.rows.of(moved[None]))

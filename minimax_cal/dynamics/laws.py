@@ -2,8 +2,8 @@
 
 Usual friction, Coulomb and viscous, stands beside the rigid body at every joint and is judged at
 the end.  A law at one joint adds to that joint's rows only; one of the whole motion to all.  Of a
-law's `torque` are made: columns of the search, the curve that is drawn, the module beside a
-simulator's file and its callback, the rows of the documentation's table.
+law's `torque` are made: columns of the search, the curve that is drawn, the rows of the
+documentation's table.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ KNOWN_LOAD, OTHER_RUNS = "a run with a known payload", "longer runs of another k
 SLOW_AND_FAST = "a run with a slow part and one at full speed"
 NO_ELEMENT = "a model has no element for it"
 CURVE, ANGLE = "friction_curve", "torque_by_angle"  # families
-# Of one joint along the motion, by the names that laws use for them; the module knows IN_MODULE.
+# Of one joint along the motion, by the names that laws use for them.
 QUANTITIES: dict[str, Callable[[Scene, int], Any]] = {
     "q": lambda s, j: s.logs.motion.q[:, j],  # joint value [rad, m]
     "v": lambda s, j: s.logs.motion.qd[:, j] / s.arm.fastest[j],  # speed over the largest
@@ -41,28 +41,24 @@ QUANTITIES: dict[str, Callable[[Scene, int], Any]] = {
     "way": lambda s, j: s.since_reversal[:, j],  # from where it turned round last [rad, m]
     "gear": lambda s, j: abs(s.arm.ratio[j]),  # its ratio
 }
-IN_MODULE = QUANTITIES.keys() - {"a"}
 
 
-OTHERS = "MJX, USD and SDF"  # that read a file of MuJoCo
+OTHERS = "MJX and USD"  # that read a file of MuJoCo
 
 
 class Element(StrEnum):
-    """What holds laws beside a simulator: elements of its file, and the module beside it.
+    """Elements of a simulator's file that hold laws, in the order in which they are shown.
 
-    attributes: of MuJoCo's file.  lost, readers: what other readers of it leave out, and which.
+    attributes: of MuJoCo's file.  lost: what other readers of it leave out.
     """
 
     attributes: str
     lost: str
-    readers: str
 
-    def __new__(
-        cls, name: str, attributes: str = "", lost: str = "", readers: str = OTHERS
-    ) -> Self:
+    def __new__(cls, name: str, attributes: str, lost: str = "") -> Self:
         """A name with its facts."""
         made = str.__new__(cls, name)
-        made._value_, made.attributes, made.lost, made.readers = name, attributes, lost, readers
+        made._value_, made.attributes, made.lost = name, attributes, lost
         return made
 
     FRICTION = "friction", "frictionloss, damping"
@@ -72,17 +68,11 @@ class Element(StrEnum):
     SPRINGS = "springs", "stiffness, springref", "all but the first number of `stiffness`"
     GAIN = "drive gain", "gear"
     DELAY = "delay", "delay", "`delay`"
-    BRISTLES = ("friction at rest", "frictionloss, dcmotor with lugre",
-                "`dcmotor`, with which MJX loads no file", "USD and SDF")  # fmt: skip
-    MODULE = "module", "", "what no element holds", "all simulators but MuJoCo"
 
     @property
     def left_out(self) -> str:
         """Who leaves out what of it, for people."""
-        return f"{self.readers} leave out {self.lost} ({self}); see plain="
-
-
-IN_FILE = tuple(one for one in Element if one.attributes)  # in the order in which they are shown
+        return f"{OTHERS} leave out {self.lost} ({self}); see plain="
 
 
 @dataclass(frozen=True)
@@ -129,7 +119,7 @@ class Law:
     at: Literal["joint", "all", "last link"] = "joint"
     repeats: bool = False
     separate: str = OTHER_RUNS
-    held: tuple[Element, ...] = (Element.MODULE,)
+    held: tuple[Element, ...] = ()
     why: str = NO_ELEMENT
 
     @cached_property
@@ -300,17 +290,19 @@ def turns(scene: Scene, j: int) -> str:
 
 WAVES: Any = {"names": ("cos", "sin"), "units": ("t", "t")}
 IN_CURVE: Any = {"family": CURVE, "separate": SLOW_AND_FAST}
+LEVELS: Any = {**IN_CURVE, "held": (Element.LEVELLED,),
+               "why": "needs `damping` of v|v| and v^3, which this file may not have"}  # fmt: skip
 BY_ANGLE: Any = {"family": ANGLE, "separate": SLOW_AND_FAST}
 SHARE: Any = {"names": ("share",), "units": ("",), "typical": 0.2, "of_torque": False}
 EVERY = (
     # a lubricant that thins with shear: a power of the speed below one
     Law("degressive", "viscous friction that levels off", ("np.abs(v) ** power",), dry=True,
         tuned={"power": Tuned((0.25, 0.5, 0.7), bounds=(0.1, 0.85))}, nonnegative=True,
-        held=(Element.LEVELLED, Element.MODULE), **IN_CURVE),
+        **LEVELS),
     # it falls from rest with the speed [Armstrong-Helouvry 1994]
     Law("stribeck", "Stribeck friction", ("np.exp(-((v / speed) ** 2))",), dry=True,
         tuned={"speed": Tuned((0.03, 0.08, 0.2), bounds=(0.01, 0.35))}, needs=is_slow,
-        nonnegative=True, held=(Element.LEVELLED, Element.MODULE), **IN_CURVE),
+        nonnegative=True, **LEVELS),
     # friction that is not yet there just after a reversal [Dahl 1968]
     Law("presliding", "presliding", ("-np.exp(-way / length)",), dry=True,
         tuned={"length": Tuned(unit="rad", bounds=(0.0, np.inf))}, choices=by_length,
@@ -321,17 +313,17 @@ EVERY = (
     Law("angle_friction", "friction that depends on the angle", ("np.cos(q)", "np.sin(q)"),
         dry=True, needs=turns, **WAVES),
     Law("warm_up", "friction that falls with warmth", made=warm_up, choices=by_warmth, needs=warms,
-        tuned={"seconds": Tuned(unit="s", bounds=(0.0, np.inf))}, held=()),
+        tuned={"seconds": Tuned(unit="s", bounds=(0.0, np.inf))}),
     Law("armature", "rotor inertia", ("a",), names=("inertia",), units=("t s^2/rad",),
         nonnegative=True, held=(Element.ARMATURE,)),
     # its rotor is no law: of parallel joints it is what a rotor of one joint and the links are
     Law("coupled_drive", "drive that turns by two joints", (), ("Coulomb", "viscous"),
         ("t", "t s/rad"), coupled_drive, choices=by_sign, needs=has_neighbour, nonnegative=True,
-        tuned={"sign": Tuned()}, held=(), why="give `coupling` in the robot file"),
+        tuned={"sign": Tuned()}, why="give `coupling` in the robot file"),
     Law("drive_gain", "drive gain", ("load",), needs=has_gains, separate=KNOWN_LOAD,
         held=(Element.GAIN,), **SHARE,
         why="scales what is logged, and no motor of the model holds it: give drive_gain="),
-    Law("torque_offset", "torque offset", ("1.0",), names=("offset",), held=(),
+    Law("torque_offset", "torque offset", ("1.0",), names=("offset",),
         why="the torque is read with an offset, which is none of the arm's", **BY_ANGLE),
     Law("torque_ripple", "torque ripple of the gear",
         ("np.cos(multiple * gear * q)", "np.sin(multiple * gear * q)"),
@@ -345,15 +337,15 @@ EVERY = (
         ("mass", *(f"moment_{k}" for k in "xyz"),
          *(f"inertia_{k}" for k in ("xx", "xy", "xz", "yy", "yz", "zz"))),
         ("kg", *("kg m",) * 3, *("kg m^2",) * 6), payload, needs=has_runs,
-        typical=10.0, of_torque=False, at="last link", repeats=True, separate=KNOWN_LOAD, held=(),
+        typical=10.0, of_torque=False, at="last link", repeats=True, separate=KNOWN_LOAD,
         why="changes between the runs; the model carries one load"),
     Law("joint_flexibility", "joint flexibility", (), ("compliance",), ("rad/(N m)",), compliant,
-        needs=has_gains, nonnegative=True, typical=1e-3, of_torque=False, held=(),
+        needs=has_gains, nonnegative=True, typical=1e-3, of_torque=False,
         why="give a static calibration (fit=), whose springs a model holds"),
     Law("delay", "delay of the torque", (), ("time",), ("s",), delay, typical=0.02, of_torque=False,
         at="all", held=(Element.DELAY,)),
     Law("encoder_zero", "encoder zero", (), ("offset",), ("rad",), encoder_zero, needs=has_gains,
-        typical=0.02, of_torque=False, held=()),
+        typical=0.02, of_torque=False),
 )  # fmt: skip
 LAWS: dict[str, Law] = {law.name: law for law in EVERY}
 BUILT_IN = frozenset(LAWS)
@@ -392,9 +384,6 @@ def register_law(law: Law) -> Law:
         raise OptionError(f"law {law.name!r}: is built in, or no name; give it one of its own")
     if len({len(law.names), len(law.units), len(law.torque or law.names)}) > 1:
         raise OptionError(f"law {law.name}: give a name and a unit for each of its parameters")
-    if Element.MODULE in law.held and not law.reads <= IN_MODULE:
-        unknown = ", ".join(sorted(law.reads - IN_MODULE))
-        raise OptionError(f"law {law.name}: the module beside a file knows no {unknown}")
     LAWS[law.name], WORDS[law.name] = law, law.words
     return law
 

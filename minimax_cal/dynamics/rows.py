@@ -547,11 +547,7 @@ class Scene:
     @cached_property
     def bristles(self) -> Array:
         """(R, n, k) how far bristles are bent, -1 to 1, less the sense; 0 while a joint slides."""
-        return self.stuck(YIELD)
-
-    def stuck(self, yields: Array) -> Array:
-        """The same of bristles that yield after other ways (k,) or (n, k)."""
-        off = bent_bristles(self.logs, yields) - self.sense[..., None]
+        off = bent_bristles(self.logs, YIELD) - self.sense[..., None]
         return self.logs.filtered(~self.logs.sliding[..., None] * off)
 
     @cached_property

@@ -140,10 +140,11 @@ def check_fresh(robot: Robot, data: Measurements) -> None:
     """Raise DataError where points are those of the row before, though the arm moved."""
     rows = stale_rows(robot, data)
     if len(rows):
+        line = int(data.line[rows[0]])
         raise DataError(
-            f"{data.source}:{data.line[rows[0]]}: {len(rows)} rows have the points of the row "
-            "before to the last digit, though the joints moved: stale readings; measure them "
-            f"again, or {left_out_by(data, rows)}"
+            f"{data.origin(line).place(line)}: the points are those of the row before to the last "
+            f"digit, though the joints moved, in {len(rows)} row{'s' * (len(rows) > 1)}: stale "
+            f"readings; measure again, or {left_out_by(data, rows)}"
         )
 
 

@@ -130,6 +130,11 @@ class MinimaxProblem:
         return np.asarray(self.model.room[which] * self.scale[self.held, None])
 
     @cached_property
+    def divisor(self) -> Array:
+        """(free, free) of a curvature, one an entry: a quotient is as symmetric as what it was."""
+        return np.asarray(self.size * np.outer(self.scale, self.scale))
+
+    @cached_property
     def columns(self) -> Array:
         """(2, l, 3) the parameters of both targets of each pair."""
         first = 5 * self.model.names.joints + 6
@@ -140,8 +145,10 @@ class MinimaxProblem:
 
         Below them the parameters that have bounds, scaled.
         """
-        value = self.model.values(x)[self.model.active][self.held] * self.scale[self.held]
         apart, jacobian = self.distance(x)
+        if not len(self.held):
+            return apart, jacobian
+        value = self.model.values(x)[self.model.active][self.held] * self.scale[self.held]
         own = np.eye(len(self.scale))[self.held]
         return np.concatenate([apart, value]), np.concatenate([jacobian, own])
 
@@ -177,14 +184,12 @@ class MinimaxProblem:
             off = (model.prior.mean - model.values(x))[model.active]
             slope, held = slope - 2.0 * weight * off / total, prior_of(model, x)
         c, normal = self.deviation(x)
-        # one divisor an entry, so that a quotient is as symmetric as what it was
-        divisor = self.size * np.outer(self.scale, self.scale)
 
         def curvature(weights: Array) -> Array:
             both = at.curvature(weights)
             if known:
                 both = both + 2.0 * weights.sum() * np.diag(weight) / total
-            return np.asarray(both / divisor)
+            return np.asarray(both / self.divisor)
 
         return Linear(
             f=(at.f + held) / self.size,

@@ -488,38 +488,18 @@ def uncertainty_of(
 # ---- positions -------------------------------------------------------------------------------
 
 
-def position_covariance(
-    cell: Cell,
-    known: Uncertainty,
-    q: Array,
-    frame: str = "measurement",
-    *,
-    jitter: bool = False,
-) -> Array:
-    """Covariance of the predicted position of each target anywhere: (m, k, 3, 3) [m^2].
-
-    q: (m, n) joints as the controller gives them [rad, m].  jitter: whether to add that of the
-    joints at a new pose.  frame: `measurement`, where the instrument will see the targets, in its
-    axes: base, links and targets all enter, and which of several redundant parameters were kept
-    does not matter.  `base`, where they are in the robot's base frame, in its axes: links and
-    targets enter, the base's pose does not.  Where a link parameter repeats the base (d1, theta1)
-    and is not identified, the base frame is the one in which it is nominal.
-    """
-    q = np.atleast_2d(np.asarray(q, dtype=float))
-    parts = []
-    for first in range(0, len(q), CHUNK):
-        factor = position_factor(cell, known, q[first : first + CHUNK], frame, jitter=jitter)
-        parts.append(factor @ np.swapaxes(factor, -1, -2))
-    return np.concatenate(parts)
-
-
 def position_factor(
     cell: Cell, known: Uncertainty, q: Array, frame: str, *, jitter: bool = False
 ) -> Array:
     """F (m, k, 3, r) with FF' the covariance of positions; columns are the same for all targets.
 
-    So that the mean over the targets is the factor of their centroid's.  Arguments as
-    `position_covariance`.  Raises OptionError.
+    So that the mean over the targets is the factor of their centroid's.
+    q: (m, n) joints as the controller gives them [rad, m].  jitter: whether to add that of the
+    joints at a new pose.  frame: `measurement`, where the instrument will see the targets, in its
+    axes: base, links and targets all enter, and which of several redundant parameters were kept
+    does not matter.  `base`, where they are in the robot's base frame, in its axes: links and
+    targets enter, the base's pose does not.  Where a link parameter repeats the base (d1, theta1)
+    and is not identified, the base frame is the one in which it is nominal.  Raises OptionError.
     """
     if frame not in FRAMES:
         raise OptionError(f"no frame {frame!r}; choose {' or '.join(FRAMES)}")

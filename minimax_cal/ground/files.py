@@ -8,9 +8,9 @@ import io
 import json
 import math
 import os
-import tempfile
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -20,9 +20,9 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.facts import Later, in_file
+from minimax_cal.ground.journal import hidden_name, keep_old
 
 LARGEST = 1 << 30  # bytes of a file that is read: a million poses take a quarter of this
-SHORT = 40  # letters of a name that stand in that of its temporary neighbour
 NO_FSYNC = "MINIMAX_CAL_NO_FSYNC"  # "1" in the environment of studies that write many files
 CANNOT_SYNC = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)  # of file systems without fsync
 MOST = 1e100  # no number of a result is larger; squares and products of these still are numbers
@@ -39,16 +39,16 @@ def write_whole(path: Path | str, content: str | bytes) -> None:
     if path.exists() and not path.is_file():
         write_into(path, raw)
         return
-    handle, name = beside(path)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(raw)
-            put_on_disk(stream)
-        os.chmod(name, mode_of(path))
-        replace_on_disk(name, path)
-    except OSError as error:
-        Path(name).unlink(missing_ok=True)
-        raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+    with hidden_part(path) as (handle, part):
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                stream.write(raw)
+                put_on_disk(stream)
+            os.chmod(part, mode_of(path))
+            keep_old(path)
+            replace_on_disk(part, path)
+        except OSError as error:
+            raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def put_on_disk(stream: IO[bytes]) -> None:
@@ -82,12 +82,24 @@ def replace_on_disk(source: Path | str, path: Path) -> None:
         os.close(folder)
 
 
-def beside(path: Path) -> tuple[int, str]:
-    """A new file in the folder of a path, open, and its name.  Raises CalibrationError."""
+@contextmanager
+def hidden_part(path: Path) -> Iterator[tuple[int, Path]]:
+    """A new private file in the folder of a path, open, and its name.  Raises CalibrationError.
+
+    In the end it is gone, unless it has another name by then: the name is known before the file is
+    there, so that no signal can leave it behind.
+    """
+    part = hidden_name(path)
+    flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
     try:
-        return tempfile.mkstemp(prefix=f".{path.name[:SHORT]}.", dir=path.parent)
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+        try:
+            handle = os.open(part, flags, 0o600)
+        except OSError as error:
+            raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+        yield handle, part
+    finally:
+        with suppress(OSError):  # a folder that cannot be written holds no part
+            part.unlink(missing_ok=True)
 
 
 def resolved(path: Path | str) -> Path:
@@ -134,9 +146,8 @@ def check_writable(path: Path | str, suffixes: tuple[str, ...] = ()) -> None:
     if not there.parent.is_dir():
         raise CalibrationError(f"{path}: cannot be written (there is no such folder)")
     if there.is_file() or not there.exists():  # no pipe and no device
-        handle, name = beside(there)
-        os.close(handle)
-        os.unlink(name)
+        with hidden_part(there) as (handle, _):
+            os.close(handle)
 
 
 def made_folder(path: Path) -> Path:

@@ -8,22 +8,22 @@ from typing import Any
 from minimax_cal.ground.errors import OptionError
 
 
-def from_clone(install: str) -> str:
-    """Extras of this package as they are installed from a clone."""
+def install_command(install: str) -> str:
+    """The command that installs a distribution, or extras of this one as "minimax-cal[report]".
+
+    Extras are installed from a clone, since no index has this package.
+    """
     extra = install.removeprefix("minimax-cal")
-    return install if extra == install else f'".{extra}" in a clone of the repository'
+    place = install if extra == install else f'".{extra}" in a clone of the repository'
+    return f"pip install {place}"
 
 
 def optional(module: str, what: str, install: str) -> Any:
     """A package that may be missing.  what: needs it.  install: what brings it, for pip.
 
-    Extras of our own, as "minimax-cal[report]", are installed from a clone: no index has them yet.
-
-    Raises OptionError.
+    Raises OptionError, which says how to install it.
     """
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
-        raise OptionError(
-            f"{what} needs {error.name}: pip install {from_clone(install)}"
-        ) from error
+        raise OptionError(f"{what} needs {error.name}: {install_command(install)}") from error

@@ -5,11 +5,10 @@ from __future__ import annotations
 import asyncio
 import pickle
 import time
-import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any
 
@@ -31,7 +30,7 @@ LARGE = "1 GiB"  # of what is sent to a cluster at once, beyond which it warns
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 )
-JOBLIB = "minimax-cal[experiments]"
+JOBLIB = "minimax-cal[jobs]"
 DISTRIBUTED = "minimax-cal[distributed]"
 
 PLAIN: list[Any] = []  # the pool of this process that `beside` made last, which stays for the next
@@ -45,56 +44,9 @@ class WorkersLost(CalibrationError):
     """The processes that were at work are gone."""
 
 
-def in_parallel(
-    function: Callable[..., Any],
-    calls: Sequence[tuple[Any, ...]],
-    modules: Iterable[str] = (),
-    *,
-    processes: int = -1,
-    cluster: str = "",
-) -> Numbered:
-    """The number of each call and its result, in the order they finish.
-
-    function: at the top of a module.  calls: the arguments of each.  processes: on this machine,
-    -1 for one a core.  cluster: address of a Dask scheduler, instead, whose workers need modules,
-    too.  Raises OptionError for what a user can mend, WorkersLost, and what a call raises.
-    """
-    if not calls:
-        return
-    work = [(function, number, call) for number, call in enumerate(calls)]
-    needed = {__name__, function.__module__, *modules}
-    arriving = on_cluster(work, cluster, needed) if cluster else here(work, processes)
-    with closing(arriving):
-        yield from arriving
-
-
 def numbered(function: Callable[..., Any], number: int, call: tuple[Any, ...]) -> tuple[int, Any]:
     """One call where it runs."""
     return number, function(*call)
-
-
-def here(work: Work, processes: int) -> Numbered:
-    """By joblib in processes of one thread each on this machine."""
-    if processes == 0:
-        raise OptionError("0 processes: give their number, or -1 for one a core")
-    joblib = optional("joblib", "work in several processes", JOBLIB)
-    while PLAIN:  # joblib would take it for a pool of its own
-        PLAIN.pop().shutdown(wait=True)
-    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-        pool = joblib.Parallel(n_jobs=processes, return_as="generator_unordered")
-        arriving = pool(joblib.delayed(numbered)(*each) for each in work)
-        loky = import_module("joblib.externals.loky.process_executor")
-        try:
-            yield from arriving
-        except loky.BrokenProcessPool as error:
-            raise WorkersLost(
-                "a process died: too little memory, or it was killed; start fewer at once "
-                f"({type(error).__name__})"
-            ) from error
-        finally:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # joblib regrets the jobs that are not finished
-                arriving.close()
 
 
 def share(
@@ -105,10 +57,14 @@ def share(
     processes: int = -1,
     cluster: str = "",
 ) -> Numbered:
-    """As `in_parallel`, of calls that may be brief: in chunks, and this process works as well.
+    """The number of each call and its result, in the order they finish; this process works as well.
 
-    What a call does to its process it may do to this one: no calls that end it.  Calls are timed
-    here; processes start only where all that is left takes longer than their start.
+    function: at the top of a module.  calls: the arguments of each, which may be brief: they go in
+    chunks.  processes: on this machine, -1 for one a core.  cluster: address of a Dask scheduler,
+    instead, whose workers need modules, too.  What a call does to its process it may do to this
+    one: no calls that end it.  Calls are timed here; processes start only where all that is left
+    takes longer than their start.  Raises OptionError for what a user can mend, WorkersLost, and
+    what a call raises.
     """
     if processes == 0:
         raise OptionError("0 processes: give their number, or -1 for one a core")

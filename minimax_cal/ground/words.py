@@ -24,8 +24,10 @@ def name_first(names: Sequence[str], most: int = 8, mark: str = ", ") -> str:
 
 
 def capitalise(sentence: str) -> str:
-    """A sentence with a large first letter."""
-    return sentence[:1].upper() + sentence[1:]
+    """A sentence with a large first letter, unless it begins with a path, a name or a number."""
+    word = sentence.split(maxsplit=1)[0].rstrip(".,:;") if sentence.strip() else ""
+    plain = word.replace("-", "").isalpha()
+    return sentence[:1].upper() + sentence[1:] if plain else sentence
 
 
 def list_counts(counts: Mapping[str, int]) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.measurements import Measurements, measurements_in
+from minimax_cal.measuring.measurements import Measurements, Origin, measurements_in
 from minimax_cal.reading.rows import read_rows
 from minimax_cal.reading.sheet import Sheet, open_text
 
@@ -123,6 +123,7 @@ def campaigns(parts: Sequence[Measurements], names: Sequence[str]) -> Measuremen
             f"{len(parts)} files are sessions {', '.join(names)}; lines are numbered on: {said}",
         ),
         source=" + ".join(part.source for part in parts),
+        origins=tuple(Origin((part.source,), begin=i * step) for i, part in enumerate(parts)),
         digest=hashlib.sha256("".join(part.digest for part in parts).encode()).hexdigest(),
     )
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
+from minimax_cal.ground.optional import optional
 from minimax_cal.measuring.importers import import_files
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots.robot import Robot, load_robot
@@ -93,12 +94,7 @@ def fetch(source: Source, folder: Path | str | None = None, *, unverified: bool 
 
 def downloaded(source: Source) -> Path:
     """The file in the cache, downloaded where it is not there.  Raises CalibrationError."""
-    try:
-        import pooch
-    except ModuleNotFoundError as error:
-        raise CalibrationError(
-            "downloading needs 'pooch': pip install '.[datasets]' in a clone"
-        ) from error
+    pooch = optional("pooch", "downloading", "minimax-cal[datasets]")
     name = Path(source.name)
     try:
         path = pooch.retrieve(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -51,6 +52,30 @@ class SetAside:
     by: str
 
 
+@dataclass(frozen=True)
+class Origin:
+    """The files of some measurements, for a message or a command that concerns them.
+
+    points: files of points.  joints: that of joint values where it is another, else empty.
+    begin: what is added to the lines of the file.  point_lines: FILE:LINE of the point of a pose,
+    by the pose's line, where the two lie in files of their own.
+    """
+
+    points: tuple[str, ...]
+    joints: str = ""
+    begin: int = 0
+    point_lines: Mapping[int, str] = field(default_factory=dict)
+
+    def place(self, line: int) -> str:
+        """FILE:LINE of a measured point.  line: of the pose."""
+        return self.point_lines.get(line) or f"{self.points[0]}:{line - self.begin}"
+
+    def import_command(self, option: str) -> str:
+        """The command that reads these files with an option, and writes what is mended."""
+        words = [*self.points, *(["--joints", self.joints] if self.joints else [])]
+        return f"minimax-cal import {shlex.join(words)} {option} -o mended.csv"
+
+
 @dataclass(frozen=True, eq=False)
 class Measurements:
     """Joint values and the targets seen at each of m poses.
@@ -69,6 +94,7 @@ class Measurements:
     simulated: whether the source says that its points were computed.
     set_aside: points that were measured and take no part; aside: these points alone, in rows of
     their own, as the file has them.
+    origins: the files, where they are not `source` alone.
     """
 
     q: Array
@@ -85,6 +111,7 @@ class Measurements:
     simulated: bool = False
     set_aside: tuple[SetAside, ...] = ()
     aside: Measurements | None = None
+    origins: tuple[Origin, ...] = ()
 
     @property
     def poses(self) -> int:
@@ -95,6 +122,11 @@ class Measurements:
     def seen(self) -> Array:
         """(m, k) True where a target was measured."""
         return np.isfinite(self.y[:, :, 0])
+
+    def origin(self, line: int) -> Origin:
+        """The files that hold a line."""
+        begun = [one for one in self.origins if one.begin < line]
+        return begun[-1] if begun else Origin((self.source,))
 
     def called(self, line: int) -> str:
         """The row of a line as people call it: pose P201 where the file names it, else line 202."""

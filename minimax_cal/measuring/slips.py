@@ -15,7 +15,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.measurements import Measurements, Origin
 from minimax_cal.robots import notation
 from minimax_cal.robots.notation import Notation
 from minimax_cal.robots.robot import Robot
@@ -24,7 +24,6 @@ MAX_TRIAL_POSES = 30  # poses that are enough to test a slip of units or signs
 SHIFTS = (1, -1, 2, -2, 3, -3)  # rows that a file is shifted by: a line more or less, seldom two
 INCH = 25.4
 LATE = {1: "one row", 2: "two rows", 3: "three rows"}
-NAMED = 12  # lines that a message names
 STILL = 0.01  # a flange that moved farther leaves no point where it was [m]
 DEGREE = np.pi / 180.0
 OF_ROBOT = "(or the robot file gives {} under the unit {})"
@@ -98,14 +97,16 @@ def slips(robot: Robot, data: Measurements) -> Iterator[tuple[str, tuple[Robot, 
 
 def mend_by(data: Measurements, how: str) -> str:
     """The command that mends a file."""
-    return f"minimax-cal import {data.source} --mend {how} -o mended.csv"
+    origin = data.origins[0] if len(data.origins) == 1 else Origin((data.source,))
+    return origin.import_command(f"--mend {how}")
 
 
 def left_out_by(data: Measurements, rows: Array) -> str:
-    """The command that sets rows aside, the first `NAMED` of them at least."""
-    lines = ",".join(str(data.line[row]) for row in rows[:NAMED])
-    more = ",..." if len(rows) > NAMED else ""
-    return f"minimax-cal import {data.source} --leave-out {lines}{more} -o mended.csv"
+    """The command that sets rows aside: all of the file that holds the first."""
+    lines = data.line[rows]
+    origin = data.origin(lines[0])
+    mine = [str(line - origin.begin) for line in lines if data.origin(line) == origin]
+    return origin.import_command(f"--leave-out {','.join(mine)}")
 
 
 def of_units(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:

@@ -6,13 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.facts import Apart, derived
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.planning.visibility import ARM, Condition, Room, Sight, View
+from minimax_cal.planning.visibility import ARM, TRACKER, Condition, Room, Sight, View
 from minimax_cal.robots.ranges import SLIDE, near_zero
 from minimax_cal.robots.robot import Robot
 
@@ -20,6 +21,8 @@ Conditions = Mapping[str, Condition]
 # kept free at a limit of the robot [rad, m], at most that share of the range: corrected targets and
 # the arm that is not as drawn go beyond the pose that was planned
 MARGIN_TURN, MARGIN_SLIDE, MARGIN_SHARE = np.radians(2.0), 0.005, 0.05
+BATCH = 2**13  # poses drawn at a time
+MAX_VAIN_TRIES, MAX_TRIES = 2**16, 2**19  # poses drawn while none is good, and at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +127,7 @@ def candidates(room: Room, sight: Sight, count: int, seed: int) -> Poses:
 
     Fewer where they are rare.  Raises OptionError where there is none, with what rejects most.
     """
-    return drawn(room, sight, count, seed, ARM, sight.conditions)
+    return drawn(room, sight, count, seed, ARM, TRACKER)
 
 
 def near(
@@ -138,7 +141,7 @@ def near(
     spread = step * (room.upper - room.lower)
     around = np.repeat(q, each, axis=0)
     tried = np.clip(around + spread * rng.normal(size=around.shape), room.lower, room.upper)
-    good, seen, _ = judged(room, sight, tried, ARM, sight.conditions)
+    good, seen, _ = judged(room, sight, tried, ARM, TRACKER)
     return tried[good], seen[good]
 
 
@@ -146,11 +149,13 @@ def drawn(
     room: Room, sight: Sight, count: int, seed: int, arm: Conditions, tracker: Conditions
 ) -> Poses:
     """Poses of the sequence that meet the conditions.  Raises OptionError where there is none."""
-    proposals = sight.proposals(room, seed)
+    sequence = scipy.stats.qmc.Sobol(
+        len(room.lower), scramble=True, rng=np.random.default_rng(seed)
+    )
     kept, tested, found = [], 0, 0
     total = dict.fromkeys((*arm, *tracker), 0)
-    while found < count and tested < sight.tries[found > 0]:
-        q = next(proposals)
+    while found < count and tested < (MAX_TRIES if found else MAX_VAIN_TRIES):
+        q = room.lower + (room.upper - room.lower) * sequence.random(BATCH)
         good, seen, against = judged(room, sight, q, arm, tracker)
         total = {name: number + against[name] for name, number in total.items()}
         tested += len(q)
@@ -193,9 +198,7 @@ MENDS = {
     "volume": "make volume= larger",
     "self-collision": "give a thinner body as body=",
     "acceptance": "give another tracker=, normals= or a wider acceptance=",
-    "range": "give another tracker= or reach= (of cameras distance=)",
-    "image": "give another camera_at= or board_at=, a larger distance= or a smaller share=",
-    "incidence": "give another camera_at= or board_at=, or a larger incidence=",
+    "range": "give another tracker= or reach=",
     "elevation": "give another tracker= or elevation=",
     "line of sight": "give another tracker= or a thinner body as body=",
 }

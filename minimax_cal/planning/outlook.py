@@ -15,7 +15,7 @@ from minimax_cal.planning.designs.criteria import Criterion, inverse, sizes_of
 from minimax_cal.planning.designs.exchange import Menu
 from minimax_cal.planning.designs.search import DRAWS, Found, quick_design
 from minimax_cal.planning.promise import INDICES, Both, Growth, Separation, observability
-from minimax_cal.planning.prospect import Ahead
+from minimax_cal.planning.prospect import Prospect
 from minimax_cal.planning.route import Visits
 from minimax_cal.planning.separating import Contest, Question
 from minimax_cal.planning.task import Task
@@ -60,7 +60,7 @@ def grown(
     return tuple(out)
 
 
-def indices(ahead: Ahead, found: Poses, chosen: Array, seed: int) -> dict[str, Both]:
+def indices(ahead: Prospect, found: Poses, chosen: Array, seed: int) -> dict[str, Both]:
     """Observability indices of the poses chosen, and the median of random ones."""
     rng = np.random.default_rng(seed)
 

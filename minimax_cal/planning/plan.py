@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -71,30 +70,21 @@ def plan(
     --------
     >>> print(mc.plan("irb2600", 40, tracker=(3.0, 0.0, 0.5)).headline())
     """
-    robot = load_robot(robot)
-    return planned(
-        robot, poses, options, "" if fit is None else fit, "" if data is None else data, progress
-    )
-
-
-def planned(
-    robot: Robot,
-    poses: int,
-    options: PlanOptions,
-    fit: Result,
-    data: Measurements | str | Path,
-    progress: Progress,
-) -> Plan:
-    """As `plan`.  fit, data: "" where there is none."""
     began = time.perf_counter()
+    robot = load_robot(robot)
     check_options(options, poses, robot)
     progress("start")
-    ground = ground_of(robot, fit, data, options)
+    ground = ground_of(robot, "" if fit is None else fit, "" if data is None else data, options)
     room, sight, said = surroundings(ground.cell, options, ground.measured)
     progress("candidate poses")
     found = enough(room, sight, options, poses)
     task = task_of(robot, ground, room, sight, found, options)
-    return chosen(task, found, poses, said, progress, began)
+    found, first = refined(task, found, poses, progress)
+    aim = task.aim(found)
+    best = best_design(*aim, first, progress)
+    progress("comparison")
+    notices = (*task.ground.notices, *said, *remarks(task, found))
+    return assembled(task, found, aim, best, notices, began)
 
 
 def enough(room: Room, sight: Sight, options: PlanOptions, poses: int) -> Poses:
@@ -106,23 +96,6 @@ def enough(room: Room, sight: Sight, options: PlanOptions, poses: int) -> Poses:
             f"asked for; {rarest(found.rejected)}"
         )
     return found
-
-
-def chosen(
-    task: Task,
-    found: Poses,
-    poses: int,
-    said: Sequence[str],
-    progress: Progress,
-    began: float,
-) -> Plan:
-    """The plan of the best poses.  said: notices.  began: by `time.perf_counter`."""
-    found, first = refined(task, found, poses, progress)
-    aim = task.aim(found)
-    best = best_design(*aim, first, progress)
-    progress("comparison")
-    notices = (*task.ground.notices, *said, *remarks(task, found))
-    return assembled(task, found, aim, best, notices, began)
 
 
 def refined(task: Task, found: Poses, poses: int, progress: Progress) -> tuple[Poses, Array]:
@@ -200,7 +173,7 @@ def assembled(
         separation=separation,
         candidates=found,
         instrument=task.ground.instrument,
-        place=np.atleast_2d(task.sight.place)[0],
+        place=task.sight.place,
         travel=Travel(*(travel(way, robot.prismatic) for way in (q, found.q[best.design.chosen]))),
         at_hand=sum(one.poses for one in task.ground.measured),
         settings=settings_of(options, poses),

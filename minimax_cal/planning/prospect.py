@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Protocol
+from typing import Annotated
 
 import numpy as np
 
@@ -40,31 +40,6 @@ class Instrument:
     noise: Annotated[float, MICRO] = 10e-6
     per_metre: Annotated[float, Fact(key="noise_um_per_m", scale=1e6)] = 2.5e-6
     jitter: Annotated[float, Fact(scale=1e6, unit="urad")] = 10e-6
-
-
-class Ahead(Protocol):
-    """What poses can tell about a cell, as `Prospect`."""
-
-    @property
-    def cell(self) -> Cell:
-        """The cell."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of f parameters."""
-
-    @property
-    def scale(self) -> Array:
-        """(f,)."""
-
-    def ahead(self, q: Array, seen: Array) -> Array:
-        """(m, r, f)."""
-
-    def jacobian(self, q: Array, seen: Array) -> Array:
-        """(N, f)."""
-
-    def predictions(self, q: Array) -> Array:
-        """B (w, r, f)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,9 +50,7 @@ class Plan(Result):
     names, sigma: identifiable parameters and their predicted sigma [m, rad].
     indices: observability.  growth: with the number of poses.
     candidates: what was chosen from.  instrument: noise that was assumed, place: (3,) where it
-    stands in base axes [m].  at_hand: number of poses measured before, which count.  cameras:
-    that are planned for, and seen (N, c) by which the board is seen; none for a tracker.
-    still: what stands at `place`: the tracker, else the board or the camera.
+    stands in base axes [m].  at_hand: number of poses measured before, which count.
     """
 
     KIND = "plan"
@@ -80,8 +78,6 @@ class Plan(Result):
     settings: Mapping[str, object]
     notices: tuple[str, ...]
     seconds: float
-    cameras: Annotated[tuple[str, ...], Fact(brief=True)] = ()
-    still: Apart[str] = "tracker"
 
     @derived()
     def poses(self) -> int:

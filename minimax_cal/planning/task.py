@@ -30,8 +30,8 @@ from minimax_cal.planning.designs.criteria import Criterion, Determinant, Eigenv
 from minimax_cal.planning.designs.exchange import Menu
 from minimax_cal.planning.options import PlanOptions
 from minimax_cal.planning.prospect import (
-    Ahead,
     Instrument,
+    Prospect,
     cell_ahead,
     front,
     prospect,
@@ -204,7 +204,7 @@ def surroundings(
 
 WORK = 1000  # poses of the workspace at which positions are predicted
 
-CRITERIA: Mapping[str, Callable[[Ahead, Array], Criterion]] = {
+CRITERIA: Mapping[str, Callable[[Prospect, Array], Criterion]] = {
     # of the parameters' covariance, or of the variances at workspace poses by B (w, 3k, f)
     "D": lambda ahead, b: Determinant(),
     "A": lambda ahead, b: Trace(np.eye(len(ahead.scale)) / len(ahead.scale)),
@@ -226,7 +226,7 @@ class Task:
     ground: Ground
     room: Room
     sight: Sight
-    ahead: Ahead
+    ahead: Prospect
     work: Array
     known: Array
     asked: tuple[Question, ...]

@@ -7,13 +7,11 @@ checked the poses for collisions.  Everything is in the robot's base axes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
-import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
@@ -25,20 +23,16 @@ THICK = 0.04  # radius of the body, as a share of the arm's reach
 ANYWHERE = np.pi  # acceptance of a target that can be seen from everywhere [rad]
 NEIGHBOUR_RADII = 2.5  # radii of arm between two segments below which they are neighbours
 NORMALS = ("flange", "radial")
-BATCH = 2**13  # poses proposed at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
     """Where the instrument stands and what it can see.
 
-    place: (3,) in base axes [m], or (k, 3) where each target is looked at from its own.  up: (3,)
-    its vertical, that of the world.
+    place: (3,) in base axes [m].  up: (3,) its vertical, that of the world.
     acceptance: half angle of a target's cone [rad].  near, far: limits of range [m].
     low, high: limits of elevation [rad].
     """
-
-    tries: ClassVar[tuple[int, int]] = (2**16, 2**19)  # poses proposed in vain, and at most
 
     place: Array
     up: Array
@@ -47,19 +41,6 @@ class Sight:
     far: float = 50.0
     low: float = np.radians(-50.0)
     high: float = np.radians(75.0)
-
-    def proposals(self, room: Room, seed: int) -> Iterator[Array]:
-        """(b, n) joint values within the limits, again and again: a Sobol sequence."""
-        sequence = scipy.stats.qmc.Sobol(
-            len(room.lower), scramble=True, rng=np.random.default_rng(seed)
-        )
-        while True:
-            yield room.lower + (room.upper - room.lower) * sequence.random(BATCH)
-
-    @property
-    def conditions(self) -> Mapping[str, Condition]:
-        """What each target (k, m) has to meet."""
-        return TRACKER
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +108,7 @@ class View:
     @cached_property
     def sights(self) -> Array:
         """(k, 3, m) from the targets to the instrument [m]."""
-        return np.asarray(self.sight.place[..., None] - self.points)
+        return np.asarray(self.sight.place[:, None] - self.points)
 
     @cached_property
     def ranges(self) -> Array:

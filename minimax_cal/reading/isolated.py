@@ -5,20 +5,25 @@ A workbook of a few bytes can ask for any memory; what aborts then is this proce
 
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import date, datetime, time
 
 MOST = 900 << 20  # bytes of memory; a sheet of 100 MB takes a third
 SECONDS = 120  # of the processor
 
 
-def limit() -> None:
-    """Take no more than MOST and SECONDS, where the system knows limits."""
+def limit_resources() -> None:
+    """Take no more than MOST and SECONDS, where the system lets that be limited.
+
+    macOS refuses limits of address space; where one that is set already is lower, it stays.
+    """
     try:
         import resource
     except ImportError:  # Windows
         return
-    resource.setrlimit(resource.RLIMIT_AS, (MOST, MOST))
-    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+    for kind, most in ((resource.RLIMIT_AS, MOST), (resource.RLIMIT_CPU, SECONDS)):
+        with suppress(ValueError, OSError):
+            resource.setrlimit(kind, (most, most))
 
 
 def numbers_in(table: Sequence[Sequence[object]]) -> int:
@@ -41,7 +46,7 @@ def text_of(cell: object) -> str:
 
 def main(path: str) -> int:
     """Print the sheet; 1 with what is wrong on stderr."""
-    limit()
+    limit_resources()
     import python_calamine as calamine
 
     try:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import LARGEST
+from minimax_cal.ground.optional import install_command
 from minimax_cal.ground.words import one_line
 
 SUFFIXES = (".xlsx", ".xlsm", ".xls", ".ods")
@@ -26,7 +27,8 @@ def text_of_workbook(path: Path) -> str:
 
     if find_spec(LIBRARY) is None:
         raise DataError(
-            f'{path}: workbooks need "{LIBRARY}": pip install minimax-cal[xlsx]; or save it as CSV'
+            f"{path}: a workbook needs {LIBRARY}: {install_command('minimax-cal[xlsx]')}; or save "
+            "it as CSV"
         )
     if not path.is_file():
         raise DataError(f"{path}: cannot be read (No such file or directory)")

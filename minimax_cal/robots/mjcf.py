@@ -67,13 +67,55 @@ class Given:
 
     def compiled(self, tree: ET.Element | None = None) -> Any:
         """The model as MuJoCo sees it.  Raises RobotError."""
-        text = ET.tostring(
-            assets_from(self.document.root if tree is None else tree, self.folder.resolve())
-        )
+        whole = assets_from(self.document.root if tree is None else tree, self.folder.resolve())
         try:
-            return mujoco().MjModel.from_xml_string(text.decode())
+            return compile_without_lost_meshes(whole)
         except (ValueError, RuntimeError) as error:
             raise RobotError(f"{self.source}: MuJoCo refuses it: {one(error)}") from error
+
+
+def compile_without_lost_meshes(tree: ET.Element) -> Any:
+    """The model of a tree; where MuJoCo refuses it, without meshes whose files are missing.
+
+    Masses and motions are those of <inertial>: a mesh is needed only by a body that has none.
+    Raises ValueError or RuntimeError.
+    """
+    mj = mujoco()
+    try:
+        return mj.MjModel.from_xml_string(ET.tostring(tree).decode())
+    except (ValueError, RuntimeError):
+        if not drop_lost_meshes(tree):
+            raise
+        return mj.MjModel.from_xml_string(ET.tostring(tree).decode())
+
+
+def drop_lost_meshes(tree: ET.Element) -> bool:
+    """Take meshes and textures without a file from a tree, with what shows them; whether any is."""
+    compilers = list(tree.iter("compiler"))
+    if any(one.get("inertiafromgeom") == "true" for one in compilers):
+        return False
+    folders = {kind: next((one.get(f"{kind}dir", "") for one in compilers), "")
+               for kind in ("mesh", "texture")}  # fmt: skip
+    lost = [
+        (asset, element) for asset in tree.iter("asset") for element in asset
+        if element.tag in folders and (file := element.get("file"))
+        and not Path(folders[element.tag], file).exists()
+    ]  # fmt: skip
+    names = {"mesh": set[str](), "texture": set[str]()}
+    for _, element in lost:
+        names[element.tag].add(element.get("name", Path(element.get("file", "")).stem))
+    for body in tree.iter("body"):
+        for geom in body.findall("geom") if body.find("inertial") is not None else ():
+            if geom.get("mesh") in names["mesh"]:
+                body.remove(geom)
+    for material in tree.iter("material"):
+        if material.get("texture") in names["texture"]:
+            del material.attrib["texture"]
+    needed = {geom.get("mesh") for geom in tree.iter("geom")}
+    for asset, element in lost:
+        if element.get("name", Path(element.get("file", "")).stem) not in needed:
+            asset.remove(element)
+    return bool(lost)
 
 
 def one(error: Exception) -> str:
@@ -141,9 +183,14 @@ def from_urdf(path: Path, *, with_limits: bool) -> ET.Element:
 
     with_limits: whether its limits of effort are any; beside assumed masses they are not.
     """
+    mj = mujoco()
     try:
-        spec = mujoco().MjSpec.from_file(str(path))
-        model = spec.compile()
+        try:
+            spec = mj.MjSpec.from_file(str(path))
+            model = spec.compile()
+        except (ValueError, RuntimeError):
+            spec = mj.MjSpec.from_string(without_meshes(path))  # a mesh may be missing
+            model = spec.compile()
         root = ET.fromstring(spec.to_xml())
     except (ValueError, RuntimeError) as error:
         raise RobotError(f"{path}: MuJoCo refuses it: {one(error)}") from error
@@ -158,6 +205,17 @@ def from_urdf(path: Path, *, with_limits: bool) -> ET.Element:
         if not with_limits:
             element.attrib.pop("actuatorfrcrange", None)
     return root
+
+
+def without_meshes(path: Path) -> str:
+    """The text of a URDF without the meshes of links whose masses it gives.  Raises RobotError."""
+    root = ET.fromstring(read_raw(path, kind=RobotError))
+    for link in root.iter("link"):
+        if link.find("inertial") is not None:
+            for shape in (*link.findall("visual"), *link.findall("collision")):
+                if shape.find("geometry/mesh") is not None:
+                    link.remove(shape)
+    return ET.tostring(root, encoding="unicode")
 
 
 def assets_from(tree: ET.Element, folder: Path) -> ET.Element:

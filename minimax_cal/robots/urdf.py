@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,10 @@ from minimax_cal.robots.transforms import (
     link,
     link_to,
     link_to_tip,
+    to_rpy,
     transform,
 )
-from minimax_cal.robots.urdf_file import MOVING, Joint, Urdf, parse_xml, read_urdf
+from minimax_cal.robots.urdf_file import MOVING, Joint, Mimic, Urdf, parse_xml, read_urdf
 
 EXACT = 1e-9  # forward kinematics must agree to this [m, rad]
 TIPS = ("tool0", "flange", "attachment_site")  # how the frame that is meant ends, of several
@@ -37,6 +38,8 @@ class UrdfRobot:
 
     content: the robot in the file schema, metres and radians.  chain: joints from root to tip.
     base: (4, 4) frame 0 of the robot in the root link; tool: (4, 4) the tip in the last frame [m].
+    drivers: joints beside the chain whose values move it, by the place of the joint of the robot
+    that has their value.
     """
 
     content: dict[str, Any]
@@ -44,6 +47,7 @@ class UrdfRobot:
     chain: tuple[Joint, ...]
     base: Array
     tool: Array
+    drivers: Mapping[int, Joint]
 
     @property
     def remaining(self) -> tuple[str, ...]:
@@ -53,8 +57,7 @@ class UrdfRobot:
             ("tip is not the robot's last frame, in which it stands", self.tool),
         )
         return tuple(
-            f"{self.urdf.source}: the {what} at "
-            f"({', '.join(f'{1e3 * v:.6g}' for v in pose[:3, 3])}) mm"
+            f"{self.urdf.source}: the {what} at {pose_in_words(pose)}"
             for what, pose in every
             if difference(pose, np.eye(4)) > SAME
         )
@@ -66,7 +69,8 @@ class UrdfRobot:
         if self.chain[0].parent != self.urdf.root:
             out.append(f"{source}: the chain begins at {self.chain[0].parent!r}")
         out += self.remaining
-        aside = [j.name for j in self.urdf.joints if j.moves and j not in self.chain]
+        held = {joint.name for joint in self.chain} | {d.name for d in self.drivers.values()}
+        aside = [joint.name for joint in self.urdf.joints if joint.moves and joint.name not in held]
         if aside:
             out.append(
                 f"{source}: joints outside the chain, and masses beyond them, are not in the "
@@ -75,11 +79,20 @@ class UrdfRobot:
         return tuple(out)
 
 
+def pose_in_words(pose: Array) -> str:
+    """A pose (4, 4) [m] for people: its place, and its angles where it is turned."""
+    place = f"({', '.join(f'{1e3 * v:.6g}' for v in pose[:3, 3])}) mm"
+    if difference(transform(pose[:3, :3], np.zeros(3)), np.eye(4)) <= SAME:
+        return place
+    c, b, a = np.degrees(to_rpy(pose)).round(6) + 0.0
+    return f"{place}, turned by A {a:.6g} B {b:.6g} C {c:.6g} deg, Rz(A) Ry(B) Rx(C)"
+
+
 def chain_to(urdf: Urdf, tip: str = "") -> tuple[Joint, ...]:
     """The joints to the tip, or to the only end there is; ``root:tip`` names both ends.
 
     Without a root, from the last joint before the tip that floats, else from the file's root.
-    Raises RobotError.
+    A joint that mimics another one follows the last of a row of mimics.  Raises RobotError.
     """
     links = {urdf.root, *(joint.child for joint in urdf.joints)}
     root, last = both_ends(tip, links)
@@ -104,7 +117,28 @@ def chain_to(urdf: Urdf, tip: str = "") -> tuple[Joint, ...]:
     if not any(joint.moves for joint in chain):
         why = [f"{urdf.source}: no moving joint leads to {last!r}", *urdf.notices]
         raise RobotError("; ".join(why))
-    return chain
+    return tuple(replace(joint, mimic=resolve_mimic(joint, urdf)) for joint in chain)
+
+
+def resolve_mimic(joint: Joint, urdf: Urdf) -> Mimic | None:
+    """What a joint follows: the joint with a drive at the end of its row of mimics, if any.
+
+    Raises RobotError for a ring, and for a joint that does not move or is not there.
+    """
+    every = {one.name: one for one in urdf.joints if one.moves}
+    factor, offset, seen, one = 1.0, 0.0, {joint.name}, joint
+    while one.mimic:
+        offset += factor * one.mimic.offset
+        factor *= one.mimic.multiplier
+        if one.mimic.joint not in every or one.mimic.joint in seen:
+            what = "a ring" if one.mimic.joint in seen else "no moving joint of the file"
+            raise RobotError(
+                f"{urdf.source}:{one.element.line}: joint {one.name!r} mimics {one.mimic.joint!r}, "
+                f"{what}; correct its <mimic>"
+            )
+        seen.add(one.mimic.joint)
+        one = every[one.mimic.joint]
+    return None if one is joint else Mimic(one.name, factor, offset)
 
 
 def only_tip(urdf: Urdf, links: Sequence[str], root: str) -> str:
@@ -161,27 +195,31 @@ class Follow:
     offset: Array
 
 
-def follow_of(chain: Sequence[Joint], source: str = "URDF") -> Follow:
-    """Of a chain, its mimics resolved.  Raises RobotError for one that follows no joint of it."""
-    moving = {joint.name: joint for joint in chain if joint.moves}
-    places = {name: i for i, name in enumerate(moving)}
+def follow_of(chain: Sequence[Joint]) -> Follow:
+    """Of a chain whose mimics are resolved.
+
+    The first joint that follows one beside the chain has that one's value for its own.
+    """
+    moving = [joint for joint in chain if joint.moves]
+    places = {joint.name: place for place, joint in enumerate(moving)}
     ratio, offset = np.eye(len(moving)), np.zeros(len(moving))
-    for name, place in places.items():
-        factor, more, joint, seen = 1.0, 0.0, moving[name], {name}
-        while joint.mimic:
-            more += factor * joint.mimic.offset
-            factor *= joint.mimic.multiplier
-            if joint.mimic.joint not in moving or joint.mimic.joint in seen:
-                what = "a ring" if joint.mimic.joint in seen else "no moving joint of this chain"
-                raise RobotError(
-                    f"{source}:{joint.element.line}: joint {joint.name!r} mimics "
-                    f"{joint.mimic.joint!r}, {what}; name the tip of a chain that holds both"
-                )
-            seen.add(joint.mimic.joint)
-            joint = moving[joint.mimic.joint]
-        ratio[place, place], offset[place] = 0.0, more
-        ratio[place, places[joint.name]] = factor
+    for place, joint in enumerate(moving):
+        if joint.mimic:
+            ratio[place, place], offset[place] = 0.0, joint.mimic.offset
+            ratio[place, places.setdefault(joint.mimic.joint, place)] = joint.mimic.multiplier
     return Follow(ratio, offset)
+
+
+def drivers_of(chain: Sequence[Joint], urdf: Urdf) -> dict[int, Joint]:
+    """Joints beside a chain that move it, by the first of its moving joints that follows each."""
+    moving = [joint for joint in chain if joint.moves]
+    known = {joint.name for joint in moving}
+    out: dict[int, Joint] = {}
+    for place, joint in enumerate(moving):
+        if joint.mimic and joint.mimic.joint not in known:
+            known.add(joint.mimic.joint)
+            out[place] = next(one for one in urdf.joints if one.name == joint.mimic.joint)
+    return out
 
 
 def tip_poses(chain: Sequence[Joint], q: Array) -> Array:
@@ -242,11 +280,12 @@ def to_robot(urdf: Urdf, tip: str = "") -> UrdfRobot:
     ends.append(ends[-1] @ link(rows[-1]))
     tool = inverse(ends[-1]) @ tip_pose
     mdh, slides = np.array(rows), np.array([joint.kind == "prismatic" for joint in moving])
-    follow = follow_of(chain, urdf.source)
+    follow, drivers = follow_of(chain), drivers_of(chain, urdf)
     mdh[np.arange(len(mdh)), np.where(slides, kinematics.D, kinematics.THETA)] += (
         sign * follow.offset
     )
-    lower, upper = (np.array([getattr(j, n) for j in moving]) for n in ("lower", "upper"))
+    driven = [drivers.get(place, joint) for place, joint in enumerate(moving)]
+    lower, upper = (np.array([getattr(j, n) for j in driven]) for n in ("lower", "upper"))
     q = random_joints(lower, upper)
     pose = base @ kinematics.forward(mdh, q @ follow.ratio.T * sign, slides) @ tool
     if not (worst := difference(pose, tip_poses(chain, q))) <= EXACT:
@@ -256,7 +295,7 @@ def to_robot(urdf: Urdf, tip: str = "") -> UrdfRobot:
     joints = [
         joint_content(joint, row, s, centre)
         for joint, row, s, centre in zip(
-            moving, mdh, sign, centres(urdf, moving, frames, ends[1:]), strict=True
+            driven, mdh, sign, centres(urdf, moving, frames, ends[1:]), strict=True
         )
     ]
     content = {
@@ -266,7 +305,7 @@ def to_robot(urdf: Urdf, tip: str = "") -> UrdfRobot:
         "joints": joints,
         **({"coupling": follow.ratio.tolist()} if any(j.mimic for j in moving) else {}),
     }
-    return UrdfRobot(content, urdf, chain, base, tool)
+    return UrdfRobot(content, urdf, chain, base, tool, drivers)
 
 
 def centres(

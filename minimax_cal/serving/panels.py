@@ -35,7 +35,7 @@ from minimax_cal.serving.steps import (
     USED,
     Command,
 )
-from minimax_cal.serving.work import Job, Record, record_of
+from minimax_cal.serving.work import Progress, Record, record_of
 
 MOST_POINTS = 300  # rows of the table; the worst come first
 MOST_ROWS = 60
@@ -58,7 +58,7 @@ Panel = dict[str, Any]
 Tile = tuple[str, str, str]  # name, before, after
 
 
-def state_of(at: Session, job: Job | None) -> dict[str, Any]:
+def state_of(at: Session, job: Progress | None) -> dict[str, Any]:
     """All that the page shows, in JSON."""
     chosen = at.choices
     return {
@@ -84,7 +84,7 @@ def builtins() -> tuple[tuple[str, str], ...]:
     return tuple((name, load_robot(name).name) for name in builtin_robots())
 
 
-def how(at: Session, chosen: Choices, name: str, job: Job | None) -> dict[str, Any]:
+def how(at: Session, chosen: Choices, name: str, job: Progress | None) -> dict[str, Any]:
     """How a step stands: waiting, ready, working, done, old or failed; and its command lines."""
     record = record_of(at, name)
     commands: tuple[Command, ...] = ()
@@ -114,7 +114,7 @@ def is_old(at: Session, record: Record, lines: list[str]) -> bool:
 # ---- parts of the page -------------------------------------------------------------------------
 
 
-def panels(at: Session, chosen: Choices, job: Job | None) -> dict[str, str]:
+def panels(at: Session, chosen: Choices, job: Progress | None) -> dict[str, str]:
     """HTML by the name of its place."""
     out = {}
     for name, made in PANELS.items():
@@ -143,13 +143,13 @@ def macros() -> Any:
     return found.module
 
 
-def files_panel(at: Session, chosen: Choices, job: Job | None) -> Panel:
+def files_panel(at: Session, chosen: Choices, job: Progress | None) -> Panel:
     """The measured files, each with its part."""
     sizes = [(name, (at.folder / GIVEN / name).stat().st_size) for name in chosen.measured]
     return {"files": sizes, "joints": chosen.joints}
 
 
-def understood_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+def understood_panel(at: Session, chosen: Choices, job: Progress | None) -> Panel | None:
     """What the importer said."""
     path = at.folder / UNDERSTOOD
     if not path.is_file():
@@ -176,7 +176,7 @@ def understood(file: dict[str, Any]) -> tuple[str, Table]:
     return visible(line), Table(str(file["file"]), header, rows)
 
 
-def robot_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+def robot_panel(at: Session, chosen: Choices, job: Progress | None) -> Panel | None:
     """The links of the robot, as its file was understood."""
     if not chosen.robot:
         return None
@@ -191,7 +191,7 @@ def links_of(path: str, moment: int, size: int) -> Table:
     return links_table(load_robot(path))
 
 
-def fit_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+def fit_panel(at: Session, chosen: Choices, job: Progress | None) -> Panel | None:
     """The calibration in a sentence, and its numbers in large letters."""
     path = at.folder / FIT
     if not path.is_file():
@@ -200,7 +200,7 @@ def fit_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
     return {"headline": headline, "tiles": tiles, "solution": solution}
 
 
-def accuracy_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+def accuracy_panel(at: Session, chosen: Choices, job: Progress | None) -> Panel | None:
     """The calibration's table of accuracy."""
     path = at.folder / FIT
     return {"table": fit_words(*mark(path))[2]} if path.is_file() else None
@@ -220,7 +220,7 @@ def fit_words(path: str, moment: int, size: int) -> tuple[str, list[Tile], Table
     return fit.headline(), tiles, fit.accuracy_table(), fit.solution()
 
 
-def points_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+def points_panel(at: Session, chosen: Choices, job: Progress | None) -> Panel | None:
     """Every point with its error, the worst first."""
     fit, poses = at.folder / FIT, at.folder / POSES
     if not (fit.is_file() and poses.is_file()):
@@ -237,7 +237,7 @@ def points_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
             "over": len(over), "more": len(found) - len(shown), "count": len(found)}  # fmt: skip
 
 
-def ladder_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+def ladder_panel(at: Session, chosen: Choices, job: Progress | None) -> Panel | None:
     """The diagnosis: while it is at work the rungs so far, then what it says."""
     if job and job.step == "diagnose":
         return {"rungs": job.rungs, "sentences": (), "tables": []}
@@ -258,7 +258,7 @@ def diagnosis_words(
     return gap.said, tables, figure_data(waterfall(gap))
 
 
-def verdict_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+def verdict_panel(at: Session, chosen: Choices, job: Progress | None) -> Panel | None:
     """What the report printed: passed, not passed or not stated, and why."""
     record = record_of(at, "judge")
     if not record or record.code:
@@ -268,7 +268,7 @@ def verdict_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None
     return {"verdict": capitalise(verdict), "kind": kind, "lines": lines, "base": base(at)}
 
 
-def plan_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+def plan_panel(at: Session, chosen: Choices, job: Progress | None) -> Panel | None:
     """What the plan promises, and its poses."""
     record, path = record_of(at, "plan"), at.folder / NEXT
     if not record or record.code or not path.is_file():
@@ -283,10 +283,10 @@ def plan_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
     }
 
 
-def told_panel(step: str) -> Callable[[Session, Choices, Job | None], Panel | None]:
+def told_panel(step: str) -> Callable[[Session, Choices, Progress | None], Panel | None]:
     """What the command of a step printed before its tables."""
 
-    def made(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+    def made(at: Session, chosen: Choices, job: Progress | None) -> Panel | None:
         text = paragraph(at, step)
         return {"text": text} if text else None
 
@@ -299,7 +299,7 @@ def paragraph(at: Session, step: str) -> str:
     return record.told.partition("\n\n")[0] if record and not record.code else ""
 
 
-def downloads_panel(at: Session, chosen: Choices, job: Job | None) -> Panel:
+def downloads_panel(at: Session, chosen: Choices, job: Progress | None) -> Panel:
     """Every file that the commands wrote."""
     files = [
         (p.name, p.stat().st_size, WHAT.get(p.name, ""), accuracy_of(at, p.name))
@@ -323,7 +323,7 @@ def base(at: Session) -> str:
     return f"/s/{at.name}/file"
 
 
-PANELS: dict[str, Callable[[Session, Choices, Job | None], Panel | None]] = {
+PANELS: dict[str, Callable[[Session, Choices, Progress | None], Panel | None]] = {
     "files": files_panel,
     "understood": understood_panel,
     "robot": robot_panel,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gzip
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
@@ -20,38 +21,39 @@ from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import json_of, put_on_disk, replace_on_disk
 from minimax_cal.reporting.html.charts import PALETTE
 from minimax_cal.reporting.html.page import needed, part, template
-from minimax_cal.serving.cell import view_of
-from minimax_cal.serving.panels import diagnosis_words, state_of
+from minimax_cal.serving.reader_pool import Answer, ReaderPool
 from minimax_cal.serving.sessions import (
     GIVEN,
     MOST_BYTES,
+    MOST_FILES,
     Session,
-    mark,
     new_session,
     session,
     sessions,
 )
-from minimax_cal.serving.steps import DIAGNOSIS, FIT, REPORT, STEPS
+from minimax_cal.serving.steps import DIAGNOSIS, FIT, REPORT, STEPS, Command
 from minimax_cal.serving.work import Work
 
 MOST_WORDS = 1 << 20  # bytes of choices
 MOST_DIGITS = 19  # of a file's length: more than any disk holds
 SEALED = "sandbox allow-scripts allow-downloads allow-modals"  # a report has no part in the page
 KINDS = {"css": "text/css", "js": "text/javascript"}
-Answer = Callable[[Request], Awaitable[Response]]
+Endpoint = Callable[[Request], Awaitable[Response]]
 
 
 def application(root: Path) -> Starlette:
     """The page of all sessions in a folder."""
-    work = Work()
 
     @asynccontextmanager
     async def living(app: Starlette) -> AsyncIterator[None]:
+        app.state.work, app.state.readers = Work(), ReaderPool()
+        app.state.changing = asyncio.Lock()  # choices are read, changed and written
+        await app.state.readers.fill()
         yield
-        await work.close()
+        await asyncio.gather(app.state.work.close(), app.state.readers.close())
 
     app = Starlette(routes=ROUTES, lifespan=living)
-    app.state.root, app.state.work = root, work
+    app.state.root = root
     return app
 
 
@@ -60,7 +62,7 @@ def said(error: CalibrationError, status: int = 400) -> Response:
     return JSONResponse({"error": str(error)}, status, {"Connection": "close"})
 
 
-def asked(answer: Answer) -> Answer:
+def asked(answer: Endpoint) -> Endpoint:
     """An answer whose errors of the user are one line."""
 
     @wraps(answer)
@@ -69,8 +71,8 @@ def asked(answer: Answer) -> Answer:
             return await answer(request)
         except CalibrationError as error:
             return said(error)
-        except ClientDisconnect:
-            return Response(status_code=400)
+        except ClientDisconnect:  # or it was silent for too long
+            return Response(status_code=400, headers={"Connection": "close"})
 
     return answered
 
@@ -86,15 +88,26 @@ def work_of(request: Request) -> Work:
     return found
 
 
+async def ask_reader(request: Request, verb: str, at: Session, **arguments: Any) -> Answer:
+    """What a process that reads files says of a session.  Raises CalibrationError."""
+    pool: ReaderPool = request.app.state.readers
+    return await pool.ask(verb, at, **arguments)
+
+
+def relayed(answer: Answer) -> Response:
+    """An answer as a reader wrote it."""
+    return Response(answer.content, answer.status, media_type="application/json")
+
+
 async def words_of(request: Request) -> dict[str, Any]:
     """The JSON object that a request brings.  Raises OptionError."""
-    raw = b""
+    raw = bytearray()
     async for chunk in request.stream():
         raw += chunk
         if len(raw) > MOST_WORDS:
             raise OptionError("that is too much for choices")
     try:
-        content = json_of(raw)
+        content = json_of(bytes(raw))
     except ValueError:
         content = None
     if not isinstance(content, dict):
@@ -135,7 +148,8 @@ async def static(request: Request) -> Response:
     name = request.path_params["name"]
     if name == "plotly.js":
         headers = {"Content-Encoding": "gzip", "Cache-Control": "private, max-age=86400"}
-        return Response(packed_plotly(), media_type="text/javascript", headers=headers)
+        content = await run_in_threadpool(packed_plotly)
+        return Response(content, media_type="text/javascript", headers=headers)
     own = {"serve.css", "serve.js", "start.js"}
     if name not in own | {"page.css", "drawing.js"}:
         return said(OptionError("no such file"), 404)
@@ -163,7 +177,8 @@ async def state(request: Request) -> Response:
     working = {"stamp": now, "job": job.state() if job else None}
     if request.query_params.get("seen") == now:
         return JSONResponse(working)
-    return JSONResponse({**await run_in_threadpool(state_of, at, job), **working})
+    step = {"step": job.step, "rungs": job.rungs} if job else None
+    return relayed(await ask_reader(request, "state", at, job=step, working=working))
 
 
 @asked
@@ -173,9 +188,7 @@ async def view(request: Request) -> Response:
     path = at.folder / {"workspace": FIT, "ladder": DIAGNOSIS}.get(name, "")
     if not path.is_file():
         return said(OptionError("no such chart"), 404)
-    if name == "workspace":
-        return JSONResponse(await run_in_threadpool(view_of, *mark(path)))
-    return JSONResponse((await run_in_threadpool(diagnosis_words, *mark(path)))[2])
+    return relayed(await ask_reader(request, "view", at, name=name))
 
 
 @asked
@@ -189,8 +202,9 @@ async def begin(request: Request) -> Response:
 @asked
 async def choose(request: Request) -> Response:
     """Choices."""
-    changes = await words_of(request)
-    session_of(request).choose(changes)
+    at, changes = session_of(request), await words_of(request)
+    async with request.app.state.changing:
+        await run_in_threadpool(at.choose, changes)
     return JSONResponse({})
 
 
@@ -216,9 +230,9 @@ async def put(request: Request) -> Response:
         part_of_it = at.part(path.name, int(told))
         with part_of_it.open("r+b") as stream:
             async for chunk in request.stream():  # no more than its length: the server sees to it
-                stream.write(chunk)
-            put_on_disk(stream)
-        replace_on_disk(part_of_it, path)
+                await run_in_threadpool(stream.write, chunk)
+            await run_in_threadpool(put_on_disk, stream)
+        await run_in_threadpool(replace_on_disk, part_of_it, path)
     except OSError as error:
         raise OptionError(f"{path.name}: cannot be kept ({error.strerror})") from error
     finally:
@@ -230,18 +244,37 @@ async def put(request: Request) -> Response:
 
 @asked
 async def take(request: Request) -> Response:
-    """Choose files that were dropped, in the place of those that they replace."""
-    told = await words_of(request)
-    names = told.get("names")
-    names = list(map(str, names)) if isinstance(names, list) else []
-    await run_in_threadpool(session_of(request).take, str(told.get("kind")), names)
+    """Choose files that were dropped, in the place of those that they replace.
+
+    All are read before any goes.
+    """
+    at, told = session_of(request), await words_of(request)
+    kind, names = told.get("kind"), told.get("names")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise OptionError("name the files, and what they are for")
+    if len(names) > MOST_FILES:
+        raise OptionError(f"{len(names)} files are too many at once; choose at most {MOST_FILES}")
+    contents = {}
+    if kind == "measured":
+        every = [*dict.fromkeys([*names, *at.choices.measured])]
+        contents = (await ask_reader(request, "contents", at, names=every)).value()
+    elif kind == "targets":
+        (await ask_reader(request, "targets", at, names=names)).value()
+    async with request.app.state.changing:
+        await run_in_threadpool(at.take, str(kind), names, contents)
     return JSONResponse({})
 
 
 @asked
 async def drop(request: Request) -> Response:
-    """Remove a file that was dropped."""
-    session_of(request).remove(request.query_params.get("name", ""))
+    """Remove a file that was dropped; what is left of the measured ones is read again."""
+    at, name = session_of(request), request.query_params.get("name", "")
+    async with request.app.state.changing:
+        before = at.choices.measured
+        left = (await run_in_threadpool(at.remove, name)).measured
+    if left and left != before and at.name not in work_of(request).jobs:
+        with suppress(CalibrationError):  # the file is gone all the same
+            await start_step(request, at, "read")
     return JSONResponse({})
 
 
@@ -268,9 +301,16 @@ async def run(request: Request) -> Response:
     at, name = session_of(request), request.path_params["step"]
     if name not in STEPS:
         raise OptionError("there is no such step")
-    commands = STEPS[name].commands(at, at.choices)
-    job = work_of(request).start(at, name, commands)
-    return JSONResponse({"lines": [command.line() for command in job.commands]})
+    commands = await start_step(request, at, name)
+    return JSONResponse({"lines": [command.line() for command in commands]})
+
+
+async def start_step(request: Request, at: Session, name: str) -> list[Command]:
+    """Begin a step; its command lines.  Raises CalibrationError where it cannot be done."""
+    found = (await ask_reader(request, "commands", at, step=name)).value()
+    commands = [Command(tuple(one["words"]), one["to"], one["judges"]) for one in found]
+    work_of(request).start(at, name, commands)
+    return commands
 
 
 @asked

@@ -195,6 +195,11 @@
     if (!names.length) return;
     const taken = await tell("POST", "/given", JSON.stringify({ kind, names }));
     if (taken && kind === "measured") await run("read");
+    if (taken) return;
+    const chosen = new Set([...now.choices.measured, now.choices.robot, now.choices.targets]);
+    for (const name of names.filter((one) => !chosen.has(one))) { // it is of no use here
+      await ask("DELETE", `/given?name=${encodeURIComponent(name)}`).catch(() => null);
+    }
   }
 
   // ---- a DH table that is typed: a CSV of it goes the way of a dropped file ----------------------

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from hashlib import sha256
+from hashlib import file_digest
+from itertools import chain, count
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,14 +28,22 @@ GIVEN, LOG = "given", "log"  # folders of a session: what people dropped, how ea
 CHOICES, SCRIPT = "session.json", "commands.sh"
 MOST_BYTES = 256 << 20  # of a file that is dropped: a million poses
 MOST_FILES, MOST_TOGETHER = 200, 1 << 30  # of a session: how many, and their bytes
+MAX_LEFT_OUT = 1000  # points that are set aside one by one; their names fit on a command line
+MAX_NAME_BYTES = 200  # of a dropped file; file systems take 255, of which a hidden part needs some
 ABANDONED = 3600.0  # [s]; 256 MiB take less on any line to this machine itself
 NAME = re.compile(r"[\w(][\w .()+@=-]{0,119}")
-RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.I)  # devices of Windows
+# Devices of Windows, whatever the ending [Microsoft, Naming Files, Paths, and Namespaces].
+RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[\d\u00b9\u00b2\u00b3]) *(\..*)?", re.I)
 SESSION = re.compile(r"[a-z0-9][a-z0-9-]{0,59}")
 
 Limit = Annotated[float, Field(gt=0.0, le=1e6)] | None
 Word = Annotated[str, Field(max_length=2000, pattern=r"^[^\x00-\x1f\x7f]*$")]
+PointName = Annotated[str, Field(max_length=40)]
+Point = Annotated[PointName, Field(pattern=f"^{POINT.pattern}$")]
 Reason = Annotated[str, Field(max_length=MOST_LETTERS, pattern=r"^[^\x00-\x1f\x7f]*$")]
+
+
+Contents = Mapping[str, Iterable[str]]  # of dropped files: joints, points, both or neither
 
 
 class Choices(BaseModel):
@@ -55,8 +64,8 @@ class Choices(BaseModel):
     columns: Word = ""
     layout: Literal["", "pose", "target"] = ""
     decimal: Literal["", "point", "comma"] = ""
-    left_out: tuple[Annotated[str, Field(pattern=f"^{POINT.pattern}$", max_length=40)], ...] = ()
-    reasons: dict[Annotated[str, Field(max_length=40)], Reason] = {}
+    left_out: Annotated[tuple[Point, ...], Field(max_length=MAX_LEFT_OUT)] = ()
+    reasons: Annotated[dict[PointName, Reason], Field(max_length=MAX_LEFT_OUT)] = {}
     objective: Literal["minimax", "sum", "point"] = "minimax"
     effects: bool = False
     quick: bool = False
@@ -68,6 +77,11 @@ class Choices(BaseModel):
     def files(self) -> set[str]:
         """The dropped files that are named somewhere."""
         return {*self.measured, self.joints, self.targets, self.robot}
+
+    def without(self, name: str) -> dict[str, Any]:
+        """The changes that leave a file out of every choice."""
+        left = {key: "" for key in ("robot", "joints", "targets") if getattr(self, key) == name}
+        return {"measured": [one for one in self.measured if one != name], **left}
 
 
 @dataclass(frozen=True)
@@ -94,18 +108,24 @@ class Session:
 
     def choose(self, changes: Mapping[str, Any]) -> Choices:
         """Make choices.  Raises OptionError; then nothing changes."""
-        whole = {**self.choices.model_dump(), **changes}
+        made = self.checked(changes)
+        write_whole(self.folder / CHOICES, json_text(made.model_dump(mode="json")))
+        return made
+
+    def checked(self, changes: Mapping[str, Any]) -> Choices:
+        """The choices with changes, of files that are there.  Raises OptionError."""
+        now = self.choices
+        whole = {**now.model_dump(), **changes}
         try:
             made = Choices.model_validate(whole)
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"]))
             raise OptionError(one_line(f"{where}: {first['msg']}")) from error
-        for name in made.files():
+        for name in made.files() - now.files():  # of one that is gone since, its command will say
             known = name in builtin_robots() and name == made.robot
             if name and not known and not self.file(GIVEN, name).is_file():
                 raise OptionError(f"{visible(name)}: was not dropped here")
-        write_whole(self.folder / CHOICES, json_text(made.model_dump(mode="json")))
         return made
 
     def file(self, *parts: str) -> Path:
@@ -141,35 +161,41 @@ class Session:
             stream.truncate(size)
         return path
 
-    def take(self, kind: str, names: Sequence[str]) -> Choices:
+    def take(self, kind: str, names: Sequence[str], contents: Contents) -> Choices:
         """Choose files that were dropped at once; they replace what they cannot stand beside.
 
-        kind: measured, robot or targets.  Of measured files, those go that hold joint values, or
-        points, as one of these does.  Raises OptionError.
+        kind: measured, robot or targets.  contents: of the measured files, old and new, as `held`
+        says.  Of measured files, those go that hold joint values, or points, as one of the new does
+        that can be read.  Raises OptionError; then nothing changes.
         """
-        now, new = self.choices, self.held(*names)
-        gone = {
-            "measured": [name for name in now.measured if self.held(name) & new],
-            "robot": [],  # which can be chosen again
-            "targets": [now.targets],
+        now = self.choices
+        new = {content for name in names for content in contents.get(name, ())}
+        replaced = {
+            "measured": {name for name in now.measured if new & {*contents.get(name, ())}},
+            "robot": set[str](),  # which can be chosen again
+            "targets": {now.targets} - {""},
         }
-        if kind not in gone or not names:
+        if kind not in replaced or not names:
             raise OptionError("name the files, and what they are for")
-        for name in {*gone[kind]} - {"", *names}:
-            self.remove(name)
-        every = list(dict.fromkeys([*self.choices.measured, *names]))
-        return self.choose({kind: every if kind == "measured" else names[0]})
+        gone = replaced[kind] - {*names}
+        stay = [name for name in now.measured if name not in gone]
+        chosen = [*dict.fromkeys([*stay, *names])] if kind == "measured" else names[0]
+        left = {key: "" for key in ("robot", "joints", "targets") if getattr(now, key) in gone}
+        made = self.choose({**left, "measured": stay, kind: chosen})
+        for name in gone:
+            self.file(GIVEN, name).unlink(missing_ok=True)
+        return made
 
-    def held(self, *names: str) -> frozenset[str]:
-        """What dropped files say that they hold: joints, points, both or neither."""
-        return frozenset().union(*(held_in(*mark(self.file(GIVEN, name))) for name in names))
+    def held(self, name: str) -> frozenset[str]:
+        """What a dropped file says that it holds: joints, points, both or neither."""
+        return held_in(*mark(self.file(GIVEN, name)))
 
     def remove(self, name: str) -> Choices:
-        """Remove a file that was dropped, and every choice of it."""
-        self.file(GIVEN, name).unlink(missing_ok=True)
-        now = self.choices
-        left = {key: "" for key in ("robot", "joints", "targets") if getattr(now, key) == name}
-        return self.choose({"measured": [one for one in now.measured if one != name], **left})
+        """Remove a file that was dropped, and every choice of it.  Raises OptionError."""
+        path = self.file(GIVEN, name)
+        made = self.choose(self.choices.without(name))
+        path.unlink(missing_ok=True)
+        return made
 
     def files(self) -> list[Path]:
         """What the commands wrote."""
@@ -200,7 +226,8 @@ def mark(path: Path) -> tuple[str, int, int]:
 @lru_cache(maxsize=256)
 def digest_of(path: str, moment: int, size: int) -> str:
     """SHA-256 of a file as it was at a moment."""
-    return sha256(Path(path).read_bytes()).hexdigest()
+    with open(path, "rb") as stream:
+        return file_digest(stream, "sha256").hexdigest()
 
 
 @lru_cache(maxsize=256)
@@ -224,7 +251,8 @@ def plain_name(name: str) -> str:
     shown = one_line(name)[:60]
     if "/" in name or "\\" in name or name in (".", ".."):
         raise OptionError(f"file name {shown!r}: holds a path; give the name alone")
-    if not NAME.fullmatch(name) or RESERVED.fullmatch(name) or name[-1] in " .":
+    long = len(name.encode("utf-8", "replace")) > MAX_NAME_BYTES
+    if long or not NAME.fullmatch(name) or RESERVED.fullmatch(name) or name[-1] in " .":
         raise OptionError(
             f"file name {shown!r}: rename it; letters, digits and _-+.()@= serve, 120 at most"
         )
@@ -263,13 +291,18 @@ def new_session(root: Path, title: str) -> Session:
     """A new folder, called after a title, or the day.  Raises CalibrationError."""
     words = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40].strip("-")
     stem = words or time.strftime("%Y-%m-%d")
-    taken = {path.name for path in root.iterdir()}
-    name = next(
-        each for i in range(1, 10**6) if (each := stem if i == 1 else f"{stem}-{i}") not in taken
-    )
+    if RESERVED.fullmatch(stem):
+        stem = f"session-{stem}"
+    taken = {path.name.casefold() for path in root.iterdir()}
+    numbered = (f"{stem}-{i}" for i in count(2))
+    folder = root / next(name for name in chain([stem], numbered) if name not in taken)
+    made: list[Path] = []
     try:
-        for folder in (root / name, root / name / GIVEN, root / name / LOG):
-            folder.mkdir(mode=0o700)
+        for each in (folder, folder / GIVEN, folder / LOG):
+            each.mkdir(mode=0o700)
+            made.append(each)
     except OSError as error:
-        raise CalibrationError(f"{root / name}: cannot be made ({error.strerror})") from error
-    return Session(root / name)
+        for each in reversed(made):
+            each.rmdir()
+        raise CalibrationError(f"{folder}: cannot be made ({error.strerror})") from error
+    return Session(folder)

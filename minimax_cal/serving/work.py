@@ -16,7 +16,7 @@ from typing import Annotated, Any, cast
 
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.facts import Fact
-from minimax_cal.ground.files import json_of, json_text, plain, write_whole
+from minimax_cal.ground.files import json_of, json_text, made_folder, plain, write_whole
 from minimax_cal.ground.records import read
 from minimax_cal.ground.stages import clock
 from minimax_cal.ground.words import one_line
@@ -24,6 +24,7 @@ from minimax_cal.serving.sessions import LOG, SCRIPT, Session
 from minimax_cal.serving.steps import Command
 
 PATIENCE = 5.0  # seconds from asking a process to end to ending it
+CHILD = "minimax_cal.cli.child"  # the program that does a command line
 MOST_TOLD = 20_000  # letters of stdout that are kept
 MOST_LINES = 400
 MOST_LINE = 1 << 20  # bytes of a line on stderr
@@ -52,6 +53,14 @@ def record_of(at: Session, step: str) -> Record | None:
         return read(Record, json_of((at.folder / LOG / f"{step}.json").read_bytes()))
     except (OSError, ValueError):
         return None
+
+
+@dataclass(frozen=True)
+class Progress:
+    """A step at work, and of a diagnosis the steps so far: name and error [mm]."""
+
+    step: str
+    rungs: Sequence[tuple[str, str]]
 
 
 @dataclass(eq=False)
@@ -134,16 +143,16 @@ class Work:
             async with self.cores:
                 job.began = time.monotonic()
                 for command in job.commands:
+                    job.stage = command.words[0]
+                    inputs |= await asyncio.to_thread(digests, job.at, command)
                     if job.cancelled:
                         code = 1
                         break
-                    job.stage = command.words[0]
-                    inputs |= digests(job.at, command)
                     code, told = await self.one(job, command)
                     if code:
                         break
             if not (job.cancelled and code):  # what ended well was cancelled too late
-                kept(job, code, told, inputs)
+                await asyncio.to_thread(kept, job, code, told, inputs)
         except (OSError, CalibrationError) as error:  # no room, or no process to be had
             job.error = one_line(f"the work could not be done ({error})")
             with suppress(OSError, CalibrationError):
@@ -155,8 +164,8 @@ class Work:
         """Run a command line; its exit code and what it printed."""
         pipe = asyncio.subprocess.PIPE
         job.process = process = await asyncio.create_subprocess_exec(
-            *child(), str(job.at.folder), *in_json(command), stdin=pipe, stdout=pipe, stderr=pipe,
-            limit=MOST_LINE, env={**os.environ, "PYTHONUTF8": "1"},
+            *module_command(CHILD), str(job.at.folder), *in_json(command), stdin=pipe, stdout=pipe,
+            stderr=pipe, limit=MOST_LINE, env={**os.environ, "PYTHONUTF8": "1"},
         )  # fmt: skip
         out, told = (cast(asyncio.StreamReader, s) for s in (process.stdout, process.stderr))
         raw, _ = await asyncio.gather(out.read(), listen(job, told))
@@ -191,10 +200,10 @@ class Work:
         await asyncio.gather(*(self.cancel(name) for name in list(self.jobs)))
 
 
-def child() -> list[str]:
-    """What starts a process that imports what this one does, and nothing from its folder."""
+def module_command(module: str) -> list[str]:
+    """What starts a module that imports what this process does, and nothing from its folder."""
     safe = [] if os.getcwd() in sys.path else ["-P"]
-    return [sys.executable, *safe, "-m", "minimax_cal.cli.child"]
+    return [sys.executable, *safe, "-m", module]
 
 
 def in_json(command: Command) -> tuple[str, ...]:
@@ -226,7 +235,7 @@ def kept(job: Job, code: int, told: str, inputs: dict[str, str]) -> None:
     seconds = round(time.monotonic() - job.began, 1)
     commands = tuple(command.line() for command in job.commands)
     record = Record(commands, code, seconds, told, tuple(job.notices), job.error, inputs, job.more)
-    write_whole(job.at.folder / LOG / f"{job.step}.json", json_text(plain(record)))
+    write_whole(made_folder(job.at.folder / LOG) / f"{job.step}.json", json_text(plain(record)))
     script = job.at.folder / SCRIPT
     text = script.read_text("utf-8") if script.exists() else start_of(job.at.folder)
     when = time.strftime("%Y-%m-%d %H:%M:%S")

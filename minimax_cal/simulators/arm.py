@@ -200,7 +200,7 @@ def condensed(fields: Array, right: Array) -> tuple[Array, Array]:
     e, moments_, rows = fields.shape
     every = np.vstack([fields.reshape(-1, rows), right]).T
     triangle = np.asarray(np.linalg.qr(every, mode="r"))
-    return triangle[:, :-1].T.reshape(e, moments_, -1), triangle[:, -1]
+    return triangle[:, :-1].T.reshape(e, moments_, len(triangle)), triangle[:, -1]
 
 
 def together(

@@ -16,6 +16,7 @@ from minimax_cal.ground.facts import Fact, derived
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
+from minimax_cal.ground.words import capitalise
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.solvers.status import Status
 
@@ -161,12 +162,11 @@ class MotionRung:
 class WrittenElement:
     """Numbers of a model that were corrected.
 
-    held_by: `file`, or `module` where no element of MuJoCo holds it.  worth: of each joint that it
-    changes, the held-out RMS torque of moving rows without and with it, in the unit of the log.
+    worth: of each joint that it changes, the held-out RMS torque of moving rows without and with
+    it, in the unit of the log.
     """
 
     name: str
-    held_by: Literal["file", "module"]
     attributes: str
     worth: Mapping[str, tuple[float, float]]
 
@@ -197,8 +197,8 @@ class MotionGap(Result):
     """The gap between a simulator's model and logs of the arm, measured in the simulator.
 
     rungs: as given, then with each element.  elements: what was corrected, with its worth.
-    left_out: what is in neither file nor module, and what that costs.  drives: what moved the arm.
-    held_out: runs that no fit saw, or quarters of one.  written, module: paths, empty if none.
+    left_out: what is not in the file, and what that costs.  drives: what moved the arm.
+    held_out: runs that no fit saw, or quarters of one.  written: a path, empty if none.
     effects: of its drives, each with the held-out joint error [mrad] without and with it.
     along: tells its file from that of poses.
     """
@@ -215,7 +215,6 @@ class MotionGap(Result):
     held_out: tuple[str, ...]
     notices: tuple[str, ...]
     written: str
-    module: str
     seconds: float
     effects: tuple[MotionEffect, ...] = ()
     along: Literal["trajectories"] = "trajectories"
@@ -248,7 +247,7 @@ class MotionGap(Result):
             )
         first, last = self.rungs[0], self.rungs[-1]
         if not first.torque_rms:
-            return f"{self.driven().capitalize()}."
+            return f"{capitalise(self.driven())}."
         share = np.array(last.torque_rms_moving) / np.maximum(first.torque_rms_moving, 1e-300)
         worst = int(np.argmax(share))
         said = (
@@ -264,15 +263,14 @@ class MotionGap(Result):
         return f"the joint error under {self.drives} from {ends[0]:.3g} to {ends[1]:.3g} mrad"
 
     def sentences(self) -> tuple[str, ...]:
-        """What was corrected and its worth, what the file alone lacks, and what nothing holds."""
-        said = {"file": "corrected", "module": "not in the file, in its module:"}
+        """What was corrected and its worth, and what the file does not hold."""
         drives = (of_drive(one) for one in self.effects)
-        each = (f"{said[one.held_by]} {one.words(self.unit)}" for one in self.elements)
+        each = (f"corrected {one.words(self.unit)}" for one in self.elements)
         return (*drives, *each, *(f"not in the model: {text}" for text in self.left_out))
 
     def short(self) -> dict[str, Any]:
         """What another result says of the file that was written."""
-        names = ("written", "module", "elements", "left_out")
+        names = ("written", "elements", "left_out")
         return {name: plain(getattr(self, name)) for name in names}
 
     def table(self) -> Table:

@@ -23,7 +23,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.status import Status
-from qp_backends import Problem, Solution
+from qp_backends import Problem, ProblemError, Solution
 from qp_backends import Status as QpStatus
 from qp_backends.problem import COLD
 
@@ -41,15 +41,35 @@ SHARE = 3  # times the unknowns: of more functions than twice that, so many make
 PATIENCE = 10  # iterations without progress in value or optimality before giving up
 WORTH = 1e-8  # relative: a fall by less is no progress where QP answers are used as they are
 NOTHING = 1e-12  # of the value at the start: what is as good as zero
-ENDLESS = 1e72  # times that: a value so large belongs to what falls without end
+ENDLESS = 1e32  # times that: a value so large belongs to what falls without end
 CANCELLED = 1e-7  # a value below this share of the terms that make it is known no better
 MOST_DAMPING = 1e8  # of the Hessian's diagonal
 RELENTLESS = 1e6  # price of a violation, in slopes of f, beyond which it is there to stay
+MIN_FALLING_SLOPE = 0.25  # at the end of a step, relative to its start: worth going on
+MAX_LENGTHENING = 1e15  # times a step
 NEARLY = 100.0  # times the tolerance: optimal as far as rounding lets one see
 
-# P_vv of the epigraph variable: makes P definite for solvers that ask for it.  v is the decrease
-# that is still to be had, so the term vanishes at the solution and does not move it.
+# Curvature of a direction that has none, for solvers that ask for a definite P.
 EPIGRAPH = 1e-8
+# P_vv of the epigraph variable v: a force that changes the sum of the multipliers by a part of
+# NEGLIGIBLE_FORCE at the decrease that is still to be had, but no more curvature than this.  Active
+# set methods work with A P^-1 A', whose entries are of size one beside 1 / P_vv: from 1e8 on the
+# rounding of the sum exceeds a QP's tolerance.
+NEGLIGIBLE_FORCE = 1e-9
+MAX_DECREASE_CURVATURE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class StartScales:
+    """Scales of a problem at the start.
+
+    lengths: (p,) over which a variable alone changes the functions by their size.
+    largest_level: with what changes of the value are compared at most; less than the value where
+    that holds a number which is added to all functions.
+    """
+
+    lengths: Array
+    largest_level: float = np.inf
 
 
 class Solver(Protocol):
@@ -255,12 +275,14 @@ def solve(
     settings: Sqp = Sqp(),
     progress: Callable[[Step], None] = lambda step: None,
     mu: Array = EVEN,
+    scales: StartScales | None = None,
 ) -> Optimum[X]:
     """Minimise max f from x.  qp: a QP solver; it is given each answer as the next one's start.
 
     mu: (k,) multipliers of a similar problem, to begin with.
+    scales: of variables and value, where they are known; else the derivatives at x give them.
     """
-    at, ask = Iterate.begin(problem, x, settings, mu), Asking(qp)
+    at, ask = Iterate.begin(problem, x, settings, mu, scales), Asking(qp)
     status, tolerance = Status.ITERATION_LIMIT, settings.tolerance
     trace: list[Step] = []
     notes: list[str] = []
@@ -270,7 +292,11 @@ def solve(
             status = Status.FAILED
             break
         hessian = at.hessian(settings.floor)
-        plan = at.subproblem(hessian, ask)
+        try:
+            plan = at.subproblem(hessian, ask)
+        except ProblemError:  # values so large that the QP's numbers overflow
+            status = Status.FAILED
+            break
         notes += plan.notes
         if not plan.usable:  # the point may be optimal all the same
             best, status = at.balanced(), Status.FAILED
@@ -329,8 +355,9 @@ class Iterate(Generic[X]):
     here: the problem at x.  mu, lam: multipliers of the latest QP.  quasi: the Hessian where the
     problem has none of its own.  gone: (p,) from the start.  reach: (p,) the farthest of it, at
     least as far as the start's derivatives suggest.  price: (l,) of a violation.  least: a value
-    that is as good as none.  damping: of the Hessian's diagonal.  best, lowest: least residual and
-    value so far.  idle: iterations since either fell.  step: QPs so far.
+    that is as good as none.  largest_level: as `StartScales` has it.  damping: of the Hessian's
+    diagonal.  best, lowest: least residual and value so far.  idle: iterations since either fell.
+    step: QPs so far.
     """
 
     problem: Minimax[X]
@@ -343,6 +370,7 @@ class Iterate(Generic[X]):
     reach: Array
     price: Array
     least: float
+    largest_level: float = np.inf
     damping: float = 0.0
     best: float = np.inf
     lowest: float = np.inf
@@ -350,18 +378,21 @@ class Iterate(Generic[X]):
     step: int = 0
 
     @staticmethod
-    def begin(problem: Minimax[X], x: X, settings: Sqp, mu: Array) -> Iterate[X]:
+    def begin(
+        problem: Minimax[X], x: X, settings: Sqp, mu: Array, scales: StartScales | None = None
+    ) -> Iterate[X]:
         """The start; without mu all functions share the multipliers evenly."""
         here = problem.linearise(x)
         (k, p), none = here.jacobian.shape, np.zeros(len(here.c))
         f, slope = np.abs(here.f), np.abs(here.jacobian)
         level = float(max(abs(here.f.max()), CANCELLED * f.mean()) or slope.max() or 1.0)
-        bent = level / here.lengths(level) ** 2
+        bent = level / (scales.lengths if scales else here.lengths(level)) ** 2
         bfgs = Bfgs.start(here, bent)
         reach = np.sqrt(level / np.maximum(bent, np.diag(bfgs.matrix)))
         quasi = None if settings.hessian == "gauss-newton" else bfgs
         mu, least = mu if len(mu) else np.full(k, 1.0 / k), NOTHING * level
-        return Iterate(problem, x, here, mu, none, quasi, np.zeros(p), reach, none, least)
+        cap = scales.largest_level if scales else np.inf
+        return Iterate(problem, x, here, mu, none, quasi, np.zeros(p), reach, none, least, cap)
 
     @cached_property
     def terms(self) -> float:
@@ -375,7 +406,8 @@ class Iterate(Generic[X]):
     @cached_property
     def units(self) -> Units:
         """Of the value as large as it is, of variables as far as they go."""
-        level = max(abs(float(self.here.f.max())), CANCELLED * self.terms, self.least)
+        size = min(abs(float(self.here.f.max())), self.largest_level)
+        level = max(size, CANCELLED * self.terms, min(self.least, self.largest_level))
         return Units.of(self.here, level, self.reach, self.problem.lower, self.problem.upper)
 
     @cached_property
@@ -398,7 +430,8 @@ class Iterate(Generic[X]):
 
     def hessian(self, floor: float) -> Array:
         """(p, p) of the Lagrangian, damped.  floor: as `Sqp.floor`."""
-        least = EPIGRAPH * np.diag(self.units.value / self.lengths**2)
+        with np.errstate(over="ignore"):
+            least = EPIGRAPH * np.diag(self.units.value / self.lengths**2)
         if self.quasi is None:
             matrix = self.here.curvature(np.maximum(self.mu, floor / len(self.mu)))
         else:
@@ -423,10 +456,13 @@ class Iterate(Generic[X]):
             hessian / units.value * np.outer(units.x, units.x),
             self.problem.upper / units.c,
         )
+        # What weak duality leaves at the last multipliers, the Hessian taken as its diagonal.
+        slope = self.mu @ here.jacobian + (self.lam * units.c / units.value) @ here.normal
+        decrease = self.kkt.complementarity + 0.5 * float(slope @ slope)
         missed = rows = self.likely(here)
         while len(missed):
             some = here if len(rows) == len(here.f) else here.of(rows)
-            plain = epigraph(some, here.f.max(), bent, lower, upper)
+            plain = epigraph(some, here.f.max(), bent, lower, upper, decrease)
             solution = qp(plain)
             missed = forgotten(here, rows, solution)
             rows = np.concatenate([rows, missed])
@@ -562,14 +598,19 @@ def forgotten(here: Linear, rows: Array, solution: Solution) -> Array:
     return found[np.argsort(-over[found])[:p]]
 
 
-def epigraph(here: Linear, largest: float, hessian: Array, lower: Array, upper: Array) -> Problem:
-    """min 1/2 d'Hd + v with rows f - largest + f'd <= v and lower - c <= c'd <= upper - c."""
+def epigraph(
+    here: Linear, largest: float, hessian: Array, lower: Array, upper: Array, decrease: float
+) -> Problem:
+    """min 1/2 d'Hd + v with rows f - largest + f'd <= v and lower - c <= c'd <= upper - c.
+
+    decrease: about how far v may fall.
+    """
     k, p = here.jacobian.shape
     rows = np.zeros((k + len(here.c), p + 1))
     rows[:k, :p], rows[:k, p], rows[k:, :p] = here.jacobian, -1.0, here.normal
     quadratic = np.zeros((p + 1, p + 1))
     quadratic[:p, :p] = hessian
-    quadratic[p, p] = EPIGRAPH
+    quadratic[p, p] = min(MAX_DECREASE_CURVATURE, NEGLIGIBLE_FORCE / max(decrease, EPIGRAPH))
     linear = np.zeros(p + 1)
     linear[p] = 1.0
     low = np.concatenate([np.full(k, -np.inf), lower - here.c])
@@ -642,6 +683,8 @@ def multipliers_at(here: Linear, lower: Array, upper: Array) -> tuple[Array, Arr
         (np.flatnonzero(upper < np.inf), np.flatnonzero(lower > -np.inf)),
     )
     columns = np.concatenate([here.jacobian, here.normal[above], -here.normal[below]]).T
+    if not np.all(np.isfinite(columns)):
+        return np.full(k, 1.0 / k), np.zeros(len(here.c))
     rooms = (here.f.max() - here.f, (upper - here.c)[above], (here.c - lower)[below])
     room = np.maximum(np.concatenate(rooms), 0.0)
     one = 1e3 * (np.arange(len(room)) < k)  # heavy: the sum is then one but for a millionth
@@ -689,7 +732,15 @@ def search(at: Iterate[X], plan: Plan, resolve: Resolve) -> tuple[float, Array, 
     there = problem.linearise(trial)
     value = merit(there.f, there.c)
     if value <= start - 1e-4 * decrease + slack:
-        return 1.0, plan.d, trial, there
+        falls_on = value - merit(there.f + there.jacobian @ plan.d, there.c + there.normal @ plan.d)
+        length = 1.0
+        if at.quasi is not None and falls_on > MIN_FALLING_SLOPE * decrease > slack:
+            length = lengthen(at, plan.d, merit, start, value)
+        if length == 1.0:
+            return 1.0, plan.d, trial, there
+        move = length * plan.d
+        trial = problem.step(x, move)
+        return length, move, trial, problem.linearise(trial)
     if np.isfinite(value):
         # what the linear model missed at the full step goes into the constants
         bent = resolve(there.f - here.jacobian @ plan.d, there.c - here.normal @ plan.d)
@@ -711,6 +762,27 @@ def search(at: Iterate[X], plan: Plan, resolve: Resolve) -> tuple[float, Array, 
         if value <= start - 1e-4 * length * decrease + slack:
             return length, move, trial, problem.linearise(trial)
     return 0.0, np.zeros_like(plan.d), x, here
+
+
+def lengthen(
+    at: Iterate[X], d: Array, merit: Callable[[Array, Array], float], start: float, value: float
+) -> float:
+    """How many times the step d to go, doubled while the merit falls well.
+
+    Where an estimated Hessian is far too large, as after steps through functions that grow fast.
+    start, value: merits here and after d.  A step ends where a linearised constraint does.
+    """
+    here, lower, upper = at.here, at.problem.lower, at.problem.upper
+    length = 1.0
+    while length < MAX_LENGTHENING:
+        ends = here.c + 2.0 * length * (here.normal @ d)
+        if np.any(excess(ends, lower, upper) > excess(here.c, lower, upper)):
+            break
+        farther = merit(*at.problem.evaluate(at.problem.step(at.x, 2.0 * length * d)))
+        if not value - farther > min(0.1 * (start - value), 0.5 * abs(value)):
+            break
+        length, value = 2.0 * length, farther
+    return length
 
 
 @dataclass(frozen=True, eq=False)
@@ -745,5 +817,18 @@ class Bfgs:
         if float(q @ s) < 0.2 * curve:
             share = 0.8 * curve / (curve - float(q @ s))
             q = share * q + (1.0 - share) * bs
-        new = matrix - np.outer(bs, bs) / curve + np.outer(q, q) / float(q @ s)
-        return Bfgs(0.5 * (new + new.T), fresh=False)
+        bs, q = bs / np.sqrt(curve), q / np.sqrt(float(q @ s))  # first, against overflow
+        new = matrix - np.outer(bs, bs) + np.outer(q, q)
+        new = 0.5 * (new + new.T)
+        if not is_positive_definite(new):  # by rounding, of entries of many sizes
+            new = np.diag(np.maximum(np.diag(new), EPS * np.diag(matrix)))
+        return Bfgs(new, fresh=False)
+
+
+def is_positive_definite(matrix: Array) -> bool:
+    """Whether a symmetric matrix has a Cholesky factor; also where it holds no numbers."""
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return not bool(np.all(np.isfinite(matrix)))
+    return True

@@ -135,7 +135,7 @@ def test_numbers_that_break_down_are_exit_1(here, says, monkeypatch):
 def test_a_figure_needs_matplotlib_and_says_so(here, says, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     out, err = says("diagnose ur10 gap.csv --figure gap.png", code=2)
-    assert "pip install '.[plot]' in a clone" in err
+    assert 'pip install ".[plot]" in a clone' in err
     assert not out  # asked before the work
     assert not (here / "gap.png").exists()
 

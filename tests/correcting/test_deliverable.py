@@ -101,7 +101,7 @@ def soft() -> mc.Fit:
 
 
 CARRIED = {
-    **dict.fromkeys(["urdf", "json", "dh-csv", "ros-yaml", "ros2-control", "ur-yaml", "sdf"], ()),
+    **dict.fromkeys(["urdf", "json", "dh-csv", "ros-yaml", "ros2-control", "ur-yaml"], ()),
     "moc": (EFFECTS,),
     "mjcf": (EFFECTS, "backlash:J3", "tool_flex:all"),
     "compensate": (EFFECTS, "backlash:J3"),

@@ -9,10 +9,9 @@ from dynamics.motions import simulated, three_joints
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.dynamics.laws import LAWS, QUANTITIES, WORDS, Element, Law, Tuned, laws_table
+from minimax_cal.dynamics.laws import LAWS, QUANTITIES, WORDS, Law, Tuned, laws_table
 from minimax_cal.dynamics.rows import Arm, Scene, prepare, sense_of
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.simulators.motion.judge import laws_text
 
 DOCS = Path(__file__).parents[2] / "docs" / "torques.md"
 WAVE = Law(
@@ -32,18 +31,6 @@ def scene() -> Scene:
 def registered() -> Iterator[Law]:
     yield mc.register_law(WAVE)
     del LAWS[WAVE.name], WORDS[WAVE.name]
-
-
-@pytest.mark.parametrize("name", [name for name, law in LAWS.items() if Element.MODULE in law.held])
-def test_the_module_says_what_the_rows_say(name: str, scene: Scene) -> None:
-    law, j = LAWS[name], 1
-    written = eval(f"{{{laws_text({name: law})}}}", {"np": np})
-    dry, per_unit = written[name]
-    for choice in law.tried(scene, j):
-        at = {of: quantity(scene, j) for of, quantity in QUANTITIES.items()}
-        sense = scene.sense[:, j] if dry else 1.0
-        said = np.stack([sense * one for one in per_unit(**at, **choice)], axis=1)
-        assert_allclose(law.columns(scene, j, choice), said, rtol=1e-15)
 
 
 def test_a_curve_over_speed_is_the_law_along_it(scene: Scene) -> None:
@@ -74,8 +61,6 @@ def test_wrong_facts_are_refused() -> None:
         mc.register_law(Law("two", "two", ("q", "v")))
     with pytest.raises(mc.OptionError, match="law 'stribeck': is built in"):
         mc.register_law(Law("stribeck", "mine", ("q",)))
-    with pytest.raises(OptionError, match="knows no a"):
-        mc.register_law(Law("late", "late", ("a",)))
 
 
 def test_the_documentation_has_every_law() -> None:

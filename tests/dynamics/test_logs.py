@@ -440,3 +440,52 @@ def test_joints_outside_their_limits(robot: mc.Robot) -> None:
     assert re.search(r"a.csv: joint 2 moves from .* deg, outside the limits of", told)
     with pytest.raises(mc.OptionError, match=r"a.csv: has 5 joints, .* has 6"):
         runs_of(robot, robot, [replace(run, q=run.q[:, :5])])
+
+
+# ---- runs that coincide, and runs that are short -------------------------------------------------
+
+
+def stepped(values: Array, step: float) -> Array:
+    """Values in the steps of an encoder or a drive."""
+    return np.asarray(step * np.round(values / step))
+
+
+def slow_sweep(shape: Callable[[Array], Array], seed: int) -> Columns:
+    """One joint goes slowly through the same angles; joints and currents in coarse steps."""
+    t = 0.01 * np.arange(3000)
+    q = np.zeros((len(t), N))
+    q[:, 1] = stepped(0.5 * shape(t / 30.0), 2e-3)
+    tau = np.zeros_like(q)
+    rng = np.random.default_rng(seed)
+    tau[1:, [0, 2]] = 1.0  # joints that rest hold what they hold
+    tau[:, 1] = 8.0 * np.cos(q[:, 1]) + np.sign(np.gradient(q[:, 1])) + 0.3 * rng.normal(size=3000)
+    return {"t": t, "q": q, "tau": stepped(tau, 1.0)}
+
+
+def test_currents_in_steps_that_coincide_are_no_repeats(tmp_path: Path) -> None:
+    """Two runs through the same encoder counts, by currents of few values; a copy is one."""
+    made = {
+        "sine1": slow_sweep(lambda x: np.sin(2.0 * np.pi * x), 1),
+        "triangle1": slow_sweep(lambda x: 2.0 * np.abs(2.0 * ((x + 0.25) % 1.0) - 1.0) - 1.0, 2),
+    }
+    files = [write(tmp_path / f"{name}.csv", house(one)) for name, one in made.items()]
+    assert [run.name for run in read_runs(files)] == ["sine1", "triangle1"]
+    part = {name: column[:2000] for name, column in house(made["sine1"]).items()}
+    with pytest.raises(mc.DataError, match=r"run part holds rows of sine1; give each once"):
+        read_runs([files[0], write(tmp_path / "part.csv", part)])
+
+
+def test_short_runs_of_a_file_are_joined(tmp_path: Path) -> None:
+    """Each of 1.98 s; the motion is as logged, with a gap that nothing bridges."""
+    made = motion(rows=5 * 199)
+    label = np.repeat([f"r{i}" for i in range(5)], 199)
+    columns = {**house(made), "run": label.tolist()}
+    runs = read_runs(write(tmp_path / "x.csv", columns))
+    assert [run.name for run in runs] == ["x:r0+r1", "x:r2+r3+r4"]
+    assert_allclose(np.concatenate([run.q for run in runs]), made["q"], atol=1e-5)
+    assert np.diff(runs[0].time).max() > 0.5
+    assert np.count_nonzero(np.diff(runs[0].time) > 0.1) == 1
+    assert any("short runs are joined" in text for text in runs[0].notices)
+    payload = np.repeat([0.0, 1.0, 2.0, 3.0, 4.0], 199)  # of one run there is one
+    with pytest.raises(mc.DataError, match=r"too short for a run; .* they are joined"):
+        read_runs(write(tmp_path / "x.csv", {**columns, "payload_kg": payload}))

@@ -13,8 +13,8 @@ from scipy.optimize import lsq_linear
 
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
+from experiments.resemblance import resemblance
 from minimax_cal.diagnosing.causes import chosen
-from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.bench import against_signs, bench, columns_of, credible

@@ -408,20 +408,6 @@ def test_a_diagnosis_is_what_one_process_finds(cluster):
     assert_allclose(found.beyond.typical_mm, alone.beyond.typical_mm, rtol=1e-12)
 
 
-def test_a_fleet_is_what_one_process_finds(cluster, tmp_path, says):
-    cells = tmp_path / "cells.toml"
-    lines = ['[defaults]\nrobot = "irb120"\nobjective = "sum"\ntolerance = "rms 0.5"']
-    for name in ("0", "1"):
-        sheet = mc.simulate("irb120", 30, 1, int(name)).data
-        mc.write_measurements(tmp_path / f"{name}.csv", sheet)
-        lines.append(f'[[cells]]\nname = "{name}"\ndata = "{name}.csv"')
-    lines.append('[[cells]]\nname = "none"\ndata = "none.csv"')
-    cells.write_text("\n".join(lines))
-    told = json.loads(says("fleet", cells, "--cluster", cluster, "--json", code=1).out)
-    assert [row["status"] for row in told["rows"]] == ["converged", "converged", "failed"]
-    assert told == mc.fleet(cells, processes=1).to_dict()
-
-
 def test_a_cluster_with_other_code_is_refused(cluster, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "fingerprint", lambda function: "other")
     with pytest.raises(OptionError, match="other code"):

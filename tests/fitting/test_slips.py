@@ -46,7 +46,7 @@ SLIPS: dict[str, tuple[Callable[[mc.Measurements], mc.Measurements], str]] = {
     "by three": (lambda d: slips.with_points_moved(d, -3), "three rows below .*--mend shift=3 -o"),
     "reversed": (slips.with_points_reversed, "in reverse order; .*--mend reverse -o"),
     "lost": (lambda d: lost(d, 25), "from about this line .*--mend shift=-1@\\d+\\.\\. -o"),
-    "stale": (stale, "3 rows have the points of the row before .*--leave-out 9,22,35 -o"),
+    "stale": (stale, "points are those of the row before .* in 3 rows.*--leave-out 9,22,35 -o"),
     "joints": (
         lambda d: slips.with_joints_ordered(d, [0, 2, 1, 3, 4, 5]),
         "columns of joints 2 and 3 look swapped; .*--mend joints=1:3:2:4:5:6 -o",

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from experiments import coverage
+from experiments.coverage import position_covariance
 from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting import uncertainty
 from minimax_cal.fitting.options import Options, silent
@@ -22,7 +23,6 @@ from minimax_cal.fitting.uncertainty import (
     by_poses,
     holding_radius,
     point_share,
-    position_covariance,
     position_factor,
     quantile,
     uncertainty_from_dict,

@@ -43,8 +43,6 @@ TEMPLATES = (
     "check fit.json data.csv --tolerance rms=0.3 --json",
     "check effects.json data.csv --tolerance max=5 -o out.json",
     "compare fit.json effects.json --json",
-    "fleet cells.toml --jobs 1 --json",
-    "fleet cells.toml --jobs 1 --page out.html -o out.json",
     "iso9283 fit.json --poses --json",
     "iso9283 fit.json data.csv -o out.json",
     "map fit.json --samples 500 --json",
@@ -54,8 +52,6 @@ TEMPLATES = (
     "export fit.json --to ros2-control -o out.xml",
     "export ROBOT --to json -o out.json",
     "export effects.json --to ur-yaml -o out.yaml",
-    "export fit.json --to sdf -o out.sdf",
-    "export links.xml --to sdf -o out.sdf",
     "export fit.json --to urdf --urdf robot.urdf -o out.urdf",
     "report fit.json -o out.html --date 2026-01-01",
     "report effects.json -o out.html --date 2026-01-01 --customer Name",
@@ -98,7 +94,6 @@ ROBOTS = ("robot.json", "robot.yaml", "robot.toml", "robot.urdf", "irb120")
 # How often, beside the others: those that take seconds, and those that can hardly go wrong.
 RATES = {"calibrate": 0.15, "diagnose": 0.1, "plan": 0.08, "gap": 0.3}
 RATES |= {"robots": 0.2, "backends": 0.2}
-NAMED = {"cells.toml": ("robot.json", "data.csv", "fit.json")}  # files that a file names
 PLACES = (
     "/dev/null",
     ".",
@@ -155,7 +150,6 @@ def case(seed: int, number: int) -> Case:
         return Case(number, seed, tuple(words), files, (said,), "noticed")
     broke = []
     inputs = [word for word in words if word in files]
-    inputs += [name for word in inputs for name in NAMED.get(word, ())]
     for _ in range(int(rng.choice([1, 2, 3], p=[0.7, 0.2, 0.1]))):
         how = rng.random()
         if inputs and how < 0.65:

@@ -22,20 +22,6 @@ from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_
 from minimax_cal.instruments.sockets import reach
 
 POSES = 24
-CELLS = """
-[defaults]
-tolerance = "rms 0.5"
-objective = "sum"
-[[cells]]
-name = "one"
-robot = "robot.json"
-data = "data.csv"
-fit = "fit.json"
-[[cells]]
-name = "two"
-fit = "fit.json"
-check = "data.csv"
-"""
 
 
 def done(*arguments: str) -> None:
@@ -87,7 +73,6 @@ def make() -> None:
     done("diagnose", "robot.json", "data.csv", "-o", "diagnosis.json")
     done("export", "fit.json", "--to", "urdf", "-o", "robot.urdf")
     done("export", "fit.json", "--to", "mjcf", "-o", "arm.xml")
-    Path("cells.toml").write_text(CELLS)
     rows = list(csv.reader(Path("data.csv").read_text().splitlines()))
     bent = np.random.default_rng(1).uniform(0.3, 0.9, (12, 6))  # far from singular poses
     write("targets.csv", [[*rows[0][:6], "note"], *([*map(str, q), "a"] for q in bent)])

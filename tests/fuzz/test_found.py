@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import shlex
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,11 +52,8 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
         ("fit.json targets.csv", "compensate fit.json targets.csv --tolerance 1e308", "at most 1e"),
         ("", "plan irb120 --poses 9 --noise -1e300", "cannot be"),
         ("", "plan irb120 --motion --payload null", "payload"),
-        ("", "fleet cells.toml --jobs 0", "give their number"),
-        ("", "fleet cells.toml --jobs -2", "give their number"),
-        ("", f"fleet cells.toml --jobs {'9' * 20}", "give their number"),
         ("data.csv fit.json", "check fit.json data.csv --tolerance 'rms 1' --seed -1", "seed -1"),
-        ("cells.toml robot.json data.csv fit.json", "fleet cells.toml --out a -o a", "two results"),
+        ("data.csv", "plan irb120 --motion --waypoints a.csv -o a.csv", "two results"),
         ("data.csv", f"calibrate irb120 data.csv --bootstrap {10**20}", "give 2 to 100000"),
         ("links.json run1.csv", "torques links.json run1.csv --payload 1e308", "payload"),
         ("links.json run1.csv", "torques links.json run1.csv --ratio 1e308", "ratio"),
@@ -283,48 +278,20 @@ def test_measurements_without_a_joint_are_not_those_of_the_fit(tmp_path, capsys)
         assert "has 5 joint columns" in refused(capsys, command, fit, path, *more)
 
 
-def test_of_two_outputs_none_is_left_where_one_cannot_be_written(tmp_path, capsys, monkeypatch):
-    """A fleet's page stood there when its rows could not be written."""
-    for name in ("cells.toml", "robot.json", "data.csv", "fit.json"):
-        (tmp_path / name).write_bytes(material()[name])
-    page, closed, made = tmp_path / "out.html", tmp_path / "closed", tempfile.mkstemp
-    closed.mkdir()
-
-    def denied(prefix: str, dir: Path) -> tuple[int, str]:
-        if dir == closed:
-            raise PermissionError(errno.EACCES, "Permission denied")
-        return made(prefix=prefix, dir=dir)
-
-    monkeypatch.setattr(tempfile, "mkstemp", denied)
-    told = refused(capsys, "fleet", tmp_path / "cells.toml", "--page", page, "--jobs", 1, "-o",
-                   closed / "out.json")  # fmt: skip
-    assert "cannot be written (Permission denied)" in told
-    assert not page.exists()
-
-
-@pytest.mark.parametrize("value", ["9" * 5000, "[" * 5000, "2020-02-31"])
-def test_a_fleet_that_python_does_not_read_is_refused(value, tmp_path, capsys):
-    """A number of 5000 digits was a traceback."""
-    path = tmp_path / "cells.toml"
-    path.write_text(f"[[cells]]\nname = {value}\n")
-    assert "is not TOML" in refused(capsys, "fleet", path)
-
-
 def test_what_is_no_scheduler_is_told_in_our_words(tmp_path, capsys, monkeypatch):
     """Dask took the first bytes of another server for the size of an array."""
     distributed = pytest.importorskip("distributed")
-    for name in ("cells.toml", "robot.json", "data.csv", "fit.json"):
+    for name in ("robot.json", "data.csv"):
         (tmp_path / name).write_bytes(material()[name])
 
     def other(*given: object, **more: object) -> None:
         raise MemoryError("Unable to allocate 3.07 EiB for an array and data type uint8")
 
     monkeypatch.setattr(distributed, "rpc", other)
-    said = refused(capsys, "fleet", tmp_path / "cells.toml", "--cluster", "tcp://127.0.0.1:9",
-                   "--out", tmp_path / "made")  # fmt: skip
+    said = refused(capsys, "diagnose", tmp_path / "robot.json", tmp_path / "data.csv", "--cluster",
+                   "tcp://127.0.0.1:9")  # fmt: skip
     assert "what answers there is something else" in said
     assert "uint8" not in said
-    assert not (tmp_path / "made").exists()  # an empty folder was left
 
 
 def test_a_joint_that_never_comes_to_zero_is_no_trouble():

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import pytest
 
+from experiments.sweep import in_parallel
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.parallel import (
     START,
@@ -15,7 +16,6 @@ from minimax_cal.ground.parallel import (
     chunked,
     deque,
     fetched,
-    in_parallel,
     share,
 )
 

@@ -140,7 +140,7 @@ def test_the_command(tmp_path, answered, says, short):
     ("words", "message"),
     [
         ((), "give the number of --poses, or --motion for a motion"),
-        (("--poses", 3, "--payload", 1), "--payload is about a motion; add --motion"),
+        (("--poses", 3, "--payload", 1), "--payload is about a motion, with --motion"),
         (("--motion", "--poses", 3), "--poses is about poses, not about a motion"),
         (("--motion", "--tracker", "1,2,3"), "--tracker is about poses, not about a motion"),
         (("--motion", "--payload", -1), "--payload -1: give its mass in kg"),

@@ -11,11 +11,10 @@ from scipy.optimize import minimize
 
 import minimax_cal as mc
 from minimax_cal.ground.arrays import Array
-from minimax_cal.planning.candidates import candidates, limits_of, near
+from minimax_cal.planning.candidates import BATCH, candidates, limits_of, near
 from minimax_cal.planning.visibility import (
     ANYWHERE,
     ARM,
-    BATCH,
     TRACKER,
     Room,
     Sight,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -224,3 +225,23 @@ def test_a_solution_is_returned_as_float_arrays(problem, own):
     own("lists", lambda p: Solution([0] * 12, [0] * 9, Status.SOLVED, 0.0))
     solution = solve(problem, "lists", fallback=False)
     assert solution.x.dtype == solution.y.dtype == np.float64
+
+
+def test_no_answer_is_judged_twice(problem, truth, own, monkeypatch):
+    """One that is right after polishing, and one that is wrong before another takes over."""
+    judge, polishing = (import_module(f"qp_backends.{name}") for name in ("judge", "polish"))
+    seen = []
+
+    def counted(given, solution):
+        seen.append(solution.x.tobytes() + solution.y.tobytes())
+        return accuracy(given, solution)
+
+    monkeypatch.setattr(judge, "accuracy", counted)
+    monkeypatch.setattr(polishing, "accuracy", counted)
+    own("rough", lambda p: (truth.x + 1e-6, truth.y))
+    assert solve(problem, "rough").backend == "rough"
+    assert len(seen) == len(set(seen)) == 2
+    seen.clear()
+    own("wrong", lambda p: replace(truth, x=truth.x + 1.0, status=Status.ITERATION_LIMIT))
+    assert solve(problem, "wrong").backend == "daqp"
+    assert len(seen) == len(set(seen))

@@ -273,6 +273,21 @@ def test_without_numba_numpy_answers(monkeypatch):
     choice.best.cache_clear()
 
 
+def test_where_compiled_kernels_have_no_folder_numpy_answers(monkeypatch, caplog):
+    """numba raises where package and home are both read-only, as in a container."""
+
+    def fail(_: str) -> None:
+        raise RuntimeError("cannot cache function 'chain': no locator available")
+
+    choice.best.cache_clear()
+    monkeypatch.delenv(choice.SWITCH, raising=False)
+    monkeypatch.setattr(choice, "import_module", fail)
+    monkeypatch.setattr(choice.util, "find_spec", lambda name: True)
+    assert choice.kernels() is plain
+    assert "NUMBA_CACHE_DIR" in caplog.text
+    choice.best.cache_clear()
+
+
 @pytest.mark.parametrize("name", ["plain", "fast"])
 def test_targets_alone_may_be_free(name, request, rng):
     own = plain if name == "plain" else request.getfixturevalue(name)

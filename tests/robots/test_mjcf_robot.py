@@ -1,5 +1,6 @@
 """MJCF as robot: MuJoCo's own forward kinematics and inverse dynamics, and who is left out."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 import minimax_cal as mc
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
 from minimax_cal.ground.arrays import Array
+from minimax_cal.robots.mjcf import read_model
 from minimax_cal.robots.ranges import near_zero
 from minimax_cal.robots.robot import robot_from_dict
 from minimax_cal.robots.urdf import load_urdf
@@ -293,3 +295,39 @@ def test_an_arm_without_actuators_beside_driven_fingers_is_refused_with_the_reas
     file.write_text(COLON.format('<actuator><motor joint="j1"/></actuator>'))
     with pytest.raises(mc.RobotError, match=r"no actuator drives these joints.* j2, j3, j4"):
         mc.load_robot(f"{file}#a:b0:a:b3")
+
+
+MESHED = """<mujoco><compiler meshdir="looks" angle="radian"/><asset><mesh file="hull.obj"/>
+<texture name="skin" type="2d" file="skin.png"/><material name="m" texture="skin"/></asset>
+<worldbody><body name="a" pos="0 0 0.3"><inertial pos="0.1 0 0" mass="3" diaginertia=".1 .2 .2"/>
+<joint name="j1" axis="0 0 1"/><geom type="mesh" mesh="hull" material="m"/>
+<body name="b" pos="0.4 0 0">{inertial}<joint name="j2" axis="0 1 0"/>
+<geom type="mesh" mesh="hull"/></body></body></worldbody></mujoco>"""
+INERTIAL = '<inertial pos="0.2 0 0" mass="2" diaginertia=".1 .1 .1"/>'
+
+
+def test_a_mesh_that_is_missing_is_no_reason_where_masses_are_given(tmp_path):
+    """Of a simulator's model and of a URDF: what is drawn of an arm moves nothing."""
+    file = tmp_path / "arm.xml"
+    file.write_text(MESHED.format(inertial=INERTIAL))
+    robot = mc.load_robot(file)
+    assert robot.mass.tolist() == [3.0, 2.0]
+    bare = re.sub(
+        r"<asset>.*</asset>|<geom[^>]*>", "", MESHED.format(inertial=INERTIAL), flags=re.S
+    )
+    (tmp_path / "bare.xml").write_text(bare)
+    q = np.array([[0.3, -0.8]])
+    assert_allclose(robot.pose(q), mc.load_robot(tmp_path / "bare.xml").pose(q), atol=1e-12)
+    file.write_text(MESHED.format(inertial=""))  # here the mesh would tell the mass
+    with pytest.raises(mc.RobotError, match=r"MuJoCo refuses it: .*hull\.obj"):
+        mc.load_robot(file)
+    shape = '<geometry><mesh filename="package://maker/meshes/hull.dae"/></geometry>'
+    inertia = '<inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/>'
+    link = f'<inertial><mass value="2"/>{inertia}</inertial><collision>{shape}</collision>'
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(
+        f'<robot name="r"><link name="w"/><link name="a">{link}</link><joint name="j" '
+        'type="continuous"><parent link="w"/><child link="a"/><axis xyz="0 0 1"/></joint></robot>'
+    )
+    model = read_model(urdf).compiled()
+    assert model.body_mass.sum() == 2.0

@@ -1,12 +1,14 @@
 """URDF as robot: any chain, the same poses, and clear words for what is not one."""
 
 import itertools
+import re
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from minimax_cal.robots.robot import robot_from_dict
@@ -253,7 +255,7 @@ BROKEN = {
             '<limit lower="1" upper="-1"/>': "limit lower is above upper",
             '<limit lower="0" upper="0"/>': r"joint that its limits \(lower = upper\) do not hold",
             '<limit lower="one"/>': "expected a number",
-            '<mimic joint="k"/>': "mimics 'k', no moving joint of this chain",
+            '<mimic joint="k"/>': "mimics 'k', no moving joint of the file",
             '<mimic joint="j"/>': "mimics 'j', a ring",
             '<origin xyz="1e300 0 0"/>': "is off by|over 1 km|check units",
         }.items()
@@ -316,3 +318,82 @@ def test_not_text_and_not_there(tmp_path):
     path.write_bytes(b"<robot>" + b"<a>" * 200_000)  # depth costs no stack
     with pytest.raises(mc.RobotError, match="is not XML"):
         mc.load_robot(path)
+
+
+# ---- ends that are not the robot's own -----------------------------------------------------------
+
+
+def limited(name: str, kind: str, links: str, more: str = "", axis: str = "0 0 1") -> str:
+    """A joint with limits, its links as parent and child."""
+    parent, child = links.split()
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<axis xyz="{axis}"/><limit lower="0.5" upper="2" effort="1" velocity="1"/>{more}</joint>'
+    )
+
+
+def made_of(*joints: str) -> str:
+    """A URDF of joints; its links are those that they name."""
+    names = dict.fromkeys(re.findall(r'link="(\w+)"', "".join(joints)))
+    links = "".join(f'<link name="{name}"/>' for name in names)
+    return f'<robot name="made up">{links}{"".join(joints)}</robot>'
+
+
+def test_a_base_that_leans_in_the_root_link_is_said_with_its_turn(tmp_path):
+    """First a base that only stands elsewhere: then there is no turn to say."""
+    place = '<origin xyz="0.1 0 0.2" rpy="{}"/>'
+    for rpy, turn in (("0 0 0", ""), ("0 0.785398163397448 0", "A 0 B 45 C 0 deg")):
+        fixed = '<joint name="fix" type="fixed"><parent link="root"/><child link="a"/>'
+        text = made_of(fixed + place.format(rpy) + "</joint>", limited("j", "revolute", "a b"))
+        model = to_robot(parse_urdf(text.encode()))
+        (said,) = model.remaining
+        assert "root link is not the robot's base" in said
+        assert turn in said
+        assert ("turned by" in said) == bool(turn)
+        angles = [float(x) for x in re.findall(r"[ABC] ([-\d.]+)", said)] or [0.0] * 3
+        spoken = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
+        assert_allclose(spoken, model.base[:3, :3], rtol=0, atol=1e-7)
+        (tmp_path / "arm.urdf").write_text(text)
+        assert said.partition(": ")[2] in mc.load_robot(tmp_path / "arm.urdf").notices[0]
+
+
+@pytest.mark.parametrize("kind", ["prismatic", "revolute"])
+def test_joints_of_the_chain_follow_one_beside_it(kind):
+    """Two stages of a column by half each; the values are those of the joint beside the chain.
+
+    One stage follows it by way of the other's mimic.
+    """
+    text = made_of(
+        limited("column", kind, "base virtual"),
+        limited("middle", kind, "base m", '<mimic joint="column" multiplier="0.5" offset="-0.7"/>'),
+        limited("top", kind, "m t", '<mimic joint="middle" multiplier="2" offset="0.4"/>'),
+        limited("turn", "revolute", "t tool", axis="0 1 0"),
+    )
+    model = to_robot(parse_urdf(text.encode()), "tool")
+    robot = robot_from_dict(model.content)
+    assert robot.passive.tolist() == [False, True, False]
+    assert model.content["joints"][0]["name"] == "column"
+    assert (robot.lower[0], robot.upper[0]) == (0.5, 2.0)
+    assert not [text for text in model.notices if "outside the chain" in text]
+    u, turn = 1.3, 0.6
+    stage = (0.5 * u - 0.7) + (2.0 * (0.5 * u - 0.7) + 0.4)
+    wanted = np.eye(4)
+    if kind == "prismatic":
+        wanted[2, 3] = stage
+    else:
+        wanted[:3, :3] = Rotation.from_euler("Z", stage).as_matrix()
+    wanted[:3, :3] = wanted[:3, :3] @ Rotation.from_euler("Y", turn).as_matrix()
+    found = model.base @ robot.pose(np.array([[u, turn]])) @ model.tool
+    assert_allclose(found[0], wanted, **EXACT)
+    same_poses(text, "tool")
+
+
+def test_a_joint_beside_the_chain_may_be_held_by_none(tmp_path):
+    """A ring of mimics beside the chain, and one that is fixed, are refused in one line."""
+    for beside, said in (
+        (limited("side", "revolute", "base s", '<mimic joint="side"/>'), "mimics 'side', a ring"),
+        (limited("side", "fixed", "base s"), "mimics 'side', no moving joint of the file"),
+    ):
+        text = made_of(beside, limited("j", "revolute", "base tool", '<mimic joint="side"/>'))
+        with pytest.raises(mc.RobotError, match=said):
+            to_robot(parse_urdf(text.encode()), "tool")

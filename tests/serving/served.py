@@ -106,9 +106,10 @@ class Served:
 
 
 @contextmanager
-def serving(folder: Path) -> Iterator[Served]:
-    """`minimax-cal serve` on a port of its own; ended at the end."""
-    command = [sys.executable, "-m", "minimax_cal.cli", "serve", "--port", "0", "--no-browser"]
+def serving(folder: Path, *program: str) -> Iterator[Served]:
+    """`minimax-cal serve` on a port of its own; ended at the end.  program: another of Python."""
+    started = program or ("-m", "minimax_cal.cli")
+    command = [sys.executable, *started, "serve", "--port", "0", "--no-browser"]
     process = subprocess.Popen(
         [*command, "--folder", str(folder)], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         text=True,

@@ -3,14 +3,16 @@
 import os
 import stat
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
 
-from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.serving.sessions import (
     CHOICES,
     GIVEN,
+    RESERVED,
     Session,
     new_session,
     plain_name,
@@ -30,7 +32,8 @@ def at(tmp_path: Path) -> Session:
 @pytest.mark.parametrize(
     "name",
     ["../x.csv", "a/b.csv", "a\\b.csv", "/etc/passwd", "..", ".", "", ".hidden", "-o", "con",
-     "NUL.csv", "a\0b", "a\nb", "a.csv ", "a.", "x" * 121, "C:poses.csv", "a\u202egpj.csv"],
+     "NUL.csv", "Con .txt", "com\u00b9.csv", "lpt9", "aux.tar.gz", "\u6e2c" * 100,
+     "a\0b", "a\nb", "a.csv ", "a.", "x" * 121, "C:poses.csv", "a\u202egpj.csv"],
 )  # fmt: skip
 def test_names_that_are_refused(at, name):
     with pytest.raises(OptionError, match=r"^file name "):
@@ -59,6 +62,25 @@ def test_sessions_have_names_of_their_own(at, tmp_path):
             session(tmp_path, name)
 
 
+@pytest.mark.parametrize("title", ["con", "NUL", "prn.", " aux ", "Com1", "lpt9...", "con...  "])
+def test_no_session_has_the_name_of_a_device(tmp_path, title):
+    made = new_session(tmp_path, title)
+    assert not RESERVED.fullmatch(made.name)
+    assert session(tmp_path, made.name).folder.is_dir()
+
+
+def test_a_folder_in_capitals_is_the_same_where_the_system_says_so(tmp_path):
+    (tmp_path / "CELL").mkdir()
+    assert new_session(tmp_path, "cell").name == "cell-2"
+
+
+def test_a_session_that_cannot_be_made_leaves_no_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr("minimax_cal.serving.sessions.LOG", "x" * 300)
+    with pytest.raises(CalibrationError, match="cannot be made"):
+        new_session(tmp_path, "cell")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_choices_are_kept_as_they_were_made(at):
     at.choose({"measured": ["poses.csv"], "robot": "irb120", "left_out": ["12:smr2"], "rms": 0.2})
     again = Session(at.folder).choices
@@ -72,7 +94,9 @@ def test_choices_are_kept_as_they_were_made(at):
     [{"measured": ["../x"]}, {"measured": ["none.csv"]}, {"robot": "nobody"}, {"rms": -1},
      {"rms": float("nan")}, {"left_out": ["x; rm"]}, {"objective": "best"}, {"poses": 0},
      {"unknown": 1}, {"measured": "poses.csv"}, {"units": "x" * 3000},
-     {"units": "a\0b"}, {"columns": "a\nb"}, {"units": "\ud800"}],
+     {"units": "a\0b"}, {"columns": "a\nb"}, {"units": "\ud800"},
+     {"left_out": [f"{line}:smr1" for line in range(100_000)]}, {"measured": ["poses.csv"] * 1000},
+     {"reasons": {f"{line}:smr1": "knocked" for line in range(100_000)}}],
 )  # fmt: skip
 def test_choices_that_are_refused_change_nothing(at, changes):
     before = at.choose({"measured": ["poses.csv"]})
@@ -88,10 +112,35 @@ def test_a_removed_file_is_chosen_no_more(at):
     assert at.given() == []
 
 
+@pytest.mark.parametrize(
+    "change",
+    [lambda at: at.remove("poses.csv"), lambda at: at.take("measured", ["new.csv"], {}),
+     lambda at: at.take("targets", ["poses.csv"], {})],
+    ids=["remove", "take", "targets"],
+)  # fmt: skip
+def test_files_stay_where_choices_cannot_be_written(at, change):
+    """A file goes only once no choice is about it."""
+    (at.folder / CHOICES).write_text("{")
+    with pytest.raises(OptionError, match=r"session\.json"):
+        change(at)
+    assert at.given() == ["poses.csv"]
+
+
+def test_a_file_that_is_gone_keeps_no_other_choice(at):
+    at.choose({"measured": ["poses.csv"]})
+    (at.folder / GIVEN / "poses.csv").unlink()
+    assert at.choose({"rms": 0.1}).rms == 0.1
+    assert at.remove("poses.csv").measured == ()
+
+
 JOINTS = "Pose,q1_deg,q2_deg\nP1,1,2\nP2,3,4\n"
 POINTS = "Pose,x_mm,y_mm,z_mm\nP1,1,2,3\nP2,3,4,5\n"
 BOTH = "q1_deg,q2_deg,smr1_x_mm,smr1_y_mm,smr1_z_mm\n1,2,3,4,5\n3,4,5,6,7\n"
 NO_HEADER = "1 2 3\n4 5 6\n"
+
+
+def take_measured(at: Session, names: Iterable[str]) -> None:
+    at.take("measured", [*names], {n: at.held(n) for n in {*names, *at.choices.measured}})
 
 
 @pytest.mark.parametrize(
@@ -111,7 +160,7 @@ def test_a_dropped_file_replaces_what_holds_the_same(at, before, dropped, left):
         for name, text in files.items():
             (at.folder / GIVEN / name).write_text(text)
         if files:
-            at.take("measured", list(files))
+            take_measured(at, files)
     assert list(at.choices.measured) == left
     assert set(at.given()) == {"poses.csv", *left}
 
@@ -121,12 +170,12 @@ def test_targets_replace_those_before_and_robots_stay_to_choose(at):
         (at.folder / GIVEN / name).write_text("x")
     for kind, names in (("targets", ("a.csv", "b.csv")), ("robot", ("arm.json", "other.json"))):
         for name in names:
-            at.take(kind, [name])
+            at.take(kind, [name], {})
     assert (at.choices.targets, at.choices.robot) == ("b.csv", "other.json")
     assert at.given() == ["arm.json", "b.csv", "other.json", "poses.csv"]
     for kind, names in (("report", ["a.csv"]), ("robot", []), ("robot", ["../x"])):
         with pytest.raises(OptionError):
-            at.take(kind, names)
+            at.take(kind, names, {})
 
 
 def test_a_session_is_full_at_last(at, monkeypatch):

@@ -9,14 +9,14 @@ from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, linpro
 from scipy.sparse import csr_array
 
 import minimax_cal as mc
-from minimax_cal.solvers.minimize import (
-    MaxOfFunctions,
-    Rows,
-    below,
-    complex_step,
-    differences,
-    lengths,
+from minimax_cal.solvers.answer_check import find_descent_from_stationary_point
+from minimax_cal.solvers.derivatives import (
+    CountedFunction,
+    complex_step_jacobian,
+    difference_jacobian,
+    measure_lengths,
 )
+from minimax_cal.solvers.max_problem import MaxOfFunctions
 from minimax_cal.solvers.status import Status
 from qp_backends import Problem, Solution
 from qp_backends import Status as QpStatus
@@ -31,7 +31,7 @@ def test_complex_step_is_the_gradient(name):
     x = np.array(classic.start, dtype=float) + 0.01 * rng.normal(size=len(classic.start))
     if name in ("MAD4", "MAD5"):
         x[1] = abs(x[1])  # inside the domain of the logarithm
-    exact = complex_step(classic.fun, x)
+    exact = complex_step_jacobian(classic.fun, x, np.ones(len(x)))
     step = 1e-6 * np.maximum(1.0, np.abs(x))
     for i, e in enumerate(np.diag(step)):
         jacobian = (np.asarray(classic.fun(x + e)) - np.asarray(classic.fun(x - e))) / (2 * step[i])
@@ -61,7 +61,7 @@ def test_classics_reach_their_published_optimum(name):
     assert abs(found.fun - classic.best) <= 1e-6 * max(1.0, abs(classic.best))
     assert found.fun == np.max(classic.fun(found.x))
     # a certificate from outside the solver: KKT with the multipliers it reports
-    jacobians = complex_step(classic.fun, found.x)
+    jacobians = complex_step_jacobian(classic.fun, found.x, np.ones(len(found.x)))
     gradient = found.multipliers @ jacobians
     rows = np.zeros((0, len(found.x)))
     if classic.bounds is not None:
@@ -349,9 +349,9 @@ def test_central_differences_are_of_second_order():
     def fun(z: np.ndarray) -> np.ndarray:
         return np.array([np.exp(z[0]), np.log(z[1])])
 
-    found = differences(fun, x, length, central=True)
+    found = difference_jacobian(fun, x, length, central=True)
     assert_allclose(found, slopes, rtol=1e-9, atol=1e-10)
-    found = differences(fun, x, length, central=False)
+    found = difference_jacobian(fun, x, length, central=False)
     assert_allclose(found, slopes, rtol=1e-7, atol=1e-7)
 
 
@@ -364,15 +364,14 @@ def test_the_length_of_a_variable_is_found_from_zero(unit):
         return np.array([np.exp(a), 1.0 + 4.0 * b**2, 0.1 * c - 1.0, d**4])
 
     with np.errstate(over="ignore"):
-        found = lengths(fun, np.zeros(5), -np.inf, np.inf)
+        found = measure_lengths(fun, np.zeros(5), -np.inf, np.inf, 1.0, np.ones(5))
     assert_allclose(np.log10(found[:3] / unit), np.log10([1.0, 0.5, 10.0]), rtol=0, atol=1.0)
     assert 0.1 < found[3] / unit < 1e4  # by steps of 1e-4 of it, flat
     assert found[4] == 1.0  # on which nothing depends
 
 
-def scaled(fun: object, x: np.ndarray, rows: Rows | None = None) -> MaxOfFunctions:
-    jacobian, length = lambda z: complex_step(fun, z), lengths(fun, x, -np.inf, np.inf)
-    return MaxOfFunctions.at(x, fun, jacobian, rows or Rows.of(length, None, []), length)
+def describe(fun: object, x: np.ndarray, bounds: Bounds | None = None) -> MaxOfFunctions:
+    return MaxOfFunctions.describe(x, CountedFunction(fun), "cs", bounds, [])
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
@@ -384,17 +383,22 @@ def test_the_way_down_from_a_flat_point_is_the_steepest(unit):
         a, b = x / unit
         return np.array([1.0 - a**2 - 3.0 * b**2 - 1e3 * b**3, -(a**2) - 1.0])
 
-    down = below(scaled(top, nowhere), nowhere)
-    assert_allclose(down, [0.0, 1e-3 * np.sqrt(1.0 / 6.0) * unit], rtol=1e-4)
-    only = Rows.of(np.ones(2), Bounds([-unit, -unit], [unit, 0.0]), [])
-    other = below(scaled(top, nowhere, only), nowhere)  # the cubic is against it there
-    assert_allclose(other, [1e-3 * np.sqrt(1.0 / 2.0) * unit, 0.0], rtol=1e-4)
+    def steeper(x: np.ndarray) -> np.ndarray:
+        return top(x) - np.array([1e4 * (x[1] / unit) ** 3, 0.0])
+
+    down = find_descent_from_stationary_point(describe(top, nowhere), nowhere)
+    assert_allclose(down, [0.0, 1e-3 * np.sqrt(1.0 / 6.0) * unit], rtol=1e-2)
+    only = Bounds([-unit, -unit], [unit, 0.0])
+    other = find_descent_from_stationary_point(describe(steeper, nowhere, only), nowhere)
+    assert_allclose(
+        other, [1e-3 * np.sqrt(1.0 / 2.0) * unit, 0.0], rtol=1e-2
+    )  # the cubic is against it there
     for flat in (
         lambda x: np.array([1.0 + 0.0 * x[0]]),
         lambda x: np.array([1.0 + x[0] ** 2 + x[1] ** 2]),
         lambda x: np.array([1.0 + x[0]]),  # a slope: the search itself goes down
     ):
-        assert below(scaled(flat, nowhere), nowhere) is None
+        assert find_descent_from_stationary_point(describe(flat, nowhere), nowhere) is None
 
 
 def two(x):

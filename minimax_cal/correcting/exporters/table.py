@@ -21,7 +21,6 @@ from minimax_cal.fitting.options import OFFSETS
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
-from minimax_cal.robots.urdf import MODELS
 
 Carries = Callable[[Cell], tuple[Term, ...]]
 
@@ -52,7 +51,7 @@ def later(module: str, verb: str) -> Callable[..., Any]:
     return lambda *given: getattr(import_module(module), verb)(*given)
 
 
-MJCF, SDF = "minimax_cal.simulators.mjcf", "minimax_cal.simulators.sdf"
+MJCF = "minimax_cal.simulators.mjcf"
 EXPORTERS: dict[str, Exporter] = {
     "urdf": Exporter(urdf.write, couples=True),
     "ur-yaml": Exporter(ur_yaml.write),
@@ -62,13 +61,10 @@ EXPORTERS: dict[str, Exporter] = {
     "json": Exporter(robot_json.write, couples=True),
     "moc": Exporter(moc.write, moc.carries),
     "mjcf": Exporter(later(MJCF, "write"), later(MJCF, "carries"), simulated=True),
-    "sdf": Exporter(later(SDF, "write")),
 }
 
 
 FORMATS = tuple(name for name in EXPORTERS if name != "moc")  # its frames are not documented
-CONVERTERS = {"sdf": MODELS}  # formats that a simulator's own model is converted to
-convert = later(SDF, "convert")
 
 
 def exporter(to: str) -> Exporter:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.dynamics.logs.bags import is_bag, read_bag
-from minimax_cal.dynamics.logs.faults import check_repeats, checked
+from minimax_cal.dynamics.logs.faults import check_repeats, checked, join_short_runs
 from minimax_cal.dynamics.logs.table import (
     TORQUE,
     Draft,
@@ -128,7 +128,7 @@ def import_logs(
     for path in files:
         name = path.stem if [p.stem for p in files].count(path.stem) == 1 else str(path)
         for log in read_bag(path) if is_bag(path) else [read_table(path, given)]:
-            drafts += map(checked, drafts_of(in_order(log, joints), name))
+            drafts += map(checked, join_short_runs(drafts_of(in_order(log, joints), name)))
     same_arm(drafts)
     check_repeats([draft for draft in drafts if draft.measured])
     return LogFiles(

@@ -6,15 +6,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from math import comb
+from typing import Any
 
 import numpy as np
 
-from minimax_cal.dynamics.logs.table import Draft
+from minimax_cal.dynamics.logs.table import ROWS, Draft
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 
 LEAST_ROWS, SHORTEST_RUN = 50, 2.0  # of a run that shows anything [1, s]
 GAP = 0.1  # a step over which no filter of the motion reaches [s]
+JOIN_PAUSE = 1.0  # between short runs that are joined [s]
 UNEVEN, MOST_UNEVEN = 0.5, 0.05  # deviation of a step, of the median; share that may have it
 SLOWEST_RATE = 25.0  # fewer rows a second hold no motion of a few Hz [Hz]
 TURN = 2.0 * np.pi
@@ -50,15 +52,47 @@ def in_order_of_time(draft: Draft) -> Draft:
     return draft.saying(f"{said} ({draft.lines(np.flatnonzero(again))})").keeping(~again)
 
 
+def is_short(draft: Draft) -> bool:
+    """Whether a run is too short to show anything."""
+    return len(draft.time) < LEAST_ROWS or draft.time[-1] - draft.time[0] < SHORTEST_RUN
+
+
 def long_enough(draft: Draft) -> Draft:
     """A run of some length."""
-    rows, seconds = len(draft.time), draft.time[-1] - draft.time[0]
-    if rows < LEAST_ROWS or seconds < SHORTEST_RUN:
+    if is_short(draft):
         raise draft.error(
-            f"{rows} rows in {seconds:.2f} s are too short for a run; log at least "
-            f"{SHORTEST_RUN:g} s of motion"
+            f"{len(draft.time)} rows in {draft.time[-1] - draft.time[0]:.2f} s are too short for a "
+            f"run; log at least {SHORTEST_RUN:g} s of motion, or give short runs in one file with "
+            "a column run: they are joined"
         )
     return draft
+
+
+def join_short_runs(drafts: Sequence[Draft]) -> list[Draft]:
+    """Runs of one log; those too short by themselves are parts of one run, with gaps between."""
+    out: list[Draft] = []
+    for draft in drafts:
+        if out and is_short(out[-1]) and draft.payloads == out[-1].payloads:
+            out[-1] = joined(out[-1], draft)
+        else:
+            out.append(draft)
+    if len(out) > 1 and is_short(out[-1]) and out[-1].payloads == out[-2].payloads:
+        out[-2:] = [joined(*out[-2:])]
+    return out
+
+
+def joined(one: Draft, other: Draft) -> Draft:
+    """Two runs of one log after each other, with a gap that no filter reaches over."""
+    later = replace(other, time=other.time + one.time[-1] + JOIN_PAUSE)
+    parts: dict[str, Any] = {
+        name: None if (first := getattr(one, name)) is None or (second := getattr(later, name)) is
+        None else np.concatenate([first, second])
+        for name in (*ROWS, "row")
+    }  # fmt: skip
+    name = f"{one.name}+{other.name.rpartition(':')[2]}"
+    said = f"{one.log.source}: short runs are joined, with a pause between: {name}"
+    kept = (text for text in one.notices if "short runs are joined" not in text)
+    return replace(one, name=name, notices=(*kept, said), **parts)
 
 
 def sampled_well(draft: Draft) -> Draft:
@@ -310,30 +344,43 @@ def checked(draft: Draft) -> Draft:
 # ---- runs that are one ---------------------------------------------------------------------------
 
 
-WORD = 4  # rows that have to follow each other alike
-MOST_ALIKE = 0.2  # share of a run's words of torque that may stand elsewhere
+WORD, WORD_SHARE = 4, 0.05  # rows that have to follow each other alike: at least, and of a run
+MAX_SHARE_ALIKE = 0.2  # of a run's words that may stand elsewhere
 
 
-def words(values: Array) -> Array:
-    """Rows that follow each other, WORD at a time, a number for each; repeated rows count once."""
-    fresh = np.append(True, (values[1:] != values[:-1]).any(axis=1))
-    bits = np.ascontiguousarray(values[fresh], dtype=float).view(np.uint64)
-    count, random = max(len(bits) - WORD + 1, 0), np.random.default_rng(0)
-    mixed = bits @ (2 * random.integers(2**63, size=(bits.shape[1], WORD), dtype=np.uint64) + 1)
-    return np.asarray(sum(mixed[i : i + count, i] for i in range(WORD)))
+def fresh_rows(values: Array) -> Array:
+    """(m, n) values without rows that repeat the one before."""
+    return np.asarray(values[np.append(True, (values[1:] != values[:-1]).any(axis=1))])
+
+
+def words(values: Array, length: int) -> Array:
+    """(w,) a number for each so many rows (m, n) that follow each other."""
+    bits = np.ascontiguousarray(values, dtype=float).view(np.uint64)
+    count, random = max(len(bits) - length + 1, 0), np.random.default_rng(0)
+    mixed = bits @ (2 * random.integers(2**63, size=(bits.shape[1], length), dtype=np.uint64) + 1)
+    return np.asarray(sum(mixed[i : i + count, i] for i in range(length)))
+
+
+def share_alike(one: Array, other: Array) -> float:
+    """Share of the words of the shorter of two runs (m, n) that the other holds too.
+
+    A word has WORD_SHARE of that run's rows: what drives log in coarse steps coincides in a few
+    rows of any two runs, and seldom in many that follow each other.
+    """
+    one, other = fresh_rows(one), fresh_rows(other)
+    length = max(WORD, int(WORD_SHARE * min(len(one), len(other))))
+    told = np.unique(words(one, length)), np.unique(words(other, length))
+    few = min(map(len, told))
+    return len(np.intersect1d(*told, assume_unique=True)) / few if few else 0.0
 
 
 def check_repeats(drafts: Sequence[Draft]) -> None:
     """Raise DataError for a run given twice, or torques equal to the digit in other motions."""
-    said = [words(draft.torque) for draft in drafts]
-    of_torque = [np.unique(every) for every in said]
-    for a, b in combinations(range(len(drafts)), 2):
-        few = min(len(of_torque[a]), len(of_torque[b]))
-        if alike(of_torque[a], of_torque[b]) <= MOST_ALIKE * few:
+    for one, other in combinations(drafts, 2):
+        if share_alike(one.torque, other.torque) <= MAX_SHARE_ALIKE:
             continue
-        one, other = drafts[a], drafts[b]
-        moved = np.unique(words(one.q)), np.unique(words(other.q))
-        if alike(*moved) > MOST_ALIKE * min(map(len, moved)):
+        whole = (np.hstack([draft.q, draft.torque]) for draft in (one, other))
+        if share_alike(*whole) > MAX_SHARE_ALIKE:
             raise DataError(
                 f"{other.log.source}: run {other.name} holds rows of {one.name}; give each once"
             )
@@ -341,25 +388,20 @@ def check_repeats(drafts: Sequence[Draft]) -> None:
             f"{other.log.source}: torques of run {other.name} equal those of {one.name} to the "
             "digit, but the motions differ: they are commands; log the measured ones"
         )
-    for draft, every, torque in zip(drafts, said, of_torque, strict=True):
-        if within(draft, every, len(every) - len(torque)):
+    for draft in drafts:
+        if repeats_torques(draft):
             raise draft.error(
                 "torques repeat to the digit while the motion differs: they are commands; log the "
                 "measured ones"
             )
 
 
-def alike(one: Array, other: Array) -> int:
-    """How many words two runs share."""
-    return len(np.intersect1d(one, other, assume_unique=True))
-
-
-def within(draft: Draft, said: Array, repeated: int) -> bool:
-    """Whether torques of one run repeat to the digit, and its motion does not.
-
-    said: their words, of which so many stand there before.
-    """
-    if len(said) <= WORD or repeated <= MOST_ALIKE * len(said):
+def repeats_torques(draft: Draft) -> bool:
+    """Whether torques of one run repeat to the digit, and its motion does not."""
+    torque = fresh_rows(draft.torque)
+    length = max(WORD, int(WORD_SHARE * len(torque)))
+    said, moved = words(torque, length), words(fresh_rows(draft.q), length)
+    repeated = len(said) - len(np.unique(said))
+    if len(said) <= WORD or repeated <= MAX_SHARE_ALIKE * len(said):
         return False
-    moved = words(draft.q)
     return len(moved) - len(np.unique(moved)) < 0.5 * repeated

@@ -438,6 +438,13 @@ class Draft(Run):
         """Whether torques or currents were logged; else commands stand in their place."""
         return self.kind != COMMANDS
 
+    @property
+    def payloads(self) -> list[float]:
+        """The masses at the flange that its rows report, each once [kg]."""
+        told = self.log.values.get("payload", np.empty(0))
+        told = told[self.row] if len(told) else told
+        return [float(mass) for mass in np.unique(told[np.isfinite(told)])]
+
     def saying(self, *notices: str) -> Draft:
         """With more notices."""
         where = f"{self.log.source}: " + (f"run {self.name}: " if self.log.run else "")
@@ -469,8 +476,7 @@ class Draft(Run):
     def run(self) -> Run:
         """The finished run.  Raises DataError for a payload that changes."""
         values = {kind: value[self.row] for kind, value in self.log.values.items()}
-        payload = values.get("payload", np.empty(0))
-        payload = np.unique(payload[np.isfinite(payload)])
+        payload = self.payloads
         if len(payload) > 1:
             raise self.error(
                 f"the payload changes from {payload[0]:g} to {payload[-1]:g} kg within a run; give "
@@ -479,7 +485,7 @@ class Draft(Run):
         warmth = values.get("temperature")
         more = {
             "torque": self.torque if self.measured else 0.0 * self.torque,
-            "payload": float(payload[0]) if len(payload) else None,
+            "payload": payload[0] if payload else None,
             "temperature": warmth if warmth is not None and np.isfinite(warmth).all() else None,
             "command": commanded(values.get(COMMANDS), self.q),
         }

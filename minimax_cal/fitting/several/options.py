@@ -151,11 +151,17 @@ def check_options(every: Sequence[Instrument], options: RelativeOptions) -> None
         raise OptionError(f"loss={options.loss} and objective=minimax weigh errors twice: give one")
     if options.loss != SQUARE and any(one.kind == "pixels" for one in every):
         raise OptionError(f"loss={options.loss} is not for pixels yet: leave it or them out")
-    default = RelativeOptions()
-    for found in map(instrument, INSTRUMENTS):
+    default, kinds = RelativeOptions(), {data.kind for data in every}
+    chosen = {
+        one.name
+        for one in fields(options)
+        if getattr(options, one.name) != getattr(default, one.name)
+    }
+    # An instrument is imported only where its files are given, or an option might be its own.
+    for found in (instrument(name) for name in INSTRUMENTS if chosen or name in kinds):
         mine = [data for data in every if data.kind == found.kind]
         for name in found.options:
-            if not mine and getattr(options, name) != getattr(default, name):
+            if not mine and name in chosen:
                 raise OptionError(f"{name}= is for {found.kind}; {held_by(every)}: leave it out")
         if mine:
             found.check_options(mine, options)

@@ -21,7 +21,7 @@ from minimax_cal.measuring.importers.join import (
 )
 from minimax_cal.measuring.importers.tables import KEPT, Column, Given, Reading
 from minimax_cal.measuring.importers.units import STAMPED, celsius, decide, seconds
-from minimax_cal.measuring.measurements import FILE, Measurements, check_finite, marked
+from minimax_cal.measuring.measurements import FILE, Measurements, Origin, check_finite, marked
 from minimax_cal.measuring.set_aside import COLUMN, from_column, set_aside, sound
 from minimax_cal.measuring.tools import by_tool
 from minimax_cal.reading.sheet import number_of
@@ -143,12 +143,23 @@ def assemble(points: Sequence[Reading], joints: Reading, given: Given) -> Assemb
         unknown=unknown,
         notices=tuple(notice for reading in readings for notice in reading.notices),
         source=str(joints.sheet.path),
+        origins=(apart_from(joints, points, places),) if alone else (),
         digest=hashlib.sha256("".join(r.sheet.text for r in readings).encode()).hexdigest(),
         simulated=any(r.sheet.simulated for r in readings),
     )
     matched = (*(spot.how for spot in places), "")[: len(readings)]
     data = by_tool(without_marked(from_column(marked(data)), points, places))
     return Assembly(check_finite(data), readings, meanings, matched)
+
+
+def apart_from(joints: Reading, points: Sequence[Reading], places: Sequence[Places]) -> Origin:
+    """The files of points and of joints, and where the point of each pose stands."""
+    lines: dict[int, str] = {}
+    for reading, spot in zip(points, places, strict=True):
+        for line, pose in zip(reading.line, spot.pose, strict=True):
+            lines.setdefault(int(joints.line[pose]), f"{reading.sheet.path}:{line}")
+    files = tuple(str(reading.sheet.path) for reading in points)
+    return Origin(files, str(joints.sheet.path), point_lines=lines)
 
 
 def without_marked(

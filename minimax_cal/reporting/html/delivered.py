@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from minimax_cal.correcting.deliverable import COMPENSATED, Delivered, deliver
+from minimax_cal.correcting.deliverable import COMPENSATED, Delivered, deliver_or_explain
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.words import capitalise
@@ -54,7 +54,7 @@ class Row:
     def said(self) -> str:
         """What it does not hold of the whole model, in a sentence."""
         own, name = self.delivered, capitalise(self.short)
-        if own.reason:
+        if own.reason or own.unmade:
             return f"{own.sentence()}."
         return f"{name}: {f'cannot hold {own.lacks}' if own.lacks else 'all of the model'}."
 
@@ -73,7 +73,7 @@ def rows_of(
     claims_of: Callable[[Fit], Claims],
     as_it_is: Claims,
 ) -> tuple[Row, ...]:
-    """Each deliverable against the requirements.
+    """Each deliverable against the requirements; a file that cannot be made is a row that says why.
 
     names: as of `deliver`; the usual ones where nothing is named and the result has effects.
     as_it_is: the claims of the result itself.  Raises OptionError.
@@ -87,17 +87,11 @@ def rows_of(
         return ()
     out = []
     for name in names or USUAL:
-        try:
-            found = deliver(source, name, rung=rung)
-        except OptionError:
-            if names:
-                raise
-            continue  # the rest of a model that fails without its effects is no deliverable
+        found = deliver_or_explain(source, name, rung)
         claims = as_it_is
-        if found.reason:
+        if why := found.reason or found.unmade:
             claims = tuple(
-                Claim(claim.name, NOWHERE, NOWHERE, 0, "", reason=found.reason)
-                for claim in as_it_is
+                Claim(claim.name, NOWHERE, NOWHERE, 0, "", reason=why) for claim in as_it_is
             )
         elif found.fit and found.fit is not source:
             claims = claims_of(found.fit)
@@ -142,11 +136,11 @@ def has_effects(sources: Sources, rung: int | None) -> bool:
 
 
 def governing(rows: Sequence[Row], named: bool) -> Row | None:
-    """That which the verdict is of: of those named the worst, else corrected targets."""
+    """That which the verdict is of: of those named the worst, else the first that can be made."""
     if not rows:
         return None
     if not named:
-        return rows[0]
+        return next((row for row in rows if not row.delivered.unmade), rows[0])
     for verdict in (NOT_PASSED, NOT_STATED):
         for row in rows:
             if row.verdict == verdict:

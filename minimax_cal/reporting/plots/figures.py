@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import write_whole
+from minimax_cal.ground.optional import install_command
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 PICTURES = (".png", ".svg", ".pdf")
 BEFORE, AFTER = "#d55e00", "#0072b2"  # told apart by colour-blind eyes too [Okabe and Ito 2008]
 MAP_COLOURS = "OrRd"  # pale is small, dark is large: one hue, for colour-blind eyes too
-NEEDED = "a picture needs matplotlib: pip install '.[plot]' in a clone"
+NEEDED = f"a picture needs matplotlib: {install_command('minimax-cal[plot]')}"
 
 
 def new_figure(width: float, height: float) -> Figure:

@@ -60,7 +60,7 @@ def views(plan: Plan, side: Any, above: Any) -> None:
     )
     far = max(away(points, place) for _, points, place in panels) > FAR
     for one, points, place in panels:
-        mark(one, points, place, plan.still, f"{np.linalg.norm(eye):.1f} m away" if far else "")
+        mark(one, points, place, f"{np.linalg.norm(eye):.1f} m away" if far else "")
     side.set(xlabel="flange, distance from the base's vertical (mm)", ylabel="height (mm)")
     above.set(xlabel="flange from above, along (mm)", ylabel="across (mm)")
     for one in (side, above):
@@ -75,20 +75,20 @@ def away(points: Array, place: Array) -> float:
     return float(np.linalg.norm(place - points.mean(axis=0)) / np.ptp(points, axis=0).max())
 
 
-def mark(axes: Any, points: Array, place: Array, name: str, far: str) -> None:
-    """What stands still, or the way to it where it would leave a thumbnail of the arm.
+def mark(axes: Any, points: Array, place: Array, far: str) -> None:
+    """The tracker, or the way to it where it would leave a thumbnail of the arm.
 
     far: how far it is away, empty where it is near.
     """
     if not far:
-        axes.plot(*place, "^", color=BEFORE, linestyle="", label=name)
+        axes.plot(*place, "^", color=BEFORE, linestyle="", label="tracker")
         return
     middle, span = points.mean(axis=0), float(np.ptp(points, axis=0).max())
     way = (place - middle) / np.linalg.norm(place - middle)
     tip = middle + 0.75 * span * way
     arrow = {"arrowstyle": "-|>", "color": BEFORE, "linewidth": 1.5}
     axes.annotate("", tip, xytext=middle + 0.55 * span * way, arrowprops=arrow)
-    axes.plot([], [], color=BEFORE, label=f"arrow: to the {name}, {far}")
+    axes.plot([], [], color=BEFORE, label=f"arrow: to the tracker, {far}")
     axes.plot(*tip, alpha=0.0)  # within the limits
 
 

@@ -19,6 +19,10 @@ from minimax_cal.robots.kernels import plain
 
 SWITCH = "MINIMAX_CAL_KERNELS"  # plain or fast, in the environment; unset takes what is there
 NOTICE = "compiling kernels for this machine, once: about ten seconds"
+NO_CACHE = (
+    "numba finds no folder for compiled kernels, and NumPy does their work, more slowly: set "
+    "NUMBA_CACHE_DIR to a folder that can be written"
+)
 BRIEF: ContextVar[bool] = ContextVar("brief", default=False)
 
 
@@ -43,7 +47,11 @@ def best() -> Any:
     told = os.environ.get(SWITCH, "")
     if told == "plain" or (told != "fast" and util.find_spec("numba") is None):
         return plain
-    fast = import_module("minimax_cal.robots.kernels.fast")
+    try:
+        fast = import_module("minimax_cal.robots.kernels.fast")
+    except RuntimeError:  # package and home are both read-only
+        logging.getLogger("minimax_cal").warning(NO_CACHE)
+        return plain
     if not any(Path(fast.unwound.stats.cache_path).glob("fast.*.nbi")):
         logging.getLogger("minimax_cal").warning(NOTICE)
     return fast

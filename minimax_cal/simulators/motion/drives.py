@@ -335,6 +335,12 @@ def write_share(root: ET.Element, chain: Chain, share: float) -> None:
         joint.set("actuatorgravcomp", "true" if share else "false")
 
 
+def filtered_servos(chain: Chain) -> str:
+    """The joints whose servos filter their commands, in words; empty where none does."""
+    filtered = chain.model.actuator_dyntype[chain.servos] * (chain.servos >= 0)
+    return ", ".join(np.array(chain.names)[filtered > 0])
+
+
 def can_write(opened: Opened) -> bool:
     """Whether every joint has a servo of its own that can be given other numbers."""
     chain, root = opened.chain, opened.given.document.root
@@ -460,8 +466,7 @@ def of_body(made: Candidate, study: Study, joints: tuple[str, ...]) -> Ranged:
         unknown = np.full(len(names), np.nan)
         return Ranged(names, mean, np.diag(unknown), unknown)
     studies = (study.only([run for run in runs if run != out]) for out in runs)
-    asked = replace(made.asked, behind=())
-    change = np.array([values(fit_numbers(one, asked)) - mean for one in studies])
+    change = np.array([values(fit_numbers(one, made.asked)) - mean for one in studies])
     whole = (len(runs) - 1.0) / len(runs) * change.T @ change
     return Ranged(names, mean, whole, spread(change))
 
@@ -519,6 +524,12 @@ def by_positions(judge: Judge, opened: Opened, *, plain: bool) -> Answer:
 
     Raises OptionError without servos to correct.
     """
+    if filtered := filtered_servos(opened.chain):
+        raise OptionError(
+            f"{opened.given.source}: the servos of {filtered} filter their commands (dyntype or "
+            "timeconst): positions alone do not correct them; leave the filter out of the model, "
+            "or log torques or currents"
+        )
     if judge.drives != OWN_SERVOS or not can_write(opened):
         raise OptionError(
             f"{judge.runs[0].source}: no column of torque or current: then every run needs "
@@ -537,8 +548,8 @@ def by_positions(judge: Judge, opened: Opened, *, plain: bool) -> Answer:
     steps += [(f"+ {name}", with_body(driven, served, names[: number + 1]))
               for number, name in enumerate(names)]  # fmt: skip
     rungs = tuple(judge.rung(name, one.chain) for name, one in steps)
-    elements = tuple(WrittenElement(name.value, "file", HELD[name][1], {}) for name in names)
-    return Answer(with_body(driven, served, names), rungs, elements, None, "", (), (SCALE,),
+    elements = tuple(WrittenElement(name.value, HELD[name][1], {}) for name in names)
+    return Answer(with_body(driven, served, names), rungs, elements, None, (), (SCALE,),
                   tuple(lost_late(effects)), served=served, effects=effects)  # fmt: skip
 
 
@@ -549,6 +560,7 @@ def with_body(opened: Opened, served: Served, names: Sequence[Element]) -> Opene
     for name in names:
         values = [old if fit is None else max(fit.beside[HELD[name][0]], 0.0)
                   for fit, old in zip(served.fits, getattr(given, name), strict=True)]  # fmt: skip
-        new = new.put(**{name: np.array(values)})
+        changes: dict[str, Any] = {name: np.array(values)}
+        new = replace(new, **changes)
     write_numbers(document, opened.chain, given, new)
     return opened.again(document)

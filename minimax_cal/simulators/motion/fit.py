@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.dynamics.laws import Element, Term
-from minimax_cal.dynamics.model import Columns, held_friction, solve_scaled
+from minimax_cal.dynamics.laws import CURVE, Element, Term
+from minimax_cal.dynamics.model import Columns, solve_scaled
 from minimax_cal.dynamics.regressor import PER_LINK
-from minimax_cal.dynamics.rows import YIELD, Arm, Logs, Scene, Whitening
+from minimax_cal.dynamics.rows import Arm, Logs, Scene, Whitening
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.simulators.chain import Chain
@@ -47,9 +47,9 @@ class Asked:
     """What is fitted; the rest stays as the model has it.
 
     elements: of those above.  link: the only one whose masses change, -1 for all.
-    behind: laws with which masses and armature are fitted first, and kept.
     curved: joints whose damping levels off.  sprung, geared: joints with a spring, or whose drive
-    gain is off.  laws: that no element holds.  bent: powers of the angle in a spring's torque.
+    gain is off.  laws: that no element holds: masses and armature are fitted with them first, and
+    kept.  bent: powers of the angle in a spring's torque.
     """
 
     elements: frozenset[Element]
@@ -58,17 +58,16 @@ class Asked:
     sprung: tuple[int, ...] = ()
     geared: tuple[int, ...] = ()
     laws: tuple[Term, ...] = ()
-    behind: tuple[Term, ...] = ()
     late: float = 0.0
     bent: int = POWERS - 1
-
-    def adding(self, element: Element) -> Asked:
-        """With one element more."""
-        return replace(self, elements=self.elements | {element})
 
     def without(self, element: Element) -> Asked:
         """All but one element."""
         return replace(self, elements=self.elements - {element})
+
+    def without_law(self, effect: str) -> Asked:
+        """All but the laws of one effect."""
+        return replace(self, laws=tuple(term for term in self.laws if term.effect != effect))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,12 +108,12 @@ class Study:
 
     @staticmethod
     def of(chain: Chain, arm: Arm, logs: Logs, terms: tuple[Term, ...], inertia: Array,
-           prior: float, white: Whitening | None = None) -> Study:  # fmt: skip
-        """Of the logs to learn from.  white: by the laws, unless given."""
+           prior: float) -> Study:  # fmt: skip
+        """Of the logs to learn from."""
         bodies, scene = Bodies.of(chain), Scene.of(arm, logs)
         given = given_numbers(chain, bodies)
         columns = Columns(scene.with_body(of_all(bodies.links(given.bodies)), scene.friction))
-        white = white or columns.whitening(terms)
+        white = columns.whitening(terms)
         links = white.white(columns.links[white.kept])
         return Study(chain, bodies, given, columns.scene, white, links, inertia, prior, terms)
 
@@ -122,11 +121,6 @@ class Study:
         """Of some of the runs."""
         arm, logs = self.scene.arm, self.scene.logs.only(runs)
         return Study.of(self.chain, arm, logs, self.terms, self.inertia, self.prior)
-
-    def of_file(self, chain: Chain, gain: Array) -> Study:
-        """The same logs, for a written model.  gain: (n,) of its drives over those of the logs."""
-        arm, logs = replace(self.scene.arm, gain=self.scene.arm.gain / gain), self.scene.logs
-        return Study.of(chain, arm, logs, self.terms, self.inertia, self.prior, self.white)
 
     def error(self, late: float) -> Array:
         """(N,) whitened torques less those of a known payload; so much earlier [s]."""
@@ -138,7 +132,7 @@ class Study:
         """The same logs, for a model that has masses and armature already."""
         own = np.array([physical(body) for body in found.bodies])
         bodies = replace(self.bodies, drawn=own)
-        given = self.given.put(bodies=own, armature=found.armature)
+        given = replace(self.given, bodies=own, armature=found.armature)
         scene = self.scene.with_body(of_all(bodies.links(own)), self.scene.friction)
         return replace(self, bodies=bodies, given=given, scene=scene)
 
@@ -150,16 +144,22 @@ def of_all(links: Array) -> Array:
 
 def fit_numbers(study: Study, asked: Asked) -> Numbers:
     """The numbers that the logs show."""
-    if asked.behind:
-        whole = replace(asked, laws=asked.behind, behind=())
-        study = study.with_masses(fit_numbers(study, whole))
-        asked = replace(asked, behind=()).without(Element.MASSES).without(Element.ARMATURE)
-    scene, numbers = study.scene, study.given.put(fastest=study.scene.arm.fastest)
+    if asked.laws:
+        curved = any(term.law.family == CURVE for term in asked.laws)  # which says it better
+        first = fit_elements(study, asked.without(Element.LEVELLED) if curved else asked)
+        study = study.with_masses(first)
+        asked = replace(asked, laws=()).without(Element.MASSES).without(Element.ARMATURE)
+    return fit_elements(study, asked)
+
+
+def fit_elements(study: Study, asked: Asked) -> Numbers:
+    """All that is asked for, in one fit that is repeated with its own load and friction."""
+    scene, numbers = study.scene, study.given
     late = asked.late if Element.DELAY in asked.elements else 0.0
     error = study.error(late)
     for _ in range(ROUNDS):
         columns = list(columns_of(study, scene, asked))
-        numbers = solved(study, scene, asked, columns, error, numbers.put(late=late))
+        numbers = solved(study, scene, asked, columns, error, replace(numbers, late=late))
         scene = with_numbers(study, scene, numbers)
     return numbers
 
@@ -208,10 +208,10 @@ def kept_numbers(study: Study, asked: Asked) -> Numbers:
     own, free = Element.FRICTION not in fitted, asked.sprung if Element.SPRINGS in fitted else ()
     stiffness = given.stiffness.copy()
     stiffness[list(free)] = 0.0
-    return given.put(
+    return replace(
+        given,
         friction=given.friction * own,
         damping=given.damping * own,
-        bristles=given.bristles * own,
         armature=given.armature * (Element.ARMATURE not in fitted),
         stiffness=stiffness,
     )
@@ -351,10 +351,10 @@ def numbers_of(
     for j in asked.sprung if Element.SPRINGS in asked.elements else ():
         stiffness[j], rest[j] = spring_of(spring[j] / gain[j])
     law = np.array([column.at if column.field == "law" else -1 for column in columns])
-    return before.put(
+    return replace(
+        before,
         **{name: (one.T / gain).T for name, one in found.items()},
         bodies=bodies,
-        bristles=own.bristles,
         stiffness=stiffness,
         rest=rest,
         gain=gain,
@@ -427,38 +427,3 @@ def weights(chain: Chain, numbers: Numbers) -> Array:
     model.dof_armature[dofs] = numbers.armature
     mj.mj_setConst(model, mj.MjData(model))
     return np.asarray(np.maximum(model.dof_invweight0[dofs], 1e-15))
-
-
-# ---- friction at rest ----------------------------------------------------------------------------
-
-
-STABLE = 0.3  # timestep times frequency of a joint on its bristles, at most
-DAMPED = 0.02  # of critical damping; 0.5 and more do worse than no bristle
-BRISTLE_ROUNDS = 2  # of fits, each with the ways of the one before
-
-
-def has_bristles() -> bool:
-    """Whether this MuJoCo has motors without input."""
-    return hasattr(mujoco(), "mjtCtrlInput")
-
-
-def fit_bristles(study: Study, numbers: Numbers, missed: Array) -> Numbers:
-    """Numbers with bristles, by what the model misses on the runs to learn from (R, n).
-
-    A bristle of friction F that yields after a way L [Dahl 1968] is MuJoCo's `dcmotor` without
-    input, whose friction is of LuGre, of stiffness F / L and the same at every speed.  MuJoCo takes
-    its force at the beginning of a step: L is longer where the inertia of the joint and the
-    timestep ask for it.  A damper keeps a joint from creeping, and brakes where it turns round:
-    DAMPED is a small share of the critical one.
-    """
-    scene = with_numbers(study, study.scene, numbers)
-    inertia = 1.0 / weights(study.chain, numbers)
-    yields = np.broadcast_to(YIELD, numbers.bristles.shape)
-    for _ in range(BRISTLE_ROUNDS):
-        held = held_friction(scene.stuck(yields), missed) * (scene.divisor / numbers.gain)[:, None]
-        whole = np.maximum(held.sum(axis=1), 1e-300)
-        held *= np.minimum(1.0, numbers.friction / whole)[:, None]
-        slow = (study.chain.step / STABLE) ** 2 / inertia
-        yields = np.maximum(YIELD, held.shape[1] * held * slow[:, None])
-    damping = 2.0 * DAMPED * np.sqrt(inertia / np.maximum((held / yields).sum(axis=1), 1e-300))
-    return numbers.put(bristles=held, yields=yields, damped=damping)

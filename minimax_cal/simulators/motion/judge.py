@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import pprint
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib import resources
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,7 +14,6 @@ import scipy
 from minimax_cal.dynamics.diagnose import named_runs
 from minimax_cal.dynamics.drives import command_of
 from minimax_cal.dynamics.given import MotionKnown
-from minimax_cal.dynamics.laws import Law
 from minimax_cal.dynamics.logs.table import NOTHING, Run
 from minimax_cal.dynamics.rows import (
     EDGE_S,
@@ -25,87 +21,16 @@ from minimax_cal.dynamics.rows import (
     Logs,
     Scene,
     at_times,
-    bent_bristles,
     prepare,
     rms_by_joint,
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.simulators.chain import Chain, fill_history, id_of
 from minimax_cal.simulators.drive import check_stable
 from minimax_cal.simulators.mjcf import largest_inertia
-from minimax_cal.simulators.motion.numbers import (
-    FRICTION,
-    Numbers,
-    Opened,
-    bristles_in,
-    given_bristles,
-    in_its_gravity,
-)
+from minimax_cal.simulators.motion.numbers import Numbers, Opened, in_its_gravity
 from minimax_cal.simulators.result import COMMANDS, MotionRung
-
-NUMBERS = "NUMBERS: dict[str, dict[str, Any]] = {}"  # in callback.py, to be filled
-LAWS = "LAWS: dict[str, tuple[bool, Any]] = {}"
-ENDING = "_friction.py"
-
-
-def module_text(chain: Chain, numbers: Numbers, unit: Array, ratio: Array) -> str:
-    """The module.  unit: (n,) torque per unit of the log.  ratio: (n,) of the gears."""
-    told: dict[str, Any] = {}
-    laws = {term.effect: term.law for term in numbers.laws}
-    for j, name in enumerate(chain.names):
-        pairs = zip(numbers.laws, numbers.value, strict=True)
-        mine = [(t.effect, amounts_of(t.law, value, unit[j], numbers.gain[j]),
-                 dict(t.tuned)) for t, value in pairs if t.joint == j]  # fmt: skip
-        told[name] = {
-            "frictionloss": float(numbers.loss[j]),
-            "damping": numbers.damping[j].tolist(),
-            "fastest": float(numbers.fastest[j]),
-            "laws": mine,
-        }
-        if any("gear" in laws[law].reads for law, *_ in mine):
-            told[name]["gear"] = abs(float(ratio[j]))
-    source = (resources.files("minimax_cal.simulators.motion") / "callback.py").read_text("utf-8")
-    filled = pprint.pformat(told, width=96, sort_dicts=False)
-    source = source.replace(NUMBERS, f"{NUMBERS[:-2]}{filled}")
-    return source.replace(LAWS, f"{LAWS[:-1]}\n{laws_text(laws)}}}" if laws else LAWS)
-
-
-def amounts_of(law: Law, value: Array, unit: float, gain: float) -> list[float]:
-    """A law's parameters at the joint [N m, or its share of torque]."""
-    pairs = zip(value, law.units, strict=False)
-    return [float(v * (unit if of.startswith("t") else 1.0) / gain) for v, of in pairs]
-
-
-def laws_text(laws: Mapping[str, Law]) -> str:
-    """Laws as entries of the module: whether friction, and torque per unit of each parameter."""
-    out = ""
-    for name, law in laws.items():
-        known = ", ".join([*sorted(law.reads), *law.tuned, "**_"])
-        out += f"    # {law.words}\n"
-        out += f'    "{name}": ({law.dry}, lambda {known}: ({", ".join(law.torque)},)),\n'
-    return out
-
-
-def loaded(text: str) -> ModuleType:
-    """A module of a text."""
-    made = ModuleType("friction")
-    exec(compile(text, "friction", "exec"), vars(made))
-    return made
-
-
-@contextmanager
-def installed(text: str, chain: Chain) -> Iterator[None]:
-    """A model with its module, if the text is not empty; another callback comes back after it."""
-    before = mujoco().get_mjcb_passive()
-    try:
-        if text:
-            loaded(text).install(chain.model)
-        yield
-    finally:
-        mujoco().set_mjcb_passive(before)
-
 
 # ---- a simulated arm along a log -----------------------------------------------------------------
 
@@ -130,20 +55,12 @@ def inverse_torque(chain: Chain, logs: Logs) -> Array:
     """(M, n) torque that a model takes for the motion of logs, as its drives feel it [N m]."""
     mj, model, data, at, dofs = chain.fresh()
     out = np.empty(logs.motion.q.shape)
-    joint, number, bristle = np.array(bristles_in(chain), dtype=int).reshape(-1, 3).T
-    yields = given_bristles(chain)["yields"]
-    bent = (bent_bristles(logs, yields) * yields)[:, joint, number]
     floating = ~model.jnt_actgravcomp[list(chain.joints)].astype(bool)
     motion = logs.motion
     for k in range(len(out)):
         data.qpos[at], data.qvel[dofs], data.qacc[dofs] = motion.q[k], motion.qd[k], motion.qdd[k]
-        data.time = float(logs.since[k])
         mj.mj_inverse(model, data)
         out[k] = data.qfrc_inverse[dofs] + floating * data.qfrc_gravcomp[dofs]
-        if len(bristle):
-            data.act[model.actuator_actadr[bristle]] = bent[k]
-            mj.mj_fwdActuation(model, data)
-            np.subtract.at(out[k], joint, data.actuator_force[bristle])
     return out
 
 
@@ -158,8 +75,10 @@ def follow_commands(chain: Chain, run: Run, commands: Array, source: str) -> Arr
     def drive(data: Any, now: int) -> None:
         data.ctrl[servos] = path[now]
         data.ctrl[list(speeds)] = rates[now, list(speeds.values())]
-        if not now:
+        if not now:  # delayed and filtered commands begin as if they had been there all the time
             fill_history(chain.model, data)
+            states = chain.model.actuator_actadr[servos]
+            data.act[states[states >= 0]] = path[0][states >= 0]
 
     path = at_times(steps_of(run.time, chain), run.time, commands)
     rates = np.gradient(path, chain.step, axis=0)
@@ -224,13 +143,12 @@ def by_inertia(chain: Chain) -> Pull:
 
 @contextmanager
 def own_drives_off(model: Any) -> Iterator[None]:
-    """A model without its actuators' forces but for bristles, and with all its weight."""
+    """A model without its actuators' forces, and with all its weight."""
     fields = ("actuator_gainprm", "actuator_biasprm", "body_gravcomp")
     kept = {name: getattr(model, name).copy() for name in fields}
-    drives = kept["actuator_biasprm"][:, FRICTION] == 0.0
     try:
         for name in fields:
-            getattr(model, name)[drives if name.startswith("actuator") else ...] = 0.0
+            getattr(model, name)[:] = 0.0
         yield
     finally:
         for name in fields:
@@ -389,14 +307,13 @@ class Judge:
         torque = at_times(time + late, time, run.torque - carried) * self.arm.gain / gain
         return follow_torques(chain, run, torque, self.hold, self.source)
 
-    def rung(self, name: str, chain: Chain, numbers: Numbers | None = None, module: str = "",
+    def rung(self, name: str, chain: Chain, numbers: Numbers | None = None,
              missed: Missed | None = None) -> MotionRung:  # fmt: skip
         """How far a model misses.  missed: where it is known already."""
         if self.held.unit == NOTHING:
             return MotionRung(name, (), (), (), tuple((1e3 * self.tracking(chain)).tolist()))
-        with installed(module, chain):
-            off = self.torque(chain, numbers) if missed is None else missed
-            where = self.tracking(chain, numbers) if self.drives else np.zeros(0)
+        off = self.torque(chain, numbers) if missed is None else missed
+        where = self.tracking(chain, numbers) if self.drives else np.zeros(0)
         sizes = (off.whole * self.arm.gain, off.whole, off.moving, 1e3 * where)
         return MotionRung(name, *(tuple(size.tolist()) for size in sizes))
 

@@ -25,12 +25,10 @@ from minimax_cal.robots.urdf import MODELS
 from minimax_cal.simulators.mjcf import largest_inertia
 from minimax_cal.simulators.motion import drives
 from minimax_cal.simulators.motion.correct import STAYS, Bench, asked_of, correct, mean_log
-from minimax_cal.simulators.motion.fit import PRIOR, PRIOR_ASSUMED, Study, has_bristles
-from minimax_cal.simulators.motion.judge import ENDING, OWN_SERVOS, Judge
+from minimax_cal.simulators.motion.fit import PRIOR, PRIOR_ASSUMED, Study
+from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge
 from minimax_cal.simulators.motion.numbers import Opened, calibrated, open_model
 from minimax_cal.simulators.result import MotionGap, MotionRung
-
-MOTOR = "dcmotor"  # what holds friction beside a constraint
 
 
 @takes(known=MotionKnown)
@@ -44,7 +42,6 @@ def motion_gap(
     tip: str = "",
     known: MotionKnown,
     gains: tuple[Sequence[float], Sequence[float]] | None = None,
-    friction: str | None = None,
     plain: bool = False,
     actuators: tuple[str, Path | str] | None = None,
     randomize: Path | str | None = None,
@@ -64,19 +61,16 @@ def motion_gap(
     diagnosis
         Of the motion, where it is known already.
     write
-        Where the corrected model goes; what no element holds goes into a module beside it.
+        Where the corrected model goes.
     tip
         Last body of the arm, where the model has several.
     known
         See `MotionKnown`.
     gains
         Stiffness [N m/rad] and damper [N m s/rad] of the drives, of all joints or of each.
-    friction
-        `dcmotor` for motors without input beside MuJoCo's `frictionloss`, whose LuGre friction is
-        that of a joint at rest (MuJoCo 3.16 or later).
     plain
         Whether the file is fitted without what other simulators leave out of it: damping and
-        stiffness of higher powers, delay, and the module.
+        stiffness of higher powers, and delay.
     actuators
         `isaac` or `json`, and where the actuators of the corrected model go.
     randomize
@@ -100,7 +94,7 @@ def motion_gap(
     >>> print(mc.motion_gap("arm.xml", ["run1.csv", "run2.csv"], write="corrected.xml").summary())
     """
     began = time.perf_counter()
-    check_request(write, friction, actuators, randomize, plain=plain)
+    check_request(write, actuators, randomize)
     progress("reading the model and the logs")
     runs = read_logs(model, logs)
     opened = open_model(model, runs[0].joints if runs else 0, tip)
@@ -125,11 +119,10 @@ def motion_gap(
             found = told_or_found(judge, opened, diagnosis, known.payload, progress)
             judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
                                                soft=found.arm.soft))  # fmt: skip
-            bench = bench_of(judge, opened, found, (friction == MOTOR, plain))
+            bench = bench_of(judge, opened, found, plain=plain)
             made = by_torques(bench, found, progress)
     nothing = judge.commanded and not improves((*first, *made.rungs))
     path = None if write is None or nothing else Path(write)
-    beside = path.with_name(path.stem + ENDING) if path and made.module else None
     if path is not None:
         write_whole(path, made.opened.content(path))
     if actuators is not None and not nothing:
@@ -137,8 +130,6 @@ def motion_gap(
     if randomize is not None and not nothing:
         count = len(judge.learning_runs)
         drives.write_ranges(randomize, made.fitted, made.served, opened.chain.names, count)
-    if beside is not None:
-        write_whole(beside, made.module)
     told = (text for run in runs for text in run.notices)
     said = (*told, *notices, *made.notices, *(made.lost if path else ()))
     return MotionGap(
@@ -153,7 +144,6 @@ def motion_gap(
         held_out=judge.held.names,
         notices=tuple(dict.fromkeys(said)),
         written="" if path is None else str(path),
-        module="" if beside is None else str(beside),
         seconds=time.perf_counter() - began,
     )
 
@@ -163,6 +153,9 @@ def by_torques(bench: Bench, found: MotionDiagnosis, progress: Progress) -> driv
     bench, served, rungs, effects = by_commands(bench, found, progress)
     made = correct(bench, found, progress)
     more = {"rungs": (*rungs, *made.rungs), "lost": (*made.lost, *drives.lost_late(effects))}
+    if bench.judge.drives == OWN_SERVOS and (names := drives.filtered_servos(bench.opened.chain)):
+        said = f"the servos of {names} filter their commands: gains and delay stay as they are"
+        more["notices"] = (*made.notices, said)
     return drives.Answer(**vars(made) | more, served=served, effects=effects)
 
 
@@ -173,22 +166,22 @@ def by_commands(
     each is worth.
     """
     judge, opened = bench.judge, bench.opened
-    asked = bench.bristled, bench.plain
     if judge.drives != OWN_SERVOS or not drives.can_write(opened):
         return bench, None, (), ()
     progress("fitting the drives to their commands")
     served = drives.serve(judge, opened, plain=bench.plain)
     if not served.changes:
         return bench, served, (), ()
-    whole, _ = asked_of(found, bench)
+    whole = asked_of(found, bench)
     driven = drives.with_drives(opened, served)
-    beside = bench_of(judge, driven, found, asked).candidate(whole).opened
+    beside = bench_of(judge, driven, found, plain=bench.plain).candidate(whole).opened
     served = drives.kept(served, judge, beside)
     effects = tuple(drives.effects_of(served, judge, beside))
     off = judge.torque(opened.chain)
     rungs = tuple(judge.rung(name, one.chain, missed=off)
                   for name, one in drives.steps_with(served, effects, opened))  # fmt: skip
-    return bench_of(judge, drives.with_drives(opened, served), found, asked), served, rungs, effects
+    bench = bench_of(judge, drives.with_drives(opened, served), found, plain=bench.plain)
+    return bench, served, rungs, effects
 
 
 def improves(rungs: Sequence[MotionRung]) -> bool:
@@ -229,22 +222,13 @@ def told_or_found(
 
 def check_request(
     write: Path | str | None,
-    friction: str | None,
     actuators: tuple[str, Path | str] | None,
     ranges: Path | str | None,
-    *,
-    plain: bool,
 ) -> None:
-    """Raise CalibrationError for what cannot be written, what holds no friction, and no MuJoCo."""
+    """Raise CalibrationError for what cannot be written, and where there is no MuJoCo."""
     if write is not None:
         check_writable(write, MODELS)
     mujoco()
-    if friction not in (None, MOTOR):
-        raise OptionError(f"friction={friction!r}: give {MOTOR}, or leave it")
-    if friction and plain:
-        raise OptionError(f"plain: other simulators leave out {MOTOR}; leave plain or friction")
-    if friction == MOTOR and not has_bristles():
-        raise OptionError(f"friction={MOTOR}: this MuJoCo has no motors without input; update it")
     if actuators and actuators[0] not in ("isaac", "json"):
         raise OptionError(f"actuators={actuators[0]!r}: give isaac or json, and a file")
     for path in (actuators and actuators[1], ranges):
@@ -252,12 +236,10 @@ def check_request(
             check_writable(path)
 
 
-def bench_of(
-    judge: Judge, opened: Opened, found: MotionDiagnosis, asked: tuple[bool, bool]
-) -> Bench:
-    """Where corrections of a model are fitted and judged.  asked: its `bristled` and `plain`."""
+def bench_of(judge: Judge, opened: Opened, found: MotionDiagnosis, *, plain: bool) -> Bench:
+    """Where corrections of a model are fitted and judged.  plain: as of `Bench`."""
     assumed = opened.given.assumed or not weighed(opened.chain.robot).all()
     study = Study.of(opened.chain, judge.arm, judge.learning, found.models[-1].terms,
                      largest_inertia(opened.chain),
                      PRIOR_ASSUMED if assumed else PRIOR)  # fmt: skip
-    return Bench(judge, opened, study, *asked)
+    return Bench(judge, opened, study, plain)

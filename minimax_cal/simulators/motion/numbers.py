@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -22,7 +22,6 @@ from scipy.spatial.transform import Rotation
 from minimax_cal.correcting.exporters.correct import laid
 from minimax_cal.dynamics.laws import Term
 from minimax_cal.dynamics.regressor import SQUARE, inertial_parameters
-from minimax_cal.dynamics.rows import YIELD
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
@@ -41,9 +40,8 @@ from minimax_cal.simulators.chain import (
     chain_along,
     chain_of,
     holders,
-    id_of,
 )
-from minimax_cal.simulators.elements import STEPS, forget, known, parents_of, section, tune
+from minimax_cal.simulators.elements import STEPS, known, parents_of, section, tune
 from minimax_cal.simulators.mjcf import (
     content_for,
     corrected,
@@ -197,7 +195,6 @@ def inertial(pseudo: Array) -> dict[str, Array]:
 # ---- what elements hold --------------------------------------------------------------------------
 
 
-FRICTION, STIFFNESS = 3, 5  # places in a dcmotor's biasprm and dynprm, then its damper
 POWERS = 3  # of the speed in MuJoCo's damping: v, v |v|, v^3; of the angle in its springs
 
 
@@ -207,13 +204,10 @@ class Numbers:
 
     bodies: (n, 4, 4) pseudo-inertias of the joints' bodies in their own frames.
     armature: (n,) [kg m^2].  friction: (n,) [N m].  damping: (n, 3) of v, v |v|, v^3.
-    bristles: (n, k) share of the friction that bristles hold [N m]; yields: (n, k) the ways after
-    which they yield [rad, m]; damped: (n,) their dampers over their stiffness [s].
     stiffness: (n, 3) of x, x^2, x^3, x from rest: (n,) [rad].
     gain: (n,) torque of the log per torque of the joint.  late: by which torques are logged after
     the motion [s].
-    laws, value: what no element holds, in the unit of the log; fastest, soft: (n,) speeds by which
-    these count.
+    laws, value: what no element holds, in the unit of the log.
     """
 
     bodies: Array
@@ -223,32 +217,14 @@ class Numbers:
     stiffness: Array
     rest: Array
     gain: Array
-    bristles: Array
-    yields: Array
-    damped: Array
     late: float = 0.0
     laws: tuple[Term, ...] = ()
     value: tuple[Array, ...] = ()
-    fastest: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def joints(self) -> int:
         """How many there are."""
         return len(self.armature)
-
-    @property
-    def loss(self) -> Array:
-        """(n,) friction that no bristle holds."""
-        return np.asarray(np.maximum(self.friction - self.bristles.sum(axis=1), 0.0))
-
-    @property
-    def at_rest(self) -> dict[str, Any]:
-        """The numbers of its bristles."""
-        return {name: getattr(self, name) for name in ("bristles", "yields", "damped")}
-
-    def put(self, **changes: Any) -> Numbers:
-        """With other fields."""
-        return replace(self, **changes)
 
 
 def given_numbers(chain: Chain, bodies: Bodies) -> Numbers:
@@ -258,40 +234,15 @@ def given_numbers(chain: Chain, bodies: Bodies) -> Numbers:
     spring = np.column_stack(
         [model.jnt_stiffness[joints], of_powers(model, "jnt_stiffnesspoly", joints)]
     )
-    held = given_bristles(chain)
     return Numbers(
         bodies=bodies.drawn,
         armature=model.dof_armature[dofs],
-        friction=model.dof_frictionloss[dofs] + held["bristles"].sum(axis=1),
+        friction=model.dof_frictionloss[dofs],
         damping=damping,
         stiffness=spring,
         rest=model.qpos_spring[chain.places],
         gain=np.ones(len(dofs)),
-        **held,
     )
-
-
-def bristle(joint: str, number: int) -> str:
-    """The name of a joint's bristle, from 0."""
-    return f"{joint}_bristle{number + 1}"
-
-
-def bristles_in(chain: Chain) -> list[tuple[int, int, int]]:
-    """Joint, number and id of every bristle of a model."""
-    places = [(j, k, id_of(chain.model, "ACTUATOR", bristle(name, k)))
-              for j, name in enumerate(chain.names) for k in range(len(YIELD))]  # fmt: skip
-    return [place for place in places if place[2] >= 0]
-
-
-def given_bristles(chain: Chain) -> dict[str, Any]:
-    """Friction (n, k), ways (n, k) and dampers (n,) of a model's bristles, as in `Numbers`."""
-    damped = np.zeros(len(chain.joints))
-    held, yields = np.zeros((len(damped), len(YIELD))), np.tile(YIELD, (len(damped), 1))
-    for j, k, number in bristles_in(chain):
-        stiffness, damper = chain.model.actuator_dynprm[number, STIFFNESS : STIFFNESS + 2]
-        held[j, k] = chain.model.actuator_biasprm[number, FRICTION]
-        yields[j, k], damped[j] = held[j, k] / stiffness, damper / stiffness
-    return {"bristles": held, "yields": yields, "damped": damped}
 
 
 def of_powers(model: Any, name: str, places: Array) -> Array:
@@ -310,7 +261,6 @@ def has_powers(model: Any) -> bool:
 
 SAME = 1e-12  # relative change of a number that is none
 STOPS = 4e-6  # friction moves the tool of a new file, at each joint, by no more [m]
-OPEN = {"motorconst": "1", "resistance": "1e9", "input": "none"}  # a motor that drives nothing
 HISTORY = 2  # samples of a delayed signal beyond those of the delay
 SHORTEST = 0.5  # of a timestep: a shorter delay is none
 
@@ -325,7 +275,7 @@ def write_numbers(document: Document, chain: Chain, given: Numbers, found: Numbe
         if differs(found.bodies[i], given.bodies[i]):
             weigh(parents[joint], found.bodies[i])
         put(joint, "armature", found.armature[i], given.armature[i])
-        put(joint, "frictionloss", found.loss[i], given.loss[i])
+        put(joint, "frictionloss", found.friction[i], given.friction[i])
         put(joint, "damping", powers(found.damping[i]), powers(given.damping[i]))
         put(joint, "stiffness", powers(found.stiffness[i]), powers(given.stiffness[i]))
         if differs(found.stiffness[i], given.stiffness[i]):
@@ -334,7 +284,6 @@ def write_numbers(document: Document, chain: Chain, given: Numbers, found: Numbe
             joint.set("springref", numbers([np.degrees(rest) if turns else rest]))
     write_gains(document.root, chain, found)
     write_delay(document.root, chain, found)
-    write_bristles(document.root, chain, found)
 
 
 def differs(found: Array, given: Array) -> bool:
@@ -381,20 +330,7 @@ def write_gains(root: ET.Element, chain: Chain, found: Numbers) -> None:
 def actuators_of(root: ET.Element, joint: str) -> list[ET.Element]:
     """The actuators that drive a joint."""
     every = [e for part in root.iter("actuator") for e in part]
-    return [e for e in every if e.get("joint") == joint and e.get("input") != OPEN["input"]]
-
-
-def write_bristles(root: ET.Element, chain: Chain, found: Numbers) -> None:
-    """Give joints their bristles, and take away those that they have no more."""
-    for j, name in enumerate(chain.names):
-        for k, friction in enumerate(found.bristles[j]):
-            if friction > 0.0:
-                stiffness = friction / found.yields[j, k]
-                level = [stiffness, stiffness * found.damped[j], friction, friction, 1.0]
-                known(section(root, "actuator"), "dcmotor", bristle(name, k), joint=name,
-                      lugre=level, **OPEN)  # fmt: skip
-            else:
-                forget(root, "actuator", "dcmotor", bristle(name, k))
+    return [e for e in every if e.get("joint") == joint]
 
 
 def write_delay(root: ET.Element, chain: Chain, found: Numbers) -> None:
