@@ -24,7 +24,7 @@ from minimax_cal.cli.running import cli
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.robots.robot import robot_from_dict
 
-from .__main__ import lines
+from .__main__ import table_of
 from .cases import EACH, PLAIN, TEMPLATES, Case, case, each_option
 from .known import FATAL, HARMLESS, disagreement, with_known
 from .material import material
@@ -223,12 +223,12 @@ def test_the_table_counts_everything_once():
         Outcome(1, "a", "hang", "", (), 1.0),
         Outcome(2, "b", "ok", "", (), 1.0),
     ]
-    table = [row.strip("| ").split(" | ") for row in lines(found)]
-    count = dict(zip(table[0], table[-1], strict=True))
-    assert count["cases"] == "3"
-    assert count["ok"] == "2"
-    assert count["hang"] == "1"
-    assert Counter(row[0] for row in table[2:]) == {"a": 1, "b": 1, "all": 1}
+    table = table_of(found)
+    count = dict(zip(table.header, table.rows[-1], strict=True))
+    assert count["cases"] == 3
+    assert count["ok"] == 2
+    assert count["hang"] == 1
+    assert Counter(row[0] for row in table.rows) == {"a": 1, "b": 1, "all": 1}
 
 
 # ---- whatever a reader is given ---------------------------------------------------------------
