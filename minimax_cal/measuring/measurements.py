@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -69,11 +68,6 @@ class Origin:
     def place(self, line: int) -> str:
         """FILE:LINE of a measured point.  line: of the pose."""
         return self.point_lines.get(line) or f"{self.points[0]}:{line - self.begin}"
-
-    def import_command(self, option: str) -> str:
-        """The command that reads these files with an option, and writes what is mended."""
-        words = [*self.points, *(["--joints", self.joints] if self.joints else [])]
-        return f"minimax-cal import {shlex.join(words)} {option} -o mended.csv"
 
 
 @dataclass(frozen=True, eq=False)

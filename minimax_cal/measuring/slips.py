@@ -7,6 +7,7 @@ files that the messages name are made here as well, where the user asks for them
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import combinations
@@ -95,10 +96,16 @@ def slips(robot: Robot, data: Measurements) -> Iterator[tuple[str, tuple[Robot, 
         yield text, (robot, mended)
 
 
+def import_command(origin: Origin, option: str) -> str:
+    """The command that reads some files with an option, and writes what is mended."""
+    words = [*origin.points, *(["--joints", origin.joints] if origin.joints else [])]
+    return f"minimax-cal import {shlex.join(words)} {option} -o mended.csv"
+
+
 def mend_by(data: Measurements, how: str) -> str:
     """The command that mends a file."""
     origin = data.origins[0] if len(data.origins) == 1 else Origin((data.source,))
-    return origin.import_command(f"--mend {how}")
+    return import_command(origin, f"--mend {how}")
 
 
 def left_out_by(data: Measurements, rows: Array) -> str:
@@ -106,7 +113,7 @@ def left_out_by(data: Measurements, rows: Array) -> str:
     lines = data.line[rows]
     origin = data.origin(lines[0])
     mine = [str(line - origin.begin) for line in lines if data.origin(line) == origin]
-    return origin.import_command(f"--leave-out {','.join(mine)}")
+    return import_command(origin, f"--leave-out {','.join(mine)}")
 
 
 def of_units(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:

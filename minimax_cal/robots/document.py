@@ -2,8 +2,8 @@
 
 Every element remembers the bytes of its tags and what stood between them, comments and blanks
 with it.  Written again, an element that did not change is its own bytes; a changed tag keeps its
-order, quotes and blanks; a new element stands on a line of its own.  Includes are part of the tree,
-but written out only where something in them changed.
+order, quotes and blanks; a new element stands on a line of its own.  Includes are part of the tree;
+one in which something changed is a file beside the written one, or written out where that has none.
 """
 
 from __future__ import annotations
@@ -29,12 +29,32 @@ SPACED = re.compile(rb"(\s+)" + ATTRIBUTE.pattern)  # an attribute and the blank
 
 @dataclass(eq=False)
 class Included:
-    """What an <include> brought: its own bytes, what stands before the first element, and these."""
+    """What an <include> brought: its own bytes, what stands before the first element, and these.
+
+    file: its name.  before, after: what its file has around what stands in its root.
+    """
 
     tag: bytes
     tail: bytes
     head: bytes
     children: tuple[ET.Element, ...] = ()
+    file: str = ""
+    before: bytes = b""
+    after: bytes = b""
+
+
+@dataclass(eq=False)
+class Writing:
+    """How a document is written.
+
+    whole: with all that it includes, changed or not.  name: of the file, without its ending, whose
+    changed includes are files beside it; empty where they are written out.  beside: these, by the
+    ending that takes the place of the file's own.
+    """
+
+    whole: bool = False
+    name: str = ""
+    beside: dict[str, bytes] = field(default_factory=dict)
 
 
 @dataclass(eq=False)
@@ -51,6 +71,11 @@ class Piece:
     attributes: dict[str, str]
     children: tuple[ET.Element, ...] = ()
     included: Included | None = None
+
+    @staticmethod
+    def of_tag(included: Included) -> Piece:
+        """Of an <include> itself."""
+        return Piece(included.tag, b"", b"", b"", {"file": included.file})
 
     @staticmethod
     def new(element: ET.Element) -> Piece:
@@ -72,11 +97,11 @@ class Document:
         """Another one, to be changed by itself."""
         return deepcopy(self)
 
-    def raw(self, *, whole: bool = False) -> bytes:
-        """The file.  whole: with all that it includes written out."""
-        return self.before + self.element(self.root, b"", whole=whole) + self.after
+    def raw(self, how: Writing | None = None) -> bytes:
+        """The file."""
+        return self.before + self.element(self.root, b"", how or Writing()) + self.after
 
-    def element(self, element: ET.Element, indent: bytes, *, whole: bool) -> bytes:
+    def element(self, element: ET.Element, indent: bytes, how: Writing) -> bytes:
         """The bytes of an element.  indent: line break and blanks before it."""
         piece = self.pieces.get(element) or Piece.new(element)
         start, end = tag_with(piece, element.attrib), piece.end
@@ -85,14 +110,14 @@ class Document:
         if not end:
             start, end = re.sub(rb"\s*/>\Z", b">", start), b"</" + element.tag.encode() + b">"
         if not piece.children:
-            inside = self.inside(element, indent and indent + b"  ", whole=whole)
+            inside = self.inside(element, indent and indent + b"  ", how)
             return start + before_blank(piece.text, inside, indent) + end
-        inside = self.inside(element, blank(piece.text), whole=whole)
+        inside = self.inside(element, blank(piece.text), how)
         last = self.pieces[piece.children[-1]]
         closing = blank(last.included.tail if last.included else last.tail)
         return start + piece.text + before_blank(inside, b"", closing) + end
 
-    def inside(self, parent: ET.Element, indent: bytes, *, whole: bool) -> bytes:
+    def inside(self, parent: ET.Element, indent: bytes, how: Writing) -> bytes:
         """The bytes of what an element holds."""
         out, children, at = b"", list(parent), 0
         own = self.pieces[parent].children if parent in self.pieces else ()
@@ -100,12 +125,12 @@ class Document:
             child = children[at]
             piece = self.pieces.get(child)
             if piece is None or child not in own:
-                out = before_blank(out, indent + self.element(child, indent, whole=whole))
+                out = before_blank(out, indent + self.element(child, indent, how))
             elif piece.included is None:
-                out += self.element(child, indent, whole=whole) + piece.tail
+                out += self.element(child, indent, how) + piece.tail
             else:
                 group = self.group(children, at, piece.included)
-                out += self.include(piece.included, group, indent, whole=whole)
+                out += self.include(piece.included, group, indent, how)
                 at += len(group) - 1
             at += 1
         return out
@@ -116,20 +141,27 @@ class Document:
         return children[first : last + 1]
 
     def include(
-        self, included: Included, children: list[ET.Element], indent: bytes, *, whole: bool
+        self, included: Included, children: list[ET.Element], indent: bytes, how: Writing
     ) -> bytes:
-        """An include as it was, or what it brought where that changed."""
+        """An include as it was; where what it brought changed, that, or its new file's name."""
         same = tuple(children) == included.children and not any(map(self.changed, children))
-        if same and not whole:
+        if same and not how.whole:
             return included.tag + included.tail
-        out = included.head.lstrip()
+        out = included.head if how.name else included.head.lstrip()
         for child in children:
-            text = self.element(child, indent, whole=whole)
+            text = self.element(child, indent, how)
             if child in included.children:
                 out += text + self.pieces[child].tail
             else:
                 out = before_blank(out, indent + text)
-        return out.rstrip() + included.tail
+        if not how.name:
+            return out.rstrip() + included.tail
+        ending = f".{Path(included.file).stem}.xml"
+        if ending in how.beside:
+            ending = f".{len(how.beside)}{ending}"
+        how.beside[ending] = included.before + out + included.after
+        attributes = {"file": f"{how.name}{ending}"}
+        return tag_with(Piece.of_tag(included), attributes) + included.tail
 
     def changed(self, element: ET.Element) -> bool:
         """Whether anything in an element is other than it was."""
@@ -298,8 +330,9 @@ def fill(
         if not brought:
             continue  # its bytes stay among the text
         between(child.start)
-        record = Included(raw[child.start : child.stop], b"", part.pieces[part.root].text,
-                          tuple(brought))  # fmt: skip
+        around, name = part.pieces[part.root], child.attributes.get("file", "")
+        record = Included(raw[child.start : child.stop], b"", around.text, tuple(brought), name,
+                          part.before + around.start, around.end + part.after)  # fmt: skip
         document.pieces |= {k: v for k, v in part.pieces.items() if k is not part.root}
         for one in brought:
             element.append(one)

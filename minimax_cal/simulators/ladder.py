@@ -40,10 +40,10 @@ from minimax_cal.simulators.drive import Commands, Driven, drive, placed_error, 
 from minimax_cal.simulators.mjcf import (
     beside,
     check_limits,
-    content_for,
     corrected,
     own_masses,
     told,
+    write_document,
 )
 from minimax_cal.simulators.result import Rung, SimulatorGap
 from minimax_cal.solvers.status import Status
@@ -375,10 +375,9 @@ class Run:
 
     def saved(self, document: Document, path: Path | None) -> Chain:
         """The arm in a changed tree, from the file where one is written."""
-        content = content_for(document, self.given.folder, path)
         if path is None:
             return self.of(document)
-        write_whole(path, content)
+        write_document(document, self.given.folder, path)
         return self.chain.in_model(mujoco().MjModel.from_xml_path(str(path)))
 
     def with_commands(self, whole: Arm, fit: Fit, path: Path | None) -> Rung:

@@ -24,11 +24,11 @@ from minimax_cal.correcting.exporters.job import Export, Job, origins
 from minimax_cal.correcting.exporters.urdf import assumptions, in_link
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError, RobotError
-from minimax_cal.ground.files import json_text
+from minimax_cal.ground.files import json_text, write_whole
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.words import name_effect
-from minimax_cal.robots.document import Document
+from minimax_cal.robots.document import Document, Writing
 from minimax_cal.robots.gravity import LEAST_MASS, G, inertia_of, masses_of
 from minimax_cal.robots.mjcf import Given, body_pose, find_assets, mujoco, read_model, shifted
 from minimax_cal.robots.robot import Robot
@@ -173,19 +173,30 @@ def drawn(body: ET.Element, robot: Robot, i: int) -> None:
 IMPLICIT = (2, 3)  # mjINT_IMPLICIT, mjINT_IMPLICITFAST
 
 
-def content_for(document: Document, source: Path, path: Path | None) -> bytes:
+def content_for(
+    document: Document, source: Path, path: Path | None
+) -> tuple[bytes, dict[str, bytes]]:
     """The file of a changed document at path: beside the given one its text but for the changes.
 
-    Elsewhere it says where its assets are, and what it includes is written out.
-    source: folder of the given file.
+    Elsewhere it says where its assets are.  What it includes and what changed is in files of their
+    own, by the ending that takes the place of the path's.  source: folder of the given file.
     """
     here = source.resolve()
     away = path is not None and path.resolve().parent != here
     if away and path is not None and any(e.get("file") for e in document.root.iter()):
         find_assets(document.root, Path(os.path.relpath(here, path.resolve().parent)))
     if not document.pieces:
-        return text_of(document.root)
-    return document.raw(whole=away)
+        return text_of(document.root), {}
+    how = Writing(away, path.stem if path else "")
+    return document.raw(how), how.beside
+
+
+def write_document(document: Document, source: Path, path: Path) -> None:
+    """Write a changed document to a path, and what it includes and changed beside it."""
+    content, beside = content_for(document, source, path)
+    for ending, text in beside.items():
+        write_whole(path.with_suffix(ending), text)
+    write_whole(path, content)
 
 
 def own_masses(chain: Chain, nominal: Robot) -> tuple[Array, Array] | None:
@@ -484,6 +495,6 @@ def correct(job: Job) -> Export:
     check_limits(chain, sample(job.robot) if job.q is None else job.q, given.source)
     document, notices = corrected(given, chain, job.nominal, arm, job.cell.target_names)
     made = chain.in_model(given.compiled(document.root))  # before its files are named from there
-    content = content_for(document, given.folder, job.path)
+    content, parts = content_for(document, given.folder, job.path)
     off = Written(made, job.cell, arm, match(job.nominal, chain.seen)[0]).off
-    return Export(content, (*notices, *told(arm)), beside(job.cell, arm), off)
+    return Export(content, (*notices, *told(arm)), {**parts, **beside(job.cell, arm)}, off)

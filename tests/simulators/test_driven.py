@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.correcting.export import exported
+from minimax_cal.correcting.export import exported, written
 from minimax_cal.correcting.exporters.job import job_of
 from minimax_cal.modelling.cell import still
-from minimax_cal.simulators.mjcf import write
+from minimax_cal.simulators.mjcf import correct, write
 from minimax_cal.simulators.result import SimulatorGap
 from tests.conftest import run
 from tests.problems_mjcf import drive_alone, published_like, ur10_like
@@ -22,7 +23,7 @@ from tests.simulators.test_mjcf import cell_with, in_base, poses, robot_called, 
 mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
 
 from experiments import simulator_gap as study  # noqa: E402
-from minimax_cal.robots.document import read_document  # noqa: E402
+from minimax_cal.robots.document import Writing, read_document  # noqa: E402
 from minimax_cal.robots.mjcf import read_model  # noqa: E402
 from minimax_cal.simulators.chain import chain_of  # noqa: E402
 from minimax_cal.simulators.drive import drive  # noqa: E402
@@ -247,6 +248,43 @@ def test_an_include_is_written_out_only_where_it_changed(tmp_path):
     assert document.raw().decode() == (
         "<mujoco>\n  <option gravity='0 0 -9'/>\n  <include file='b.xml'/>\n</mujoco>\n"
     )
+    how = Writing(name="new")
+    assert document.raw(how).decode() == (
+        "<mujoco>\n  <include file='new.a.xml'/>\n  <include file='b.xml'/>\n</mujoco>\n"
+    )
+    assert how.beside == {
+        ".a.xml": b"<mujocoinclude>\n  <option gravity='0 0 -9'/>\n</mujocoinclude>"
+    }
+
+
+@pytest.mark.parametrize("folder", [".", "elsewhere"])
+def test_a_scene_stays_and_the_arm_that_it_includes_is_beside_it(folder, tmp_path):
+    """`export --mjcf` of a scene: MuJoCo makes the same model of it as of one file."""
+    model = ur10_like(tmp_path)
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        f"<mujoco>\n  <include file='{model.name}'/>\n  <statistic extent='2'/>\n"
+        "  <worldbody><light pos='0 0 3'/></worldbody>\n</mujoco>\n"
+    )
+    (tmp_path / folder).mkdir(exist_ok=True)
+    weighs = chain_of(read_model(model).compiled(), 6, str(model)).robot
+    cell = cell_with(weighs, "joint_compliance:J2", size=5e-6)
+    made = {}
+    for given, name in ((scene, "new_scene.xml"), (model, "new_arm.xml")):
+        path = tmp_path / folder / name
+        written(correct(replace(job_of("cell", cell), nominal=weighs, fitted=True, model=given,
+                                path=path)), path)  # fmt: skip
+        made[name] = mujoco.MjModel.from_xml_path(str(path))
+    text = (tmp_path / folder / "new_scene.xml").read_text()
+    assert f"<include file='new_scene.{model.stem}.xml'/>" in text
+    assert "<light pos='0 0 3'/>" in text
+    assert "<body" not in text.replace("<worldbody", "")
+    arm = (tmp_path / folder / f"new_scene.{model.stem}.xml").read_text()
+    assert arm.count("<body") >= 6
+    one, other = made.values()
+    assert one.nlight == other.nlight + 1
+    assert_allclose(one.body_pos, other.body_pos, atol=0)
+    assert_allclose(one.actuator_gainprm, other.actuator_gainprm, atol=0)
 
 
 def test_a_keyframe_grows_with_the_springs(tmp_path):

@@ -52,11 +52,12 @@ def bent_cell(robot: mc.Robot, texts: dict[str, list[float]]) -> mc.Cell:
 
 
 def corrected(path: Path, chain: Chain, cell: mc.Cell, out: Path) -> Any:
+    from minimax_cal.correcting.export import written
     from minimax_cal.correcting.exporters.job import job_of
     from minimax_cal.simulators.mjcf import write
 
     job = replace(job_of("cell", cell), nominal=chain.robot, fitted=True, model=path, path=out)
-    out.write_bytes(write(job).content)
+    written(write(job), out)
     return mujoco.MjModel.from_xml_path(str(out))
 
 

@@ -31,7 +31,7 @@ def test_what_usd_holds_of_a_written_model(tmp_path):
         stiffness=np.array([[7.0, 0.0, 0.5]] * 6), rest=rng.uniform(0.1, 0.3, 6), late=-0.004,
     ))  # fmt: skip
     path = tmp_path / "arm.xml"
-    path.write_bytes(opened.content(path))
+    opened.write(path)
     model = mujoco.MjModel.from_xml_path(str(path))
     stage = Usd.Stage.Open(usd.Converter().convert(str(path), str(tmp_path / "usd")).path)
     prims = {prim.GetName(): prim for prim in stage.Traverse()

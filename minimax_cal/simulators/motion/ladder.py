@@ -15,7 +15,7 @@ from minimax_cal.dynamics.logs.table import CURRENT, NOTHING, Run
 from minimax_cal.dynamics.result import MotionDiagnosis, MotionEffect, load_motion
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import check_writable, write_whole
+from minimax_cal.ground.files import check_writable
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.ground.threads import one_thread
@@ -124,7 +124,7 @@ def motion_gap(
     nothing = judge.commanded and not improves((*first, *made.rungs))
     path = None if write is None or nothing else Path(write)
     if path is not None:
-        write_whole(path, made.opened.content(path))
+        made.opened.write(path)
     if actuators is not None and not nothing:
         drives.write_actuators(actuators[1], actuators[0], made.opened.chain, made.served)
     if randomize is not None and not nothing:

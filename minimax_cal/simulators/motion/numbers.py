@@ -43,12 +43,12 @@ from minimax_cal.simulators.chain import (
 )
 from minimax_cal.simulators.elements import STEPS, known, parents_of, section, tune
 from minimax_cal.simulators.mjcf import (
-    content_for,
     corrected,
     counts_degrees,
     elements_of,
     new_tree,
     own_masses,
+    write_document,
 )
 
 ROWS, COLUMNS = np.triu_indices(4)  # places of the ten coordinates in U
@@ -436,9 +436,9 @@ class Opened:
         free_joints(self.given.document.root, self.chain)
         return self.again(self.given.document)
 
-    def content(self, path: Path | None) -> bytes:
-        """The file, to be written at a path."""
-        return content_for(self.given.document, self.given.folder, path)
+    def write(self, path: Path) -> None:
+        """Write the file, and what it includes and changed beside it."""
+        write_document(self.given.document, self.given.folder, path)
 
 
 def is_mjcf(model: Path | str) -> bool:
