@@ -21,7 +21,7 @@ from .scaling import in_good_units
 Solver = Callable[..., Solution]
 
 BACKENDS: dict[str, tuple[str, str]] = {  # name: (module, method)
-    "daqp": ("via_qpsolvers", "daqp"),
+    "daqp": ("via_daqp", "daqp"),
     "quadprog": ("via_qpsolvers", "quadprog"),
     "piqp": ("via_qpsolvers", "piqp"),
     "clarabel": ("via_qpsolvers", "clarabel"),
