@@ -396,6 +396,8 @@ class Output:
             screen["advice"] = ()
         said = found.notices if notices is None else notices
         self.notice(*(text for text in said if text != reason))
+        if status is Status.FAILED:  # nothing follows a failure but its mend
+            screen["advice"] = ()
         if self.deliver(json or found.json, status, file, rows):
             (show or partial(self.present, found, **screen))()
         if self.figure and draw:
@@ -529,7 +531,7 @@ def together(
     to.undrawn()
     seen = [detected(*files.paths())] if files.given else []
     found = to.work(verb, robot, [*data, *seen], **chosen)
-    return to.finish(found, status=found.status)
+    return to.finish(found, status=found.status, reason=found.reason)
 
 
 def result_options(what: str, *, keep: str = "", figure: str = "") -> Decorator:

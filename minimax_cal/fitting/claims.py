@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from minimax_cal.evidence.noise import orthonormal
-from minimax_cal.fitting.accuracy import Accuracy, accuracy
 from minimax_cal.fitting.beyond import Beyond, left_out, not_claimed
 from minimax_cal.fitting.crossed import MIN_HELD_POSES, crossed
-from minimax_cal.fitting.floor import known_floor
-from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.options import Options, known_within
 from minimax_cal.fitting.solve import Solved
 from minimax_cal.fitting.stations import steps_of
-from minimax_cal.fitting.suspects import MIN_POINTS_LEFT, Suspect, aside, held_suspects
+from minimax_cal.fitting.suspects import Suspect, aside, held_suspects
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import name_first
@@ -30,7 +29,7 @@ from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import NOTHING, of_sessions
 from minimax_cal.modelling.joint_fit import extended, fitted, refitted
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots.kinematics import hat
 from minimax_cal.robots.robot import Robot
 
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
 TOOL = np.array([0.0, 0.0, 0.1])  # a point beside the last axes, in the flange [m]
 OPEN = 1e-4  # of the largest column: positions that a parameter moves by less depend on it no more
 NO_VALUES: Array = np.zeros(0)
+NO_PRIORS: Mapping[str, float] = MappingProxyType({})
 
 
 def position_sigma(
@@ -108,12 +108,36 @@ def positions_by(
     return np.asarray(jacobian - basis @ (basis.T @ jacobian))
 
 
+def drawn_sigmas(robot: Robot, priors: Mapping[str, float] = NO_PRIORS) -> Array:
+    """(5n,) how well the links of a drawing are known: by `drawn_within`, or by a prior [SI]."""
+    within = np.repeat(robot.drawn_within, np.array([2, 3]) * robot.joints)
+    told = known_within(Names.of(robot, ()), priors, "")[: len(within)]
+    return np.where(np.isfinite(told), told, within)
+
+
+def known_positions(robot: Robot, solved: Solved, within: Array) -> tuple[float, float]:
+    """RMS by which positions of the calibrated and of the drawn arm are known, by `position_sigma`.
+
+    within: (5n,) sigmas of the drawing.  Of the drawn one the links that were adopted count.  NaN
+    where no sigma is known [m].
+    """
+    spots, sure = solved.state.target_positions, solved.uncertainty.covariance
+    count = 5 * robot.joints + 6 + spots.size
+    links, active = slice(5 * robot.joints), solved.identification.active[:count]
+    if not np.isfinite(np.diag(sure)[:count][active]).all():
+        return np.nan, np.nan
+    drawn = np.full((count, count), np.nan)
+    drawn[links, links] = np.diag(within**2)
+    drawn[~active] = drawn[:, ~active] = np.nan
+    return (
+        position_sigma(robot, solved.state.mdh, spots, sure[:count, :count]),
+        position_sigma(robot, robot.mdh, spots, drawn),
+    )
+
+
 # ---- what is claimed -----------------------------------------------------------------------------
 
 
-MAX_MISS_OF_REACH = 0.01  # of the reach: a fit that misses by more contradicts its own data
-MAX_MISS_OF_FLOOR = 50.0  # times the floor, likewise
-YIELDS = 0.001  # of the reach: so much a sound arm may bend, however well it comes back
 MAX_NAMED = 5  # poses that a notice names
 WEAK = 3.0  # times what the reflectors miss by: points that are known worse are weakly told
 
@@ -183,51 +207,6 @@ def unjudged(data: Measurements, crossed: Array) -> Iterator[str]:
                 f"{data.source}: {lost.sum()} of {data.poses} poses are needed for the fit, so "
                 f"that none without them judges them: {named}"
             )
-
-
-def contradiction(
-    robot: Robot, data: Measurements, error: Array, held: Array, suspects: Sequence[Suspect]
-) -> str:
-    """Why a fit contradicts its own data; empty where it does not.
-
-    error: (k, m, 3) of all poses [m].  held: (m,).
-    """
-    rest = aside(error, data, suspects)
-    scores = {
-        name: (accuracy(error[:, rows]), accuracy(rest[:, rows]))
-        for name, rows in (("training", ~held), ("held-out", held))
-    }
-    return too_far(robot, known_floor(data, rest, robot.repeatability), scores)
-
-
-def too_far(
-    robot: Robot,
-    floor: tuple[float, str] | None,
-    scores: Mapping[str, tuple[Accuracy, Accuracy]],
-) -> str:
-    """Why a result contradicts its own data; empty where it does not.
-
-    floor: of noise [mm], and how it is known.  scores: of parts of the poses by their names, over
-    all points and without those that are suspect.
-    """
-    limit = 1e3 * MAX_MISS_OF_REACH * robot.reach()
-    what = f"{100 * MAX_MISS_OF_REACH:g} % of the arm's reach"
-    if floor and MAX_MISS_OF_FLOOR * floor[0] < limit:
-        limit = MAX_MISS_OF_FLOOR * floor[0]
-        what = f"{MAX_MISS_OF_FLOOR:g} times the noise floor ({floor[1]})"
-        if limit < 1e3 * YIELDS * robot.reach():
-            limit = 1e3 * YIELDS * robot.reach()
-            what += f" and {100 * YIELDS:g} % of the arm's reach"
-    for name, (whole, left) in scores.items():
-        few = sum(left.counts) < MIN_POINTS_LEFT * sum(whole.counts)
-        miss = whole.rms_mm if few else left.rms_mm  # where most are suspects it is the fit
-        if miss > limit:
-            return (
-                f"the fit misses the {name} poses by {miss:.3g} mm, more than {what}, suspects "
-                "aside: it is no calibration of this arm; check the robot file, joint signs, units "
-                "and the sign of each coordinate"
-            )
-    return ""
 
 
 def errors_of(robot: Robot, data: Measurements, solved: Solved) -> Callable[[State, Array], Array]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.fitting.checks import POOR_FIT
-from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
+from minimax_cal.fitting.outcome import MAX_MISS_OF_REACH
 from minimax_cal.fitting.pixels.fit import ROUNDS, PixelFit, PixelSquares, fit_pixels, right, softly
 from minimax_cal.fitting.pixels.options import PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import (

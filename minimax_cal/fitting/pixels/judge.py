@@ -20,7 +20,7 @@ import numpy as np
 import scipy
 
 from minimax_cal.evidence.noise import fit_components
-from minimax_cal.fitting.claims import TOOL
+from minimax_cal.fitting.claims import TOOL, drawn_sigmas
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.several.identify import lengths_of
 from minimax_cal.ground.arrays import Array
@@ -228,19 +228,13 @@ def position_sigma(robot: Robot, sure: Uncertainty) -> float:
     return position_error(robot, links[:n, :n], sure.moved[:n], sure.lack)
 
 
-def drawn_covariance(robot: Robot) -> Array:
-    """(5n, 5n) of the links of a drawing as good as `drawn_within`."""
-    length, angle = robot.drawn_within
-    return np.diag(np.repeat([length, angle], [2 * robot.joints, 3 * robot.joints]) ** 2)
-
-
 def drawn_sigma(robot: Robot, lack: Lack, share: float = 1.0) -> float:
     """`position_error` that a drawing leaves, which holds no more of the lack [m].
 
     share: of the variance that `drawn_within` says.
     """
     nothing = np.zeros((5 * robot.joints, len(lack.moment)))
-    return position_error(robot, share * drawn_covariance(robot), nothing, lack)
+    return position_error(robot, share * np.diag(drawn_sigmas(robot) ** 2), nothing, lack)
 
 
 # ---- the drawing beside the pixels --------------------------------------------------------------
@@ -272,7 +266,7 @@ class Drawing:
         links = np.flatnonzero(among & fit.problem.active[: len(among)])
         off = links_of(robot.mdh - fit.state.mdh)[links]
         some = np.ix_(links, links)
-        noise = drawn_covariance(robot)[some] + (sure.drawn @ sure.drawn.T)[some]
+        noise = np.diag(drawn_sigmas(robot) ** 2)[some] + (sure.drawn @ sure.drawn.T)[some]
         return Drawing(links, off, sure.covariance[some], noise)
 
     @cached_property

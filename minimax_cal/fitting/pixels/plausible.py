@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
-from minimax_cal.fitting.checks import POOR_FIT, check_mends, too_changed
-from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
+from minimax_cal.fitting.checks import POOR_FIT, check_mends
+from minimax_cal.fitting.outcome import MAX_MISS_OF_REACH
 from minimax_cal.fitting.pixels.fit import FAR_LENS, PixelFit
 from minimax_cal.fitting.pixels.judge import Scale
-from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import IMAGES, Started, poses_of_images, start_scene
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import name_first
@@ -134,8 +133,8 @@ def extent_of(data: PixelData, camera: int) -> tuple[float, float]:
     return float(width), float(height)
 
 
-def contradiction(robot: Robot, fit: PixelFit, scale: Scale | None, options: PixelOptions) -> str:
-    """Why a fit contradicts its own data; empty where it does not."""
+def objection(robot: Robot, fit: PixelFit, scale: Scale | None) -> str:
+    """What pixels themselves hold against a fit; empty for nothing."""
     (arm, own), images = fit.problem.at(fit.state), fit.images
     focal = images.intrinsic[images.pixels.camera, 0]
     size = np.linalg.norm(images.off(arm, own), axis=0) * np.abs(images.depth(arm, own)) / focal
@@ -150,10 +149,7 @@ def contradiction(robot: Robot, fit: PixelFit, scale: Scale | None, options: Pix
             f"{said}: check that joints, detections, board and camera files belong together, and "
             "what the cameras are fixed to (camera_on)"
         )
-    wrong = other_lens(fit) or other_size(scale, OTHER_SIZE, LEAST_SIZE)
-    if wrong or options.allow_large_changes:
-        return wrong
-    return too_changed(robot, fit.state.mdh, fit.problem.active[: 5 * robot.joints])
+    return other_lens(fit) or other_size(scale, OTHER_SIZE, LEAST_SIZE)
 
 
 def other_lens(fit: PixelFit) -> str:
