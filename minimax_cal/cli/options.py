@@ -396,8 +396,6 @@ class Output:
             screen["advice"] = ()
         said = found.notices if notices is None else notices
         self.notice(*(text for text in said if text != reason))
-        if status is Status.FAILED:  # nothing follows a failure but its mend
-            screen["advice"] = ()
         if self.deliver(json or found.json, status, file, rows):
             (show or partial(self.present, found, **screen))()
         if self.figure and draw:

@@ -20,7 +20,14 @@ from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import name_first
 from minimax_cal.instruments.instrument import PLENTY, anywhere
-from minimax_cal.instruments.protocol import Arm, Given, ResidualRows, by_arm, corners
+from minimax_cal.instruments.protocol import (
+    Arm,
+    FlangePoses,
+    Given,
+    ResidualRows,
+    by_arm,
+    corners,
+)
 from minimax_cal.measuring.grouping import clusters, grouped, parts
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Sessions
@@ -29,7 +36,8 @@ from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import NOTHING, of_sessions
 from minimax_cal.modelling.joint_fit import extended, fitted, refitted
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.parameters import Names, State
+from minimax_cal.modelling.parameters import Names, State, zero_positions
+from minimax_cal.modelling.rows import by_pose
 from minimax_cal.robots.kinematics import hat
 from minimax_cal.robots.robot import Robot
 
@@ -39,24 +47,30 @@ if TYPE_CHECKING:
 TOOL = np.array([0.0, 0.0, 0.1])  # a point beside the last axes, in the flange [m]
 OPEN = 1e-4  # of the largest column: positions that a parameter moves by less depend on it no more
 NO_VALUES: Array = np.zeros(0)
+NO_MOTION: Array = np.zeros((0, 0))
 NO_PRIORS: Mapping[str, float] = MappingProxyType({})
 
 
 def position_sigma(
     robot: Robot, mdh: Array, spots: Array, covariance: Array, laws: Laws | None = None,
-    values: Array = NO_VALUES,
+    values: Array = NO_VALUES, moved: Array = NO_MOTION, moment: Array = NO_MOTION,
 ) -> float:  # fmt: skip
-    """RMS of a position's standard deviation at random poses, by the parameters alone [m].
+    """RMS of a position's standard deviation at random poses [m].
 
-    Arguments as of `positions_by`.  covariance: (p, p), NaN where not identified.
+    Arguments as of `positions_by`.  covariance: (p, p), NaN where not identified.  moved: (p, c)
+    how far each factor of the lack of fit moves the parameters, whose covariance is then without
+    it; moment: (c, c) mean of the factors' products.  Without them, by the parameters alone.
     """
     known = np.isfinite(np.diag(covariance))
     known[5 * robot.joints : 5 * robot.joints + 6] = False  # the base, fitted again
-    jacobian = positions_by(robot, mdh, spots, laws, values)
+    jacobian, lack = positions_by(robot, mdh, spots, laws, values), 0.0
+    if moved.size:
+        turned = positions_by_lack(robot, mdh, spots) - jacobian[:, known] @ moved[known]
+        lack = float(np.sum((turned @ moment) * turned))
     # by its square root: where much is known badly, rounding would make the sum itself negative
     spread, axes = np.linalg.eigh(covariance[np.ix_(known, known)])
     root = jacobian[:, known] @ (axes * np.sqrt(np.maximum(spread, 0.0)))
-    return float(np.sqrt(3.0 * (root**2).sum() / len(jacobian)))
+    return float(np.sqrt(3.0 * ((root**2).sum() + lack) / len(jacobian)))
 
 
 def lacking(jacobian: Array, active: Array, asked: Array) -> Array:
@@ -101,11 +115,33 @@ def positions_by(
     target = flange.rotation.reshape(-1, 3) / max(len(spots), 1)
     links, bends = np.split(by, [5 * len(mdh)], axis=1)
     jacobian = np.hstack([links, np.zeros((len(by), 6)), *[target] * len(spots), bends])
-    stiff = arm.at(mdh).place(spot)
+    return without_rigid_motion(jacobian, arm.at(mdh), spots)
+
+
+def without_rigid_motion(motion: Array, flange: FlangePoses, spots: Array) -> Array:
+    """(3 m, p) motion of a point without the best rigid motion of all its positions.
+
+    Where no target is known on the flange, without what another point of the tool does either.
+    """
+    spot = spots.mean(axis=0) if len(spots) else TOOL
+    stiff = flange.place(spot)
     stiff = stiff - stiff.mean(axis=0)
     rigid = np.concatenate([np.tile(np.eye(3), (len(stiff), 1, 1)), -hat(stiff)], axis=2)
+    target = flange.rotation.reshape(-1, 3)
     basis = orthonormal(np.hstack([rigid.reshape(-1, 6), *[target] * (not len(spots))]))
-    return np.asarray(jacobian - basis @ (basis.T @ jacobian))
+    return np.asarray(motion - basis @ (basis.T @ motion))
+
+
+def positions_by_lack(robot: Robot, mdh: Array, spots: Array) -> Array:
+    """(3 m, c) as `positions_by`, per factor of each function of the pose (`rows.by_pose`)."""
+    at, zeros = anywhere(robot, PLENTY), zero_positions(robot.prismatic)
+    arm, spot = Arm.of(robot, at.q), spots.mean(axis=0) if len(spots) else TOOL
+    flange = arm.at(mdh, NO_VALUES, np.isin(np.arange(5 * len(mdh)), zeros))
+    point = flange.place(spot)
+    by_joint = flange.linear + np.cross(flange.angular, point - flange.origin)  # (n, m, 3)
+    by_joint = by_joint[np.argsort(np.argsort(zeros))]
+    motion, _ = by_pose(robot.with_mdh(mdh), arm.q, np.moveaxis(by_joint, 0, -1))
+    return without_rigid_motion(motion.reshape(3 * PLENTY, -1), arm.at(mdh), spots)
 
 
 def drawn_sigmas(robot: Robot, priors: Mapping[str, float] = NO_PRIORS) -> Array:

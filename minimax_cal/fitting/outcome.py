@@ -59,7 +59,8 @@ class FitEvidence:
     position_sigma, drawn_sigma: RMS over the joints' range by which positions of the calibrated and
     of the drawn arm are known [m]; NaN where not known.  objection: what an instrument itself holds
     against the fit, computed: why its points were not measured, worse: why the drawn arm is no
-    worse, outliers: to be checked where the drawn arm is kept; each empty for none.
+    worse, outliers: to be checked where the drawn arm is kept; each empty for none.  doubts: that
+    decide nothing.
     """
 
     robot: Robot
@@ -76,6 +77,7 @@ class FitEvidence:
     contradictions: tuple[Contradiction, ...] = ()
     worse: str = ""
     outliers: str = ""
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

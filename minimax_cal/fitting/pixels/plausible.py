@@ -9,9 +9,9 @@ import numpy as np
 import scipy
 
 from minimax_cal.fitting.checks import POOR_FIT, check_mends
+from minimax_cal.fitting.common_scale import ScaleOfLengths
 from minimax_cal.fitting.outcome import MAX_MISS_OF_REACH
 from minimax_cal.fitting.pixels.fit import FAR_LENS, PixelFit
-from minimax_cal.fitting.pixels.judge import Scale
 from minimax_cal.fitting.pixels.start import IMAGES, Started, poses_of_images, start_scene
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import name_first
@@ -133,7 +133,7 @@ def extent_of(data: PixelData, camera: int) -> tuple[float, float]:
     return float(width), float(height)
 
 
-def objection(robot: Robot, fit: PixelFit, scale: Scale | None) -> str:
+def objection(robot: Robot, fit: PixelFit, scale: ScaleOfLengths | None) -> str:
     """What pixels themselves hold against a fit; empty for nothing."""
     (arm, own), images = fit.problem.at(fit.state), fit.images
     focal = images.intrinsic[images.pixels.camera, 0]
@@ -165,7 +165,7 @@ def other_lens(fit: PixelFit) -> str:
     return ""
 
 
-def other_size(scale: Scale | None, limit: float, least: float = 0.0) -> str:
+def other_size(scale: ScaleOfLengths | None, limit: float, least: float = 0.0) -> str:
     """That the board is of another size than its file says; empty where it is not.
 
     limit: p-value from which on it is.  Pixels leave it open how large all is: with a board of
@@ -182,7 +182,7 @@ def other_size(scale: Scale | None, limit: float, least: float = 0.0) -> str:
     )
 
 
-def file_notices(fit: PixelFit, scale: Scale | None) -> list[str]:
+def file_notices(fit: PixelFit, scale: ScaleOfLengths | None) -> list[str]:
     """Notices of lenses that are far from their files, and of a board of another size."""
     file = fit.images.intrinsic[:, : len(INTRINSICS)]
     off = np.abs(fit.lens - file) / fit.doubt

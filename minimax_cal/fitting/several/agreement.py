@@ -1,10 +1,8 @@
 """Whether several files agree on one arm, beside what an arm does that no link holds.
 
-Each file's rows are linear where the joint fit ended.  What no link holds (gears, bending) turns
-the joints by functions of the pose (`modelling.rows.by_pose`), the same ones in all files; how
-large they are, and how noisy each file is, restricted maximum likelihood says of fits of each file
-with links of its own.  Links of its own are then tested against those of all together: a score test
-in the covariance of noise and functions.  A cause is a direction among these links.
+How large that is (`several.lack`), and how noisy each file is, fits of each file with links of its
+own say.  Links of its own are then tested against those of all together: a score test in the
+covariance of noise and lack.  A cause is a direction among these links.
 """
 
 from __future__ import annotations
@@ -16,120 +14,35 @@ from functools import cached_property
 import numpy as np
 from scipy.special import fdtrc
 
-from minimax_cal.evidence.noise import fit_components, orthonormal
+from minimax_cal.fitting.common_scale import LEAST_SHARE, but_for_tool, fit_scale_of_lengths
 from minimax_cal.fitting.disagreement import JOINT_ZERO, SCALE, Cause, Contradiction
+from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.several.fit import InstrumentFit, fit_instruments
+from minimax_cal.fitting.several.lack import (
+    Components,
+    FileRows,
+    estimate_components,
+    rows_of_files,
+)
 from minimax_cal.fitting.several.options import RelativeOptions, silent
-from minimax_cal.fitting.several.stack import Block
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.instrument import Instrument
-from minimax_cal.instruments.protocol import by_arm
 from minimax_cal.instruments.tracker import Points
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import labels as labels_of_sessions
-from minimax_cal.modelling.parameters import State, links_of, zero_positions
-from minimax_cal.modelling.rows import by_pose
+from minimax_cal.modelling.parameters import links_of, zero_positions
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.least_squares import solve_normal
 
 MAX_P = 1e-4  # of no contradiction, below which files contradict each other
+MAX_P_OF_NOTICE = 0.01  # of no common factor, below which one is worth a word
 MIN_P_OF_REST = 1e-3  # of what a cause leaves, above which it explains the contradiction
 MIN_LEAD = 12.0  # in twice the log likelihood, of a cause before its rivals
 MIN_TOLD = 0.1  # of a link as far off as a bad drawing, beside noise: a direction that files tell
 OFF_LENGTH, OFF_ANGLE = 1e-3, 1e-3  # how far links may differ between files [m, rad]
-SAME = 1e-9  # of a direction: what is told of it is rounding
+MIN_SHARE = 0.3  # of the noise, by which files that differ move what was measured
 MIN_DOF = 15  # numbers beyond links of its own, of a file that is tested
-ROUNDS = 6  # in which noises and functions of the pose are weighed against each other
-
-
-@dataclass(frozen=True, eq=False)
-class FileRows:
-    """The rows of one file, linear where the joint fit ended, in units of metres.
-
-    error: (r,).  shared: (p, r) slopes by all parameters that were fitted, zero for those of other
-    files.  links: (5n, r) by every link.  lack: (c, r) by the factors of functions of the pose.
-    degrees: independent numbers.
-    """
-
-    error: Array
-    shared: Array
-    links: Array
-    lack: Array
-    degrees: int
-
-    @cached_property
-    def alone(self) -> tuple[Array, Array, int]:
-        """Error (r,) and lack (c, r) without what links of its own take, and degrees beyond these."""
-        basis = orthonormal(np.concatenate([self.shared, self.links]).T)
-        error = self.error - basis @ (basis.T @ self.error)
-        lack = self.lack - (self.lack @ basis) @ basis.T
-        return error, lack, self.degrees - basis.shape[1]
-
-
-def lack_slopes(robot: Robot, block: Block, x: State) -> tuple[Array, Array]:
-    """(c, r) motion of the rows of a block by each factor of the lack of fit, and (c, 2) its kind.
-
-    robot: with the links of the state.
-    """
-    rows, links = block.read(x), np.zeros(5 * robot.joints + x.effects.size, dtype=bool)
-    zeros = zero_positions(robot.prismatic)
-    links[zeros] = True
-    links = links[: 5 * robot.joints + x.effects.size - len(block.instrument.names)]
-    slopes = by_arm(block.flange(x, links), rows)[np.argsort(np.argsort(zeros))]
-    lack, kind = by_pose(robot, block.arm.q[rows.pose], slopes.T[:, None, :])
-    return rows.settled(lack[:, 0].T, share=block.share)[1], kind
-
-
-def rows_of_files(robot: Robot, fit: InstrumentFit) -> tuple[list[FileRows], Array]:
-    """The rows of each file, and (c,) the group of each factor of the lack."""
-    stack, active = fit.stack, fit.problem.active
-    every, out, kind = np.ones(stack.names.count, dtype=bool), [], np.zeros((0, 2), dtype=int)
-    place = np.flatnonzero(active)
-    arm = robot.with_mdh(fit.state.mdh)
-    for i, (block, (error, slopes)) in enumerate(
-        zip(stack.blocks, stack.rows_by_block(fit.state, every), strict=True)
-    ):
-        lack, kind = lack_slopes(arm, block, stack.part(fit.state, i))
-        links = slopes[: 5 * robot.joints]
-        degrees = block.instrument.degrees
-        root = np.sqrt(np.broadcast_to(block.weight, error.shape))
-        out.append(
-            FileRows(root * error, root * slopes[place], root * links, root * lack, degrees)
-        )
-    groups = kind[:, 0] * (int(kind[:, 1].max(initial=0)) + 1) + kind[:, 1]
-    return out, groups
-
-
-@dataclass(frozen=True, eq=False)
-class Components:
-    """noise: (b,) variance of a row of each file [m^2].  lack: (c,) of each factor."""
-
-    noise: Array
-    lack: Array
-
-
-def estimate_components(files: list[FileRows], groups: Array) -> Components:
-    """Noises and sizes of the lack, each file with links of its own, by restricted likelihood."""
-    left = [one.alone for one in files]
-    noise = np.array([float(error @ error) / dof for error, _, dof in left])
-    noise = np.maximum(noise, 1e-18)
-    lack, dof = np.zeros(len(groups)), sum(dof for _, _, dof in left)
-    for _ in range(ROUNDS):
-        gram = sum(l @ l.T / v for (_, l, _), v in zip(left, noise, strict=True))
-        gradient = sum(l @ e / v for (e, l, _), v in zip(left, noise, strict=True))
-        square = sum(float(e @ e) / v for (e, _, _), v in zip(left, noise, strict=True))
-        found = fit_components(gram, gradient, square, dof, groups)
-        spread = found.moment - np.outer(found.mean, found.mean)
-        before = noise
-        noise = np.array([
-            (float(((e - found.mean @ l) ** 2).sum()) + float(((spread @ l) * l).sum())) / d
-            for e, l, d in left
-        ])  # fmt: skip
-        noise, lack = np.maximum(noise, 1e-18), found.variance[groups]
-        if np.all(np.abs(np.log(noise / before)) < 0.01):
-            break
-    return Components(noise, lack)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +83,7 @@ class ScoreTest:
             score - beside.T @ taken[:, -1],
             plain - beside.T @ taken[:, :-1],
             np.tile(unit, len(files) - 1),
-            float(min(one.alone[2] for one in files)),
+            float(min(one.alone.degrees for one in files)),
         )
 
     @cached_property
@@ -197,12 +110,11 @@ class ScoreTest:
 
     def along(self, direction: Array) -> tuple[float, float]:
         """Statistic of one direction (k,) [SI], and how far along it the files differ."""
-        values, vectors = self.told
-        part = vectors.T @ (direction / self.unit)
-        told = float(part**2 @ values)
-        if told <= SAME * float(part @ part):  # own unknowns of the file take it
+        direction = direction / self.unit
+        told = float(direction @ self.information @ direction)
+        if told < MIN_TOLD**2 * float(direction @ direction):  # own unknowns of the file take it
             return 0.0, 0.0
-        pull = float(part @ (vectors.T @ self.score))
+        pull = float(direction @ self.score)
         return pull**2 / told, pull / told
 
 
@@ -229,12 +141,14 @@ def find_contradictions(robot: Robot, fit: InstrumentFit) -> tuple[Contradiction
     if len(fit.trains) < 2:
         return ()
     files, groups = rows_of_files(robot, fit)
-    known = [i for i, one in enumerate(files) if one.alone[2] >= MIN_DOF]  # else no fit of its own
+    known = [
+        i for i, one in enumerate(files) if one.alone.degrees >= MIN_DOF
+    ]  # else no fit of its own
     files, labels = [files[i] for i in known], [fit.stack.labels[i] for i in known]
     if len(files) < 2:
         return ()
     unit = np.repeat([OFF_LENGTH, OFF_ANGLE], [2 * robot.joints, 3 * robot.joints])
-    test = ScoreTest.of(files, estimate_components(files, groups), unit)
+    test = ScoreTest.of(files, estimate_components([one.alone for one in files], groups), unit)
     if not test.count:
         return ()
     tried = []
@@ -245,7 +159,8 @@ def find_contradictions(robot: Robot, fit: InstrumentFit) -> tuple[Contradiction
     p_whole = test.p_value(test.statistic, test.count)
     p_cause = min(test.p_value(gain, 1) * len(tried), 1.0)
     p = min(2.0 * min(p_whole, p_cause), 1.0)
-    if p > MAX_P:
+    beyond = test.statistic - test.count
+    if p > MAX_P or beyond < MIN_SHARE**2 * sum(one.degrees for one in files):
         return ()
     names = [labels[file], *(name for i, name in enumerate(labels) if i != file)]
     rest = test.p_value(max(test.statistic - gain, 0.0), test.count - 1)
@@ -259,6 +174,32 @@ def find_contradictions(robot: Robot, fit: InstrumentFit) -> tuple[Contradiction
     cause = Cause(kind, place or names[0], by, unit_name)
     return (Contradiction(tuple(names), p, cause),)
 
+
+def find_other_scale(
+    robot: Robot, fit: InstrumentFit, within: Array
+) -> tuple[tuple[Contradiction, ...], str]:
+    """That a lone file has another length standard than the drawing; where that is not sure, a
+    notice.
+
+    within: (5n,) how well the drawing is known [m, rad].
+    """
+    links, one = 5 * robot.joints, fit.stack.instruments[0]
+    kept = {why.kind for why in fit.identification.reasons.values()}
+    if len(fit.trains) > 1 or robot.rough or not one.has_length or Because.NO_SCALE in kept:
+        return (), ""
+    told = np.flatnonzero(fit.identification.active[:links] & but_for_tool(robot))
+    covariance = fit.covariance[np.ix_(told, told)] + np.diag(within[told] ** 2)
+    found = fit_scale_of_lengths(robot, told, links_of(fit.state.mdh - robot.mdh)[told], covariance)
+    if not found or found.p_value > MAX_P_OF_NOTICE or abs(found.share) < LEAST_SHARE:
+        return (), ""
+    name, long = fit.stack.labels[0], "longer" if found.share > 0.0 else "shorter"
+    if found.p_value < MAX_P:
+        return (Contradiction((name,), found.p_value, Cause(SCALE, name, found.share, "1")),), ""
+    return (), (
+        f"all lengths of the arm come out {100 * abs(found.share):.3g} % (sigma "
+        f"{100 * found.sigma:.2g} %) {long} than drawn (p = {found.p_value:.0e}): check the scale, "
+        f"units and temperature compensation of {name}"
+    )
 
 
 def find_contradicting_sessions(

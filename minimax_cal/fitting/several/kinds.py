@@ -19,9 +19,10 @@ from minimax_cal.fitting.opened import listed_effects
 from minimax_cal.fitting.options import listed, priors_of, qp_name
 from minimax_cal.fitting.outcome import FileEvidence, FitEvidence, judge
 from minimax_cal.fitting.several import fit, plausible
-from minimax_cal.fitting.several.agreement import find_contradictions
+from minimax_cal.fitting.several.agreement import find_contradictions, find_other_scale
 from minimax_cal.fitting.several.fit import InstrumentFit
 from minimax_cal.fitting.several.identify import Alone
+from minimax_cal.fitting.several.lack import with_lack
 from minimax_cal.fitting.several.options import (
     Progress,
     RelativeOptions,
@@ -139,7 +140,9 @@ class Asked:
 
     def fit(self, progress: Progress) -> InstrumentFit:
         """The fit of the training measurements."""
-        return fit.fit_instruments(self.robot, self.trains, self.options, progress)
+        found = fit.fit_instruments(self.robot, self.trains, self.options, progress)
+        progress("sigmas")
+        return with_lack(self.robot, found)
 
     def calibrated(self, progress: Progress) -> RelativeCalibration:
         """The calibration."""
@@ -266,6 +269,7 @@ def judged(
         *plausible.of_scale(found),
         *plausible.weak(found, result, measured, sigma),
         *plausible.unlikely(result, measured),
+        *evidence.doubts,
         *filter(None, (*(notice for notice, _ in unfitted), ended.reason)),
     ]  # fmt: skip
     for data, (held, _), each in zip(every, asked.splits, measured, strict=True):
@@ -318,6 +322,7 @@ def evidence_of(
     )
     within = drawn_sigmas(robot, asked.options.priors)
     fits_links = geometry.identification.active[links].any() or stack.laws.names
+    scale = find_other_scale(robot, geometry, within)
     worse = bool(fits_links and better and not better.is_better)
     return FitEvidence(
         robot,
@@ -330,7 +335,8 @@ def evidence_of(
         drawn_sigma=drawn_sigma_of_positions(robot, geometry, within),
         allow_large_changes=asked.options.allow_large_changes,
         objection=objection,
-        contradictions=find_contradictions(robot, geometry),
+        contradictions=find_contradictions(robot, geometry) or scale[0],
+        doubts=(scale[1],) if scale[1] else (),
         worse=no_better(better) if better and worse else "",
     )
 
@@ -419,7 +425,12 @@ def sigma_of_positions(robot: Robot, found: InstrumentFit) -> float:
     count = 5 * robot.joints + 6 + 3 * len(spots) + len(values)
     covariance = np.full((count, count), np.nan)
     covariance[np.ix_(column, column)] = found.covariance[np.ix_(place, place)]
-    return position_sigma(robot, found.state.mdh, spots, covariance, stack.laws, values)
+    if found.lack is None:
+        return position_sigma(robot, found.state.mdh, spots, covariance, stack.laws, values)
+    moved, moment = np.zeros((count, found.lack.moved.shape[1])), found.lack.moment
+    moved[column] = found.lack.moved[place]
+    alone = covariance - moved @ moment @ moved.T
+    return position_sigma(robot, found.state.mdh, spots, alone, stack.laws, values, moved, moment)
 
 
 def drawn_sigma_of_positions(robot: Robot, found: InstrumentFit, within: Array) -> float:
