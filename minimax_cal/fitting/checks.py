@@ -13,7 +13,7 @@ from minimax_cal.fitting.common_scale import LEAST_SHARE, scale_of, with_links
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import name_first
-from minimax_cal.measuring.checks import best_orders, swapped
+from minimax_cal.measuring.checks import best_orders, check_span, swapped
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.slips import (
     DIGITS,
@@ -102,11 +102,12 @@ def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
 
     All rows are looked at, those held out too: they judge the fit.
     """
-    if not (robot.mdh[:, :2].any() or robot.prismatic.any()):
+    if not (np.delete(robot.mdh, 2, axis=1).any() or robot.prismatic.any()):
         raise DataError(
-            f"{data.source}: {robot.name} has no lengths: every a and d of its joints is 0; "
-            "check the robot file"
+            f"{data.source}: {robot.name} has no lengths and no angles: every a, d, alpha and beta "
+            "of its joints is 0; check the robot file"
         )
+    check_span(data)
     check_fresh(robot, data)
     given = fitted(robot, data)
     check_names(robot, data, given)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from minimax_cal.fitting.outcome import MAX_MISS_OF_REACH
 from minimax_cal.fitting.pixels.fit import FAR_LENS, PixelFit
 from minimax_cal.fitting.pixels.start import IMAGES, Started, poses_of_images, start_scene
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import name_first
 from minimax_cal.instruments.camera import INTRINSICS
 from minimax_cal.instruments.pixels import PixelData
@@ -31,11 +32,14 @@ LEAST_SIZE = 3e-3  # share of a board's size: by less it is no other board
 MOST_PAIRED = 300  # images whose pairing with poses is looked into
 SHIFTS, PAIRINGS = 3, 20  # images lost in a row that are tried; rounds of a pairing
 UNITS = (1e-3, 1e3, 0.1, 10.0, 25.4, 1.0 / 25.4)  # slips of a board's unit
+SIZES, STEP = (0.5, 2.0), 0.02  # of a board, or a lens, that are tried; a step that tells a slope
+ODD_FACTOR = 0.02  # a board so far off is another one, before links are fitted
 
 
 def check_start(robot: Robot, data: PixelData, started: Started) -> None:
     """Raise DataError for slips that show where the arm as drawn is fitted."""
     miss, good = started.miss(robot), POOR_FIT * robot.reach()
+    check_size(robot, data, started, miss)
     if miss <= good:
         return
 
@@ -46,6 +50,44 @@ def check_start(robot: Robot, data: PixelData, started: Started) -> None:
     every = (*slips(data), *other_poses(robot, data, started.direction))
     given = miss**2, miss**2
     check_mends(data.source, given, [every], tried, good, 1.0, BETTER**2, ALIKE**2, SAID)
+
+
+def check_size(robot: Robot, data: PixelData, started: Started, miss: float) -> None:
+    """Raise DataError where the arm's own motion says that board or lens are of another size.
+
+    A board s times larger is s times farther away, and the arm says by how much that moves; a
+    longer lens leaves the board's size and moves the depths alone.  What leaves hardly anything is
+    named where the other does not.  miss: as it is [m].
+    """
+    if not len(data.board):
+        return
+
+    def left(size: float, focal: float) -> float:
+        cameras = tuple(
+            replace(one, intrinsic=one.intrinsic * np.where(np.arange(len(one.intrinsic)) < 2, focal, 1.0))
+            for one in data.cameras
+        )
+        some = replace(data, board=size * data.board, cameras=cameras)
+        return start_scene(robot, some, started.images.on_flange).miss(robot)
+
+    def least(of: Callable[[float], float]) -> tuple[float, float]:
+        """What is left of the error by the best factor, and that factor."""
+        if min(of(1.0 - STEP), of(1.0 + STEP)) > (1.0 - 0.5 * STEP) * miss:
+            return miss, 1.0
+        found = scipy.optimize.minimize_scalar(
+            lambda x: of(np.exp(x)), bounds=np.log(SIZES), method="bounded",
+            options={"xatol": 1e-4, "maxiter": 40},
+        )  # fmt: skip
+        return float(found.fun), float(np.exp(found.x))
+
+    board, size = least(lambda x: left(x, 1.0))
+    lens, focal = least(lambda x: left(1.0, x))
+    if board > BETTER * miss or abs(size - 1.0) < ODD_FACTOR or board * ALIKE > lens:
+        return
+    raise DataError(
+        f"{data.source}: the robot's own motion says that the board is {size:.4g} times as large as "
+        f"its file says (board): measure its squares ({SAID.format(1e3 * board, 1e3 * miss)})"
+    )
 
 
 def slips(data: PixelData) -> Iterator[tuple[str, PixelData]]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from minimax_cal.fitting.checks import POOR_FIT, WILD_ANGLE, check_mends, check_plausible
 from minimax_cal.fitting.identify import Because
+from minimax_cal.fitting.outcome import MAX_ROTATION_MISS
 from minimax_cal.fitting.several.fit import (
     InstrumentFit,
     allowed_of,
@@ -26,7 +27,8 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.instrument import Instrument, Slip
 from minimax_cal.instruments.options import FAR
-from minimax_cal.instruments.protocol import FlangePoses
+from minimax_cal.instruments.protocol import Arm, FlangePoses
+from minimax_cal.instruments.reflectors import LEVER
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.slips import of_joints, of_units
 from minimax_cal.modelling.model import TARGET
@@ -36,7 +38,9 @@ from minimax_cal.robots.robot import Robot
 
 def check_slips(robot: Robot, data: Instrument, options: RelativeOptions) -> None:
     """Raise DataError or OptionError for slips that show where the arm as drawn is fitted."""
+    checks.check_span(data.at)
     if data.seen.target_names:
+        check_rotations(robot, data, options)
         seen = (data.ready(robot, options) if data.options else data).seen
         try:
             check_plausible(robot, seen)
@@ -63,6 +67,31 @@ def check_slips(robot: Robot, data: Instrument, options: RelativeOptions) -> Non
         lambda mended: measured(*fitted(mended)),
         good,
     )
+
+
+def check_rotations(robot: Robot, data: Instrument, options: RelativeOptions) -> None:
+    """Raise DataError where rotations are met as other columns hold them, and not as they stand.
+
+    Rotations of another order or kind may leave the places that are measured beside them as small
+    as they are.
+    """
+    if not any(True for _ in data.slips()):
+        return
+
+    def misses(one: Instrument) -> tuple[float, float]:
+        ready, arm = one.ready(robot, options), Arm.of(robot, one.at.q).at(robot.mdh)
+        turns = ready.turns(arm, ready.starts(arm, np.zeros(0))[0])
+        square = float((turns**2).mean()) if len(turns) else 0.0
+        return square * LEVER**2, square
+
+    some = data.tried()
+    given = misses(some)
+    if np.sqrt(given[1]) <= MAX_ROTATION_MISS:
+        return
+    check_mends(
+        data.at.source, given, (some.slips(),), misses, MAX_ROTATION_MISS * LEVER, limit=1.0,
+        said="the rotations of the drawn arm then miss by {:.3g} mm at 100 mm, not {:.3g} mm",
+    )  # fmt: skip
 
 
 def measured(one: Instrument, arm: FlangePoses, own: Array) -> tuple[float, float]:
