@@ -247,7 +247,7 @@ def fitted_spot(found: RelativeCalibration) -> Array:
     if "tool" in one:
         return 1e-3 * np.array(one["tool"]["translation_mm"])
     spots = one["targets_mm"].values() if "targets_mm" in one else [one["target_mm"]]
-    return 1e-3 * np.array(list(spots)).mean(axis=0)
+    return np.asarray(1e-3 * np.array(list(spots)).mean(axis=0))
 
 
 def ratio_of(job: SigmaJob) -> float:
@@ -293,8 +293,11 @@ def main(study: Study, count: int, arms: int) -> None:
         sigma_rows(sigma_jobs, ratios),
         "files | rigid .2f | bending .2f",
     )
-    study.save([table, sigmas], {"rows": table.records("cause", "sets", "told", "right"),
-                                 "sigmas": sigmas.records("files", "rigid", "bending")})  # fmt: skip
+    content = {
+        "rows": table.records("cause", "sets", "told", "right"),
+        "sigmas": sigmas.records("files", "rigid", "bending"),
+    }
+    study.save([table, sigmas], content)
 
 
 if __name__ == "__main__":

@@ -209,7 +209,7 @@ def but_for_tool(robot: Robot) -> Array:
     """(5n,) False for lengths of the last link, which are those of the tool and may be anything."""
     number = np.arange(5 * robot.joints)
     last = (number % robot.joints) == robot.joints - 1
-    return ~((number < 2 * robot.joints) & last)
+    return np.asarray(~((number < 2 * robot.joints) & last))
 
 
 def fit_scale_of_lengths(

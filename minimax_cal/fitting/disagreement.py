@@ -29,8 +29,8 @@ class Cause:
         if self.kind == SCALE:
             long = "longer" if self.by > 0.0 else "shorter"
             return (
-                f"all lengths of {self.place} are {abs(100.0 * self.by):.3g} % {long}: check scale, "
-                "units and temperature compensation of both"
+                f"all lengths of {self.place} are {abs(100.0 * self.by):.3g} % {long}: check the "
+                "scale, the units and the temperature compensation"
             )
         return (
             f"the zero of {self.place.replace('J', 'joint ')} differs by {scale * self.by:+.3g} "

@@ -28,8 +28,8 @@ from minimax_cal.instruments.protocol import FlangePoses
 from minimax_cal.instruments.reflectors import LEVER, posed, reflectors, spots_of
 from minimax_cal.instruments.tracker import Points
 from minimax_cal.measuring.grouping import groups
-from minimax_cal.measuring.slips import MAX_TRIAL_POSES
 from minimax_cal.measuring.measurements import FARTHEST, Measurements, joint_rows
+from minimax_cal.measuring.slips import MAX_TRIAL_POSES
 from minimax_cal.modelling.cell import pose_to_dict
 from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.kinematics import hat, rotation_vector

@@ -1,7 +1,8 @@
-"""What people mix up of any instrument is named with its mend, and the mend makes the file right."""
+"""What people mix up of any instrument is named with its mend, which makes the file right."""
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -104,12 +105,10 @@ def test_lengths_in_another_unit_are_named(arm, factor, words, tmp_path, refuses
 def test_joints_that_never_move_are_said_first(arm, kind):
     data = arm.measure(kind, 40, 2e-5)
     q = data.at.q[0] + 1e-4 * np.random.default_rng(0).normal(size=data.at.q.shape)
-    still = data.at.__class__(**{**vars(data.at), "q": q})
+    still = replace(data.at, q=q)
+    given = still if kind == "tracker" else replace(data, at=still)
     with pytest.raises(mc.DataError, match=r"do not move \(0\.0\d deg|the same joint values"):
-        if kind == "tracker":
-            mc.calibrate(arm.robot, still)
-        else:
-            relative(arm.robot, type(data)(**{**vars(data), "at": still}))
+        mc.calibrate(arm.robot, given)
 
 
 # ---- the reports ---------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -63,10 +64,9 @@ def check_size(robot: Robot, data: PixelData, started: Started, miss: float) -> 
         return
 
     def left(size: float, focal: float) -> float:
-        cameras = tuple(
-            replace(one, intrinsic=one.intrinsic * np.where(np.arange(len(one.intrinsic)) < 2, focal, 1.0))
-            for one in data.cameras
-        )
+        times = np.ones(len(data.cameras[0].intrinsic))
+        times[:2] = focal
+        cameras = tuple(replace(one, intrinsic=times * one.intrinsic) for one in data.cameras)
         some = replace(data, board=size * data.board, cameras=cameras)
         return start_scene(robot, some, started.images.on_flange).miss(robot)
 
@@ -75,18 +75,19 @@ def check_size(robot: Robot, data: PixelData, started: Started, miss: float) -> 
         if min(of(1.0 - STEP), of(1.0 + STEP)) > (1.0 - 0.5 * STEP) * miss:
             return miss, 1.0
         found = scipy.optimize.minimize_scalar(
-            lambda x: of(np.exp(x)), bounds=np.log(SIZES), method="bounded",
+            lambda x: of(float(np.exp(x))), bounds=(math.log(SIZES[0]), math.log(SIZES[1])),
+            method="bounded",
             options={"xatol": 1e-4, "maxiter": 40},
         )  # fmt: skip
         return float(found.fun), float(np.exp(found.x))
 
     board, size = least(lambda x: left(x, 1.0))
-    lens, focal = least(lambda x: left(1.0, x))
+    lens, _ = least(lambda x: left(1.0, x))
     if board > BETTER * miss or abs(size - 1.0) < ODD_FACTOR or board * ALIKE > lens:
         return
     raise DataError(
-        f"{data.source}: the robot's own motion says that the board is {size:.4g} times as large as "
-        f"its file says (board): measure its squares ({SAID.format(1e3 * board, 1e3 * miss)})"
+        f"{data.source}: the robot's own motion says that the board is {size:.4g} times as large "
+        f"as its file says (board): measure its squares ({SAID.format(1e3 * board, 1e3 * miss)})"
     )
 
 

@@ -1,4 +1,4 @@
-"""What an arm does that no link holds, as several instruments see it: how large it is, what it moves.
+"""What an arm does that no link holds, as several instruments see it.
 
 Gears, bending and cables turn the joints by functions of the pose (`modelling.rows.by_pose`), the
 same ones in all files.  Each file's rows are linear where the joint fit ended; how large the
@@ -89,9 +89,8 @@ def rows_of_files(robot: Robot, fit: InstrumentFit) -> tuple[list[FileRows], Arr
     for i, (block, (error, slopes)) in enumerate(zip(stack.blocks, rows, strict=True)):
         lack, kind = slopes_by_lack(arm, block, stack.part(fit.state, i))
         root = np.sqrt(np.broadcast_to(block.weight, error.shape))
-        links = slopes[: 5 * robot.joints]
-        parts = (root * part for part in (error, slopes[place], links, lack))
-        out.append(FileRows(*parts, block.instrument.degrees))
+        links, degrees = slopes[: 5 * robot.joints], block.instrument.degrees
+        out.append(FileRows(root * error, root * slopes[place], root * links, root * lack, degrees))
     return out, kind[:, 0] * (int(kind[:, 1].max(initial=0)) + 1) + kind[:, 1]
 
 

@@ -233,7 +233,7 @@ class RelativeCalibration(Measured, Result):
     """A robot calibrated from lengths, closures or poses, or from several files together.
 
     robot: calibrated; nominal: as drawn.  position_sigma: expected error of a position over the
-    joints' range, by the parameters' sigmas alone, the base fitted [m]; NaN while a direction that
+    joints' range, by the parameters' sigmas and the lack of fit, the base fitted [m]; NaN while a direction that
     moves positions is open.  positions_open: parameters that positions depend on and that the
     measurements do not determine.
     beyond: parameters that whole poses tell and one reflector does not.  instruments: each file.
@@ -345,9 +345,9 @@ class RelativeCalibration(Measured, Result):
                 "positions depend: how good a position is they do not say."
             )
         return (
-            "By the parameters' sigmas alone, which hold neither effects that the model lacks nor "
-            "errors of what is fixed, a position over the joints' range is good to "
-            f"{1e3 * self.position_sigma:.3f} mm RMS once {self.words.fitted} fitted."
+            "By the parameters' sigmas, lack of fit included, but for errors of what is fixed, a "
+            f"position over the joints' range is good to {1e3 * self.position_sigma:.3f} mm RMS "
+            f"once {self.words.fitted} fitted."
         )
 
     def headline(self) -> str:
