@@ -136,43 +136,68 @@ def causes(robot: Robot, mdh: Array, files: int) -> Iterator[tuple[int, str, str
             yield file, kind, place, unit, direction.reshape(-1)
 
 
+@dataclass(frozen=True)
+class TestedCause:
+    """A cause, what it gains in the statistic, and how far it moves what was measured [m]."""
+
+    gain: float
+    cause: Cause
+    file: int
+    motion: float
+
+
+def tested_causes(
+    robot: Robot, mdh: Array, files: list[FileRows], labels: list[str], test: ScoreTest
+) -> list[TestedCause]:
+    """Every cause, the one that gains most first."""
+    out, links = [], [one.links for one in files[1:]]
+    for file, kind, place, unit, direction in causes(robot, mdh, len(files)):
+        gain, by = test.along(direction)
+        each = zip(links, direction.reshape(len(links), -1), strict=True)
+        motion = np.concatenate([part.T @ one for part, one in each])
+        motion = motion[motion != 0.0]
+        size = abs(by) * float(np.sqrt((motion**2).mean())) if len(motion) else 0.0
+        out.append(TestedCause(gain, Cause(kind, place or labels[file], by, unit), file, size))
+    return sorted(out, key=lambda one: -one.gain)
+
+
 def find_contradictions(robot: Robot, fit: InstrumentFit) -> tuple[Contradiction, ...]:
-    """What the files of a fit contradict each other by; none where they agree, or there is one."""
+    """What the files of a fit contradict each other by; none where they agree, or there is one.
+
+    Nothing is said of a difference that hardly moves what was measured beside noise and lack.
+    """
     if len(fit.trains) < 2:
         return ()
     files, groups = rows_of_files(robot, fit)
-    known = [
-        i for i, one in enumerate(files) if one.alone.degrees >= MIN_DOF
-    ]  # else no fit of its own
-    files, labels = [files[i] for i in known], [fit.stack.labels[i] for i in known]
+    told = [one.alone.degrees >= MIN_DOF for one in files]  # the others have no fit of their own
+    files = [one for one, known in zip(files, told, strict=True) if known]
+    labels = [label for label, known in zip(fit.stack.labels, told, strict=True) if known]
     if len(files) < 2:
         return ()
     unit = np.repeat([OFF_LENGTH, OFF_ANGLE], [2 * robot.joints, 3 * robot.joints])
-    test = ScoreTest.of(files, estimate_components([one.alone for one in files], groups), unit)
+    found = estimate_components([one.alone for one in files], groups)
+    test = ScoreTest.of(files, found, unit)
     if not test.count:
         return ()
-    tried = []
-    for file, kind, place, unit_name, direction in causes(robot, fit.state.mdh, len(files)):
-        tried.append((*test.along(direction), file, kind, place, unit_name))
-    tried.sort(key=lambda one: -one[0])
-    gain, by, file, kind, place, unit_name = tried[0]
-    p_whole = test.p_value(test.statistic, test.count)
-    p_cause = min(test.p_value(gain, 1) * len(tried), 1.0)
-    p = min(2.0 * min(p_whole, p_cause), 1.0)
-    beyond = test.statistic - test.count
-    if p > MAX_P or beyond < MIN_SHARE**2 * sum(one.degrees for one in files):
+    first, *rivals = tested_causes(robot, fit.state.mdh, files, labels, test)
+    p_cause = test.p_value(first.gain, 1) * (1 + len(rivals))
+    p = min(2.0 * min(test.p_value(test.statistic, test.count), p_cause), 1.0)
+    numbers = sum(one.degrees for one in files)
+    lack = [float((found.lack @ one.lack**2).mean()) for one in files]
+    usual = float(np.sqrt(np.mean(found.noise + lack)))
+    is_small = test.statistic - test.count < MIN_SHARE**2 * numbers
+    if p > MAX_P or is_small or first.motion < MIN_SHARE * usual:
         return ()
-    names = [labels[file], *(name for i, name in enumerate(labels) if i != file)]
-    rest = test.p_value(max(test.statistic - gain, 0.0), test.count - 1)
-    alone = all(
-        gain - other[0] > MIN_LEAD
-        or test.p_value(max(test.statistic - other[0], 0.0), test.count - 1) < MIN_P_OF_REST
-        for other in tried[1:]
+    names = (labels[first.file], *(n for i, n in enumerate(labels) if i != first.file))
+
+    def p_of_rest(one: TestedCause) -> float:
+        return test.p_value(max(test.statistic - one.gain, 0.0), test.count - 1)
+
+    is_alone = all(
+        first.gain - one.gain > MIN_LEAD or p_of_rest(one) < MIN_P_OF_REST for one in rivals
     )
-    if rest < MIN_P_OF_REST or not alone:
-        return (Contradiction(tuple(names), p),)
-    cause = Cause(kind, place or names[0], by, unit_name)
-    return (Contradiction(tuple(names), p, cause),)
+    named = first.cause if is_alone and p_of_rest(first) >= MIN_P_OF_REST else None
+    return (Contradiction(names, p, named),)
 
 
 def find_other_scale(

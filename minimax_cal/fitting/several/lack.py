@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from minimax_cal.evidence.noise import fit_components, orthonormal
+from minimax_cal.fitting.identify import RESOLUTION
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.several.fit import InstrumentFit, LackOfFit
 from minimax_cal.fitting.several.stack import Block
@@ -24,10 +25,10 @@ from minimax_cal.modelling.rows import by_pose
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.least_squares import solve_normal
 
-ROUNDS = 6  # in which noises and functions of the pose are weighed against each other
+ROUNDS, INNER_ROUNDS = 6, 10  # in which noises, and functions of the pose, are weighed
 MIN_VARIANCE = 1e-18  # of a row [m^2]
+SAME_FUNCTION = 0.95  # of a motion that a law makes: it is that law
 MIN_GAIN = 10.0  # in twice the log likelihood, of a lack that the rows show
-MAX_CHANGE = 0.01  # relative, of the noises in the last round
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +48,11 @@ class FileRows:
 
     @cached_property
     def alone(self) -> RowsLeft:
-        """What links of its own leave."""
-        return RowsLeft.of(self, orthonormal(np.concatenate([self.shared, self.links]).T))
+        """What links of its own leave, in directions that its rows tell (`identify.RESOLUTION`)."""
+        slopes = np.concatenate([self.shared, self.links]).T
+        norm = np.linalg.norm(slopes, axis=0)
+        span, size, _ = np.linalg.svd(slopes[:, norm > 0.0] / norm[norm > 0.0], full_matrices=False)
+        return RowsLeft.of(self, span[:, size > RESOLUTION * size[0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,11 +124,15 @@ def estimate_components(left: Sequence[RowsLeft], groups: Array) -> Components:
     pairs = list(zip(left, degrees, strict=True))
     noise = np.array([one.error @ one.error / d + MIN_VARIANCE for one, d in pairs])
     without = sum(d * (np.log(v) + 1.0) for d, v in zip(degrees, noise, strict=True))
+    variance = np.ones(int(groups.max(initial=-1)) + 1)
     for _ in range(ROUNDS):
         gram = sum(one.lack @ one.lack.T / v for one, v in zip(left, noise, strict=True))
         gradient = sum(one.lack @ one.error / v for one, v in zip(left, noise, strict=True))
         square = sum(float(one.error @ one.error) / v for one, v in zip(left, noise, strict=True))
-        found = fit_components(gram, gradient, square, int(sum(degrees)), groups)
+        found = fit_components(
+            gram, gradient, square, sum(degrees), groups, variance, INNER_ROUNDS, 0.0
+        )
+        variance = found.variance
         spread = found.moment - np.outer(found.mean, found.mean)
         before = noise
         noise = np.array([
@@ -133,8 +141,6 @@ def estimate_components(left: Sequence[RowsLeft], groups: Array) -> Components:
             for one, d in pairs
         ])  # fmt: skip
         noise = np.maximum(noise, MIN_VARIANCE)
-        if np.all(np.abs(np.log(noise / before)) < MAX_CHANGE):
-            break
     root = np.sqrt(found.variance[groups])
     inner = np.eye(len(root)) + gram * np.outer(root, root)
     explained = root * gradient @ np.linalg.solve(inner, root * gradient)
@@ -146,6 +152,17 @@ def estimate_components(left: Sequence[RowsLeft], groups: Array) -> Components:
 # ---- what it does to a fit -----------------------------------------------------------------------
 
 
+def without_laws(fit: InstrumentFit, files: list[FileRows]) -> list[FileRows]:
+    """The rows without those functions of the pose that a law of the fit is itself."""
+    laws = np.flatnonzero(fit.problem.active) >= fit.stack.lawless
+    if not laws.any():
+        return files
+    basis = orthonormal(np.concatenate([one.shared[laws] for one in files], axis=1).T)
+    whole = np.concatenate([one.lack for one in files], axis=1)
+    inside = ((whole @ basis) ** 2).sum(axis=1) >= SAME_FUNCTION * (whole**2).sum(axis=1)
+    return [replace(one, lack=np.where(inside[:, None], 0.0, one.lack)) for one in files]
+
+
 def with_lack(robot: Robot, fit: InstrumentFit) -> InstrumentFit:
     """The fit, its covariance with what the arm does that no link holds.
 
@@ -153,6 +170,7 @@ def with_lack(robot: Robot, fit: InstrumentFit) -> InstrumentFit:
     those by the factors u of the lack.  Noises are those that remain beside the lack.
     """
     files, groups = rows_of_files(robot, fit)
+    files = without_laws(fit, files)
     problem, unit = fit.problem, float(fit.stack.precision.max())
     weights = fit.stack.precision / unit
     pairs = list(zip(weights, files, strict=True))
@@ -176,7 +194,8 @@ def with_lack(robot: Robot, fit: InstrumentFit) -> InstrumentFit:
             fit.stack.weights(fit.state), np.cumsum([len(o.error) for o in files])[:-1]
         )
         middle = float((fit.noise**2).min()) * prior
-        for (w, one), v, h in zip(pairs, found.noise, heavy, strict=True):
+        noise = fit.stack.variance(found.noise)  # as given, where it is
+        for (w, one), v, h in zip(pairs, noise, heavy, strict=True):
             middle = middle + w**2 * v * (one.shared * h) @ one.shared.T
         covariance[active] = cover @ middle @ cover
     covariance[active] += moved @ found.moment @ moved.T

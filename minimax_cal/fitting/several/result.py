@@ -233,9 +233,9 @@ class RelativeCalibration(Measured, Result):
     """A robot calibrated from lengths, closures or poses, or from several files together.
 
     robot: calibrated; nominal: as drawn.  position_sigma: expected error of a position over the
-    joints' range, by the parameters' sigmas and the lack of fit, the base fitted [m]; NaN while a direction that
-    moves positions is open.  positions_open: parameters that positions depend on and that the
-    measurements do not determine.
+    joints' range, by the parameters' sigmas and the lack of fit, the base fitted [m]; NaN while
+    a direction that moves positions is open.  positions_open: parameters that positions depend on
+    and that the measurements do not determine.
     beyond: parameters that whole poses tell and one reflector does not.  instruments: each file.
     cell: the arm with its effects, fitted together; None without any.  robot is then of a fit
     without them.  worst: what a minimax rests on, None where there was none.
