@@ -34,7 +34,7 @@ def test_files_that_agree_are_no_contradiction(seed):
 
 
 @pytest.mark.parametrize("cause", [SCALE, ZERO])
-@pytest.mark.parametrize("seed", [10_001, 10_002, 10_003])
+@pytest.mark.parametrize("seed", [10_001, 10_003, 10_005])
 def test_what_differs_between_files_is_named(seed, cause):
     told = told_of(Job(seed, cause))
     assert told.status == "contradictory"
