@@ -1,4 +1,4 @@
-"""Do files of one arm agree?  Rates at which contradictions are told, and how true sigmas are.
+"""Do files of one arm agree?  Rates at which contradictions are found, and how true sigmas are.
 
     python -m experiments.agreement [--quick] [--out FOLDER] [--json FILE] [--seed N] [--jobs N] ...
 
@@ -284,7 +284,7 @@ def main(study: Study, count: int, arms: int) -> None:
         some = [t for job, t in zip(jobs, told, strict=True) if job.cause == cause]
         known = sum(t.status == "contradictory" for t in some)
         rows.append((cause or "they agree", len(some), known, sum(t.right for t in some)))
-    table = Table.made("two or three files", rows, "what differs | sets d | told d | right cause d")
+    table = Table.made("two or three files", rows, "what differs | sets d | reported d | right cause d")
     sigma_jobs = [SigmaJob(study.seed + s, k, b) for k in SETS for b in (False, True)
                   for s in range(arms)]  # fmt: skip
     ratios = study.sweep(ratio_of, sigma_jobs, "sigmas")
