@@ -30,8 +30,8 @@ from minimax_cal.ground.parallel import look_for
 STUDIES = (
     "papers", "convergence", "any_base", "algorithm_1", "warm_start", "conditions", "splits",
     "methods", "courses", "solver_accuracy", "external", "blind_gap", "machine_gap", "relative",
-    "relative_gap", "pixels", "coverage", "one_session", "errata", "simulator_gap", "motion_real",
-    "motion_gap", "servos", "motion_blind", "speed",
+    "relative_gap", "agreement", "pixels", "coverage", "one_session", "errata", "simulator_gap",
+    "motion_real", "motion_gap", "servos", "motion_blind", "speed",
 )  # fmt: skip
 
 

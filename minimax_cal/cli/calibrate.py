@@ -141,7 +141,8 @@ def advice(
     """What to do next, and its command.  written: where the result went."""
     from minimax_cal.robots.urdf import ends_of, has_links, is_urdf  # not before it has calibrated
 
-    if not (fit.cell.effects.terms or "effects" in on_command_line()):
+    has_effects = fit.cell.effects.terms or "effects" in on_command_line()
+    if not has_effects and not fit.status.keeps_drawn:
         left = f"{fit.within.after.rms_mm:.3f} mm"
         diagnose = f"minimax-cal diagnose {robot} {' '.join(map(str, data))}"
         yield f"Next, to find the cause of the remaining {left}", diagnose

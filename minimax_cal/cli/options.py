@@ -529,7 +529,7 @@ def together(
     to.undrawn()
     seen = [detected(*files.paths())] if files.given else []
     found = to.work(verb, robot, [*data, *seen], **chosen)
-    return to.finish(found, status=found.status)
+    return to.finish(found, status=found.status, reason=found.reason)
 
 
 def result_options(what: str, *, keep: str = "", figure: str = "") -> Decorator:

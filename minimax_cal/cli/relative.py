@@ -28,7 +28,7 @@ from minimax_cal.ground.errors import OptionError
 @command
 @ROBOT
 @SOME_CAMPAIGNS
-@options_from(Options, "holdout", "seed", "fix", "free", "priors", "effects")
+@options_from(Options, "holdout", "seed", "fix", "free", "priors", "effects", "allow_large_changes")
 @options_from(RelativeOptions)
 @options_from(PixelFiles)
 @options_from(Options, "qp", "method", "loss")

@@ -257,15 +257,16 @@ def check_format(to: str) -> None:
 
 
 def check_kept(known: Opened, keep_anyway: bool) -> None:
-    """Raise OptionError for a calibrated arm that is no better than the drawn one."""
-    if known.status is Status.NO_BETTER and known.number and not keep_anyway:
+    """Raise OptionError for a calibrated arm beside which the drawn one is kept."""
+    if known.status and known.status.keeps_drawn and known.number and not keep_anyway:
         raise kept_back(known.source, known.status)
 
 
 def kept_back(source: str, status: Status) -> OptionError:
     """What is said where the drawn arm should be kept."""
     return OptionError(
-        f"{source}: {status.advice}; with keep_anyway=True the calibrated one is taken all the same"
+        f"{source}: {status}: {status.advice}; with keep_anyway=True the calibrated one is taken "
+        "all the same"
     )
 
 
@@ -283,7 +284,7 @@ def kept(
     """
     check_kept(known, keep_anyway)
     found = delivered(known, to, clock, torques=torques)
-    if found.fit is not None and found.fit.is_no_better and not keep_anyway:
+    if found.fit is not None and found.fit.status.keeps_drawn and not keep_anyway:
         raise kept_back(f"{known.source}: {to}, without {found.lacks}", found.fit.status)
     return found
 

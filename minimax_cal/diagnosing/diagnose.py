@@ -47,12 +47,12 @@ from minimax_cal.diagnosing.what_remains import remaining_of
 from minimax_cal.diagnosing.where import where
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
-from minimax_cal.fitting.claims import too_far
 from minimax_cal.fitting.crossed import MIN_HELD_POSES
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.floor import DISTANCES, Floor, floor_of, noise_at_most, with_instrument
 from minimax_cal.fitting.judged import doubts
 from minimax_cal.fitting.options import Options, Progress, silent
+from minimax_cal.fitting.outcome import FileEvidence, missed_rows
 from minimax_cal.fitting.several.kinds import READ
 from minimax_cal.fitting.several.options import RelativeOptions, check_no_others, with_others
 from minimax_cal.fitting.solve import Solved, fit_cell
@@ -419,7 +419,7 @@ def against(robot: Robot, floor: Floor, last: Step) -> str:
     certain = floor.certain and floor.source != DISTANCES  # which do not hold what the arm does
     known = (floor.value, floor.source) if certain else None
     scores = {"training": (last.train, last.train), "held-out": (last.holdout, last.trusted)}
-    return too_far(robot, known, scores)
+    return missed_rows(robot, FileEvidence(scores, floor=known))
 
 
 # ---- data faults -------------------------------------------------------------------------------

@@ -71,6 +71,11 @@ class RelativeDiagnosis(Explained, Result):
         return f"{where}at least {low:.3f} mm against at most {high:.3f} mm (given)"
 
     @property
+    def reason(self) -> str:
+        """Why its calibration failed or keeps the drawn arm; empty where neither."""
+        return self.calibration.reason
+
+    @property
     def notices(self) -> tuple[str, ...]:
         """What the reader should know."""
         return self.calibration.notices

@@ -270,16 +270,21 @@ class Components:
 
 
 def fit_components(
-    gram: Array, gradient: Array, square: float, dof: int, group: Array
-) -> Components:
+    gram: Array, gradient: Array, square: float, dof: float, group: Array,
+    start: Array | None = None, rounds: int = MAX_ROUNDS, tolerance: float = VARIANCE_TOLERANCE,
+) -> Components:  # fmt: skip
     """Restricted maximum likelihood by its fixed point [Harville 1977].
+
+    start: (g,) variances to begin with.  rounds: at most.  tolerance: that ends them; with 0 the
+    result is a smooth function of what is given.
 
     gram: (c, c) products of the factors' columns, parameters taken out.  gradient: (c,) their
     products with the errors.  square: of the errors.  dof: numbers less parameters.  group: (c,)
     whose factors share a variance.
     """
-    variance, noise = np.ones(int(group.max(initial=-1)) + 1), max(square / dof, MIN_VARIANCE)
-    for _ in range(MAX_ROUNDS):
+    variance = np.ones(int(group.max(initial=-1)) + 1) if start is None else start
+    noise = max(square / dof, MIN_VARIANCE)
+    for _ in range(rounds):
         before = np.append(variance, noise)
         cover = np.linalg.inv(gram / noise + np.diag(1.0 / variance[group]))
         mean = cover @ gradient / noise
@@ -288,6 +293,6 @@ def fit_components(
         left = square - 2.0 * mean @ gradient + mean @ gram @ mean
         noise = max(left / max(dof - told.sum(), 1.0), MIN_VARIANCE)
         variance = np.clip(one, MIN_VARIANCE, MAX_VARIANCE)
-        if np.all(np.abs(np.log(np.append(variance, noise) / before)) < VARIANCE_TOLERANCE):
+        if np.all(np.abs(np.log(np.append(variance, noise) / before)) < tolerance):
             break
     return Components(float(noise), variance, mean, cover + np.outer(mean, mean))

@@ -13,7 +13,7 @@ from minimax_cal.fitting.common_scale import LEAST_SHARE, scale_of, with_links
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import name_first
-from minimax_cal.measuring.checks import best_orders, swapped
+from minimax_cal.measuring.checks import best_orders, check_span, swapped
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.slips import (
     DIGITS,
@@ -42,6 +42,7 @@ MAX_NAMED = 5  # changes that are told one by one
 POOR_FIT = 5e-3  # errors above this share of the arm's reach are not what calibration is about
 EXPLAINED = 0.04  # of the mean square: a slip that leaves no more is the cause
 MAX_ROUNDS = 5
+MAX_MEETING_AXES = 3  # joints of an arm whose axes all meet, as a wrist's; of more it has lengths
 MIN_STRAY_RATIO = 8.0  # times the typical miss, and this share of the reach: no error of the arm
 MIN_STRAY_OF_REACH = 0.02
 MAX_HOME_RATIO = 3.0  # times the typical miss: where a row belongs
@@ -102,11 +103,13 @@ def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
 
     All rows are looked at, those held out too: they judge the fit.
     """
-    if not (robot.mdh[:, :2].any() or robot.prismatic.any()):
+    has_lengths = robot.mdh[:, :2].any() or robot.prismatic.any()
+    if robot.joints > MAX_MEETING_AXES and not has_lengths:
         raise DataError(
             f"{data.source}: {robot.name} has no lengths: every a and d of its joints is 0; "
             "check the robot file"
         )
+    check_span(data)
     check_fresh(robot, data)
     given = fitted(robot, data)
     check_names(robot, data, given)

@@ -4,24 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from minimax_cal.evidence.noise import orthonormal
-from minimax_cal.fitting.accuracy import Accuracy, accuracy
 from minimax_cal.fitting.beyond import Beyond, left_out, not_claimed
 from minimax_cal.fitting.crossed import MIN_HELD_POSES, crossed
-from minimax_cal.fitting.floor import known_floor
-from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.options import Options, known_within
 from minimax_cal.fitting.solve import Solved
 from minimax_cal.fitting.stations import steps_of
-from minimax_cal.fitting.suspects import MIN_POINTS_LEFT, Suspect, aside, held_suspects
+from minimax_cal.fitting.suspects import Suspect, aside, held_suspects
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import name_first
 from minimax_cal.instruments.instrument import PLENTY, anywhere
-from minimax_cal.instruments.protocol import Arm, Given, ResidualRows, by_arm, corners
+from minimax_cal.instruments.protocol import (
+    Arm,
+    FlangePoses,
+    Given,
+    ResidualRows,
+    by_arm,
+    corners,
+)
 from minimax_cal.measuring.grouping import clusters, grouped, parts
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Sessions
@@ -30,7 +36,8 @@ from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import NOTHING, of_sessions
 from minimax_cal.modelling.joint_fit import extended, fitted, refitted
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.parameters import Names, State, zero_positions
+from minimax_cal.modelling.rows import by_pose
 from minimax_cal.robots.kinematics import hat
 from minimax_cal.robots.robot import Robot
 
@@ -40,23 +47,30 @@ if TYPE_CHECKING:
 TOOL = np.array([0.0, 0.0, 0.1])  # a point beside the last axes, in the flange [m]
 OPEN = 1e-4  # of the largest column: positions that a parameter moves by less depend on it no more
 NO_VALUES: Array = np.zeros(0)
+NO_MOTION: Array = np.zeros((0, 0))
+NO_PRIORS: Mapping[str, float] = MappingProxyType({})
 
 
 def position_sigma(
     robot: Robot, mdh: Array, spots: Array, covariance: Array, laws: Laws | None = None,
-    values: Array = NO_VALUES,
+    values: Array = NO_VALUES, moved: Array = NO_MOTION, moment: Array = NO_MOTION,
 ) -> float:  # fmt: skip
-    """RMS of a position's standard deviation at random poses, by the parameters alone [m].
+    """RMS of a position's standard deviation at random poses [m].
 
-    Arguments as of `positions_by`.  covariance: (p, p), NaN where not identified.
+    Arguments as of `positions_by`.  covariance: (p, p), NaN where not identified.  moved: (p, c)
+    how far each factor of the lack of fit moves the parameters, whose covariance is then without
+    it; moment: (c, c) mean of the factors' products.  Without them, by the parameters alone.
     """
     known = np.isfinite(np.diag(covariance))
     known[5 * robot.joints : 5 * robot.joints + 6] = False  # the base, fitted again
-    jacobian = positions_by(robot, mdh, spots, laws, values)
+    jacobian, lack = positions_by(robot, mdh, spots, laws, values), 0.0
+    if moved.size:
+        turned = positions_by_lack(robot, mdh, spots) - jacobian[:, known] @ moved[known]
+        lack = float(np.sum((turned @ moment) * turned))
     # by its square root: where much is known badly, rounding would make the sum itself negative
     spread, axes = np.linalg.eigh(covariance[np.ix_(known, known)])
     root = jacobian[:, known] @ (axes * np.sqrt(np.maximum(spread, 0.0)))
-    return float(np.sqrt(3.0 * (root**2).sum() / len(jacobian)))
+    return float(np.sqrt(3.0 * ((root**2).sum() + lack) / len(jacobian)))
 
 
 def lacking(jacobian: Array, active: Array, asked: Array) -> Array:
@@ -101,19 +115,65 @@ def positions_by(
     target = flange.rotation.reshape(-1, 3) / max(len(spots), 1)
     links, bends = np.split(by, [5 * len(mdh)], axis=1)
     jacobian = np.hstack([links, np.zeros((len(by), 6)), *[target] * len(spots), bends])
-    stiff = arm.at(mdh).place(spot)
+    return without_rigid_motion(jacobian, arm.at(mdh), spots)
+
+
+def without_rigid_motion(motion: Array, flange: FlangePoses, spots: Array) -> Array:
+    """(3 m, p) motion of a point without the best rigid motion of all its positions.
+
+    Where no target is known on the flange, without what another point of the tool does either.
+    """
+    spot = spots.mean(axis=0) if len(spots) else TOOL
+    stiff = flange.place(spot)
     stiff = stiff - stiff.mean(axis=0)
     rigid = np.concatenate([np.tile(np.eye(3), (len(stiff), 1, 1)), -hat(stiff)], axis=2)
+    target = flange.rotation.reshape(-1, 3)
     basis = orthonormal(np.hstack([rigid.reshape(-1, 6), *[target] * (not len(spots))]))
-    return np.asarray(jacobian - basis @ (basis.T @ jacobian))
+    return np.asarray(motion - basis @ (basis.T @ motion))
+
+
+def positions_by_lack(robot: Robot, mdh: Array, spots: Array) -> Array:
+    """(3 m, c) as `positions_by`, per factor of each function of the pose (`rows.by_pose`)."""
+    at, zeros = anywhere(robot, PLENTY), zero_positions(robot.prismatic)
+    arm, spot = Arm.of(robot, at.q), spots.mean(axis=0) if len(spots) else TOOL
+    flange = arm.at(mdh, NO_VALUES, np.isin(np.arange(5 * len(mdh)), zeros))
+    point = flange.place(spot)
+    by_joint = flange.linear + np.cross(flange.angular, point - flange.origin)  # (n, m, 3)
+    by_joint = by_joint[np.argsort(np.argsort(zeros))]
+    motion, _ = by_pose(robot.with_mdh(mdh), arm.q, np.moveaxis(by_joint, 0, -1))
+    return without_rigid_motion(motion.reshape(3 * PLENTY, -1), arm.at(mdh), spots)
+
+
+def drawn_sigmas(robot: Robot, priors: Mapping[str, float] = NO_PRIORS) -> Array:
+    """(5n,) how well the links of a drawing are known: by `drawn_within`, or by a prior [SI]."""
+    within = np.repeat(robot.drawn_within, np.array([2, 3]) * robot.joints)
+    told = known_within(Names.of(robot, ()), priors, "")[: len(within)]
+    return np.where(np.isfinite(told), told, within)
+
+
+def known_positions(robot: Robot, solved: Solved, within: Array) -> tuple[float, float]:
+    """RMS by which positions of the calibrated and of the drawn arm are known, by `position_sigma`.
+
+    within: (5n,) sigmas of the drawing.  Of the drawn one the links that were adopted count.  NaN
+    where no sigma is known [m].
+    """
+    spots, sure = solved.state.target_positions, solved.uncertainty.covariance
+    count = 5 * robot.joints + 6 + spots.size
+    links, active = slice(5 * robot.joints), solved.identification.active[:count]
+    if not np.isfinite(np.diag(sure)[:count][active]).all():
+        return np.nan, np.nan
+    drawn = np.full((count, count), np.nan)
+    drawn[links, links] = np.diag(within**2)
+    drawn[~active] = drawn[:, ~active] = np.nan
+    return (
+        position_sigma(robot, solved.state.mdh, spots, sure[:count, :count]),
+        position_sigma(robot, robot.mdh, spots, drawn),
+    )
 
 
 # ---- what is claimed -----------------------------------------------------------------------------
 
 
-MAX_MISS_OF_REACH = 0.01  # of the reach: a fit that misses by more contradicts its own data
-MAX_MISS_OF_FLOOR = 50.0  # times the floor, likewise
-YIELDS = 0.001  # of the reach: so much a sound arm may bend, however well it comes back
 MAX_NAMED = 5  # poses that a notice names
 WEAK = 3.0  # times what the reflectors miss by: points that are known worse are weakly told
 
@@ -183,51 +243,6 @@ def unjudged(data: Measurements, crossed: Array) -> Iterator[str]:
                 f"{data.source}: {lost.sum()} of {data.poses} poses are needed for the fit, so "
                 f"that none without them judges them: {named}"
             )
-
-
-def contradiction(
-    robot: Robot, data: Measurements, error: Array, held: Array, suspects: Sequence[Suspect]
-) -> str:
-    """Why a fit contradicts its own data; empty where it does not.
-
-    error: (k, m, 3) of all poses [m].  held: (m,).
-    """
-    rest = aside(error, data, suspects)
-    scores = {
-        name: (accuracy(error[:, rows]), accuracy(rest[:, rows]))
-        for name, rows in (("training", ~held), ("held-out", held))
-    }
-    return too_far(robot, known_floor(data, rest, robot.repeatability), scores)
-
-
-def too_far(
-    robot: Robot,
-    floor: tuple[float, str] | None,
-    scores: Mapping[str, tuple[Accuracy, Accuracy]],
-) -> str:
-    """Why a result contradicts its own data; empty where it does not.
-
-    floor: of noise [mm], and how it is known.  scores: of parts of the poses by their names, over
-    all points and without those that are suspect.
-    """
-    limit = 1e3 * MAX_MISS_OF_REACH * robot.reach()
-    what = f"{100 * MAX_MISS_OF_REACH:g} % of the arm's reach"
-    if floor and MAX_MISS_OF_FLOOR * floor[0] < limit:
-        limit = MAX_MISS_OF_FLOOR * floor[0]
-        what = f"{MAX_MISS_OF_FLOOR:g} times the noise floor ({floor[1]})"
-        if limit < 1e3 * YIELDS * robot.reach():
-            limit = 1e3 * YIELDS * robot.reach()
-            what += f" and {100 * YIELDS:g} % of the arm's reach"
-    for name, (whole, left) in scores.items():
-        few = sum(left.counts) < MIN_POINTS_LEFT * sum(whole.counts)
-        miss = whole.rms_mm if few else left.rms_mm  # where most are suspects it is the fit
-        if miss > limit:
-            return (
-                f"the fit misses the {name} poses by {miss:.3g} mm, more than {what}, suspects "
-                "aside: it is no calibration of this arm; check the robot file, joint signs, units "
-                "and the sign of each coordinate"
-            )
-    return ""
 
 
 def errors_of(robot: Robot, data: Measurements, solved: Solved) -> Callable[[State, Array], Array]:

@@ -187,3 +187,48 @@ def best(size: Array, inside: Array, outside: Array, free: int) -> tuple[float, 
     likely = -0.5 * (ee - ec**2 / cc + sizes)
     at = np.unravel_index(int(np.argmax(likely)), likely.shape)
     return float(np.max(-0.5 * (ee + sizes))), float(likely[at]), float(ec[at] / cc[at])
+
+
+# ---- beside the drawing, by any instrument -------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ScaleOfLengths:
+    """By which share the arm's lengths come out longer than drawn, as one factor.
+
+    sigma: of that, by instrument, drawing and by how little one factor explains.  p_value: of no
+    factor.
+    """
+
+    share: float
+    sigma: float
+    p_value: float
+
+
+def but_for_tool(robot: Robot) -> Array:
+    """(5n,) False for lengths of the last link, which are those of the tool and may be anything."""
+    number = np.arange(5 * robot.joints)
+    last = (number % robot.joints) == robot.joints - 1
+    return np.asarray(~((number < 2 * robot.joints) & last))
+
+
+def fit_scale_of_lengths(
+    robot: Robot, links: Array, change: Array, covariance: Array
+) -> ScaleOfLengths | None:
+    """One factor of all lengths, by generalised least squares; None where no length tells it.
+
+    links: (l,) indices of links that were fitted.  change: (l,) from the drawing.  covariance:
+    (l, l) of the fit and of the drawing together [m, rad].
+    """
+    lengths = np.arange(5 * robot.joints) < 2 * robot.joints
+    drawn = np.where(lengths, links_of(robot.mdh), 0.0)[links]
+    dof = len(drawn) - 1
+    if not drawn.any() or dof < 1:
+        return None
+    root = np.linalg.cholesky(covariance)
+    white = np.linalg.solve(root, np.stack([drawn, change], axis=1))
+    told = float(white[:, 0] @ white[:, 0])
+    share = float(white[:, 0] @ white[:, 1]) / told
+    left = float(((white[:, 1] - share * white[:, 0]) ** 2).sum()) / dof
+    sigma = float(np.sqrt(max(left, 1.0) / told))
+    return ScaleOfLengths(share, sigma, float(2.0 * stdtr(dof, -abs(share) / sigma)))

@@ -28,6 +28,7 @@ from minimax_cal.fitting.accuracy import (
 from minimax_cal.fitting.between_sessions import Change
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.crossed import NOT_CROSSED, Within, intervals_of
+from minimax_cal.fitting.disagreement import Contradiction
 from minimax_cal.fitting.found import Parameter, Parameters, parameter_table, table_of_effects
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.minimax_problem import Certificate, Distances, trusted_distances
@@ -184,7 +185,8 @@ class Fit(Result):
     weight of each parameter's nominal value.  widening: what a robust loss adds to all sigmas.
     error_crossed: (k, m, 3) of every pose by a fit without it [m], empty unless cross-validated;
     error_drawn_crossed: the same of the drawn arm.
-    reason: why it failed or is no better than the drawn arm, and what to do; empty where neither.
+    reason: why it failed or keeps the drawn arm, and what to do; empty where neither.
+    contradictions: of the files, each a session.
     set_aside: points that take no part.
     answered: quadratic programs by the backend that answered.  work: what the solvers did.
     moved: what changed between sessions.
@@ -229,6 +231,7 @@ class Fit(Result):
     error_drawn_crossed: Annotated[Array, APART] = field(default_factory=NOT_CROSSED.copy)
     reason: str = ""
     moved: Annotated[tuple[Change, ...], Fact(key="between_sessions")] = ()
+    contradictions: tuple[Contradiction, ...] = ()
 
     def __repr__(self) -> str:
         after, known = self.within.after, sum(p.identifiable for p in self.parameters)
@@ -242,19 +245,14 @@ class Fit(Result):
         """The calibrated robot of geometry alone, usable wherever a robot is.
 
         Beside effects it is fitted without them: that of `cell` is right only together with them.
-        The drawn one where the calibrated arm is no better.
+        The drawn one where its status keeps that.
         """
         return self.kept.robot
 
     @property
     def kept(self) -> Cell:
-        """The arm to use: `geometric`, or the drawn one in its place where that is no better."""
-        return self.nominal if self.is_no_better else self.geometric
-
-    @property
-    def is_no_better(self) -> bool:
-        """Whether the calibrated arm is no better than the drawn one."""
-        return self.status is Status.NO_BETTER
+        """The arm to use: `geometric`, or the drawn one in its place where that is kept."""
+        return self.nominal if self.status.keeps_drawn else self.geometric
 
     @cached_property
     def geometric(self) -> Cell:
@@ -313,7 +311,7 @@ class Fit(Result):
 
     @derived()
     def advice(self) -> str:
-        """What to do where it failed or is no better, else what its status advises."""
+        """What to do where it failed or keeps the drawn arm, else what its status advises."""
         return self.reason or self.status.advice
 
     @property
@@ -632,7 +630,7 @@ class Fit(Result):
         beyond = read(Beyond, content["accuracy"]["beyond"], "accuracy.beyond")
         arrays = {name: array(value, name) for name, value in content["arrays"].items()}
         check_shapes(arrays, names.count, data.take(~held), data)
-        kept = told["status"] is Status.NO_BETTER or not cell.effects.causes
+        kept = told["status"].keeps_drawn or not cell.effects.causes
         found = identified(parameters, names, arrays["singular"], arrays["sensitivity"])
         return {
             "cell": cell,

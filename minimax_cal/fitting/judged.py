@@ -11,40 +11,47 @@ import numpy as np
 
 from minimax_cal.fitting.accuracy import accuracy, by_key
 from minimax_cal.fitting.between_sessions import Change, between_sessions
-from minimax_cal.fitting.checks import POOR_FIT, wild
+from minimax_cal.fitting.checks import MIN_STRAY_OF_REACH, POOR_FIT, exchanged, wild
 from minimax_cal.fitting.claims import (
     bad_rows,
     beyond_of,
     crossed_of,
+    drawn_sigmas,
     is_crossed,
+    known_positions,
     other_points,
     unjudged,
     unseen_suspects,
 )
 from minimax_cal.fitting.common_scale import common_share, with_lack
 from minimax_cal.fitting.crossed import NOT_CROSSED, few_poses
+from minimax_cal.fitting.disagreement import Contradiction
 from minimax_cal.fitting.fit import Fit, KeptDistance, Provenance, Work, WorstCase
+from minimax_cal.fitting.floor import known_floor
 from minimax_cal.fitting.found import Parameters, link_by_link
-from minimax_cal.fitting.options import Options, qp_name
-from minimax_cal.fitting.outcome import (
+from minimax_cal.fitting.improvement import (
     Improvement,
-    compared,
-    exchanged_rows,
     hidden,
-    impossible,
+    improvement,
+    name_outliers,
     no_better,
     rms_of,
-    said_of_exchanged,
     said_without,
 )
+from minimax_cal.fitting.minimax_problem import MIN_TRUSTED_WEIGHT
+from minimax_cal.fitting.options import Options, objective_of, qp_name
+from minimax_cal.fitting.outcome import FileEvidence, FitEvidence, Outcome, judge
+from minimax_cal.fitting.same_arm import computed, least_noise, residual
 from minimax_cal.fitting.set_aside import judged_with
+from minimax_cal.fitting.several.agreement import find_contradicting_sessions
 from minimax_cal.fitting.solve import PER, Solved
 from minimax_cal.fitting.stations import jumps
-from minimax_cal.fitting.suspects import Suspect, contradictions
+from minimax_cal.fitting.suspects import Suspect, aside, contradictions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import Later
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.faults.sessions import session_jumps
+from minimax_cal.measuring.grouping import grouped
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Frames
 from minimax_cal.modelling.cell import Cell
@@ -56,7 +63,6 @@ from minimax_cal.solvers.status import Status
 
 MIN_MULTIPLIER = 1e-6  # a point of a smaller multiplier does not decide
 ACTIVE_TOLERANCE = 1e-6  # a function equals the largest, relative
-ENDED = (Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED)  # with an arm to compare
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,34 +138,86 @@ class Judged:
 
     @cached_property
     def swapped(self) -> Array:
-        """(b,) rows whose points belong to other rows."""
-        return exchanged_rows(self.robot, self.data, self.before)
-
-    @cached_property
-    def wrong(self) -> str:
-        """Why this is no calibration of this arm; empty where it is one."""
-        given = self.robot, self.options, self.solved, self.data, self.held
-        return impossible(*given, self.before, self.after, self.swapped, self.suspects)
+        """(b,) rows whose points belong to other rows: their lines were exchanged."""
+        far = np.nanmax(np.linalg.norm(self.before, axis=-1), initial=0.0)
+        if far > MIN_STRAY_OF_REACH * self.robot.reach():
+            return exchanged(self.robot, self.data)
+        return np.zeros(0, dtype=int)
 
     @cached_property
     def better(self) -> Improvement | None:
-        """Both arms on unseen poses."""
-        return compared(self.options, self.solved, self.data, self.unseen, self.suspects)
+        """Both arms on unseen poses; None without such, or where both are the same arm.
+
+        With an objective of one target that one alone: the others follow.
+        """
+        solved, unseen = self.solved, self.unseen
+        fixed = not solved.identification.active[: solved.state.mdh.size].any()
+        if (fixed and not solved.effects.terms) or not np.isfinite(unseen[1]).any():
+            return None
+        if (target := objective_of(self.options.objective, self.data)) >= 0:
+            others = np.arange(len(self.data.target_names))[:, None] != target
+            unseen = hidden(*unseen, others)
+        group = grouped(self.data, self.options.holdout_by)
+        return improvement(*unseen, group, self.data, self.suspects)
 
     @cached_property
-    def ending(self) -> tuple[Status, str]:
-        """How it ended, and why where it is no calibration or no better than the drawn arm."""
-        status, better = self.solved.status, self.better
-        if self.wrong:
-            return Status.FAILED, self.wrong
-        if better and not better.is_better and status in ENDED:
-            return Status.NO_BETTER, no_better(better, self.suspects, self.data)
-        return status, ""
+    def contradictions(self) -> tuple[Contradiction, ...]:
+        """How sessions contradict each other; none where what changed between them is fitted."""
+        known = any("session" in term.choice for term in self.solved.effects.causes)
+        if len(self.solved.frames) < 2 or known:
+            return ()
+        trusted = self.solved.robust.weights > MIN_TRUSTED_WEIGHT
+        return find_contradicting_sessions(self.robot, self.poses.train, trusted)
+
+    @cached_property
+    def evidence(self) -> FitEvidence:
+        """What the outcome is judged by."""
+        robot, data, solved, held = self.robot, self.data, self.solved, self.held
+        links, active = 5 * robot.joints, solved.identification.active
+        rest = aside(self.after, data, self.suspects)
+        parts = {"training": ~held, "held-out": held}
+        pulling = (solved.robust.weights > MIN_TRUSTED_WEIGHT).any(axis=0)
+        wrong = np.isin(self.swapped, np.flatnonzero(~held)[pulling]).any()
+        noise = least_noise(data, robot.repeatability)
+        drawn_left = residual(self.before, float(active[links:].sum()))
+        left = residual(self.after, float(active.sum()))
+        better = self.better
+        within = drawn_sigmas(robot, self.options.priors)
+        calibrated, drawn = known_positions(robot, solved, within)
+        return FitEvidence(
+            robot,
+            solved.state.mdh,
+            active[:links],
+            [
+                FileEvidence(
+                    {k: (accuracy(self.after[:, rows]), accuracy(rest[:, rows]))
+                     for k, rows in parts.items()},
+                    drawn={k: accuracy(self.before[:, rows]) for k, rows in parts.items()},
+                    floor=known_floor(data, rest, robot.repeatability),
+                )
+            ],
+            sigma=solved.uncertainty.sigma[:links],
+            drawn=within,
+            position_sigma=calibrated,
+            drawn_sigma=drawn,
+            allow_large_changes=self.options.allow_large_changes,
+            objection=said_of_exchanged(data, self.swapped) if wrong else "",
+            computed=computed(data, drawn_left, noise, "the drawn arm")
+            or computed(data, left, noise, "the calibrated arm"),
+            contradictions=self.contradictions,
+            worse=no_better(better) if better and not better.is_better else "",
+            outliers=name_outliers(self.suspects, data),
+        )  # fmt: skip
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """How it ended."""
+        return judge(self.evidence, self.solved.status)
 
     @cached_property
     def moved(self) -> tuple[Change, ...]:
         """What changed between sessions."""
-        if self.wrong:
+        if self.outcome.status is Status.FAILED:
             return ()
         return between_sessions(self.robot, self.poses.train, self.solved, self.cell)
 
@@ -172,7 +230,7 @@ class Judged:
     def notices(self) -> tuple[str, ...]:
         """What the reader should know."""
         data, better, after = self.data, self.better, self.after
-        swapped = len(self.swapped) and not self.wrong
+        swapped = len(self.swapped) and self.outcome.status is not Status.FAILED
         return (
             *self.poses.notices,
             *self.solved.notices,
@@ -187,7 +245,7 @@ class Judged:
             *other_points(self.robot, self.solved, after),
             *([said_of_exchanged(data, self.swapped)] if swapped else []),
             *([said_without(better, rms_of(*self.unseen))] if better and better.wrong else []),
-            *filter(None, [self.ending[1]]),
+            *filter(None, [self.outcome.reason]),
         )
 
     def fit(self, began: float) -> Fit:
@@ -195,14 +253,13 @@ class Judged:
         solved, options, data, held = self.solved, self.options, self.data, self.held
         before, after, (drawn_crossed, crossed) = self.before, self.after, self.crossed
         gone, counted = judged_with(data, held, self.cell, after, crossed, solved, options)
-        status, reason = self.ending
         given = self.robot, options, data, held, solved, self.suspects
         return Fit(
             cell=self.cell,
             nominal=self.nominal,
             objective=options.objective,
             qp=qp_name(options.qp),
-            status=status,
+            status=self.outcome.status,
             iterations=solved.iterations,
             parameters=parameters_of(self.robot, solved),
             accuracy={
@@ -232,10 +289,19 @@ class Judged:
             answered=solved.optimum.answered if solved.optimum else {},
             work=work_of(solved),
             error_drawn_crossed=drawn_crossed,
-            reason=reason,
+            reason=self.outcome.reason,
             moved=self.moved,
+            contradictions=self.evidence.contradictions,
             seconds=time.perf_counter() - began,
         )
+
+
+def said_of_exchanged(data: Measurements, rows: Array) -> str:
+    """That rows hold each other's points, by their names or lines."""
+    return (
+        f"{data.source}: rows hold each other's points: {data.list_rows(rows)}; put their joint "
+        "values and points right, or delete them"
+    )
 
 
 def work_of(solved: Solved) -> Work:

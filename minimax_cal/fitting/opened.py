@@ -239,8 +239,7 @@ def of_relative(content: Mapping[str, Any], source: str) -> Opened:
     alone = bare(calibrated)
     whole = cell_from_dict(content["cell"], f"{source}: cell") if content.get("cell") else alone
     rungs = (Rung(NOMINAL, bare("nominal_robot")), Rung(CALIBRATED, whole))
-    kept = content.get("status") == Status.NO_BETTER  # the drawn arm is the robot of such a file
-    status = Status.NO_BETTER if kept else None
+    status = Status(content["status"]) if "status" in content else None
     known = whole.effects.causes
     firm = {term.text for term in established(content, source)} if "diagnosis" in content else None
     possible = frozenset(term.text for term in known) - firm if firm is not None else frozenset()

@@ -1,220 +1,198 @@
-"""How a calibration ended: impossible, no better than the drawn arm, or neither.
+"""How any fit ended: one list of questions, asked of what was fitted, whatever instrument saw it.
 
-Both are judged on the same poses by the same rule: base, targets and frames of the drawn arm are
-fitted to the same training poses as the calibrated arm is.  The comparison is paired, pose by pose,
-so that what both miss alike, as noise, does not count.
+A fit tells its evidence, file by file; `judge` asks the questions in their order, and the first one
+that finds something says how it ended.  Status, exit code, first sentence, files, report and page
+read the outcome and nothing else.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from minimax_cal.fitting.accuracy import accuracy
-from minimax_cal.fitting.checks import MIN_STRAY_OF_REACH, exchanged, too_changed
-from minimax_cal.fitting.claims import contradiction
-from minimax_cal.fitting.minimax_problem import MIN_TRUSTED_WEIGHT
-from minimax_cal.fitting.options import Options, objective_of
-from minimax_cal.fitting.same_arm import computed, least_noise, residual
-from minimax_cal.fitting.solve import Solved
-from minimax_cal.fitting.suspects import MIN_POINTS_LEFT, Suspect, aside
+from minimax_cal.fitting.accuracy import Accuracy
+from minimax_cal.fitting.checks import too_changed
+from minimax_cal.fitting.disagreement import Contradiction
+from minimax_cal.fitting.suspects import MIN_POINTS_LEFT
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.units import for_people
 from minimax_cal.ground.words import name_first
-from minimax_cal.measuring.grouping import grouped
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.parameters import Names, links_of
 from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers.status import Status
 
-# A point that both arms miss by so many times what lies between them there does not say which of
-# them is right; a point that only the calibrated arm misses does, and counts.
-MIN_COMMON_MISS = 2.0
-
-MAX_NAMED = 5  # points that a reason names
+MAX_MISS_OF_REACH = 0.01  # of the reach: a fit that misses by more contradicts its own data
+MAX_MISS_OF_FLOOR = 50.0  # times the floor, likewise
+YIELDS = 0.001  # of the reach: so much a sound arm may bend, however well it comes back
+MAX_ROTATION_MISS = 0.05  # RMS by which no calibrated arm misses measured rotations [rad]
+MIN_CHANGE_SIGMAS = 3.0  # a change below so many sigmas is not shown
+MAX_NAMED = 5  # values that a reason names
+JUDGED = (Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED)  # with an arm to compare
 
 
 @dataclass(frozen=True)
-class Improvement:
-    """RMS of the drawn and of the calibrated arm on the same points [mm].
+class FileEvidence:
+    """How well a fit meets one of its files.
 
-    gain: by how much the mean square is lower [mm^2].  error: standard error of that.
-    wrong: points that both arms miss and that were set aside, as a clause; empty for none.
+    source: empty where there is only one.  check: what to check where it contradicts the arm.
+    scores: by part of the poses, accuracy over all rows and without outliers.  rotations: RMS by
+    part [rad].  drawn: accuracy of the drawn arm by part.  floor: of noise [mm], and how it is
+    known; None where it is not.
     """
 
-    before: float
-    after: float
-    gain: float
-    error: float
-    wrong: str = ""
-
-    @property
-    def is_better(self) -> bool:
-        """Whether the calibrated arm is better by one standard error; True where none is known."""
-        return not (self.gain <= self.error)
-
-    @property
-    def numbers(self) -> str:
-        """Calibrated against drawn, for people."""
-        return f"{self.after:#.3g} against {self.before:#.3g} mm"
+    scores: Mapping[str, tuple[Accuracy, Accuracy]]
+    source: str = ""
+    check: str = "the sign of each coordinate"
+    rotations: Mapping[str, float] = field(default_factory=dict)
+    drawn: Mapping[str, Accuracy] = field(default_factory=dict)
+    floor: tuple[float, str] | None = None
 
 
-def compare_arms(drawn: Array, calibrated: Array, group: Array) -> Improvement:
-    """The paired comparison of errors (k, m, 3) at the points that both have [m].
+@dataclass(frozen=True, eq=False)
+class FitEvidence:
+    """What the outcome of a fit is judged by.
 
-    group: (m,) poses with one number belong together and count once.
+    robot: as drawn.  mdh: (n, 5) as calibrated.  active: (5n,) True for adopted links.  sigma:
+    (5n,) of these, lack of fit included, NaN where not known; drawn: (5n,) of the drawing [m, rad].
+    position_sigma, drawn_sigma: RMS over the joints' range by which positions of the calibrated and
+    of the drawn arm are known [m]; NaN where not known.  objection: what an instrument itself holds
+    against the fit, computed: why its points were not measured, worse: why the drawn arm is no
+    worse, outliers: to be checked where the drawn arm is kept; each empty for none.  doubts: that
+    decide nothing.
     """
-    both = np.isfinite(drawn[..., 0]) & np.isfinite(calibrated[..., 0])
-    each = [np.where(both, 1e6 * (error**2).sum(axis=-1), 0.0) for error in (drawn, calibrated)]
-    names, member = np.unique(group, return_inverse=True)
-    parts = (both, each[0] - each[1])
-    count, lower = (np.bincount(member, part.sum(axis=0), len(names)) for part in parts)
-    lower, count = lower[count > 0.0], count[count > 0.0]
-    points, poses = count.sum(), len(count)
-    before, after = (float(np.sqrt(square.sum() / points)) if poses else np.nan for square in each)
-    if poses < 2:
-        return Improvement(before, after, np.nan, np.nan)
-    gain = float(lower.sum() / points)
-    off = lower - gain * count  # of a ratio of sums, to first order
-    error = float(np.sqrt((off**2).sum() * poses / (poses - 1.0)) / points)
-    return Improvement(before, after, gain, error)
+
+    robot: Robot
+    mdh: Array
+    active: Array
+    files: Sequence[FileEvidence]
+    sigma: Array
+    drawn: Array
+    position_sigma: float = np.nan
+    drawn_sigma: float = np.nan
+    allow_large_changes: bool = False
+    objection: str = ""
+    computed: str = ""
+    contradictions: tuple[Contradiction, ...] = ()
+    worse: str = ""
+    outliers: str = ""
+    doubts: tuple[str, ...] = ()
 
 
-def improvement(
-    drawn: Array,
-    calibrated: Array,
-    group: Array,
-    data: Measurements,
-    suspects: Sequence[Suspect],
-) -> Improvement:
-    """The comparison of all points; without wrong points where these alone hide what is better.
+@dataclass(frozen=True)
+class Outcome:
+    """How a fit ended, and why where its arm is not to be used as it is."""
 
-    drawn, calibrated: (k, m, 3) errors [m], NaN where not judged.  group: (m,).  suspects: points
-    that stand out from the calibrated arm.
+    status: Status
+    reason: str = ""
+
+
+def find_missed_rows(evidence: FitEvidence) -> str:
+    """Why the fit contradicts its own rows; empty where it does not."""
+    found = (missed_rows(evidence.robot, one) for one in evidence.files)
+    return next(filter(None, found), "")
+
+
+def missed_rows(robot: Robot, file: FileEvidence) -> str:
+    """Why a fit contradicts the rows of a file; empty where it does not."""
+    limit = 1e3 * MAX_MISS_OF_REACH * robot.reach()
+    what = f"{100 * MAX_MISS_OF_REACH:g} % of the arm's reach"
+    if file.floor and MAX_MISS_OF_FLOOR * file.floor[0] < limit:
+        limit = MAX_MISS_OF_FLOOR * file.floor[0]
+        what = f"{MAX_MISS_OF_FLOOR:g} times the noise floor ({file.floor[1]})"
+        if limit < 1e3 * YIELDS * robot.reach():
+            limit = 1e3 * YIELDS * robot.reach()
+            what += f" and {100 * YIELDS:g} % of the arm's reach"
+    of_file = f" of {file.source}" if file.source else ""
+    for name, (whole, trusted) in file.scores.items():
+        few = sum(trusted.counts) < MIN_POINTS_LEFT * sum(whole.counts)
+        miss = whole.rms_mm if few else trusted.rms_mm  # where most are suspects it is the fit
+        if miss > limit:
+            return (
+                f"the fit misses the {name} poses{of_file} by {miss:.3g} mm, more than {what}, "
+                "suspects aside: it is no calibration of this arm; check the robot file, joint "
+                f"signs, units and {file.check}"
+            )
+    return ""
+
+
+def find_missed_rotations(evidence: FitEvidence) -> str:
+    """Why measured rotations are those of another convention; empty where they are met."""
+    for file in evidence.files:
+        for name, miss in file.rotations.items():
+            if miss > MAX_ROTATION_MISS:
+                of_file = f" of {file.source}" if file.source else ""
+                return (
+                    f"the fit misses the rotations of the {name} poses{of_file} by "
+                    f"{1e3 * miss:.3g} mrad RMS: check what their columns hold (a rotation vector, "
+                    "a quaternion with w first, or Euler angles in another order)"
+                )
+    return ""
+
+
+def find_another_arm(evidence: FitEvidence) -> str:
+    """Why the measured arm is not the drawn one; empty where it is.
+
+    A large change is one of the arm only where the drawn arm misses what was measured: else the
+    measurements do not show it.
     """
-    whole = compare_arms(drawn, calibrated, group)
-    if whole.is_better:
-        return whole
-    between = np.linalg.norm(drawn - calibrated, axis=-1)
-    alike = np.linalg.norm(calibrated, axis=-1) > MIN_COMMON_MISS * between
-    wrong = alike & np.isnan(aside(calibrated, data, suspects)[..., 0])
-    judged = np.isfinite(calibrated[..., 0])
-    if not (wrong & judged).any() or (judged & ~wrong).sum() < MIN_POINTS_LEFT * judged.sum():
-        return whole
-    less = compare_arms(*hidden(drawn, calibrated, wrong), group)
-    named = points_of(data, wrong & judged, calibrated)
-    return replace(less, wrong=named) if less.is_better else whole
+    robot, seen = evidence.robot, [a.rms_mm for one in evidence.files for a in one.drawn.values()]
+    if evidence.allow_large_changes or max(seen, default=np.inf) < 1e3 * YIELDS * robot.reach():
+        return ""
+    return too_changed(robot, evidence.mdh, evidence.active)
 
 
-def points_of(data: Measurements, which: Array, error: Array) -> str:
-    """Points in words.  which: (k, m).  error: (k, m, 3) [m]."""
-    size = 1e3 * np.linalg.norm(error, axis=-1)
-    shown = [
-        f"{data.called(data.line[pose])} {data.target_names[target]} {size[target, pose]:.3g} mm"
-        for target, pose in np.argwhere(which).tolist()
-    ]
-    return name_first(shown, MAX_NAMED)
+def find_contradictions(evidence: FitEvidence) -> str:
+    """How files contradict each other; empty where they do not."""
+    return "; ".join(one.sentence for one in evidence.contradictions)
 
 
-def no_better(found: Improvement, suspects: Sequence[Suspect], data: Measurements) -> str:
-    """The sentence for an arm that is no better than the drawn one, and what to do."""
-    off = [one.text(data) for one in suspects]
-    rows = f"; check the outliers ({name_first(off, MAX_NAMED)})" if off else ""
+def find_undetermined_values(evidence: FitEvidence) -> str:
+    """Why the drawing is known better than what was measured; empty where it is not.
+
+    Values count that are less sure than drawn and whose change is not shown.  One of them alone may
+    be: of lengths that move the arm alike each is poorly known, and the arm is not.  What decides
+    are positions.
+    """
+    robot, drawn = evidence.robot, evidence.drawn
+    change = np.abs(links_of(evidence.mdh - robot.mdh))
+    with np.errstate(invalid="ignore"):
+        vague = evidence.active & (evidence.sigma > drawn)
+        vague &= change < MIN_CHANGE_SIGMAS * evidence.sigma
+    if robot.rough or not vague.any() or not evidence.position_sigma > evidence.drawn_sigma:
+        return ""
+    names, times = Names.of(robot, ()), evidence.sigma / drawn
+    worst = [i for i in np.argsort(-np.nan_to_num(times)) if vague[i]]
+    named = []
+    for i in worst:
+        scale, unit = for_people("m" if names.linear[i] else "rad")
+        named.append(f"{names.all[i]} (sigma {scale * evidence.sigma[i]:.3g} {unit})")
     return (
-        f"The calibrated arm is no better than the drawn one ({found.numbers} on new poses): keep "
-        "the drawn arm, or calibrate again with more poses, joint values with all their digits "
-        f"and less noise{rows}"
+        f"these measurements do not determine {name_first(named, MAX_NAMED)}: positions of the "
+        f"calibrated arm are known to {1e3 * evidence.position_sigma:.3g} mm, of the drawn one to "
+        f"{1e3 * evidence.drawn_sigma:.3g} mm (drawn_within of the robot); the drawn arm is kept; "
+        "measure more poses, and directions that are not measured yet, or fix these parameters"
+        f"{evidence.outliers}"
     )
 
 
-def said_without(found: Improvement, whole: tuple[float, float]) -> str:
-    """Notice that wrong points hide what is better.  whole: RMS before and after of all [mm]."""
-    return (
-        f"points that the drawn and the calibrated arm both miss ({found.wrong}) hide the "
-        f"improvement on new poses: {whole[0]:#.3g} -> {whole[1]:#.3g} mm with them, "
-        f"{found.before:#.3g} -> {found.after:#.3g} mm without; correct or delete these rows"
-    )
+QUESTIONS: tuple[tuple[Status, Callable[[FitEvidence], str]], ...] = (  # the first one that finds
+    (Status.FAILED, lambda evidence: evidence.objection),
+    (Status.FAILED, find_missed_rows),
+    (Status.FAILED, find_missed_rotations),
+    (Status.FAILED, find_another_arm),
+    (Status.FAILED, lambda evidence: evidence.computed),
+    (Status.CONTRADICTORY, find_contradictions),
+    (Status.NOT_DETERMINED, find_undetermined_values),
+    (Status.NO_BETTER, lambda evidence: evidence.worse and evidence.worse + evidence.outliers),
+)
 
 
-def rms_of(drawn: Array, calibrated: Array) -> tuple[float, float]:
-    """RMS of both at the points that both have [mm]."""
-    both = np.isfinite(drawn) & np.isfinite(calibrated)
-    before, after = (accuracy(np.where(both, one, np.nan)).rms_mm for one in (drawn, calibrated))
-    return before, after
-
-
-# ---- how it ended --------------------------------------------------------------------------------
-
-
-def exchanged_rows(robot: Robot, data: Measurements, before: Array) -> Array:
-    """(b,) rows whose points belong to other rows.  before: (k, m, 3) errors as drawn [m]."""
-    far = np.nanmax(np.linalg.norm(before, axis=-1), initial=0.0)
-    if far > MIN_STRAY_OF_REACH * robot.reach():
-        return exchanged(robot, data)
-    return np.zeros(0, dtype=int)
-
-
-def said_of_exchanged(data: Measurements, rows: Array) -> str:
-    """That rows hold each other's points, by their names or lines."""
-    return (
-        f"{data.source}: rows hold each other's points: {data.list_rows(rows)}; put their joint "
-        "values and points right, or delete them"
-    )
-
-
-def impossible(
-    robot: Robot,
-    options: Options,
-    solved: Solved,
-    data: Measurements,
-    held: Array,
-    before: Array,
-    after: Array,
-    swapped: Array,
-    suspects: Sequence[Suspect],
-) -> str:
-    """Why this is no calibration of this arm; empty where it is one.
-
-    held: (m,).  before, after: (k, m, 3) errors as drawn and as calibrated [m].  swapped: rows
-    whose points belong to other rows.
-    """
-    active, links = solved.identification.active, 5 * robot.joints
-    noise, train = least_noise(data, robot.repeatability), np.flatnonzero(~held)
-    pulling = np.isin(swapped, train[(solved.robust.weights > MIN_TRUSTED_WEIGHT).any(axis=0)])
-    if pulling.any():
-        return said_of_exchanged(data, swapped)
-    changed = ""
-    if not options.allow_large_changes:
-        changed = too_changed(robot, solved.state.mdh, active[:links])
-    placed = float(active[links:].sum())
-    return (
-        contradiction(robot, data, after, held, suspects)
-        or changed
-        or computed(data, residual(before, placed), noise, "the drawn arm")
-        or computed(data, residual(after, float(active.sum())), noise, "the calibrated arm")
-    )
-
-
-def compared(
-    options: Options,
-    solved: Solved,
-    data: Measurements,
-    unseen: tuple[Array, Array],
-    suspects: Sequence[Suspect],
-) -> Improvement | None:
-    """Drawn and calibrated arm on poses that neither has seen; None where there are none, or where
-    the calibrated arm is the drawn one.
-
-    unseen: (k, m, 3) errors of both, NaN at poses that were seen [m].
-    """  # fmt: skip
-    fixed = not solved.identification.active[: solved.state.mdh.size].any()
-    if (fixed and not solved.effects.terms) or not np.isfinite(unseen[1]).any():
-        return None
-    if (target := objective_of(options.objective, data)) >= 0:  # the other targets follow
-        unseen = hidden(*unseen, np.arange(len(data.target_names))[:, None] != target)
-    return improvement(*unseen, grouped(data, options.holdout_by), data, suspects)
-
-
-def hidden(drawn: Array, calibrated: Array, which: Array) -> tuple[Array, Array]:
-    """Errors (k, m, 3) of two arms without some points.  which: (k, m), or what broadcasts."""
-    gone = np.broadcast_to(which, drawn.shape[:2])[..., None]
-    return np.where(gone, np.nan, drawn), np.where(gone, np.nan, calibrated)
+def judge(evidence: FitEvidence, ended: Status) -> Outcome:
+    """How a fit ended.  ended: how its solver did; a fit that never arrived has no arm to keep."""
+    for status, find in QUESTIONS:
+        reason = find(evidence) if status is Status.FAILED or ended in JUDGED else ""
+        if reason:
+            return Outcome(status, reason)
+    return Outcome(ended)

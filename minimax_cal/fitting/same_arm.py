@@ -8,8 +8,8 @@ import numpy as np
 
 from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.checks import check_plausible
-from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
 from minimax_cal.fitting.floor import SIGMAS, declared
+from minimax_cal.fitting.outcome import MAX_MISS_OF_REACH
 from minimax_cal.fitting.solve import LEAST_POSES
 from minimax_cal.fitting.stations import stationed
 from minimax_cal.ground.arrays import Array

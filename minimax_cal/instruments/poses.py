@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.instrument import (
     Columns,
+    Slip,
     Told,
     Words,
     bare,
@@ -27,6 +29,7 @@ from minimax_cal.instruments.reflectors import LEVER, posed, reflectors, spots_o
 from minimax_cal.instruments.tracker import Points
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import FARTHEST, Measurements, joint_rows
+from minimax_cal.measuring.slips import MAX_TRIAL_POSES
 from minimax_cal.modelling.cell import pose_to_dict
 from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.kinematics import hat, rotation_vector
@@ -38,6 +41,9 @@ TURN = re.compile(r"flange_r([xyz])_(rad|deg)")
 QUATERNION = re.compile(r"flange_q([wxyz])()")
 FLANGE = re.compile(r"flange_(?:[xyz]_(?:mm|m)|r[xyz]_(?:rad|deg)|q[wxyz])")
 DOUBTS = re.compile(r"(?:rotation_)?u95_(mm|m|rad|deg)")
+INVERSE = np.array([1.0, -1.0, -1.0, -1.0])
+QUATERNION_ORDER = "give qw, qx, qy, qz of the flange in the measurement frame"
+AS_VECTOR = "write them as a rotation vector, or as a quaternion"
 NORM = 1e-3  # a quaternion farther from unit length is no rotation
 TOOL = ("tool_x", "tool_y", "tool_z", "tool_rx", "tool_ry", "tool_rz")
 
@@ -46,7 +52,8 @@ TOOL = ("tool_x", "tool_y", "tool_z", "tool_rx", "tool_ry", "tool_rz")
 class WholePoses(Points):
     """Whole poses, as virtual reflectors.
 
-    pose: (m, 4, 4) of the flange in the measurement frame [m].  lever: that a radian counts as [m].
+    pose: (m, 4, 4) of the flange in the measurement frame [m].  written: (m, 3) or (m, 4) numbers
+    of the columns that hold its rotation.  lever: that a radian counts as [m].
 
     With four reflectors their errors' covariance is 4 s^2 times the projector on rigid motions, s^2
     being the variance of a coordinate of the pose.  No other motion is in the fit's slopes, so that
@@ -55,12 +62,13 @@ class WholePoses(Points):
     """
 
     pose: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    written: Array = field(default_factory=lambda: np.zeros((0, 3)))
     lever: float = LEVER
     whence: str = ""
 
     kind = "poses"
     words = Words(quantity="position of the flange", of_position=True, whole="the tool")
-    by_row = ("pose",)
+    by_row = ("pose", "written")
     chosen = ("drawn", "lever", "whence")
     options = ("lever",)
     row_noise = 2.0  # of the root of its four reflectors
@@ -184,6 +192,20 @@ class WholePoses(Points):
             out |= {stem + name: pose_to_dict(pose) for name, pose in places.items()}
         return out | {"lever_mm": 1e3 * self.lever}
 
+    # ---- slips and remarks -------------------------------------------------------------------
+
+    def tried(self) -> WholePoses:
+        """At some of the poses."""
+        rows = np.linspace(0, self.poses - 1, min(self.poses, MAX_TRIAL_POSES)).astype(int)
+        return self.take(rows)
+
+    def slips(self) -> Iterator[Slip]:
+        """Rotations of another kind, order or unit than the columns say."""
+        for text, turn in rotations_as(self.written):
+            pose = self.pose.copy()
+            pose[:, :3, :3] = turn
+            yield text, replace(self, pose=pose)
+
     def remarks(self, parameters: Sequence[Any], noise: float) -> tuple[str, ...]:
         """What a radian counts as."""
         return (f"a radian counts as {1e3 * self.lever:.4g} mm ({self.whence})",)
@@ -192,7 +214,9 @@ class WholePoses(Points):
 def flange_poses(q: Array, pose: Array, **columns: Array) -> WholePoses:
     """Whole poses from arrays.  q: (m, n) [rad, m].  pose: (m, 4, 4) [m]."""
     pose = np.array(pose, dtype=float)
-    return checked(WholePoses(bare(q, columns, pose=pose), pose=pose))
+    at = bare(q, columns, pose=pose)
+    written = np.zeros((len(pose), 3))  # given as matrices
+    return checked(WholePoses(at, pose=pose, written=written))
 
 
 def poses_as_targets(data: WholePoses, lever: float = LEVER, count: int = 4) -> Measurements:
@@ -241,7 +265,7 @@ def read(file: Rows) -> WholePoses:
     pose[seen, :3, :3] = (
         Rotation.from_rotvec(turn[seen]) if vector.shape[1] else unit_rotation(file, turn, seen)
     ).as_matrix()
-    return without_blind(WholePoses(at, pose=pose), blind)
+    return without_blind(WholePoses(at, pose=pose, written=np.nan_to_num(turn)), blind)
 
 
 def unit_rotation(file: Rows, quaternion: Array, seen: Array) -> Rotation:
@@ -255,6 +279,40 @@ def unit_rotation(file: Rows, quaternion: Array, seen: Array) -> Rotation:
             f"length {length[row]:.4g}, not 1"
         )
     return Rotation.from_quat(quaternion[seen], scalar_first=True)
+
+
+def rotations_as(written: Array) -> Iterator[tuple[str, Array]]:
+    """What columns of a rotation may hold instead: what to say, and the rotations (m, 3, 3).
+
+    written: (m, 3) of a rotation vector, or (m, 4) of a quaternion with the scalar first.
+    """
+    if not written.any():
+        return
+    if written.shape[1] == 4:
+        for text, quaternion in (
+            ("with its scalar last", np.roll(written, 1, axis=1)),
+            ("of the measurement frame in the flange's: conjugate it", written * INVERSE),
+        ):
+            turn = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+            yield f"flange_qw ... looks like a quaternion {text}; {QUATERNION_ORDER}", turn
+        return
+    first, *others = ("".join(order) for order in permutations("xyz"))
+    tripled = [a + b + a for a, b in permutations("xyz", 2)]
+    stem = "flange_rx, flange_ry, flange_rz look like"
+    for unit, scale in (("", 1.0), (" in degrees", np.pi / 180.0), (" in radians", 180.0 / np.pi)):
+        turn = Rotation.from_rotvec(scale * written).as_matrix()
+        if unit:
+            yield f"{stem} a rotation vector{unit}: name their unit in the columns", turn
+        yield (
+            f"{stem} the rotation vector{unit} of the measurement frame in the flange's: give the "
+            "flange's in the measurement frame",
+            np.swapaxes(turn, 1, 2),
+        )
+        for order in (first, *others, *tripled):
+            for axes, about in ((order, "fixed"), (order.upper(), "moving")):
+                turn = Rotation.from_euler(axes, scale * written).as_matrix()
+                named = " ".join(f"R{axis}" for axis in order)
+                yield f"{stem} Euler angles{unit} about {about} axes, {named}; {AS_VECTOR}", turn
 
 
 def lever_of(columns: Mapping[str, Array], lever: float | None) -> tuple[float, str]:

@@ -27,7 +27,7 @@ from minimax_cal.instruments.instrument import (
 from minimax_cal.instruments.options import InstrumentOptions
 from minimax_cal.instruments.protocol import FlangePoses, ResidualRows
 from minimax_cal.measuring.measurements import FARTHEST, joint_rows
-from minimax_cal.measuring.slips import MAX_TRIAL_POSES
+from minimax_cal.measuring.slips import MAX_TRIAL_POSES, UNITS_OF_LENGTH
 from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.robot import Robot
 
@@ -199,12 +199,10 @@ class Lengths(Instrument):
 
     def slips(self) -> Iterable[Slip]:
         """Units that were taken for others."""
-        texts = {
-            1e-3: "the lengths look like millimetres given as metres: name the columns wire1_mm, "
-            "...",
-            1e3: "the lengths look like metres given as millimetres: name the columns wire1_m, ...",
-        }
-        return [(text, replace(self, length=unit * self.length)) for unit, text in texts.items()]
+        return [
+            (text.format("the lengths", "wire1"), replace(self, length=unit * self.length))
+            for unit, text in UNITS_OF_LENGTH.items()
+        ]
 
     def remarks(self, parameters: Sequence[Any], noise: float) -> tuple[str, ...]:
         """How weakly the offsets of wires are determined."""

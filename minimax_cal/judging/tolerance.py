@@ -171,6 +171,8 @@ def open_of(found: Beyond) -> str:
 
 REFUSED = {  # ends of a calibration of which nothing is passed, whatever its numbers
     Status.FAILED: "the calibration failed",
+    Status.CONTRADICTORY: "the files contradict each other",
+    Status.NOT_DETERMINED: "the measurements do not determine the arm",
     Status.NO_BETTER: "the calibrated arm is no better than the drawn one",
 }
 

@@ -50,6 +50,19 @@ def check_joints(robot: Robot, data: Measurements) -> Measurements:
     return data
 
 
+MIN_SPAN = 5e-3  # of some joint, in measurements that could tell anything of an arm [rad, m]
+
+
+def check_span(data: Measurements) -> None:
+    """Raise DataError where no joint moves, whatever was measured."""
+    moved = float(np.ptp(data.q, axis=0).max(initial=0.0)) if data.poses else 0.0
+    if data.poses > 1 and moved < MIN_SPAN:
+        raise DataError(
+            f"{data.source}: the joint values do not move ({np.degrees(moved):.2f} deg at most) "
+            f"over {data.poses} poses: were they read once? record them at each pose"
+        )
+
+
 def with_passive(robot: Robot, data: Measurements) -> Measurements:
     """The data with columns of 0 for joints without a drive.  Raises DataError for another arm."""
     n, driven = data.q.shape[1], np.flatnonzero(~robot.passive)

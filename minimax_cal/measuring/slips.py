@@ -29,6 +29,12 @@ STILL = 0.01  # a flange that moved farther leaves no point where it was [m]
 DEGREE = np.pi / 180.0
 OF_ROBOT = "(or the robot file gives {} under the unit {})"
 INCHES = "the points look like inches given as {}: minimax-cal import {{}} --units smr=in -o "
+UNITS_OF_LENGTH = {  # by what to multiply, and what to say of what, in columns of which beginning
+    1e-3: "{0} look like millimetres given as metres: name the columns {1}_mm, ...",
+    1e3: "{0} look like metres given as millimetres: name the columns {1}_m, ...",
+    INCH: "{0} look like inches given as millimetres: multiply them by 25.4",
+    1e-3 * INCH: "{0} look like inches given as metres: multiply them by 0.0254",
+}
 SCALED = (  # what to say, and by what to multiply turning joints and points; likely ones first
     ("the measurement frame looks left-handed; reverse one of its axes",
      1.0, np.array([1.0, 1.0, -1.0])),

@@ -13,12 +13,19 @@ class Status(StrEnum):
     STALLED = "stalled"
     INFEASIBLE = "infeasible"
     FAILED = "failed"
+    CONTRADICTORY = "contradictory"
+    NOT_DETERMINED = "not_determined"
     NO_BETTER = "no_better"
 
     @property
     def advice(self) -> str:
         """What to try next."""
         return ADVICE[self]
+
+    @property
+    def keeps_drawn(self) -> bool:
+        """Whether the result's arm is the drawn one, and the fitted one is given only on demand."""
+        return self in (Status.CONTRADICTORY, Status.NOT_DETERMINED, Status.NO_BETTER)
 
 
 ADVICE = {
@@ -31,6 +38,10 @@ ADVICE = {
     "them (in a calibration the distance tolerance)",
     Status.FAILED: "the numbers broke down, or the result contradicts its own data; check the "
     "robot file, units and joint signs, or try another QP backend",
+    Status.CONTRADICTORY: "the files contradict each other; find what differs between them, or "
+    "calibrate from one",
+    Status.NOT_DETERMINED: "the measurements determine the arm less well than the drawing does; "
+    "measure more, of more kinds, or fix parameters",
     Status.NO_BETTER: "the calibrated arm is no better than the drawn one on new poses; keep the "
     "drawn arm",
 }

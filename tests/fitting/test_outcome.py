@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.checks import LARGE_LENGTH, too_changed
-from minimax_cal.fitting.outcome import compare_arms, improvement
+from minimax_cal.fitting.improvement import compare_arms, improvement
 from minimax_cal.fitting.same_arm import FRACTION, check_arm, least_noise
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.measuring.measurements import Measurements
@@ -32,6 +32,9 @@ EXACT = Truth(compliance=0.0, noise=0.0, noise_per_metre=0.0)
 def as_measured(data: Measurements) -> Measurements:
     """The same points without the word that they are simulated."""
     return replace(data, simulated=False)
+
+
+AS_DRAWN = Truth(length=1e-12, angle=1e-12, compliance=0.0)  # an arm as drawn
 
 
 def whole_degrees(data: Measurements) -> Measurements:
@@ -194,8 +197,7 @@ def test_a_simulated_file_says_so_in_a_column(tmp_path, clean):
 
 def test_an_arm_that_is_no_better_keeps_the_drawn_one(robot, tmp_path):
     data, out = tmp_path / "d.csv", tmp_path / "fit.json"
-    made = simulate(robot, 40, 2, seed=3)
-    mc.write_measurements(data, whole_degrees(made.data))
+    mc.write_measurements(data, simulate(robot, 40, 2, 3, AS_DRAWN).data)
     assert run("calibrate irb2600", data, "-o", out) == 1
     content = json.loads(out.read_text())
     assert content["status"] == "no_better"
@@ -211,6 +213,28 @@ def test_an_arm_that_is_no_better_keeps_the_drawn_one(robot, tmp_path):
         key: content[key] for key in ("robot", "reason", "status")
     }
     assert fit.headline().startswith("The calibrated arm is no better than the drawn one (")
+
+
+def test_an_arm_that_the_poses_determine_less_well_than_the_drawing_is_not_determined(
+    robot, tmp_path, refuses
+):
+    data, out = tmp_path / "d.csv", tmp_path / "fit.json"
+    mc.write_measurements(data, whole_degrees(simulate(robot, 40, 2, seed=3).data))
+    assert run("calibrate irb2600", data, "--objective", "sum", "-o", out) == 1
+    fit = mc.load_fit(out)
+    assert fit.status == "not_determined"
+    assert fit.robot is fit.nominal.robot
+    assert fit.headline().startswith("These measurements do not determine")
+    refuses("--keep-anyway", "export", out, "--to", "urdf", "-o", tmp_path / "arm.urdf")
+    # by what it says itself: some sigma is larger than drawn, and no position is known better
+    links = [p for p in fit.parameters if p.identifiable][:20]
+    within = {"m": robot.drawn_within[0], "rad": robot.drawn_within[1]}
+    vague = [p for p in links if p.sigma > within[p.unit]]
+    assert vague
+    assert all(abs(p.value - p.nominal) < 3.0 * p.sigma for p in vague)
+    # a drawing that is known worse is determined
+    rough = replace(robot, drawn_within=(20e-3, 20e-3))
+    assert mc.calibrate(rough, mc.read_measurements(data), "sum").status != "not_determined"
 
 
 def test_before_and_after_are_of_the_same_poses_by_the_same_rule(robot):
@@ -270,7 +294,7 @@ def test_a_held_out_outlier_does_not_hide_a_better_arm(robot):
     y = data.y.copy()
     y[row, 0] += np.array([0.5, 0.3, 0.4])
     fit = mc.calibrate(robot, data.with_y(y), "sum")
-    assert fit.status in ("no_better", "failed")
+    assert fit.status in ("not_determined", "no_better", "failed")
     assert f"line {data.line[row]} smr1" in fit.reason or fit.status == "failed"
 
 
@@ -295,8 +319,8 @@ def test_what_is_no_better_is_never_passed_nor_valid_nor_exported_unasked(
     robot, tmp_path, capsys, refuses, says
 ):
     data, out, arm = (tmp_path / name for name in ("d.csv", "fit.json", "arm.urdf"))
-    made = simulate(robot, 40, 2, seed=3)
-    mc.write_measurements(data, whole_degrees(made.data))
+    made = simulate(robot, 40, 2, 3, AS_DRAWN)
+    mc.write_measurements(data, made.data)
     assert (
         "error: no_better: The calibrated arm is no better"
         in says("calibrate irb2600", data, "--objective", "sum", "-o", out, code=1).err

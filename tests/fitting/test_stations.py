@@ -324,7 +324,8 @@ def test_campaigns_on_the_command_line(tmp_path, says):
         rows = data.columns["session"] == name
         paths.append(str(tmp_path / f"{name}.csv"))
         mc.write_measurements(paths[-1], replace(data.take(rows), columns={}))
-    said = says("calibrate", ROBOT, *paths, "--objective", "sum").err
+    said = says("calibrate", ROBOT, *paths, "--objective", "sum", code=1).err
+    assert "error: contradictory" in said
     assert "moved between sessions: encoder zero at joint 3 from june on by +0.5" in said
     found = mc.diagnose(ROBOT, paths, quick=True)
     assert found.verdict == "named"

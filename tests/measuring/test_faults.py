@@ -20,6 +20,7 @@ from minimax_cal.measuring.faults.sessions import jumps, mixed_units, session_ju
 from minimax_cal.measuring.history import moves
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+from minimax_cal.robots.robot import robot_from_dict
 
 TRUTH = Truth(noise=17.5e-6, noise_per_metre=0.0)
 RIGID = Truth(noise=17.5e-6, noise_per_metre=0.0, compliance=0.0)
@@ -519,5 +520,13 @@ def test_joints_outside_their_limits_and_another_robot_are_notices(robot, noisy)
 def test_an_arm_without_lengths(robot, noisy):
     flat = robot.with_mdh(robot.mdh * [0, 0, 1, 1, 1])
     assert "has no lengths: every a and d of its joints is 0" in refused(flat, noisy.data)
+    meeting = robot_from_dict({
+        "name": "pan-tilt", "convention": "standard", "units": {"length": "mm", "angle": "deg"},
+        "joints": [{"a": 0, "d": 0, "theta": 0, "alpha": alpha} for alpha in (90, 0)],
+    }, "pan-tilt")  # fmt: skip
+    seen = simulate(meeting, 40, 3, seed=2)
+    fit = mc.calibrate(meeting, seen.data, "sum")
+    assert fit.status == "converged"
+    assert fit.within.after.rms_mm < 0.05 < fit.within.before.rms_mm
     short = robot.with_mdh(robot.mdh * [1e-6, 1e-6, 1, 1, 1])
     assert any("implausibly large" in notice for notice in mc.calibrate(short, noisy.data).notices)

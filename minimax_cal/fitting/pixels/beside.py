@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.fitting.checks import POOR_FIT
-from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
+from minimax_cal.fitting.outcome import MAX_MISS_OF_REACH
 from minimax_cal.fitting.pixels.fit import ROUNDS, PixelFit, PixelSquares, fit_pixels, right, softly
 from minimax_cal.fitting.pixels.options import PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import (
@@ -28,6 +28,7 @@ from minimax_cal.instruments.instrument import UNREADY, checked
 from minimax_cal.instruments.options import InstrumentOptions
 from minimax_cal.instruments.pixels import PixelData, read_pixels
 from minimax_cal.instruments.protocol import FlangePoses
+from minimax_cal.measuring.checks import check_span
 from minimax_cal.modelling.cell import pose_to_dict
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot
@@ -121,11 +122,13 @@ class FittedImages(Images):
 
 def fitted_on(robot: Robot, data: PixelData, options: PixelOptions, progress: Progress) -> PixelFit:
     """The fit with the cameras on what was given, or on what fits better.  Raises DataError."""
+    check_span(data.at)
     places = [options.camera_on] if options.camera_on else [FLANGE, GROUND]
     both = [start_scene(robot, data, place == FLANGE) for place in places]
     both.sort(key=lambda one: one.miss(robot))
     miss = [one.miss(robot) for one in both]
     if miss[0] <= POOR_FIT * robot.reach():
+        check_start(robot, data, both[0])
         return fit_pixels(robot, both[0], options, progress)
     for started in both:
         check_start(robot, data, started)

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.fitting.accuracy import accuracy, by_key
+from minimax_cal.fitting.claims import drawn_sigmas
+from minimax_cal.fitting.outcome import FitEvidence, judge
 from minimax_cal.fitting.pixels.beside import FittedImages, as_instrument, fitted_on
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.pixels.judge import (
@@ -22,7 +24,7 @@ from minimax_cal.fitting.pixels.judge import (
     uncertainty_of,
 )
 from minimax_cal.fitting.pixels.options import FIELDS, WORST_CAMERA, PixelOptions, check_options
-from minimax_cal.fitting.pixels.plausible import contradiction, file_notices, outlier_notices
+from minimax_cal.fitting.pixels.plausible import file_notices, objection, outlier_notices
 from minimax_cal.fitting.several.fit import at_worst
 from minimax_cal.fitting.several.kinds import READ, Asked, assembled, extremes, measured_by
 from minimax_cal.fitting.several.options import SUM
@@ -169,7 +171,7 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
     asked, every = Asked(robot, [plain], options, [(held, one.notices)]), images.at_rows_of(plain)
     counts, wrong = every.counting(held)
     arms = [Block.of(robot, every).at(x) for x in (fit.nominal, fit.state)]
-    drawn, ended = (np.linalg.norm(every.off(*arm), axis=0)[None, counts] for arm in arms)
+    before, after = (np.linalg.norm(every.off(*arm), axis=0)[None, counts] for arm in arms)
     measured = measured_by(robot, found, 0, plain, held)
     scaled = {"lengths_over_drawn": {"share": scale.share, "sigma": scale.sigma}} if scale else {}
     measured = replace(
@@ -179,29 +181,39 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
     )
     arm = robot.with_mdh(fit.state.mdh)
     claim = claimed(robot, arm, sure, drawing.share)
-    reason, status = contradiction(robot, fit, scale, options), fit.found.status[0]
-    told = () if reason else file_notices(fit, scale)
-    fits_links = fit.problem.active[: 5 * robot.joints].any()
-    if reason:
-        status = Status.FAILED
-    elif fits_links and not claim.is_better and status is not Status.FAILED:
-        status, reason = Status.NO_BETTER, claim.why_kept()
+    links = slice(5 * robot.joints)
+    fits_links = fit.problem.active[links].any()
+    evidence = FitEvidence(
+        robot,
+        fit.state.mdh,
+        fit.problem.active[links],
+        (),
+        sigma=np.sqrt(np.maximum(np.diag(sure.covariance)[links], 0.0)),
+        drawn=drawn_sigmas(robot),
+        position_sigma=claim.sigma,
+        drawn_sigma=claim.drawn,
+        allow_large_changes=options.allow_large_changes,
+        objection=objection(robot, fit, scale),
+        worse=claim.why_kept() if fits_links and not claim.is_better else "",
+    )
+    ended = judge(evidence, fit.found.status[0])
+    told = () if ended.status is Status.FAILED else file_notices(fit, scale)
     aside = np.flatnonzero(wrong)
     return assembled(
         asked, found, [measured], began, PixelCalibration,
-        robot=robot if status is Status.NO_BETTER else arm,
-        status=status,
+        robot=robot if ended.status.keeps_drawn else arm,
+        status=ended.status,
         position_sigma=claim.sigma,
         notices=(
             *data.notices, *arm_notices(robot, data.at), *one.notices, *fit.notices,
             *notices_of(fit, held), *told, *outlier_notices(data, aside),
         ),
         calibrated=arm,
-        pixels=extremes(by_key(drawn, ended, held[data.pose][counts])),
+        pixels=extremes(by_key(before, after, held[data.pose][counts])),
         claim=claim,
         set_aside=set_aside(data, aside),
         with_them=accuracy(every.table(*arms[1], counts | wrong)[:, held]) if len(aside) else None,
-        reason=reason,
+        reason=ended.reason,
     )  # fmt: skip
 
 

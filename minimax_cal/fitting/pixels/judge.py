@@ -17,10 +17,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import scipy
 
 from minimax_cal.evidence.noise import fit_components
-from minimax_cal.fitting.claims import TOOL
+from minimax_cal.fitting.claims import TOOL, drawn_sigmas
+from minimax_cal.fitting.common_scale import (
+    ScaleOfLengths,
+    but_for_tool,
+    fit_scale_of_lengths,
+)
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.several.identify import lengths_of
 from minimax_cal.ground.arrays import Array
@@ -228,19 +232,13 @@ def position_sigma(robot: Robot, sure: Uncertainty) -> float:
     return position_error(robot, links[:n, :n], sure.moved[:n], sure.lack)
 
 
-def drawn_covariance(robot: Robot) -> Array:
-    """(5n, 5n) of the links of a drawing as good as `drawn_within`."""
-    length, angle = robot.drawn_within
-    return np.diag(np.repeat([length, angle], [2 * robot.joints, 3 * robot.joints]) ** 2)
-
-
 def drawn_sigma(robot: Robot, lack: Lack, share: float = 1.0) -> float:
     """`position_error` that a drawing leaves, which holds no more of the lack [m].
 
     share: of the variance that `drawn_within` says.
     """
     nothing = np.zeros((5 * robot.joints, len(lack.moment)))
-    return position_error(robot, share * drawn_covariance(robot), nothing, lack)
+    return position_error(robot, share * np.diag(drawn_sigmas(robot) ** 2), nothing, lack)
 
 
 # ---- the drawing beside the pixels --------------------------------------------------------------
@@ -272,7 +270,7 @@ class Drawing:
         links = np.flatnonzero(among & fit.problem.active[: len(among)])
         off = links_of(robot.mdh - fit.state.mdh)[links]
         some = np.ix_(links, links)
-        noise = drawn_covariance(robot)[some] + (sure.drawn @ sure.drawn.T)[some]
+        noise = np.diag(drawn_sigmas(robot) ** 2)[some] + (sure.drawn @ sure.drawn.T)[some]
         return Drawing(links, off, sure.covariance[some], noise)
 
     @cached_property
@@ -297,36 +295,12 @@ class Drawing:
         return replace(fit, state=fit.state.step(step)), sure.after(gain, self.links, noise)
 
 
-@dataclass(frozen=True)
-class Scale:
-    """By which share the arm's lengths come out longer than drawn, as one factor.
-
-    sigma: of that, by pixels, drawing and by how little one factor explains.  p_value: of no
-    factor.
-    """
-
-    share: float
-    sigma: float
-    p_value: float
-
-
-def scale_of(robot: Robot, fit: PixelFit, sure: Uncertainty) -> Scale | None:
-    """One factor of all lengths, by generalised least squares; None where nothing tells it.
+def scale_of(robot: Robot, fit: PixelFit, sure: Uncertainty) -> ScaleOfLengths | None:
+    """One factor of all lengths; None where nothing tells it.
 
     Without a board the drawing gives the scale; the tool's lengths may be anything.
     """
-    n = robot.joints
-    number = np.arange(5 * n)
-    length = number < 2 * n
-    drawing = Drawing.of(robot, fit, sure, ~(length & (number % n == n - 1)))
-    drawn = np.where(length, links_of(robot.mdh), 0.0)[drawing.links]
-    dof = len(drawn) - 1
-    if not fit.images.has_length or robot.rough or not drawn.any() or dof < 1:
+    drawing = Drawing.of(robot, fit, sure, but_for_tool(robot))
+    if not fit.images.has_length or robot.rough:
         return None
-    root = np.linalg.cholesky(drawing.cover + drawing.noise)
-    white = np.linalg.solve(root, np.stack([drawn, -drawing.off], axis=1))
-    told = float(white[:, 0] @ white[:, 0])
-    share = float(white[:, 0] @ white[:, 1]) / told
-    left = float(((white[:, 1] - share * white[:, 0]) ** 2).sum()) / dof
-    sigma = float(np.sqrt(max(left, 1.0) / told))
-    return Scale(share, sigma, float(2.0 * scipy.stats.t.sf(abs(share) / sigma, dof)))
+    return fit_scale_of_lengths(robot, drawing.links, -drawing.off, drawing.cover + drawing.noise)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.fitting.options import Options, check_resolution
+from minimax_cal.fitting.options import check_resolution
 from minimax_cal.fitting.several.options import SUM, WORST_TARGET, RelativeOptions, seen
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
@@ -132,7 +132,6 @@ class PixelOptions(RelativeOptions):
     drawn_prior: bool = seen(
         False, "Take the drawing as a prior, as well as the robot's drawn_within says or better."
     )
-    allow_large_changes: bool = Options.allow_large_changes
 
     def settings(self) -> dict[str, object]:
         """For the record."""

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 import scipy
 
-from minimax_cal.fitting.checks import POOR_FIT, check_mends, too_changed
-from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
+from minimax_cal.fitting.checks import POOR_FIT, check_mends
+from minimax_cal.fitting.common_scale import ScaleOfLengths
+from minimax_cal.fitting.outcome import MAX_MISS_OF_REACH
 from minimax_cal.fitting.pixels.fit import FAR_LENS, PixelFit
-from minimax_cal.fitting.pixels.judge import Scale
-from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import IMAGES, Started, poses_of_images, start_scene
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import name_first
 from minimax_cal.instruments.camera import INTRINSICS
 from minimax_cal.instruments.pixels import PixelData
@@ -32,11 +33,14 @@ LEAST_SIZE = 3e-3  # share of a board's size: by less it is no other board
 MOST_PAIRED = 300  # images whose pairing with poses is looked into
 SHIFTS, PAIRINGS = 3, 20  # images lost in a row that are tried; rounds of a pairing
 UNITS = (1e-3, 1e3, 0.1, 10.0, 25.4, 1.0 / 25.4)  # slips of a board's unit
+SIZES, STEP = (0.5, 2.0), 0.02  # of a board, or a lens, that are tried; a step that tells a slope
+ODD_FACTOR = 0.02  # a board so far off is another one, before links are fitted
 
 
 def check_start(robot: Robot, data: PixelData, started: Started) -> None:
     """Raise DataError for slips that show where the arm as drawn is fitted."""
     miss, good = started.miss(robot), POOR_FIT * robot.reach()
+    check_size(robot, data, started, miss)
     if miss <= good:
         return
 
@@ -47,6 +51,44 @@ def check_start(robot: Robot, data: PixelData, started: Started) -> None:
     every = (*slips(data), *other_poses(robot, data, started.direction))
     given = miss**2, miss**2
     check_mends(data.source, given, [every], tried, good, 1.0, BETTER**2, ALIKE**2, SAID)
+
+
+def check_size(robot: Robot, data: PixelData, started: Started, miss: float) -> None:
+    """Raise DataError where the arm's own motion says that board or lens are of another size.
+
+    A board s times larger is s times farther away, and the arm says by how much that moves; a
+    longer lens leaves the board's size and moves the depths alone.  What leaves hardly anything is
+    named where the other does not.  miss: as it is [m].
+    """
+    if not len(data.board):
+        return
+
+    def left(size: float, focal: float) -> float:
+        times = np.ones(len(data.cameras[0].intrinsic))
+        times[:2] = focal
+        cameras = tuple(replace(one, intrinsic=times * one.intrinsic) for one in data.cameras)
+        some = replace(data, board=size * data.board, cameras=cameras)
+        return start_scene(robot, some, started.images.on_flange).miss(robot)
+
+    def least(of: Callable[[float], float]) -> tuple[float, float]:
+        """What is left of the error by the best factor, and that factor."""
+        if min(of(1.0 - STEP), of(1.0 + STEP)) > (1.0 - 0.5 * STEP) * miss:
+            return miss, 1.0
+        found = scipy.optimize.minimize_scalar(
+            lambda x: of(float(np.exp(x))), bounds=(math.log(SIZES[0]), math.log(SIZES[1])),
+            method="bounded",
+            options={"xatol": 1e-4, "maxiter": 40},
+        )  # fmt: skip
+        return float(found.fun), float(np.exp(found.x))
+
+    board, size = least(lambda x: left(x, 1.0))
+    lens, _ = least(lambda x: left(1.0, x))
+    if board > BETTER * miss or abs(size - 1.0) < ODD_FACTOR or board * ALIKE > lens:
+        return
+    raise DataError(
+        f"{data.source}: the robot's own motion says that the board is {size:.4g} times as large "
+        f"as its file says (board): measure its squares ({SAID.format(1e3 * board, 1e3 * miss)})"
+    )
 
 
 def slips(data: PixelData) -> Iterator[tuple[str, PixelData]]:
@@ -134,8 +176,8 @@ def extent_of(data: PixelData, camera: int) -> tuple[float, float]:
     return float(width), float(height)
 
 
-def contradiction(robot: Robot, fit: PixelFit, scale: Scale | None, options: PixelOptions) -> str:
-    """Why a fit contradicts its own data; empty where it does not."""
+def objection(robot: Robot, fit: PixelFit, scale: ScaleOfLengths | None) -> str:
+    """What pixels themselves hold against a fit; empty for nothing."""
     (arm, own), images = fit.problem.at(fit.state), fit.images
     focal = images.intrinsic[images.pixels.camera, 0]
     size = np.linalg.norm(images.off(arm, own), axis=0) * np.abs(images.depth(arm, own)) / focal
@@ -150,10 +192,7 @@ def contradiction(robot: Robot, fit: PixelFit, scale: Scale | None, options: Pix
             f"{said}: check that joints, detections, board and camera files belong together, and "
             "what the cameras are fixed to (camera_on)"
         )
-    wrong = other_lens(fit) or other_size(scale, OTHER_SIZE, LEAST_SIZE)
-    if wrong or options.allow_large_changes:
-        return wrong
-    return too_changed(robot, fit.state.mdh, fit.problem.active[: 5 * robot.joints])
+    return other_lens(fit) or other_size(scale, OTHER_SIZE, LEAST_SIZE)
 
 
 def other_lens(fit: PixelFit) -> str:
@@ -169,7 +208,7 @@ def other_lens(fit: PixelFit) -> str:
     return ""
 
 
-def other_size(scale: Scale | None, limit: float, least: float = 0.0) -> str:
+def other_size(scale: ScaleOfLengths | None, limit: float, least: float = 0.0) -> str:
     """That the board is of another size than its file says; empty where it is not.
 
     limit: p-value from which on it is.  Pixels leave it open how large all is: with a board of
@@ -186,7 +225,7 @@ def other_size(scale: Scale | None, limit: float, least: float = 0.0) -> str:
     )
 
 
-def file_notices(fit: PixelFit, scale: Scale | None) -> list[str]:
+def file_notices(fit: PixelFit, scale: ScaleOfLengths | None) -> list[str]:
     """Notices of lenses that are far from their files, and of a board of another size."""
     file = fit.images.intrinsic[:, : len(INTRINSICS)]
     off = np.abs(fit.lens - file) / fit.doubt

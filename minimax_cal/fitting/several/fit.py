@@ -44,6 +44,18 @@ SETTLED = 0.01  # relative change of the noises that ends their weighing
 
 
 @dataclass(frozen=True, eq=False)
+class LackOfFit:
+    """What an arm does that no link holds: by c factors of functions of the pose.
+
+    moved: (p, c) how far each factor moves the parameters of a fit.  moment: (c, c) mean of the
+    factors' products, given the rows.
+    """
+
+    moved: Array
+    moment: Array
+
+
+@dataclass(frozen=True, eq=False)
 class InstrumentFit:
     """What the solver found.
 
@@ -52,7 +64,8 @@ class InstrumentFit:
     where not identified.  noise: (b,) sigma of a row of each instrument [m].  trains: what was
     fitted, by what the file is called.  alone: what each determines by itself, empty where there is
     one.  stiff: the fit of geometry alone, where this one has laws besides.  worst: what a minimax
-    rests on, None where the sum was minimised; notices: of it.
+    rests on, None where the sum was minimised; notices: of it.  lack: that the covariance holds,
+    None where it holds none.
     """
 
     problem: Squares
@@ -67,6 +80,7 @@ class InstrumentFit:
     stiff: InstrumentFit | None = None
     worst: Worst | None = None
     notices: tuple[str, ...] = ()
+    lack: LackOfFit | None = None
 
     @property
     def stack(self) -> Stack:

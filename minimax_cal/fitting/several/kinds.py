@@ -12,13 +12,17 @@ from typing import Any, TypeVar
 import numpy as np
 
 from minimax_cal.fitting.accuracy import HELD, by_key
-from minimax_cal.fitting.claims import lacking, position_sigma, positions_by
+from minimax_cal.fitting.claims import drawn_sigmas, lacking, position_sigma, positions_by
 from minimax_cal.fitting.fit import Provenance
+from minimax_cal.fitting.improvement import improvement_of_files, no_better
 from minimax_cal.fitting.opened import listed_effects
 from minimax_cal.fitting.options import listed, priors_of, qp_name
+from minimax_cal.fitting.outcome import FileEvidence, FitEvidence, judge
 from minimax_cal.fitting.several import fit, plausible
+from minimax_cal.fitting.several.agreement import find_contradictions, find_other_scale
 from minimax_cal.fitting.several.fit import InstrumentFit
 from minimax_cal.fitting.several.identify import Alone
+from minimax_cal.fitting.several.lack import with_lack
 from minimax_cal.fitting.several.options import (
     Progress,
     RelativeOptions,
@@ -43,6 +47,7 @@ from minimax_cal.instruments.instrument import Instrument, checked
 from minimax_cal.instruments.table import is_registered
 from minimax_cal.measuring.campaigns import session_names
 from minimax_cal.measuring.checks import arm_notices, check_joints
+from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.history import Clock, with_history
 from minimax_cal.measuring.stations import Sessions
 from minimax_cal.modelling.cell import Cell
@@ -51,9 +56,9 @@ from minimax_cal.modelling.joint_fit import fitted
 from minimax_cal.modelling.model import TARGET
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot, load_robot
-from minimax_cal.solvers.status import Status
 
 R = TypeVar("R", bound=RelativeCalibration)
+PARTS = {"train": "training", "holdout": "held-out"}  # of the poses, by the keys of accuracy
 READ: Mapping[str, Callable[[Any], Any]] = {  # what people give of an option, as its record has it
     "fix": listed,
     "free": listed,
@@ -135,7 +140,9 @@ class Asked:
 
     def fit(self, progress: Progress) -> InstrumentFit:
         """The fit of the training measurements."""
-        return fit.fit_instruments(self.robot, self.trains, self.options, progress)
+        found = fit.fit_instruments(self.robot, self.trains, self.options, progress)
+        progress("sigmas")
+        return with_lack(self.robot, found)
 
     def calibrated(self, progress: Progress) -> RelativeCalibration:
         """The calibration."""
@@ -247,13 +254,14 @@ def judged(
     result: RelativeCalibration,
     sigma: float,
 ) -> RelativeCalibration:
-    """The result with what the reader should know, failed where it is no calibration.
+    """The result with its outcome, and with what the reader should know.
 
     sigma: of a position, but for what is open [m].
     """
     robot, every, options = asked.robot, asked.every, asked.options
     unfitted = [plausible.unfitted(robot, found, i, options) for i in range(len(every))]
-    wrong = plausible.contradiction(robot, every, found, measured, [mend for _, mend in unfitted])
+    evidence = evidence_of(asked, found, measured, sigma, [mend for _, mend in unfitted])
+    ended = judge(evidence, result.status)
     said = [
         *(remark for i, one in enumerate(found.stack.instruments)
           for remark in one.remarks(fit.own_parameters(robot, found, i), found.noise[i])),
@@ -261,15 +269,75 @@ def judged(
         *plausible.of_scale(found),
         *plausible.weak(found, result, measured, sigma),
         *plausible.unlikely(result, measured),
-        *filter(None, (*(notice for notice, _ in unfitted), wrong)),
+        *evidence.doubts,
+        *filter(None, (*(notice for notice, _ in unfitted), ended.reason)),
     ]  # fmt: skip
     for data, (held, _), each in zip(every, asked.splits, measured, strict=True):
         said += plausible.general(each, data, held)
     return replace(
         result,
-        status=Status.FAILED if wrong else result.status,
-        reason=wrong,
+        robot=robot if ended.status.keeps_drawn else result.robot,
+        calibrated=result.robot,
+        status=ended.status,
+        reason=ended.reason,
+        contradictions=evidence.contradictions,
         notices=tuple(dict.fromkeys((*result.notices, *said))),
+    )
+
+
+def evidence_of(
+    asked: Asked,
+    found: InstrumentFit,
+    measured: Sequence[Measured],
+    sigma: float,
+    mends: Sequence[str],
+) -> FitEvidence:
+    """What the outcome is judged by.
+
+    sigma: of a position, but for what is open [m].  mends: of what was not fitted of each file and
+    the residuals show, empty where nothing is.
+    """
+    robot, every, geometry = asked.robot, asked.every, found.stiff or found
+    links, stack = slice(5 * robot.joints), found.stack
+    files, objection = [], ""
+    for data, one, mend in zip(every, measured, mends, strict=True):
+        seen = {what: one.accuracy[key] for key, what in PARTS.items()}
+        files.append(
+            FileEvidence(
+                {what: (score, score) for what, score in seen.items()},
+                source=data.at.source if len(every) > 1 else "",
+                check=data.words.check,
+                rotations={PARTS[key]: one.turns[key][0] for key in PARTS if key in one.turns},
+                drawn={key: one.accuracy[key] for key in ("nominal_train", "nominal")},
+            )
+        )
+        drawn, calibrated, _ = one.before_and_after()
+        if mend and calibrated.rms_mm > drawn.rms_mm:
+            objection = objection or f"the fit is worse than the arm as drawn: {mend}"
+    better = improvement_of_files(
+        [one.errors["nominal"] for one in measured],
+        [one.errors["holdout"] for one in measured],
+        [groups(data.at)[held] for data, (held, _) in zip(every, asked.splits, strict=True)],
+        [s / one.row_noise for s, one in zip(found.noise, stack.instruments, strict=True)],
+    )
+    within = drawn_sigmas(robot, asked.options.priors)
+    fits_links = geometry.identification.active[links].any() or stack.laws.names
+    scale = find_other_scale(robot, geometry, within)
+    worse = bool(fits_links and better and not better.is_better)
+    return FitEvidence(
+        robot,
+        geometry.state.mdh,
+        geometry.identification.active[links],
+        files,
+        sigma=np.sqrt(np.maximum(np.diag(geometry.covariance)[links], 0.0)),
+        drawn=within,
+        position_sigma=sigma,
+        drawn_sigma=drawn_sigma_of_positions(robot, geometry, within),
+        allow_large_changes=asked.options.allow_large_changes,
+        objection=objection,
+        contradictions=find_contradictions(robot, geometry) or scale[0],
+        doubts=(scale[1],) if scale[1] else (),
+        worse=no_better(better) if better and worse else "",
     )
 
 
@@ -357,7 +425,21 @@ def sigma_of_positions(robot: Robot, found: InstrumentFit) -> float:
     count = 5 * robot.joints + 6 + 3 * len(spots) + len(values)
     covariance = np.full((count, count), np.nan)
     covariance[np.ix_(column, column)] = found.covariance[np.ix_(place, place)]
-    return position_sigma(robot, found.state.mdh, spots, covariance, stack.laws, values)
+    if found.lack is None:
+        return position_sigma(robot, found.state.mdh, spots, covariance, stack.laws, values)
+    moved, moment = np.zeros((count, found.lack.moved.shape[1])), found.lack.moment
+    moved[column] = found.lack.moved[place]
+    alone = covariance - moved @ moment @ moved.T
+    return position_sigma(robot, found.state.mdh, spots, alone, stack.laws, values, moved, moment)
+
+
+def drawn_sigma_of_positions(robot: Robot, found: InstrumentFit, within: Array) -> float:
+    """The same of the drawn arm, by the links that were adopted.  within: (5n,) sigmas [m]."""
+    spots, links = targets_of(found, found.nominal), 5 * robot.joints
+    count = links + 6 + 3 * len(spots)
+    covariance, adopted = np.full((count, count), np.nan), found.identification.active[:links]
+    covariance[:links, :links] = np.where(np.outer(adopted, adopted), np.diag(within**2), np.nan)
+    return position_sigma(robot, robot.mdh, spots, covariance)
 
 
 def targets_of(found: InstrumentFit, x: State) -> Array:

@@ -63,6 +63,7 @@ class RelativeOptions(InstrumentOptions):
     its quadratic programs.
     loss: how errors count: square, or huber, cauchy or tukey, which outliers pull less.
     method: of the least squares.  resolution: relative singular value that counts as not measured.
+    allow_large_changes: accept an arm that is another than the one drawn.
     """
 
     objective: str = fitted(
@@ -99,6 +100,7 @@ class RelativeOptions(InstrumentOptions):
     loss: str = Options.loss
     method: str = Options.method
     resolution: float = Options.resolution
+    allow_large_changes: bool = Options.allow_large_changes
 
     def settings(self) -> dict[str, object]:
         """For the record."""

@@ -1,4 +1,4 @@
-"""Slips that no fit should be asked to explain, and fits that are no calibration of their arm."""
+"""Slips that no fit should be asked to explain, and what the reader of a result should know."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.fitting.checks import POOR_FIT, WILD_ANGLE, check_mends, check_plausible
-from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
 from minimax_cal.fitting.identify import Because
+from minimax_cal.fitting.outcome import MAX_ROTATION_MISS
 from minimax_cal.fitting.several.fit import (
     InstrumentFit,
     allowed_of,
@@ -25,22 +25,22 @@ from minimax_cal.fitting.several.result import Measured, RelativeCalibration
 from minimax_cal.fitting.several.stack import Block, Stack, own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.instruments.instrument import PLENTY, Instrument, Slip, anywhere
+from minimax_cal.instruments.instrument import Instrument, Slip
 from minimax_cal.instruments.options import FAR
 from minimax_cal.instruments.protocol import Arm, FlangePoses
+from minimax_cal.instruments.reflectors import LEVER
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.slips import of_joints, of_units
 from minimax_cal.modelling.model import TARGET
-from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.robots.robot import Robot
-
-RESIZED = 0.25  # of what the arm sweeps: a fit that changes it by more is of no arm
 
 
 def check_slips(robot: Robot, data: Instrument, options: RelativeOptions) -> None:
     """Raise DataError or OptionError for slips that show where the arm as drawn is fitted."""
+    checks.check_span(data.at)
     if data.seen.target_names:
+        check_rotations(robot, data, options)
         seen = (data.ready(robot, options) if data.options else data).seen
         try:
             check_plausible(robot, seen)
@@ -67,6 +67,31 @@ def check_slips(robot: Robot, data: Instrument, options: RelativeOptions) -> Non
         lambda mended: measured(*fitted(mended)),
         good,
     )
+
+
+def check_rotations(robot: Robot, data: Instrument, options: RelativeOptions) -> None:
+    """Raise DataError where rotations are met as other columns hold them, and not as they stand.
+
+    Rotations of another order or kind may leave the places that are measured beside them as small
+    as they are.
+    """
+    if not any(True for _ in data.slips()):
+        return
+
+    def misses(one: Instrument) -> tuple[float, float]:
+        ready, arm = one.ready(robot, options), Arm.of(robot, one.at.q).at(robot.mdh)
+        turns = ready.turns(arm, ready.starts(arm, np.zeros(0))[0])
+        square = float((turns**2).mean()) if len(turns) else 0.0
+        return square * LEVER**2, square
+
+    some = data.tried()
+    given = misses(some)
+    if np.sqrt(given[1]) <= MAX_ROTATION_MISS:
+        return
+    check_mends(
+        data.at.source, given, (some.slips(),), misses, MAX_ROTATION_MISS * LEVER, limit=1.0,
+        said="the rotations of the drawn arm then miss by {:.3g} mm at 100 mm, not {:.3g} mm",
+    )  # fmt: skip
 
 
 def measured(one: Instrument, arm: FlangePoses, own: Array) -> tuple[float, float]:
@@ -101,51 +126,6 @@ def slips_of_joints(robot: Robot, data: Instrument) -> Iterator[Slip]:
     for text, mended in (*of_units(robot, data.at), *of_joints(robot, data.at)):
         if (mended.q != data.at.q).any():  # else of points, which are not measured here
             yield text, replace(data, at=mended)
-
-
-def contradiction(
-    robot: Robot,
-    every: Sequence[Instrument],
-    fit: InstrumentFit,
-    measured: Sequence[Measured],
-    mends: Sequence[str],
-) -> str:
-    """Why the fit is no calibration of this arm; '' where it is one.
-
-    mends: of what was not fitted of each and the residuals show, '' where nothing is.
-    """
-    limit_mm = 1e3 * MAX_MISS_OF_REACH * robot.reach()
-    which = " and ".join(dict.fromkeys(d.words.check for d in every))
-    for data, one in zip(every, measured, strict=True):
-        of_file = f" of {data.at.source}" if len(every) > 1 else ""
-        for key, what in (("train", "training"), ("holdout", "held-out")):
-            miss_mm = one.accuracy[key].rms_mm
-            if miss_mm > limit_mm:
-                return (
-                    f"the fit misses the {what} rows{of_file} by {miss_mm:.3g} mm, more than "
-                    f"{100 * MAX_MISS_OF_REACH:g} % "
-                    "of the arm's reach: it is no calibration of this arm; check the robot file, "
-                    f"joint signs, units and {which}"
-                )
-    before, after = (swept(robot, fit, x) for x in (fit.nominal, fit.state))
-    if abs(after - before) > RESIZED * before:
-        return (
-            f"the fit makes an arm that sweeps {before:.3g} m one that sweeps {after:.3g} m: it is "
-            f"no calibration of this arm; check the robot file, joint signs, units and {which}"
-        )
-    for mend, one in zip(mends, measured, strict=True):
-        nominal, calibrated, _ = one.before_and_after()
-        if mend and calibrated.rms_mm > nominal.rms_mm:
-            return f"the fit is worse than the arm as drawn: {mend}"
-    return ""
-
-
-def swept(robot: Robot, fit: InstrumentFit, state: State) -> float:
-    """Spread of the first instrument's targets over the joints' range [m]."""
-    x, block = fit.stack.part(state, 0), fit.stack.blocks[0]
-    arm = Arm.of(robot, anywhere(robot, PLENTY).q).at(state.mdh)
-    place = arm.place(block.instrument.targets(block.own(x))).mean(axis=1)
-    return float(np.sqrt(place.var(axis=0).sum()))
 
 
 # ---- remarks -------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from minimax_cal.fitting.accuracy import (
     rms_interval,
     told,
 )
+from minimax_cal.fitting.disagreement import Contradiction
 from minimax_cal.fitting.fit import ACCURACIES, Provenance
 from minimax_cal.fitting.found import Parameter, parameter_table, table_of_effects
 from minimax_cal.fitting.identify import Identification
@@ -232,12 +233,15 @@ class RelativeCalibration(Measured, Result):
     """A robot calibrated from lengths, closures or poses, or from several files together.
 
     robot: calibrated; nominal: as drawn.  position_sigma: expected error of a position over the
-    joints' range, by the parameters' sigmas alone, the base fitted [m]; NaN while a direction that
-    moves positions is open.  positions_open: parameters that positions depend on and that the
-    measurements do not determine.
+    joints' range, by the parameters' sigmas and the lack of fit, the base fitted [m]; NaN while
+    a direction that moves positions is open.  positions_open: parameters that positions depend on
+    and that the measurements do not determine.
     beyond: parameters that whole poses tell and one reflector does not.  instruments: each file.
     cell: the arm with its effects, fitted together; None without any.  robot is then of a fit
     without them.  worst: what a minimax rests on, None where there was none.
+    calibrated: the robot that fits what was measured; `robot` is the drawn one where the status
+    keeps that.  reason: why it failed or keeps the drawn arm; empty where neither.
+    contradictions: of the files.
     """
 
     KIND = RELATIVE
@@ -262,14 +266,16 @@ class RelativeCalibration(Measured, Result):
     reason: str = ""
     worst: Annotated[Worst | None, Fact(key="minimax")] = None
     cell: Annotated[Cell | None, APART] = None
+    contradictions: tuple[Contradiction, ...] = ()
+    calibrated: Annotated[Robot | None, APART] = None
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.robot.name}: {self.status}>"
 
     @derived()
     def advice(self) -> str:
-        """What its status advises."""
-        return self.status.advice
+        """What to do where it failed or keeps the drawn arm, else what its status advises."""
+        return self.reason or self.status.advice
 
     @derived()
     def condition(self) -> float:
@@ -339,20 +345,25 @@ class RelativeCalibration(Measured, Result):
                 "positions depend: how good a position is they do not say."
             )
         return (
-            "By the parameters' sigmas alone, which hold neither effects that the model lacks nor "
-            "errors of what is fixed, a position over the joints' range is good to "
-            f"{1e3 * self.position_sigma:.3f} mm RMS once {self.words.fitted} fitted."
+            "By the parameters' sigmas, lack of fit included, but for errors of what is fixed, a "
+            f"position over the joints' range is good to {1e3 * self.position_sigma:.3f} mm RMS "
+            f"once {self.words.fitted} fitted."
         )
 
     def headline(self) -> str:
         """The result in some sentences, with what it does not say."""
         before, after, where = self.before_and_after()
-        text = (
+        text = f"{capitalise(self.reason)}. " if self.reason else ""
+        text += (
             f"{self.words.quantity.capitalize()}: RMS error {before.rms_mm:.3f} mm -> "
             f"{after.rms_mm:.3f} mm, largest {before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, "
-            f"at {where}. {self.words.caution}{self.position_claim} {self.outcome}"
+            f"at {where}."
         )
-        return text + (f" {self.status.advice}." if self.status.advice else "")
+        if self.status is Status.FAILED and self.reason:  # nothing follows but its mend
+            return text
+        text += f" {self.words.caution}{self.position_claim} {self.outcome}"
+        advice = "" if self.reason else self.status.advice
+        return text + (f" {advice}." if advice else "")
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
@@ -362,7 +373,8 @@ class RelativeCalibration(Measured, Result):
         """The accuracies, and the arm with its effects."""
         answered = {"answered": self.worst.answered} if self.worst else {}
         cell = {"cell": self.cell.whole()} if self.cell else {}
-        return self.measured_beside() | cell | answered
+        fitted = {"calibrated_robot": self.calibrated} if self.status.keeps_drawn else {}
+        return self.measured_beside() | cell | answered | fitted
 
     @classmethod
     def told_beside(
@@ -383,6 +395,11 @@ class RelativeCalibration(Measured, Result):
             "worst": replace(worst, answered=answered) if worst else None,
             "identification": Stated(known, {}, np.zeros(0), np.zeros(0), condition),
             "cell": cell_from_dict(whole, f"{source}: cell") if whole else None,
+            "calibrated": robot_from_dict(
+                content["calibrated_robot"], f"{source}: calibrated_robot"
+            )
+            if "calibrated_robot" in content
+            else None,
         }
 
 
@@ -462,24 +479,17 @@ NO_CLAIM = Claim(*[np.nan] * 4)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PixelCalibration(RelativeCalibration):
-    """A robot calibrated by cameras; `robot` is the drawn one where that is kept.
+    """A robot calibrated by cameras.
 
-    calibrated: the robot that fits the pixels.  pixels: RMS and largest error by key [px].
+    pixels: RMS and largest error by key [px].
     claim: of positions of the arm.  with_them: held-out accuracy with the pixels set aside.
-    reason: why it failed or the drawn arm is kept; empty where neither.  worst: what a minimax
-    rests on, None where there was none.
+    worst: what a minimax rests on, None where there was none.
     """
 
-    calibrated: Annotated[Robot | None, APART] = None
     worst: Annotated[WorstPixels | None, Fact(key="minimax")] = None
     pixels: Annotated[Mapping[str, tuple[float, float]], APART] = field(default_factory=dict)
     claim: Annotated[Claim, Fact(key="arm_position")] = NO_CLAIM
     with_them: Annotated[Accuracy | None, Fact(key="accuracy.holdout_with_them", brief=True)] = None
-
-    @property
-    def is_no_better(self) -> bool:
-        """Whether the drawn arm is kept."""
-        return self.status is Status.NO_BETTER
 
     def accuracy_table(self) -> Table:
         """Errors in the image, and at the target, before and after, training and held out."""
@@ -547,9 +557,8 @@ class PixelCalibration(RelativeCalibration):
     ) -> dict[str, Any]:
         """As `RelativeCalibration`, and what pixels tell besides."""
         own = super().told_beside(content, told, source)
-        calibrated = robot_from_dict(content["calibrated_robot"], f"{source}: calibrated_robot")
         pixels = {key: (each.rms_px, each.max_px) for key, each in own["stated"].items()}
-        return own | {"calibrated": calibrated, "pixels": pixels}
+        return own | {"pixels": pixels}
 
 
 def read_result(content: Mapping[str, Any], source: str) -> RelativeCalibration:

@@ -487,7 +487,7 @@ def trouble(status: str, advice: str) -> tuple[Note, ...]:
     """A warning where the numbers did not work out."""
     if status == "converged":
         return ()
-    if status == "no_better":
+    if Status(status).keeps_drawn:
         return (Note(f"{advice}.", "warning"),)
     tail = f": {advice}." if advice else "."
     return (Note(f"The fit did not converge ({status.replace('_', ' ')}){tail}", "warning"),)

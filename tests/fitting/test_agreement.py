@@ -1,0 +1,214 @@
+"""Files that do not agree on one arm are told, with what differs; files that agree never are.
+
+The arms are those of `experiments.agreement`: matrices, springs and leaning axes of its own.
+"""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import SHARED, run
+from numpy.testing import assert_allclose
+from scipy import stats
+
+import minimax_cal as mc
+from experiments.agreement import SCALE, ZERO, Job, SigmaJob, SimulatedArm, ratio_of, told_of
+from minimax_cal.fitting.disagreement import Cause, Contradiction
+from minimax_cal.fitting.outcome import FileEvidence, FitEvidence, judge
+from minimax_cal.fitting.several import relative
+from minimax_cal.fitting.several.agreement import ScoreTest
+from minimax_cal.fitting.several.lack import Components, FileRows
+from minimax_cal.instruments import Surface, contacts
+from minimax_cal.solvers.status import Status
+
+DISAGREE = SHARED / "reports" / "files_disagree.py"
+
+
+@pytest.mark.parametrize("seed", [2, 6, 9, 14])
+def test_files_that_agree_are_no_contradiction(seed):
+    """Of arms that bend, of files that see other joint ranges, or both."""
+    assert told_of(Job(seed)).status == "converged"
+
+
+@pytest.mark.parametrize("cause", [SCALE, ZERO])
+@pytest.mark.parametrize("seed", [10_001, 10_003, 10_005])
+def test_what_differs_between_files_is_named(seed, cause):
+    told = told_of(Job(seed, cause))
+    assert told.status == "contradictory"
+    assert told.right
+    assert told.p < 1e-4
+
+
+@pytest.mark.slow
+def test_of_many_files_few_contradict_in_vain_and_most_causes_are_named():
+    assert sum(told_of(Job(seed)).status == "contradictory" for seed in range(40)) <= 1
+    told = [told_of(Job(10_000 + i, (SCALE, ZERO)[i % 2])) for i in range(20)]
+    assert sum(one.status == "contradictory" for one in told) >= 17
+    assert sum(one.right for one in told) >= 14
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bends", [False, True])
+@pytest.mark.parametrize("kinds", [("wires",), ("tracker", "poses")])
+def test_sigmas_of_positions_are_true_on_arms_that_bend(kinds, bends):
+    median = np.median([ratio_of(SigmaJob(seed, kinds, bends)) for seed in range(8)])
+    assert (0.6 if bends else 0.7) < median < (1.6 if bends else 1.4)
+
+
+def two_files(rng, robot, **wrong):
+    """A tracker and wires of an arm; wrong: of the wires."""
+    arm = SimulatedArm(robot, rng)
+    return [arm.measure("tracker", 40, 2e-5), arm.measure("wires", 60, 2e-5, **wrong)]
+
+
+def test_a_contradiction_keeps_the_drawn_arm_and_comes_back(tmp_path, refuses):
+    robot = mc.load_robot("irb2600")
+    found = relative(robot, two_files(np.random.default_rng(3), robot, factor=1.001))
+    assert found.status == "contradictory"
+    assert found.robot is robot
+    (one,) = found.contradictions
+    assert one.files == ("distances", "points")
+    assert one.cause.kind == "scale"
+    assert_allclose(one.cause.by, 1e-3, atol=5e-5)
+    assert found.headline().startswith(one.sentence[:20].capitalize())
+    assert one.sentence in found.notices
+    path = tmp_path / "fit.json"
+    found.save(path)
+    content = json.loads(path.read_text())["contradictions"]
+    assert content[0]["cause"]["kind"] == "scale"
+    assert content[0]["files"] == ["distances", "points"]
+    refuses("--keep-anyway", "export", path, "--to", "urdf", "-o", tmp_path / "arm.urdf")
+    assert run("export", path, "--to", "urdf", "-o", tmp_path / "arm.urdf", "--keep-anyway") == 0
+    assert run("report", path, "-o", tmp_path / "report.html") == 0
+
+
+def test_a_joint_whose_zero_moved_between_files_is_named():
+    robot = mc.load_robot("irb2600")
+    moved = 1e-3 * np.eye(6)[2]
+    found = relative(robot, two_files(np.random.default_rng(3), robot, zeros=moved))
+    (one,) = found.contradictions
+    assert (one.cause.kind, one.cause.place, one.cause.unit) == ("joint_zero", "J3", "rad")
+    assert_allclose(one.cause.by, 1e-3, atol=5e-5)
+    assert relative(robot, two_files(np.random.default_rng(3), robot)).status == "converged"
+
+
+def test_the_score_test_is_that_of_generalised_least_squares(rng):
+    """Against the difference of two sums of squares in the whole covariance matrix."""
+    links, own, lack, rows = 3, 2, 4, 40
+    files = []
+    for i in range(2):
+        shared_slopes = np.zeros((links + 2 * own, rows))
+        slopes = rng.normal(size=(links, rows))
+        shared_slopes[:links] = slopes
+        shared_slopes[links + own * i : links + own * (i + 1)] = rng.normal(size=(own, rows))
+        parts = rng.normal(size=rows), shared_slopes, slopes, rng.normal(size=(lack, rows))
+        files.append(FileRows(*parts, rows))
+    noise, size = np.array([0.5, 2.0]), rng.uniform(0.1, 1.0, lack)
+    test = ScoreTest.of(files, Components(noise, size, np.eye(lack), 0.0), np.ones(links))
+    both = np.concatenate([one.lack for one in files], axis=1)
+    covariance = np.diag(np.repeat(noise, rows)) + both.T @ np.diag(size) @ both
+    white = np.linalg.inv(np.linalg.cholesky(covariance))
+    error = white @ np.concatenate([one.error for one in files])
+    plain = white @ np.concatenate([one.shared for one in files], axis=1).T
+    apart = white @ np.concatenate([np.zeros((links, rows)), files[1].links], axis=1).T
+
+    def left(columns):
+        return ((error - columns @ np.linalg.lstsq(columns, error)[0]) ** 2).sum()
+
+    assert_allclose(test.statistic, left(plain) - left(np.hstack([plain, apart])), rtol=1e-8)
+    gain, by = test.along(np.eye(links)[1])
+    one = np.hstack([plain, apart[:, [1]]])
+    assert_allclose(gain, left(plain) - left(one), rtol=1e-8)
+    assert_allclose(by, np.linalg.lstsq(one, error)[0][-1], rtol=1e-8)
+    dof = rows - (links + own)
+    assert_allclose(
+        test.p_value(test.statistic, 3), stats.f.sf(test.statistic / 3.0, 3, dof), rtol=1e-9
+    )
+
+
+# ---- precedence ----------------------------------------------------------------------------------
+
+
+def test_the_first_question_that_finds_something_says_how_a_fit_ended():
+    robot = mc.load_robot("irb2600")
+    sound = mc.relative(robot, two_files(np.random.default_rng(3), robot)).accuracy["train"]
+    vague = FitEvidence(
+        robot,
+        robot.mdh,
+        np.ones(30, dtype=bool),
+        [FileEvidence({"training": (sound, sound)}, rotations={"training": 1e-3})],
+        sigma=np.full(30, 0.1),
+        drawn=np.full(30, 1e-4),
+        position_sigma=2.0,
+        drawn_sigma=1.0,
+        worse="it is no better",
+    )
+    assert judge(vague, Status.CONVERGED).status is Status.NOT_DETERMINED
+    assert judge(vague, Status.FAILED).status is Status.FAILED
+    sure = replace(vague, position_sigma=0.5)
+    assert judge(sure, Status.CONVERGED).status is Status.NO_BETTER
+    assert judge(replace(sure, worse=""), Status.STALLED).status is Status.STALLED
+    clash = replace(vague, contradictions=(Contradiction(("a", "b"), 1e-9),))
+    assert judge(clash, Status.CONVERGED).status is Status.CONTRADICTORY
+    turned = replace(clash, files=[replace(clash.files[0], rotations={"training": 0.06})])
+    ended = judge(turned, Status.CONVERGED)
+    assert ended.status is Status.FAILED
+    assert "60 mrad" in ended.reason
+    far = robot.mdh.copy()
+    far[1, 0] += 0.06 * robot.reach()
+    seen = replace(sound, rms_mm=1e4 * robot.reach())
+    other = replace(clash, mdh=far, files=[replace(clash.files[0], drawn={"train": seen})])
+    assert judge(other, Status.CONVERGED).status is Status.FAILED
+    assert "a2" in judge(other, Status.CONVERGED).reason
+    allowed = replace(other, allow_large_changes=True)
+    assert judge(allowed, Status.CONVERGED).status is Status.CONTRADICTORY
+
+
+def test_one_plane_does_not_determine_an_arm():
+    robot, rng = mc.load_robot("irb2600"), np.random.default_rng(6)
+    spot, q = np.array([0.06, -0.04, 0.1]), np.zeros((0, 6))
+    true = robot.with_mdh(robot.mdh + rng.normal(size=(6, 5)) * [0, 0, 4e-4, 0, 0])
+    while len(q) < 40:  # by the secant, on the height of the ball above the plane
+        near = rng.uniform([-1.5, -0.5, -0.6, -2, -1.2, -2], [1.5, 1.2, 0.6, 2, 1.2, 2])
+        two = np.tile(near, (2, 1))
+        two[1, 1] += 0.05
+        for _ in range(30):
+            pose = true.pose(two)
+            high = pose[:, 2, 3] + pose[:, 2, :3] @ spot - 0.4
+            if abs(high[1] - high[0]) < 1e-14:
+                break
+            step = high[1] * (two[1, 1] - two[0, 1]) / (high[1] - high[0])
+            two = np.array([two[1], two[1]])
+            two[1, 1] -= step
+        if abs(high[1]) < 1e-10 and -0.5 < two[1, 1] < 1.2:
+            two[1, 1] += 2e-5 * rng.normal()
+            q = np.concatenate([q, two[1:]])
+    found = relative(robot, contacts(q, ["floor"] * len(q), [Surface("floor", "plane")]))
+    assert found.status == "not_determined"
+    assert found.robot is robot
+    assert "do not determine" in found.reason
+
+
+# ---- the report ----------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not DISAGREE.exists(), reason="reports are not on this machine")
+def test_the_report_of_files_that_disagree(tmp_path, capsys):
+    subprocess.run([sys.executable, DISAGREE, tmp_path], check=True)
+    for files, code, words in (
+        (("tracker.csv", "wires.csv"), 0, ""),
+        (("tracker.csv", "wires_long.csv"), 1, "all lengths of wires_long are 0.0986 % longer"),
+        (("tracker.csv", "wires_moved.csv"), 1, "the zero of joint 3 differs by +0.977 mrad"),
+        (("plane.csv",), 1, "do not determine"),
+    ):
+        assert run("calibrate", "irb2600", *(tmp_path / name for name in files)) == code
+        assert words in capsys.readouterr().err
+
+
+def test_a_cause_is_a_sentence():
+    cause = Cause("scale", "wires", -2e-3, "1")
+    assert "0.2 % shorter" in Contradiction(("wires", "points"), 1e-9, cause).sentence
+    assert "no single" in Contradiction(("wires", "points"), 1e-9).sentence

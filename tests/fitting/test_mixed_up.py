@@ -1,0 +1,146 @@
+"""What people mix up of any instrument is named with its mend, which makes the file right."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import SHARED, run
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+import minimax_cal as mc
+from experiments.agreement import SimulatedArm
+from minimax_cal.fitting.several import relative
+from minimax_cal.instruments import flange_poses
+from minimax_cal.instruments.poses import rotations_as
+
+REPORTS = SHARED / "reports"
+HEAD = [f"q{i}_rad" for i in range(1, 7)] + [f"flange_{axis}_mm" for axis in "xyz"]
+UR5_FIXED = ("--camera-on", "flange", "--fix", "a*,d*,theta*,alpha*,beta*")
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return SimulatedArm(mc.load_robot("irb2600"), np.random.default_rng(5))
+
+
+@pytest.fixture(scope="module")
+def poses(arm):
+    return arm.measure("poses", 50, 2e-5)
+
+
+def written(path, data, names, columns):
+    """A file of whole poses with these columns of rotation."""
+    table = np.c_[data.at.q, 1e3 * data.pose[:, :3, 3], columns]
+    np.savetxt(path, table, "%.8f", ",", header=",".join(HEAD + names), comments="")
+    return path
+
+
+@pytest.mark.parametrize("order", ["ZYX", "xyz", "ZYZ", "zxy"])
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_euler_angles_in_the_columns_of_a_rotation_vector_are_named(
+    order, unit, poses, tmp_path, refuses
+):
+    turn = Rotation.from_matrix(poses.pose[:, :3, :3])
+    names = [f"flange_r{axis}_{unit}" for axis in "xyz"]
+    path = written(tmp_path / "d.csv", poses, names, turn.as_euler(order, unit == "deg"))
+    named = " ".join(f"R{axis}" for axis in order.lower())
+    about = "moving" if order.isupper() else "fixed"
+    refuses(f"about {about} axes, {named}", "calibrate", "irb2600", path)
+    # what it says to do
+    good = written(tmp_path / "good.csv", poses, [f"flange_r{a}_rad" for a in "xyz"],
+                   turn.as_rotvec())  # fmt: skip
+    assert relative("irb2600", good).status == "converged"
+
+
+def test_a_quaternion_in_another_order_is_named(poses, tmp_path, refuses):
+    turn = Rotation.from_matrix(poses.pose[:, :3, :3]).as_quat()  # scalar last
+    names = [f"flange_q{a}" for a in "wxyz"]
+    path = written(tmp_path / "d.csv", poses, names, turn)
+    refuses("a quaternion with its scalar last", "calibrate", "irb2600", path)
+    path = written(tmp_path / "e.csv", poses, names, np.roll(turn, 1, axis=1))
+    assert relative("irb2600", path).status == "converged"
+
+
+def test_each_reading_of_rotations_is_that_of_scipy(rng):
+    angles = rng.uniform(-1.0, 1.0, (7, 3))
+    found = dict(rotations_as(angles))
+    assert len(found) == 3 * 25 + 2
+    (zyx,) = [t for text, t in found.items()
+              if "moving axes, Rz Ry Rx" in text and "angles about" in text]  # fmt: skip
+    one = [Rotation.from_rotvec(angle[:, None] * axis)
+           for angle, axis in zip(angles.T, np.eye(3)[::-1], strict=True)]  # fmt: skip
+    by_hand = (one[0] * one[1] * one[2]).as_matrix()
+    assert_allclose(zyx, by_hand, atol=1e-12)
+
+
+def test_rotations_that_no_convention_explains_fail(arm, poses):
+    pose = poses.pose.copy()
+    pose[:, :3, :3] = Rotation.random(len(pose), random_state=1).as_matrix()
+    found = relative(arm.robot, flange_poses(poses.at.q, pose))
+    assert found.status == "failed"
+    assert "rotations" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [(1.0 / 25.4, "inches given as millimetres"), (1e-3, "metres given as millimetres")],
+)
+def test_lengths_in_another_unit_are_named(arm, factor, words, tmp_path, refuses):
+    data = arm.measure("wires", 60, 2e-5)
+    names = [f"q{i}_rad" for i in range(1, 7)] + [f"{wire}_mm" for wire in data.wires]
+
+    def put(name, scale):
+        table = np.c_[data.at.q, scale * 1e3 * data.length]
+        np.savetxt(tmp_path / name, table, "%.9f", ",", header=",".join(names), comments="")
+        return tmp_path / name
+
+    refuses(words, "calibrate", "irb2600", put("d.csv", factor))
+    assert run("calibrate", "irb2600", put("good.csv", 1.0)) == 0
+
+
+@pytest.mark.parametrize("kind", ["tracker", "wires", "poses"])
+def test_joints_that_never_move_are_said_first(arm, kind):
+    data = arm.measure(kind, 40, 2e-5)
+    q = data.at.q[0] + 1e-4 * np.random.default_rng(0).normal(size=data.at.q.shape)
+    still = replace(data.at, q=q)
+    given = still if kind == "tracker" else replace(data, at=still)
+    with pytest.raises(mc.DataError, match=r"do not move \(0\.0\d deg|the same joint values"):
+        mc.calibrate(arm.robot, given)
+
+
+# ---- the reports ---------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not REPORTS.exists(), reason="reports are not on this machine")
+@pytest.mark.parametrize(
+    ("report", "robot", "name", "words"),
+    [
+        ("files_disagree", "irb2600", "euler", "Euler angles about moving axes, Rz Ry Rx"),
+        ("files_disagree", "irb2600", "wires_inch", "inches given as millimetres"),
+        ("controller_euler", "ur5", "euler", "Euler angles about fixed axes, Rx Ry Rz"),
+    ],
+)
+def test_reports_of_units_and_orders(report, robot, name, words, tmp_path, refuses):
+    subprocess.run([sys.executable, REPORTS / f"{report}.py", tmp_path], check=True)
+    refuses(words, "calibrate", robot, tmp_path / f"{name}.csv")
+
+
+@pytest.mark.skipif(not REPORTS.exists(), reason="reports are not on this machine")
+def test_reports_of_wrong_hand_eye_recordings(tmp_path, refuses):
+    subprocess.run([sys.executable, REPORTS / "hand_eye_wrong.py", tmp_path], check=True)
+
+    def given(joints, board):
+        files = {name: tmp_path / f"{name}.csv" for name in ("detections", joints, board)}
+        return (
+            "calibrate", "ur5", files["detections"], "--joints", files[joints],
+            "--camera", f"cam={tmp_path / 'camera.yaml'}", "--board", files[board], *UR5_FIXED,
+        )  # fmt: skip
+
+    for joints, moved in (("static", "0.00"), ("jitter", "0.03")):
+        for board in ("board", "board25"):
+            refuses(f"do not move ({moved} deg", *given(joints, board))
+    refuses("the board is 1.20", *given("joints", "board25"))
+    assert run(*given("joints", "board")) == 0
