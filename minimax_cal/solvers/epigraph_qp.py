@@ -24,8 +24,8 @@ ELASTIC_PENALTY_FACTOR = 1e2  # times what the functions could gain by a violati
 MULTIPLIER_PENALTY_FACTOR = 1.5  # times the largest multiplier of a QP
 MAX_PENALTY = 1e6  # times the minimal ones: beyond it a violation is there to stay
 # P_vv of the epigraph variable v: a force that changes the sum of the multipliers by a part of
-# NEGLIGIBLE_FORCE at the decrease that is still to be had, but no more curvature than this.  Active
-# set methods work with A P^-1 A', whose entries are of size one beside 1 / P_vv: from 1e8 on the
+# NEGLIGIBLE_FORCE at the decrease that is still to be had, from FLAT_CURVATURE to this.  Active set
+# methods work with A P^-1 A', whose entries are of size one beside 1 / P_vv: from 1e8 on the
 # rounding of the sum exceeds a QP's tolerance.
 NEGLIGIBLE_FORCE = 1e-9
 MAX_DECREASE_CURVATURE = 1e-6
@@ -201,7 +201,8 @@ def epigraph_qp(
     rows[:k, :p], rows[:k, p], rows[k:, :p] = here.jacobian, -1.0, here.normal
     quadratic = np.zeros((p + 1, p + 1))
     quadratic[:p, :p] = hessian
-    quadratic[p, p] = min(MAX_DECREASE_CURVATURE, NEGLIGIBLE_FORCE / max(decrease, FLAT_CURVATURE))
+    curvature = NEGLIGIBLE_FORCE / max(decrease, FLAT_CURVATURE)
+    quadratic[p, p] = min(max(curvature, FLAT_CURVATURE), MAX_DECREASE_CURVATURE)
     linear = np.zeros(p + 1)
     linear[p] = 1.0
     low = np.concatenate([np.full(k, -np.inf), lower - here.c])

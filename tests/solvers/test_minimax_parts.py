@@ -142,13 +142,18 @@ def test_a_violation_that_no_step_lessens_is_hopeless():
 # ---- quadratic programs ------------------------------------------------------------------------
 
 
-def test_the_epigraph_problem_is_its_formula(rng):
+@pytest.mark.parametrize(
+    ("decrease", "curvature"), [(1e20, 1e-8), (4.0, 1e-8), (4e-3, 2.5e-7), (1e-9, 1e-6)]
+)
+def test_the_epigraph_problem_is_its_formula(decrease, curvature, rng):
     hessian = np.array([[2.0, 0.5], [0.5, 1.0]])
-    made = epigraph_qp(BENT, 3.5, hessian, LOWER, UPPER, 4.0)
+    made = epigraph_qp(BENT, 3.5, hessian, LOWER, UPPER, decrease)
     d, v = rng.normal(size=2), rng.normal()
     x = np.append(d, v)
     bent = 0.5 * d @ hessian @ d
-    assert_allclose(0.5 * x @ made.P @ x + made.q @ x, bent + v + 0.125e-9 * v * v, rtol=1e-12)
+    assert_allclose(
+        0.5 * x @ made.P @ x + made.q @ x, bent + v + 0.5 * curvature * v * v, rtol=1e-12
+    )
     above = BENT.f + BENT.jacobian @ d - 3.5 - v
     assert_allclose((made.A @ x - made.u)[:3], above, rtol=1e-12)
     assert np.all(made.l[:3] == -INF)
