@@ -284,7 +284,9 @@ def main(study: Study, count: int, arms: int) -> None:
         some = [t for job, t in zip(jobs, told, strict=True) if job.cause == cause]
         known = sum(t.status == "contradictory" for t in some)
         rows.append((cause or "they agree", len(some), known, sum(t.right for t in some)))
-    table = Table.made("two or three files", rows, "what differs | sets d | reported d | right cause d")
+    table = Table.made(
+        "two or three files", rows, "what differs | sets d | reported d | right cause d"
+    )
     sigma_jobs = [SigmaJob(study.seed + s, k, b) for k in SETS for b in (False, True)
                   for s in range(arms)]  # fmt: skip
     ratios = study.sweep(ratio_of, sigma_jobs, "sigmas")

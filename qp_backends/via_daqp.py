@@ -1,6 +1,6 @@
 """DAQP without qpsolvers in between.
 
-"daqp:direct".  DAQP takes l ≤ Ax ≤ u as it is, says why it failed and has a clock; qpsolvers hides
+DAQP takes l ≤ Ax ≤ u as it is, says why it failed and has a clock; qpsolvers hides
 the first two and doubles the two-sided rows, which costs half as much as the whole solve at the
 size of an SQP step.  Sparse problems, most of whose rows are bounds, do go through qpsolvers.
 """

@@ -215,7 +215,7 @@ def test_badly_scaled_problems(name, factor):
         assert_allclose(row / objective * solution.y, y, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", [n for n in ("daqp", "osqp", "proxqp", "scs") if n in INSTALLED])
+@pytest.mark.parametrize("name", [n for n in ("osqp", "proxqp", "scs") if n in INSTALLED])
 @pytest.mark.parametrize("stored", [np.array, sparse.csc_array])
 def test_a_warm_start_gives_the_same_answer(name, stored):
     rng = np.random.default_rng(6)
@@ -230,14 +230,14 @@ def test_a_warm_start_gives_the_same_answer(name, stored):
 
 def test_a_warm_start_saves_daqp_its_iterations():
     problem = epigraph(np.random.default_rng(7), 46, 300)
-    cold = solve(problem, "daqp:direct")
-    warm = solve(problem, "daqp:direct", warm_start=cold)
+    cold = solve(problem, "daqp")
+    warm = solve(problem, "daqp", warm_start=cold)
     assert warm.warm
     assert not cold.warm
     assert warm.iterations < cold.iterations / 4
 
 
-@pytest.mark.parametrize("name", [n for n in ("daqp", "osqp", "proxqp", "scs") if n in INSTALLED])
+@pytest.mark.parametrize("name", [n for n in ("osqp", "proxqp", "scs") if n in INSTALLED])
 @pytest.mark.parametrize("with_multipliers", [True, False])
 def test_a_warm_start_is_handed_to_qpsolvers(name, with_multipliers, monkeypatch):
     """The primal as `initvals`, also where the multipliers are of another number of rows."""
