@@ -40,7 +40,13 @@ from minimax_cal.fitting.improvement import (
 )
 from minimax_cal.fitting.minimax_problem import MIN_TRUSTED_WEIGHT
 from minimax_cal.fitting.options import Options, objective_of, qp_name
-from minimax_cal.fitting.outcome import FileEvidence, FitEvidence, Outcome, judge
+from minimax_cal.fitting.outcome import (
+    FileEvidence,
+    FitEvidence,
+    Outcome,
+    judge,
+    select_vague_links,
+)
 from minimax_cal.fitting.same_arm import computed, least_noise, residual
 from minimax_cal.fitting.set_aside import judged_with
 from minimax_cal.fitting.several.agreement import find_contradicting_sessions
@@ -183,10 +189,13 @@ class Judged:
         left = residual(self.after, float(active.sum()))
         better = self.better
         within = drawn_sigmas(robot, self.options.priors)
-        calibrated, drawn = known_positions(robot, solved, within)
+        mdh, sigma = solved.state.mdh, solved.uncertainty.sigma[:links]
+        calibrated = drawn = np.nan  # positions are asked for only where a link is in doubt
+        if select_vague_links(robot, mdh, active[:links], sigma, within).any():
+            calibrated, drawn = known_positions(robot, solved, within)
         return FitEvidence(
             robot,
-            solved.state.mdh,
+            mdh,
             active[:links],
             [
                 FileEvidence(
@@ -196,7 +205,7 @@ class Judged:
                     floor=known_floor(data, rest, robot.repeatability),
                 )
             ],
-            sigma=solved.uncertainty.sigma[:links],
+            sigma=sigma,
             drawn=within,
             position_sigma=calibrated,
             drawn_sigma=drawn,

@@ -156,10 +156,7 @@ def find_undetermined_values(evidence: FitEvidence) -> str:
     are positions.
     """
     robot, drawn = evidence.robot, evidence.drawn
-    change = np.abs(links_of(evidence.mdh - robot.mdh))
-    with np.errstate(invalid="ignore"):
-        vague = evidence.active & (evidence.sigma > drawn)
-        vague &= change < MIN_CHANGE_SIGMAS * evidence.sigma
+    vague = select_vague_links(robot, evidence.mdh, evidence.active, evidence.sigma, drawn)
     if robot.rough or not vague.any() or not evidence.position_sigma > evidence.drawn_sigma:
         return ""
     names, times = Names.of(robot, ()), evidence.sigma / drawn
@@ -175,6 +172,18 @@ def find_undetermined_values(evidence: FitEvidence) -> str:
         "measure more poses, and directions that are not measured yet, or fix these parameters"
         f"{evidence.outliers}"
     )
+
+
+def select_vague_links(
+    robot: Robot, mdh: Array, active: Array, sigma: Array, drawn: Array
+) -> Array:
+    """(5n,) True for adopted links that are less sure than drawn and whose change is not shown.
+
+    Arguments as the fields of `FitEvidence`.
+    """
+    change = np.abs(links_of(mdh - robot.mdh))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(active & (sigma > drawn) & (change < MIN_CHANGE_SIGMAS * sigma))
 
 
 QUESTIONS: tuple[tuple[Status, Callable[[FitEvidence], str]], ...] = (  # the first one that finds
