@@ -16,6 +16,8 @@ from minimax_cal.solvers.linearisation import (
     MinimaxProblem,
     Scaling,
     balance_multipliers,
+    constraint_excess,
+    find_constraint_units,
     measure_kkt,
 )
 from minimax_cal.solvers.status import Status
@@ -53,12 +55,36 @@ class StartScales:
 
 
 @dataclass(frozen=True, eq=False)
+class PointTerms:
+    """What scaling takes from a point alone, whatever the multipliers.
+
+    functions: (k,) and constraints: (l,), the sizes of the terms that values and changes within
+    reach are the sums of.  constraint_units: (l,) as `Scaling` has them.
+    """
+
+    functions: Array
+    constraints: Array
+    constraint_units: Array
+
+    @staticmethod
+    def measure(here: Linearisation, reach: Array, lower: Array, upper: Array) -> PointTerms:
+        """Of a linearisation with variables that reach (p,) so far."""
+        normal = np.abs(here.normal * reach)
+        return PointTerms(
+            np.abs(here.f) + np.abs(here.jacobian) @ reach,
+            normal.sum(axis=1),
+            find_constraint_units(here, normal.max(axis=1, initial=0.0), lower, upper),
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Iterate(Generic[X]):
     """Where the iteration is.
 
     here: the problem at x.  mu, lam: multipliers of the latest QP.  quasi_newton: the Hessian where
     the problem has none of its own.  displacement: (p,) from the start.  reach: (p,) its farthest,
-    at least as far as the start's derivatives suggest.  penalties: (l,) of violations.
+    at least as far as the start's derivatives suggest.  terms: of the point.  penalties: (l,) of
+    violations.
     zero_level: a value that is as good as none.  largest_level: as `StartScales` has it.
     damping: of the Hessian's diagonal.  least_residual, least_value: so far.
     stalled_count: iterations since either fell.  qp_count: QPs so far.
@@ -72,6 +98,7 @@ class Iterate(Generic[X]):
     quasi_newton: Bfgs | None
     displacement: Array
     reach: Array
+    terms: PointTerms
     penalties: Array
     zero_level: float
     largest_level: float = np.inf
@@ -102,18 +129,15 @@ class Iterate(Generic[X]):
         reach = np.sqrt(level / np.maximum(curvature, np.diag(bfgs.matrix)))
         return Iterate(
             problem, x, here, mu if len(mu) else np.full(k, 1.0 / k), none,
-            None if hessian == "gauss-newton" else bfgs, np.zeros(p), reach, none,
+            None if hessian == "gauss-newton" else bfgs, np.zeros(p), reach,
+            PointTerms.measure(here, reach, problem.lower, problem.upper), none,
             ZERO_VALUE * level, scales.largest_level if scales else np.inf,
         )  # fmt: skip
 
     @cached_property
     def value_terms(self) -> float:
         """Size of the terms that the value is the sum of; its rounding is relative to them."""
-        here, held = self.here, self.mu > 0.0
-        slopes = self.mu[held] @ np.abs(here.jacobian[held]) + np.abs(self.lam) @ np.abs(
-            here.normal
-        )
-        return float(self.mu @ np.abs(here.f) + slopes @ self.reach)
+        return float(self.mu @ self.terms.functions + np.abs(self.lam) @ self.terms.constraints)
 
     @cached_property
     def scaling(self) -> Scaling:
@@ -121,9 +145,7 @@ class Iterate(Generic[X]):
         size = min(abs(float(self.here.f.max())), self.largest_level)
         zero_level = min(self.zero_level, self.largest_level)
         level = max(size, MIN_VALUE_OF_TERMS * self.value_terms, zero_level)
-        return Scaling.from_lengths(
-            self.here, level, self.reach, self.problem.lower, self.problem.upper
-        )
+        return Scaling(level, self.reach, self.terms.constraint_units)
 
     @property
     def scaled_lam(self) -> Array:
@@ -133,10 +155,13 @@ class Iterate(Generic[X]):
     @cached_property
     def kkt(self) -> Kkt:
         """How far from optimal, scaled."""
-        scaling, low, high = self.scaling, self.problem.lower, self.problem.upper
-        return measure_kkt(
-            scaling.apply(self.here), self.mu, self.scaled_lam, low / scaling.c, high / scaling.c
-        )
+        here, scaling, problem = self.here, self.scaling, self.problem
+        kkt = measure_kkt(here, self.mu, self.lam, problem.lower, problem.upper, self.reach)
+        violation = 0.0
+        if len(here.c):
+            excess = constraint_excess(here.c, problem.lower, problem.upper)
+            violation = float((excess / scaling.c).max())
+        return Kkt(kkt.stationarity / scaling.value, kkt.complementarity / scaling.value, violation)
 
     @cached_property
     def descent_lengths(self) -> Array:
@@ -233,10 +258,12 @@ class Iterate(Generic[X]):
             d, self.here, there, self.mu, self.lam
         )
         displacement = self.displacement + d
+        reach = np.maximum(self.reach, np.abs(displacement))
         return replace(
             self, x=x, here=there, quasi_newton=quasi_newton,
             damping=self.damping / 10.0 if self.damping > 1e-6 else 0.0,
-            displacement=displacement, reach=np.maximum(self.reach, np.abs(displacement)),
+            displacement=displacement, reach=reach,
+            terms=PointTerms.measure(there, reach, self.problem.lower, self.problem.upper),
         )  # fmt: skip
 
     def damp(self) -> Iterate[X]:

@@ -80,10 +80,8 @@ class Scaling:
         here: Linearisation, value: float, x: Array, lower: Array, upper: Array
     ) -> Scaling:
         """A constraint's is its way to a bound, at least how much it changes along a variable's."""
-        way = np.minimum(np.abs(upper - here.c), np.abs(here.c - lower))
-        c = np.abs(here.normal * x).max(axis=1, initial=0.0)
-        c = np.maximum(c, np.where(np.isfinite(way), way, 0.0))
-        return Scaling(value, x, np.where(c > 0.0, c, 1.0))
+        change = np.abs(here.normal * x).max(axis=1, initial=0.0)
+        return Scaling(value, x, find_constraint_units(here, change, lower, upper))
 
     def apply(self, here: Linearisation) -> Linearisation:
         """A linearisation in these units."""
@@ -91,6 +89,13 @@ class Scaling:
             here, f=here.f / self.value, jacobian=here.jacobian * (self.x / self.value),
             c=here.c / self.c, normal=here.normal * (self.x / self.c[:, None]),
         )  # fmt: skip
+
+
+def find_constraint_units(here: Linearisation, change: Array, lower: Array, upper: Array) -> Array:
+    """(l,) ways of constraints to their bounds, at least a change (l,) of theirs; 1 for none."""
+    way = np.minimum(np.abs(upper - here.c), np.abs(here.c - lower))
+    units = np.maximum(change, np.where(np.isfinite(way), way, 0.0))
+    return np.where(units > 0.0, units, 1.0)
 
 
 @dataclass(frozen=True)
@@ -115,9 +120,19 @@ class Kkt:
         return max(self.stationarity, self.complementarity, self.violation)
 
 
-def measure_kkt(here: Linearisation, mu: Array, lam: Array, lower: Array, upper: Array) -> Kkt:
-    """The KKT residuals at a point, for multipliers mu (k,) of sum one and lam (l,)."""
-    stationarity = mu @ here.jacobian + lam @ here.normal
+def measure_kkt(
+    here: Linearisation,
+    mu: Array,
+    lam: Array,
+    lower: Array,
+    upper: Array,
+    lengths: Array | float = 1.0,
+) -> Kkt:
+    """The KKT residuals at a point, for multipliers mu (k,) of sum one and lam (l,).
+
+    lengths: (p,) of the variables, for stationarity.
+    """
+    stationarity = (mu @ here.jacobian + lam @ here.normal) * lengths
     complementarity = float(mu @ (here.f.max() - here.f))
     if lam.any():
         held = np.flatnonzero(lam)  # elsewhere a bound may be infinitely far

@@ -22,7 +22,7 @@ from minimax_cal.solvers.epigraph_qp import (
     solve_subproblem,
     update_penalties,
 )
-from minimax_cal.solvers.iterate import Iterate
+from minimax_cal.solvers.iterate import Iterate, PointTerms
 from minimax_cal.solvers.line_search import search_along_step
 from minimax_cal.solvers.linearisation import (
     Kkt,
@@ -89,7 +89,10 @@ def standing(here: Linearisation, mu: Array, lower: Array, upper: Array) -> Iter
     """An iterate at given derivatives."""
     problem = Curve(lambda x: x, lambda x: 1.0, lower, upper)
     none, p = np.zeros(len(here.c)), here.jacobian.shape[1]
-    return Iterate(problem, np.zeros(1), here, mu, none, None, np.zeros(p), np.ones(p), none, 1e-12)
+    terms, ones = PointTerms.measure(here, np.ones(p), lower, upper), np.ones(p)
+    return Iterate(
+        problem, np.zeros(1), here, mu, none, None, np.zeros(p), ones, terms, none, 1e-12
+    )
 
 
 def plan(
