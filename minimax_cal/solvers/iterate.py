@@ -16,7 +16,6 @@ from minimax_cal.solvers.linearisation import (
     MinimaxProblem,
     Scaling,
     balance_multipliers,
-    constraint_excess,
     find_constraint_units,
     measure_kkt,
 )
@@ -155,13 +154,15 @@ class Iterate(Generic[X]):
     @cached_property
     def kkt(self) -> Kkt:
         """How far from optimal, scaled."""
-        here, scaling, problem = self.here, self.scaling, self.problem
-        kkt = measure_kkt(here, self.mu, self.lam, problem.lower, problem.upper, self.reach)
-        violation = 0.0
-        if len(here.c):
-            excess = constraint_excess(here.c, problem.lower, problem.upper)
-            violation = float((excess / scaling.c).max())
-        return Kkt(kkt.stationarity / scaling.value, kkt.complementarity / scaling.value, violation)
+        scaling, problem = self.scaling, self.problem
+        kkt = measure_kkt(
+            self.here, self.mu, self.lam, problem.lower, problem.upper, scaling.x, scaling.c
+        )
+        return replace(
+            kkt,
+            stationarity=kkt.stationarity / scaling.value,
+            complementarity=kkt.complementarity / scaling.value,
+        )
 
     @cached_property
     def descent_lengths(self) -> Array:

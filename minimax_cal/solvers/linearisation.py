@@ -127,10 +127,11 @@ def measure_kkt(
     lower: Array,
     upper: Array,
     lengths: Array | float = 1.0,
+    constraint_units: Array | float = 1.0,
 ) -> Kkt:
     """The KKT residuals at a point, for multipliers mu (k,) of sum one and lam (l,).
 
-    lengths: (p,) of the variables, for stationarity.
+    lengths: (p,) of the variables, for stationarity.  constraint_units: (l,), for violation.
     """
     stationarity = (mu @ here.jacobian + lam @ here.normal) * lengths
     complementarity = float(mu @ (here.f.max() - here.f))
@@ -138,11 +139,10 @@ def measure_kkt(
         held = np.flatnonzero(lam)  # elsewhere a bound may be infinitely far
         room = np.where(lam > 0.0, upper - here.c, here.c - lower)[held]
         complementarity += float(np.abs(lam[held] * room).sum())
-    return Kkt(
-        float(np.abs(stationarity).max(initial=0.0)),
-        complementarity,
-        float(constraint_excess(here.c, lower, upper).max(initial=0.0)) if len(lam) else 0.0,
-    )
+    violation = 0.0
+    if len(lam):
+        violation = float((constraint_excess(here.c, lower, upper) / constraint_units).max())
+    return Kkt(float(np.abs(stationarity).max(initial=0.0)), complementarity, violation)
 
 
 def balance_multipliers(here: Linearisation, lower: Array, upper: Array) -> tuple[Array, Array]:
