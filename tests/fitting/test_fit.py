@@ -210,7 +210,7 @@ def test_a_frame_of_parameters(robot, noisy):
 
 @pytest.mark.parametrize(
     ("qp", "says"),
-    [(lambda problem: problem.q, "returned ndarray"), (7, "give the name of a backend")],
+    [(lambda problem: problem.q[1:], "qp is to return x"), (7, "give the name of a backend")],
 )
 def test_a_wrong_qp_is_an_error_in_words(qp, says):
     data = mc.simulate("irb2600", 40, 2, seed=1).data
