@@ -227,8 +227,8 @@ def files_of(job: Job) -> tuple[Robot, list[Instrument], str]:
         zeros = by * (np.arange(robot.joints) == joint) * (wrong == ZERO)
         factor = 1.0 + by * (wrong == SCALE)
         poses, noise = int(rng.integers(40, 90)), log_uniform(rng, NOISE)
-        base = frame @ homogeneous(tilt, away) if wrong == BASE else frame
-        base = base if job.cause == BASE else None
+        moved = frame @ homogeneous(tilt, away) if wrong == BASE else frame
+        base = moved if job.cause == BASE else None
         one = arm.measure(kind, poses, noise, narrow=narrow, factor=factor, zeros=zeros, base=base)
         files.append(one)
     return robot, files, f"J{joint + 1}" if job.cause == ZERO else ""

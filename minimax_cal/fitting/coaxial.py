@@ -16,6 +16,7 @@ from scipy.special import fdtrc
 
 from minimax_cal.fitting.identify import (
     RANK_TOLERANCE,
+    RESOLUTION,
     Identification,
     Kept,
     redundant,
@@ -32,9 +33,11 @@ MAX_P_OF_OFFSET = 1e-4  # of no second coordinate, below which the rows show one
 def coaxial_joints(robot: Robot) -> list[int]:
     """Joints whose axis is drawn as that of the next one, as well as the drawing is known.
 
-    Both turn: where an axis of a slide lies moves nothing.
+    So are those whose common normal is so short that theta would count as not measured.  Both turn:
+    where an axis of a slide lies moves nothing.
     """
     length, angle = robot.drawn_within
+    length = max(length, RESOLUTION * robot.reach())
     tilt = np.hypot(np.sin(robot.mdh[:, kinematics.ALPHA]), np.sin(robot.mdh[:, kinematics.BETA]))
     on_next = (np.abs(robot.mdh[:, 0]) <= length) & (tilt <= angle)
     both_turn = ~robot.prismatic[:-1] & ~robot.prismatic[1:]

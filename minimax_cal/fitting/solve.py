@@ -90,16 +90,11 @@ MAX_ROUNDING = 1e-9  # an error below is rounding: data that were computed, not 
 # worst errors above this share of the reach: no calibration, so that
 MIN_HOPELESS_MISS = 10.0 * POOR_FIT
 LAST_STEPS = 20  # of the SQP are enough to say so; its QPs then go from backend to backend
-# Relative singular value from which a parameter joins at the answer.  Axes drawn parallel show it
-# by about their angle in rad: a few 1e-3 in whole arms, where it would be noise.  Of random arms
-# whose angles are off by up to 0.5 rad some need 2e-2.
-MIN_GROWN_SINGULAR = 1e-2
-# of the cost: one that shows less joins if so much is left (of those arms, 0.1 to 0.4)
+# of the cost: a fit that holds the drawing and leaves more than its inverse contradicts the drawing
 MAX_REMAINING_COST = 0.5
 # times the drawing's own doubt, or as many times a usual link's: of a larger sigma the poses
 # hardly determine a link
 MAX_DOUBT = 10.0
-MAX_GROWTHS = 3  # times that it is asked again
 LEAST_POSES = 3  # of a target in the fit; with fewer its own place explains all
 PER = {"minimax": "target", "point": "point"}  # objectives that ask for the worst of something
 
@@ -206,26 +201,6 @@ class Task:
             known=np.concatenate([known, model.prior.weight[count:] > 0.0]),
             resolution=self.options.resolution,
         )
-
-    def grown(
-        self, model: Model, state: State, known: Identification, least: float
-    ) -> Identification | None:
-        """What the poses tell besides, where a fit ended; None where it is nothing.
-
-        Axes that the drawing has parallel or coaxial may stand well apart in the arm.  What was
-        identified stays so.  least: relative singular value of what joins.
-        """
-        if not (self.allowed & ~known.active).any():
-            return None
-        stays = known.active[self.order]
-        order = np.concatenate([self.order[~stays], self.order[stays]])
-        sure, least = np.isfinite(self.sigma), max(self.options.resolution, least)
-        asked = (self.allowed, self.reference, sure, least)
-        kept, gram, scale = identify.determined(model, state, order, *asked)
-        if kept.active.sum() <= known.active.sum() or not kept.active[known.active].all():
-            return None
-        told = identify.with_priors(gram, sure)
-        return kept.identification(told, scale, model.names.target_names, identify.TOGETHER)
 
     def squares(self, model: Model, begin: State) -> tuple[Model, LeastSquares[State]]:
         """Least squares; with priors, weighed against the noise that remains."""
@@ -402,17 +377,6 @@ def geometry(task: Task, progress: Progress, *, wide: bool = True) -> Stage:
         better, notices = wider(task.robot, robust.model, robust.found, progress)
         if better is not robust.found:
             robust = task.robust(robust.plain, better)
-    for _ in range(MAX_GROWTHS):
-        at = task.base.emphasise(task.share), robust.state, identification
-        more = task.grown(*at, 0.0)
-        if more is None:
-            break
-        clear = task.grown(*at, MIN_GROWN_SINGULAR)
-        more = clear or more
-        model, squares = task.squares(robust.plain.only(more.active), at[1])
-        if clear is None and squares.cost[0] > MAX_REMAINING_COST * robust.found.cost[0]:
-            break
-        identification, robust = more, task.robust(model, squares)
     stage = Stage(task.base, identification, robust, robust.found, notices=notices)
     for joint in coaxial_joints(task.robot):
         stage = with_offset(task, stage, joint)

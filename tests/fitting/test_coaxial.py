@@ -20,7 +20,8 @@ AXES = [  # a, d [m], alpha: joints 3 and 4 are drawn on one axis, as 5 and 6 in
 ]  # fmt: skip
 WRIST = [*AXES[:2], (0.1, 0.0, np.pi / 2), AXES[3], (0.0, 0.05, 0.0), AXES[5]]
 BASE = [(0.0, 0.4, 0.0), *AXES[1:2], (0.1, 0.0, np.pi / 2), *AXES[3:]]
-ARMS = {"third": (AXES, 2), "wrist": (WRIST, 4), "base": (BASE, 0)}
+SHORT = [*AXES[:2], (8e-4, 0.1, 0.0), *AXES[3:]]
+ARMS = {"short": (SHORT, 2), "third": (AXES, 2), "wrist": (WRIST, 4), "base": (BASE, 0)}
 
 
 def drawn(axes):
@@ -93,9 +94,9 @@ def test_axes_apart_in_any_direction_are_fitted_to_the_noise(name, kind):
     noise = 1e3 * NOISE * np.sqrt(1 if kind == "wires" else 3)
     assert str(fit.status) == "converged"
     assert fit.accuracy["holdout"].rms_mm < 1.35 * noise
-    at = ARMS[name][1]
-    length = abs(fit.robot.mdh[at, 0])
-    assert abs(length - np.linalg.norm(OFFSET)) < 6e-5  # of the common normal
+    axes, at = ARMS[name]
+    length = np.hypot(axes[at][0] + OFFSET[0], OFFSET[1])
+    assert abs(abs(fit.robot.mdh[at, 0]) - length) < 6e-5  # of the common normal
 
 
 @pytest.mark.parametrize("kind", KINDS)
