@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 import scipy
 
+from minimax_cal.fitting.coaxial import change_of_coaxial_zeros
 from minimax_cal.fitting.common_scale import LEAST_SHARE, scale_of, with_links
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
@@ -380,7 +381,7 @@ def too_changed(robot: Robot, mdh: Array, active: Array) -> str:
     kinds = np.arange(5 * robot.joints).reshape(5, -1)  # a, d, theta, alpha, beta of each joint
     counts = active.copy()
     counts[[kinds[1, 0], kinds[2, 0], *kinds[:, -1]]] = False
-    change = links_of(mdh - robot.mdh)
+    change = change_of_coaxial_zeros(robot, links_of(mdh - robot.mdh))
     change[2 * robot.joints :] = np.angle(np.exp(1j * change[2 * robot.joints :]))
     zero = kinds[2]
     most = np.full(len(change), LARGE_TWIST)

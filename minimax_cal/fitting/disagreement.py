@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from minimax_cal.ground.units import for_people
 
-SCALE, JOINT_ZERO = "scale", "joint_zero"
+SCALE, JOINT_ZERO, BASE = "scale", "joint_zero", "base"
+# Frames of two files that are nearer are one frame in which the base moved: nobody sets up an
+# instrument again so near to where it stood.
+MAX_SHIFT_OF_BASE, MAX_TURN_OF_BASE = 0.02, math.radians(1.0)  # [m, rad]
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,11 @@ class Cause:
                 f"all lengths of {self.place} are {abs(100.0 * self.by):.3g} % {long}: check the "
                 "scale, the units and the temperature compensation"
             )
+        if self.kind == BASE:
+            return (
+                f"base or instrument moved by {scale * self.by:.3g} {unit} before {self.place}: "
+                "each file is fitted in a frame of its own, so that the arm is not affected"
+            )
         return (
             f"the zero of {self.place.replace('J', 'joint ')} differs by {scale * self.by:+.3g} "
             f"{unit}: check what moved between the files, or calibrate from one"
@@ -40,7 +49,7 @@ class Cause:
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Files that each fit an arm and not one together.
+    """Files that each fit an arm and not one together; with a base that moved, not in one frame.
 
     p: of so much by noise and by an arm that bends.  cause: None where no single one explains it.
     """
@@ -56,6 +65,8 @@ class Contradiction:
         if not others:
             why = self.cause.sentence if self.cause else "its scale is not that of the arm"
             return f"{first} contradicts the drawn arm (p = {self.p:.0e}): {why}"
+        if self.cause and self.cause.kind == BASE:
+            return f"{first} and {' and '.join(others)} are of one frame, but {self.cause.sentence}"
         why = (
             self.cause.sentence
             if self.cause
@@ -65,3 +76,11 @@ class Contradiction:
             f"{first} and {' and '.join(others)} each fit an arm, and not one together "
             f"(p = {self.p:.0e}): {why}"
         )
+
+
+def has_base_moved(shift: float, turn: float, p: float, max_p: float) -> bool:
+    """Whether two files are of one frame in which the base moved.
+
+    shift: [m], turn: [rad] between where it stood.  p: of so much by chance.
+    """
+    return p < max_p and shift < MAX_SHIFT_OF_BASE and turn < MAX_TURN_OF_BASE

@@ -49,7 +49,7 @@ from minimax_cal.fitting.outcome import (
 )
 from minimax_cal.fitting.same_arm import computed, least_noise, residual
 from minimax_cal.fitting.set_aside import judged_with
-from minimax_cal.fitting.several.agreement import find_contradicting_sessions
+from minimax_cal.fitting.several.agreement import find_contradicting_sessions, moved_bases_of
 from minimax_cal.fitting.solve import PER, Solved
 from minimax_cal.fitting.stations import jumps
 from minimax_cal.fitting.suspects import Suspect, aside, contradictions
@@ -300,7 +300,8 @@ class Judged:
             error_drawn_crossed=drawn_crossed,
             reason=self.outcome.reason,
             moved=self.moved,
-            contradictions=self.evidence.contradictions,
+            contradictions=self.evidence.contradictions
+            or moved_bases_of(self.moved, next(iter(solved.frames), "")),
             seconds=time.perf_counter() - began,
         )
 

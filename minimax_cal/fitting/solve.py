@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
@@ -9,6 +10,12 @@ import numpy as np
 
 from minimax_cal.fitting import identify
 from minimax_cal.fitting.checks import POOR_FIT, too_changed
+from minimax_cal.fitting.coaxial import (
+    coaxial_joints,
+    identify_with_offset,
+    is_offset_shown,
+    start_with_offset,
+)
 from minimax_cal.fitting.identify import MAX_NAMED, Because, Identification, Reason
 from minimax_cal.fitting.minimax_problem import (
     Certificate,
@@ -83,16 +90,11 @@ MAX_ROUNDING = 1e-9  # an error below is rounding: data that were computed, not 
 # worst errors above this share of the reach: no calibration, so that
 MIN_HOPELESS_MISS = 10.0 * POOR_FIT
 LAST_STEPS = 20  # of the SQP are enough to say so; its QPs then go from backend to backend
-# Relative singular value from which a parameter joins at the answer.  Axes drawn parallel show it
-# by about their angle in rad: a few 1e-3 in whole arms, where it would be noise.  Of random arms
-# whose angles are off by up to 0.5 rad some need 2e-2.
-MIN_GROWN_SINGULAR = 1e-2
-# of the cost: one that shows less joins if so much is left (of those arms, 0.1 to 0.4)
+# of the cost: a fit that holds the drawing and leaves more than its inverse contradicts the drawing
 MAX_REMAINING_COST = 0.5
 # times the drawing's own doubt, or as many times a usual link's: of a larger sigma the poses
 # hardly determine a link
 MAX_DOUBT = 10.0
-MAX_GROWTHS = 3  # times that it is asked again
 LEAST_POSES = 3  # of a target in the fit; with fewer its own place explains all
 PER = {"minimax": "target", "point": "point"}  # objectives that ask for the worst of something
 
@@ -182,38 +184,23 @@ class Task:
         """(k,) True for targets that the geometry answers to, False for those that follow."""
         return self.share > ASIDE
 
-    def identified(self, model: Model, state: State) -> Identification:
-        """The parameters that the poses of a model tell; those of effects are given up first."""
+    def identified(self, model: Model, state: State, offsets: Iterable[int] = ()) -> Identification:
+        """The parameters that the poses of a model tell; those of effects are given up first.
+
+        offsets: parameters by which coaxial axes were found apart: these stay.
+        """
         more, count = len(model.fields), self.base.names.count
+        known = np.isfinite(self.sigma)
+        known[[*offsets]] = True
         return identify.identify(
             model,
             state,
             np.concatenate([np.arange(count, count + more), self.order]),
             allowed=np.pad(self.allowed, (0, more), constant_values=True),
             reference=self.reference,
-            known=np.concatenate([np.isfinite(self.sigma), model.prior.weight[count:] > 0.0]),
+            known=np.concatenate([known, model.prior.weight[count:] > 0.0]),
             resolution=self.options.resolution,
         )
-
-    def grown(
-        self, model: Model, state: State, known: Identification, least: float
-    ) -> Identification | None:
-        """What the poses tell besides, where a fit ended; None where it is nothing.
-
-        Axes that the drawing has parallel or coaxial may stand well apart in the arm.  What was
-        identified stays so.  least: relative singular value of what joins.
-        """
-        if not (self.allowed & ~known.active).any():
-            return None
-        stays = known.active[self.order]
-        order = np.concatenate([self.order[~stays], self.order[stays]])
-        sure, least = np.isfinite(self.sigma), max(self.options.resolution, least)
-        asked = (self.allowed, self.reference, sure, least)
-        kept, gram, scale = identify.determined(model, state, order, *asked)
-        if kept.active.sum() <= known.active.sum() or not kept.active[known.active].all():
-            return None
-        told = identify.with_priors(gram, sure)
-        return kept.identification(told, scale, model.names.target_names, identify.TOGETHER)
 
     def squares(self, model: Model, begin: State) -> tuple[Model, LeastSquares[State]]:
         """Least squares; with priors, weighed against the noise that remains."""
@@ -250,7 +237,7 @@ class Stage:
     """How far a fit has come.
 
     base: the model with all columns, unweighted.  squares: the least squares that count now.
-    terms: effects in the model.
+    terms: effects in the model.  offsets: parameters by which coaxial axes were found apart.
     """
 
     base: Model
@@ -259,6 +246,7 @@ class Stage:
     squares: LeastSquares[State]
     terms: tuple[Term, ...] = ()
     notices: tuple[str, ...] = ()
+    offsets: tuple[int, ...] = ()
 
     @property
     def state(self) -> State:
@@ -389,18 +377,39 @@ def geometry(task: Task, progress: Progress, *, wide: bool = True) -> Stage:
         better, notices = wider(task.robot, robust.model, robust.found, progress)
         if better is not robust.found:
             robust = task.robust(robust.plain, better)
-    for _ in range(MAX_GROWTHS):
-        at = task.base.emphasise(task.share), robust.state, identification
-        more = task.grown(*at, 0.0)
-        if more is None:
-            break
-        clear = task.grown(*at, MIN_GROWN_SINGULAR)
-        more = clear or more
-        model, squares = task.squares(robust.plain.only(more.active), at[1])
-        if clear is None and squares.cost[0] > MAX_REMAINING_COST * robust.found.cost[0]:
-            break
-        identification, robust = more, task.robust(model, squares)
-    return Stage(task.base, identification, robust, robust.found, notices=notices)
+    stage = Stage(task.base, identification, robust, robust.found, notices=notices)
+    for joint in coaxial_joints(task.robot):
+        stage = with_offset(task, stage, joint)
+    return stage
+
+
+def with_offset(task: Task, stage: Stage, joint: int) -> Stage:
+    """The fit in which a coaxial axis and its next are apart in any direction, if poses show it."""
+    robust, base, known = stage.robust, task.base.emphasise(task.share), stage.identification
+    trial = start_with_offset(
+        task.robot, stage.state, joint, known.active, task.allowed, task.order,
+        lambda state: identify.gram_of(task.reference, state),
+    )  # fmt: skip
+    if trial is None:
+        return stage
+    _, squares = task.squares(robust.model.only(trial.active), trial.begin)
+    points = 3.0 * float(robust.model.counts[task.judged].sum()) + 3.0 * float((~task.judged).sum())
+    spare = points - float(trial.active.sum())
+    if not is_offset_shown(robust.found.cost[0], squares.cost[0], trial.joined, spare):
+        return stage
+    begin = squares.x.take(np.array(0))
+    model, squares = task.squares(robust.plain.only(trial.active), begin)
+    names = base.names
+    return replace(
+        stage,
+        identification=identify_with_offset(
+            known, names, trial, identify.gram_of(base, begin), names.target_names,
+            identify.TOGETHER,
+        ),
+        robust=(robust := task.robust(model, squares)),
+        squares=robust.found,
+        offsets=(*stage.offsets, *(int(i) for i in np.flatnonzero(trial.joined))),
+    )  # fmt: skip
 
 
 def by_drawing(task: Task, stage: Stage, progress: Progress) -> tuple[Task, Stage]:
@@ -414,9 +423,15 @@ def by_drawing(task: Task, stage: Stage, progress: Progress) -> tuple[Task, Stag
     active, reasons = model.active, stage.identification.reasons
     within = np.full(names.count, np.inf)
     within[names.links] = np.repeat(task.robot.drawn_within, np.array([2, 3]) * names.joints)
+    begin = task.frame.state
+    for joint in coaxial_joints(task.robot) if stage.offsets else ():
+        within[2 * names.joints + np.array([joint, joint + 1])] = np.inf  # the sum is drawn alone
+        mdh = begin.mdh.copy()
+        mdh[joint, 0] = stage.state.mdh[joint, 0]
+        begin = replace(begin, mdh=mdh)
     spare = 3.0 * (model.counts[judged].sum() + (~judged).sum()) - active.sum()
     noise, times = stage.squares.cost[0] / max(spare, 1.0), np.zeros(names.count)
-    for state in (task.frame.state, stage.state):  # the fit may have gone astray
+    for state in (begin, stage.state):  # the fit may have gone astray
         gram = SumOfSquares(model).normal(state)[2]
         variance = noise * np.diag(solve_normal(gram, np.eye(len(gram))))
         sigma = np.sqrt(np.maximum(variance, 0.0))
@@ -495,7 +510,7 @@ def jointly(task: Task, stage: Stage, terms: tuple[Term, ...]) -> tuple[Task, St
         active = identification.active
         model, begin = extended(plain.only(active), robot, task.data, here, terms)
         model = replace(model, room=room_of(task, model, begin, terms))
-        identification = task.identified(model, begin)
+        identification = task.identified(model, begin, stage.offsets)
         known = identification.active[task.base.names.count :]
         begin = replace(begin, effects=np.where(known, begin.effects, 0.0))
         model, squares = task.squares(model.only(identification.active), begin)
@@ -503,7 +518,9 @@ def jointly(task: Task, stage: Stage, terms: tuple[Term, ...]) -> tuple[Task, St
     base = replace(
         task.base, names=model.names, fields=model.fields, moved=model.moved, room=model.room
     )
-    return task, Stage(base, identification, robust, robust.found, terms, stage.notices)
+    return task, Stage(
+        base, identification, robust, robust.found, terms, stage.notices, stage.offsets
+    )
 
 
 def room_of(task: Task, model: Model, state: State, terms: tuple[Term, ...]) -> Array:

@@ -13,9 +13,20 @@ import pytest
 from conftest import SHARED, run
 from numpy.testing import assert_allclose
 from scipy import stats
+from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from experiments.agreement import SCALE, ZERO, Job, SigmaJob, SimulatedArm, ratio_of, told_of
+from experiments.agreement import (
+    BASE,
+    SCALE,
+    ZERO,
+    Job,
+    SigmaJob,
+    SimulatedArm,
+    homogeneous,
+    ratio_of,
+    told_of,
+)
 from minimax_cal.fitting.disagreement import Cause, Contradiction
 from minimax_cal.fitting.outcome import FileEvidence, FitEvidence, judge
 from minimax_cal.fitting.several import relative
@@ -40,6 +51,56 @@ def test_what_differs_between_files_is_named(seed, cause):
     assert told.status == "contradictory"
     assert told.right
     assert told.p < 1e-4
+
+
+@pytest.mark.parametrize("seed", [10_001, 10_003, 10_005])
+def test_a_base_that_moved_between_files_of_one_frame_is_named(seed):
+    """Files are fitted in frames of their own, so that the arm is right."""
+    told = told_of(Job(seed, BASE))
+    assert told.status == "converged"
+    assert told.right
+    assert told.p < 1e-4
+
+
+MOVED = np.array([2e-3, -1e-3, 0.5e-3])  # of the base [m]
+STOOD = homogeneous(Rotation.from_rotvec([0.3, -0.5, 1.1]).as_matrix(), np.array([1.0, -2.0, 0.5]))
+ELSEWHERE = homogeneous(np.eye(3), np.array([0.5, 0.3, 0.0]))
+
+
+@pytest.mark.parametrize("after", [np.eye(4), ELSEWHERE, homogeneous(np.eye(3), MOVED)])
+def test_how_far_a_base_moved_is_told_of_whole_poses(after):
+    arm = SimulatedArm(mc.load_robot("irb2600"), np.random.default_rng(3), "leaning", 2e-4)
+    bases = STOOD, STOOD @ after
+    files = [arm.measure("poses", 60, 2e-5, base=base, narrow=True) for base in bases]
+    found = relative(arm.robot, files)
+    assert str(found.status) == "converged"
+    if np.allclose(after[:3, 3], MOVED):
+        (one,) = found.contradictions
+        assert one.cause.kind == BASE
+        assert one.cause.by == pytest.approx(np.linalg.norm(MOVED), abs=2e-4)
+        assert one.sentence in found.notices
+    else:  # it stood still, or the instrument was set up elsewhere
+        assert not found.contradictions
+
+
+@pytest.mark.parametrize("after", [np.eye(4), ELSEWHERE, homogeneous(np.eye(3), MOVED)])
+def test_how_far_a_base_moved_is_told_of_sessions_of_a_tracker(after):
+    rng = np.random.default_rng(3)
+    arm = SimulatedArm(mc.load_robot("irb2600"), rng, "leaning", 2e-4)
+    q = arm.joints(120, narrow=True)
+    bases = np.repeat([STOOD, STOOD @ after], 60, axis=0)
+    y = (bases @ arm.pose(q) @ [0.06, -0.04, 0.1, 1.0])[:, None, :3]
+    y += 2e-5 * rng.normal(size=y.shape)
+    data = mc.measurements(q, y, session=np.repeat(["A", "B"], 60))
+    fit = mc.calibrate(arm.robot, data, "sum")
+    assert str(fit.status) == "converged"
+    if np.allclose(after[:3, 3], MOVED):
+        (one,) = fit.contradictions
+        assert (one.files, one.cause.kind) == (("B", "A"), BASE)
+        assert one.cause.by == pytest.approx(np.linalg.norm(MOVED), abs=2e-4)
+        assert fit.to_dict()["contradictions"][0]["cause"]["kind"] == "base"
+    else:
+        assert not fit.contradictions
 
 
 @pytest.mark.slow

@@ -7,15 +7,24 @@ covariance of noise and lack.  A cause is a direction among these links.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 from scipy.special import fdtrc
 
+from minimax_cal.fitting.between_sessions import Change
 from minimax_cal.fitting.common_scale import LEAST_SHARE, but_for_tool, fit_scale_of_lengths
-from minimax_cal.fitting.disagreement import JOINT_ZERO, SCALE, Cause, Contradiction
+from minimax_cal.fitting.disagreement import (
+    BASE,
+    JOINT_ZERO,
+    SCALE,
+    Cause,
+    Contradiction,
+    has_base_moved,
+)
 from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.several.fit import InstrumentFit, fit_instruments
 from minimax_cal.fitting.several.lack import (
@@ -32,6 +41,7 @@ from minimax_cal.instruments.tracker import Points
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import labels as labels_of_sessions
 from minimax_cal.modelling.parameters import links_of, zero_positions
+from minimax_cal.robots.kinematics import rotation_vector
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.least_squares import solve_normal
 
@@ -42,6 +52,7 @@ MIN_LEAD = 12.0  # in twice the log likelihood, of a cause before its rivals
 MIN_TOLD = 0.1  # of a link as far off as a bad drawing, beside noise: a direction that files tell
 OFF_LENGTH, OFF_ANGLE = 1e-3, 1e-3  # how far links may differ between files [m, rad]
 MIN_SHARE = 0.3  # of the noise, by which files that differ move what was measured
+DIFFERENCE = 1e-6  # of a central difference [m, rad]
 MIN_DOF = 15  # numbers beyond links of its own, of a file that is tested
 
 
@@ -198,6 +209,54 @@ def find_contradictions(robot: Robot, fit: InstrumentFit) -> tuple[Contradiction
     )
     named = first.cause if is_alone and p_of_rest(first) >= MIN_P_OF_REST else None
     return (Contradiction(names, p, named),)
+
+
+def find_moved_bases(fit: InstrumentFit) -> tuple[Contradiction, ...]:
+    """Which bases moved between files of one frame, as far as the fit knows where they stand.
+
+    Each file has a frame of its own, so that this contradicts no arm.  Lengths know no frame.
+    """
+    framed = [i for i, one in enumerate(fit.stack.instruments) if isinstance(one, Points)]
+    dof = max(
+        float(sum(one.degrees for one in fit.stack.instruments) - fit.problem.active.sum()), 1
+    )
+    out = []
+    for later, i in ((later, i) for at, later in enumerate(framed) for i in framed[:at]):
+        place = np.concatenate([fit.stack.own(i)[:6], fit.stack.own(later)[:6]])
+        covariance = fit.covariance[np.ix_(place, place)]
+        own = fit.state.effects[place - fit.stack.names.geometric]
+
+        def jump(own: Array, pair: tuple[int, int] = (i, later)) -> Array:
+            (turn, origin), (turned, moved) = (
+                cast(Points, fit.stack.instruments[one]).base(part)
+                for one, part in zip(pair, np.split(own, 2), strict=True)
+            )
+            return np.concatenate([turn.T @ (moved - origin), rotation_vector(turn.T @ turned)])
+
+        steps = DIFFERENCE * np.eye(12)
+        slopes = np.array([jump(own + s) - jump(own - s) for s in steps]).T / (2.0 * DIFFERENCE)
+        value, spread = jump(own), slopes @ covariance @ slopes.T
+        if not np.isfinite(spread).all():
+            continue
+        p = float(fdtrc(6, dof, value @ solve_normal(spread, value[:, None])[:, 0] / 6.0))
+        shift, turn = float(np.linalg.norm(value[:3])), float(np.linalg.norm(value[3:]))
+        if has_base_moved(shift, turn, p, MAX_P):
+            first, name = fit.stack.labels[i], fit.stack.labels[later]
+            out.append(Contradiction((name, first), p, Cause(BASE, name, shift, "m")))
+    return tuple(out)
+
+
+def moved_bases_of(changes: Iterable[Change], first: str) -> tuple[Contradiction, ...]:
+    """The same of the sessions of a tracker.  first: session, beside which the others are told."""
+    out = []
+    for one in changes:
+        if one.place != "frame" or one.text:
+            continue
+        shift, turn = (amount.value for amount in one.amounts)
+        if has_base_moved(shift, turn, one.p_value, MAX_P):
+            cause = Cause(BASE, one.session, shift, "m")
+            out.append(Contradiction((one.session, first), one.p_value, cause))
+    return tuple(out)
 
 
 def find_other_scale(

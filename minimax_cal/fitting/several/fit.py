@@ -8,6 +8,14 @@ from typing import TypeVar, cast
 
 import numpy as np
 
+from minimax_cal.fitting.coaxial import (
+    OffsetTrial,
+    coaxial_joints,
+    identify_with_offset,
+    is_offset_shown,
+    start_with_offset,
+    with_normal_turned,
+)
 from minimax_cal.fitting.found import Parameter, link_by_link
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.options import QpSolver, freed
@@ -16,6 +24,8 @@ from minimax_cal.fitting.several.identify import (
     determined_alone,
     generic_count,
     identified,
+    order_of,
+    words_of_own,
 )
 from minimax_cal.fitting.several.laws import Laws
 from minimax_cal.fitting.several.options import (
@@ -139,11 +149,13 @@ def fit_instruments(
         [*trains.values()], stack, generic_count(robot, reference, nominal, allowed & ~held)
     )
 
+    offsets = np.zeros(stack.names.count, dtype=bool)  # by which coaxial axes were found apart
+
     def identify(stack: Stack, known: Known, x: State) -> Identification:
         more = (0, len(stack.laws.names))
         return identified(
             robot, stack, reference, x, np.pad(allowed, more, constant_values=True),
-            np.pad(wanted, more), known=known.told(stack.names.count),
+            np.pad(wanted, more), known=known.told(stack.names.count) | np.pad(offsets, more),
             resolution=options.resolution,
         )  # fmt: skip
 
@@ -154,6 +166,15 @@ def fit_instruments(
         told = identify(problem.stack, known, nominal)
         again = replace(problem, active=told.active)
         problem, ended = weighed(again, nominal, options)
+    for joint in coaxial_joints(robot):
+        trial = try_offset(robot, problem, ended, joint, allowed, reference)
+        if trial is None:
+            continue
+        offsets |= trial.joined
+        again = Squares(problem.stack, trial.active, known)
+        problem, ended = weighed(again, trial.begin, options)
+        gram = problem.stack.closed(robot, trial.begin).gram(trial.begin)
+        told = identify_with_offset(told, stack.names, trial, gram, *words_of_own(problem.stack))
     fit = stiff = solved(problem, ended, nominal, told, trains)
     if options.effects:
         progress("effects")
@@ -164,6 +185,43 @@ def fit_instruments(
         laws = laws_of(robot, stiff, options.effects)
         fit = replace(beside(beside(stiff, laws), laws), stiff=stiff)  # then for finite turns too
     return with_alone(robot, of_worst(fit, options), options)
+
+
+def try_offset(
+    robot: Robot,
+    problem: Squares,
+    ended: LeastSquares[State],
+    joint: int,
+    allowed: Array,
+    reference: Stack,
+) -> OffsetTrial | None:
+    """The fit in which a coaxial axis and its next are apart, where that fit begins at its end.
+
+    None where the rows do not show it.  reference: the instruments at plenty of poses.
+    """
+    stack, state = problem.stack, ended.x.take(np.array(0))
+    order = order_of(robot, stack)
+    trial = start_with_offset(robot, state, joint, problem.active, allowed, order, reference.gram)
+    if trial is None:
+        return None
+    method, limits = method_of(least_squares.AUTO), least_squares.NEAR
+
+    def solved(problem: Squares, begin: State) -> LeastSquares[State]:
+        return least_squares.solve(problem, begin.batch(), 1, float(stack.points), method, limits)
+
+    def solved_along(angle: float) -> State:
+        mdh = with_normal_turned(robot, state.mdh, joint, trial.active, angle)
+        return solved(problem, start_of(robot.with_mdh(mdh), stack, allowed)).x.take(np.array(0))
+
+    # Tool or base turn with the normal, along a curve that steps follow slowly: where the normal
+    # lies is found first, from the two coordinates of the offset, each of a fit along it.
+    across = solved_along(np.pi / 2.0).mdh[joint, 0]
+    angle = np.arctan2(across, state.mdh[joint, 0])
+    found = solved(replace(problem, active=trial.active), solved_along(float(angle)))
+    spare = float(sum(one.degrees for one in stack.instruments) - trial.active.sum())
+    if not is_offset_shown(float(ended.cost[0]), float(found.cost[0]), trial.joined, spare):
+        return None
+    return replace(trial, begin=found.x.take(np.array(0)))
 
 
 def of_worst(fit: InstrumentFit, options: RelativeOptions) -> InstrumentFit:

@@ -129,10 +129,14 @@ def identified(
     )
     told = with_priors(gram, known)
     kept = kept.without(redundant(told, kept.active, order, resolution), Because.NOT_TOLD)
+    return kept.identification(told, scale, *words_of_own(stack))
+
+
+def words_of_own(stack: Stack) -> tuple[set[str], str]:
+    """Stems of what is the instruments' own, and what all of it is called."""
     whole = stack.instruments[0].words.whole if len(stack.blocks) == 1 else ALL_OWN
-    own = names.effects[: stiff - names.geometric]
-    stems = {name.rpartition("_")[0] for name in own if whole}
-    return kept.identification(told, scale, stems - {TARGET, "base"}, whole)
+    own = stack.names.effects[: stack.lawless - stack.names.geometric]
+    return {name.rpartition("_")[0] for name in own if whole} - {TARGET, "base"}, whole
 
 
 def lengths_of(names: Names) -> Array:

@@ -19,7 +19,11 @@ from minimax_cal.fitting.opened import listed_effects
 from minimax_cal.fitting.options import listed, priors_of, qp_name
 from minimax_cal.fitting.outcome import FileEvidence, FitEvidence, judge
 from minimax_cal.fitting.several import fit, plausible
-from minimax_cal.fitting.several.agreement import find_contradictions, find_other_scale
+from minimax_cal.fitting.several.agreement import (
+    find_contradictions,
+    find_moved_bases,
+    find_other_scale,
+)
 from minimax_cal.fitting.several.fit import InstrumentFit
 from minimax_cal.fitting.several.identify import Alone
 from minimax_cal.fitting.several.lack import with_lack
@@ -272,6 +276,8 @@ def judged(
         *evidence.doubts,
         *filter(None, (*(notice for notice, _ in unfitted), ended.reason)),
     ]  # fmt: skip
+    moved = () if ended.reason else find_moved_bases(found)
+    said += [one.sentence for one in moved]
     for data, (held, _), each in zip(every, asked.splits, measured, strict=True):
         said += plausible.general(each, data, held)
     return replace(
@@ -280,7 +286,7 @@ def judged(
         calibrated=result.robot,
         status=ended.status,
         reason=ended.reason,
-        contradictions=evidence.contradictions,
+        contradictions=evidence.contradictions or moved,
         notices=tuple(dict.fromkeys((*result.notices, *said))),
     )
 
