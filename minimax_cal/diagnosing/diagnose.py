@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -64,8 +64,9 @@ from minimax_cal.ground.options import check_left_out, grouped, takes
 from minimax_cal.ground.stages import name_rung, number_step
 from minimax_cal.ground.threads import one_thread
 from minimax_cal.ground.words import name_first
-from minimax_cal.instruments.file import Given, taken
+from minimax_cal.instruments.file import Given, InstrumentData, taken
 from minimax_cal.instruments.images import Images
+from minimax_cal.instruments.tracker import Points
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.faults import find_faults, in_lines, mended, standing_out
 from minimax_cal.measuring.faults.fault import Fault
@@ -78,7 +79,10 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.modelling.effects.time import SESSION_JUMP, TARGET_SHIFT
 from minimax_cal.modelling.effects.words import name_step
-from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.robot import Robot, RobotSource, load_robot
+
+if TYPE_CHECKING:  # it is slow to import
+    from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
 
 FAULTY, CAUSES, BUDGET = "faults of the data", "testing causes", "error budget"
 PARTS, REMAINING = "regions held out", "remaining error"
@@ -124,6 +128,36 @@ class DiagnosisOptions:
 OF_OTHERS = ("offset", "known_distances", "lever", "noises", *Images.options)
 
 
+@overload
+def diagnose(
+    robot: RobotSource,
+    data: Measurements | Points,
+    *,
+    jobs: int = 1,
+    cluster: str = "",
+    progress: Progress = silent,
+    **options: Any,
+) -> Diagnosis: ...
+@overload
+def diagnose(
+    robot: RobotSource,
+    data: InstrumentData,
+    *,
+    jobs: int = 1,
+    cluster: str = "",
+    progress: Progress = silent,
+    **options: Any,
+) -> RelativeDiagnosis: ...
+@overload
+def diagnose(
+    robot: RobotSource,
+    data: Given | Sequence[Given],
+    *,
+    jobs: int = 1,
+    cluster: str = "",
+    progress: Progress = silent,
+    **options: Any,
+) -> Diagnosis | RelativeDiagnosis: ...
 @takes(
     options=DiagnosisOptions, others=(RelativeOptions, OF_OTHERS), read={**READ, "exclude": list}
 )
@@ -136,7 +170,7 @@ def diagnose(
     jobs: int = 1,
     cluster: str = "",
     progress: Progress = silent,
-) -> Diagnosis:
+) -> Diagnosis | RelativeDiagnosis:
     """Say what is still wrong with a calibrated robot, and why, as far as the data can tell.
 
     Parameters
@@ -158,7 +192,7 @@ def diagnose(
 
     Returns
     -------
-    Diagnosis
+    Diagnosis | RelativeDiagnosis
         The causes and the error budget. Its lengths are in m, in mm where a name says so.  A
         `RelativeDiagnosis` where the data are not points of trackers alone.
 
@@ -178,7 +212,7 @@ def diagnose(
         from minimax_cal.diagnosing.instruments import diagnosed
 
         chosen = with_others(given, replace(options, exclude=()), others)
-        return cast(Diagnosis, diagnosed(robot, given, options.exclude, chosen, progress))
+        return diagnosed(robot, given, options.exclude, chosen, progress)
     check_no_others(given, others)
     check_left_out(options.exclude, EFFECTS)
     given = checks.check_joints(robot, given)
