@@ -103,9 +103,13 @@ def library(robot: Robot, train: Measurements, objective: Objective, method: str
 
 MINIMAX, POSE = "minimax", "MDH pose"
 SINGLE = ("MDH SMR 1", "MDH SMR 2", "MDH SMR 3")
+ONE_TARGET: tuple[Objective, ...] = ("smr:1", "smr:2", "smr:3")
 METHODS: Mapping[str, Callable[[Robot, Measurements], Fit]] = {
     "nominal": nominal,
-    **{SINGLE[i]: partial(library, objective=f"smr:{i + 1}", method="nlgn") for i in range(3)},
+    **{
+        name: partial(library, objective=one, method="nlgn")
+        for name, one in zip(SINGLE, ONE_TARGET, strict=True)
+    },
     POSE: mdh_pose,
     **{f"POE SMR {i + 1}": partial(poe_position, smr=i) for i in range(3)},
     "POE pose": poe_pose,

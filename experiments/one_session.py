@@ -225,7 +225,7 @@ def simulated(job: Job) -> tuple[Measurements, Array, str, float]:
 # ---- the study ---------------------------------------------------------------------------------
 
 
-def session(job: Job) -> tuple[object, Measurements, Array, str, float]:
+def session(job: Job) -> tuple[Robot, Measurements, Array, str, float]:
     """Robot, measurements, first half, joint that moved, by how much [rad]."""
     if job.is_real:
         robot, data = real(job.arm)

@@ -23,8 +23,9 @@ from minimax_cal.instruments.tracker import Points
 from qp_backends import Problem, Solution
 
 robot = mc.load_robot("irb120")
+Rows = NDArray[np.float64]
 
-def of_points(data: mc.Measurements, tracker: Points, q: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+def of_points(data: mc.Measurements, tracker: Points, q: Rows, y: Rows) -> None:
     assert_type(mc.calibrate(robot, data), mc.Fit)
     assert_type(mc.calibrate("irb120", data, "sum", "clarabel", holdout=0.3), mc.Fit)
     assert_type(mc.calibrate(robot, (q, y)), mc.Fit)

@@ -51,6 +51,7 @@ from minimax_cal.fitting.crossed import MIN_HELD_POSES
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.floor import DISTANCES, Floor, floor_of, noise_at_most, with_instrument
 from minimax_cal.fitting.judged import doubts
+from minimax_cal.fitting.jump_sizes import fit_jump_sizes
 from minimax_cal.fitting.options import Options, Progress, silent
 from minimax_cal.fitting.outcome import FileEvidence, missed_rows
 from minimax_cal.fitting.several.kinds import READ
@@ -516,7 +517,12 @@ def cleaned(asked: Asked, progress: Progress) -> Clean:
     more = (*more, *many)
     sound = mended(sound, more)
     sound = sound.take(np.asarray(sound.seen.any(axis=1)))
-    jumped = session_jumps(cell.placed(sound), cell.error(sound))
+    placed, held = cell.placed(sound), np.isin(sound.line, asked.data.line[asked.held])
+
+    def fit_sizes(rows: Array) -> Array:
+        return fit_jump_sizes(robot, placed, ~held, SUM, rows)
+
+    jumped = session_jumps(placed, cell.error(sound), fit_sizes)
     told = (*found, *more)
     remarks = tuple(fault.text for fault in told if fault.effect != TARGET_SHIFT.name)
     rows = np.concatenate([NO_ROWS, *(fault.rows for fault in jumped)])
