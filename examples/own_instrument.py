@@ -24,6 +24,7 @@ class DrawWire(Instrument):
     length: Array
 
     kind = "draw_wire"
+    unit = "m"
     words = Words(quantity="length of the draw wire")
     by_row = ("length",)
     names = (*SPOT, "anchor_x", "anchor_y", "anchor_z", "zero")

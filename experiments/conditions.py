@@ -10,7 +10,7 @@ Euler deviation) and AO' = |log(R_m' R_c)|, each on the training and on the held
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from experiments.poses import euler_deviation, orientation_error, poses_of, tria
 from experiments.real import here, real
 from experiments.record import canvas
 from experiments.sweep import Study, study_options
+from minimax_cal.fitting.options import Objective
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.grouping import split
@@ -31,7 +32,17 @@ from minimax_cal.robots.robot import Robot, load_robot
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CONDITIONS = ("nominal", "smr:1", "smr:2", "smr:3", "sum", "minimax", "pose", "point")
+Condition = Objective | Literal["nominal"]
+CONDITIONS: tuple[Condition, ...] = (
+    "nominal",
+    "smr:1",
+    "smr:2",
+    "smr:3",
+    "sum",
+    "minimax",
+    "pose",
+    "point",
+)
 PAPER = {  # Table 3 of the paper: F_1, F_2, F_3 [mm^2, 100 poses], RMSE(phi) [mm]
     "nominal": (325.90, 261.23, 373.88, 1.934),
     "smr:1": (13.20, 14.72, 15.88, 0.399),
@@ -49,7 +60,7 @@ class Job:
     """One robot under one condition: train poses, the rest held out (as many as there are)."""
 
     robot: str
-    condition: str
+    condition: Condition
     train: int
     seed: int
 

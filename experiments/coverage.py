@@ -23,7 +23,7 @@ import minimax_cal as mc
 from experiments.record import canvas
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.accuracy import chance_of_larger, max_interval, rms_interval
-from minimax_cal.fitting.options import Options, silent
+from minimax_cal.fitting.options import Objective, Options, silent
 from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.uncertainty import (
     Poses,
@@ -65,7 +65,7 @@ class Case:
     robot: str
     targets: int
     poses: int
-    objective: str = "sum"
+    objective: Objective = "sum"
     compliance: float = 0.0
     jitter: float = 10e-6
     asked: bool = False

@@ -25,6 +25,7 @@ from experiments.poses import Fit, orientation_error, poses_of, triangle
 from experiments.real import SHARED
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.options import Objective
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.measurements import Measurements, read_measurements
@@ -94,7 +95,7 @@ def divided(
 # ---- the methods: (robot, training data) -> Fit, each from the nominal geometry -------------
 
 
-def library(robot: Robot, train: Measurements, objective: str, method: str = "snllm") -> Fit:
+def library(robot: Robot, train: Measurements, objective: Objective, method: str = "snllm") -> Fit:
     """One of the library's objectives, on its set of identified parameters."""
     found = calibrate(robot, train, objective, holdout=0.0, method=method)
     return Fit(found.cell.predict, str(found.status))
@@ -102,9 +103,13 @@ def library(robot: Robot, train: Measurements, objective: str, method: str = "sn
 
 MINIMAX, POSE = "minimax", "MDH pose"
 SINGLE = ("MDH SMR 1", "MDH SMR 2", "MDH SMR 3")
+ONE_TARGET: tuple[Objective, ...] = ("smr:1", "smr:2", "smr:3")
 METHODS: Mapping[str, Callable[[Robot, Measurements], Fit]] = {
     "nominal": nominal,
-    **{SINGLE[i]: partial(library, objective=f"smr:{i + 1}", method="nlgn") for i in range(3)},
+    **{
+        name: partial(library, objective=one, method="nlgn")
+        for name, one in zip(SINGLE, ONE_TARGET, strict=True)
+    },
     POSE: mdh_pose,
     **{f"POE SMR {i + 1}": partial(poe_position, smr=i) for i in range(3)},
     "POE pose": poe_pose,

@@ -44,7 +44,7 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.changes import ENCODER_ZERO
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.simulate import Simulation, Truth, gravity, simulate
-from minimax_cal.robots.robot import load_robot
+from minimax_cal.robots.robot import Robot, load_robot
 
 REAL = ("fanuc_r2000", "irb120", "meca500_r", "qkm_hl6", "ur10_b")
 ARMS = ("irb2600", "irb120", "ur10")
@@ -225,7 +225,7 @@ def simulated(job: Job) -> tuple[Measurements, Array, str, float]:
 # ---- the study ---------------------------------------------------------------------------------
 
 
-def session(job: Job) -> tuple[object, Measurements, Array, str, float]:
+def session(job: Job) -> tuple[Robot, Measurements, Array, str, float]:
     """Robot, measurements, first half, joint that moved, by how much [rad]."""
     if job.is_real:
         robot, data = real(job.arm)
@@ -252,7 +252,7 @@ def place(term: str) -> str:
     return at if effect == ENCODER_ZERO.name else term
 
 
-def in_one_fit(robot: object, both: Measurements) -> Names:
+def in_one_fit(robot: Robot, both: Measurements) -> Names:
     """What one fit of two sessions says has moved of arm and reflectors."""
     try:
         fit = calibrate(robot, both, "sum")
@@ -262,7 +262,7 @@ def in_one_fit(robot: object, both: Measurements) -> Names:
     return tuple(dict.fromkeys(map(place, labels)))
 
 
-def in_one_diagnosis(robot: object, both: Measurements) -> Names:
+def in_one_diagnosis(robot: Robot, both: Measurements) -> Names:
     """What a diagnosis of two sessions has confirmed of what moved."""
     try:
         found = diagnose(robot, both, quick=True)
@@ -277,7 +277,7 @@ def in_one_diagnosis(robot: object, both: Measurements) -> Names:
     return tuple(dict.fromkeys(named))
 
 
-def of_halves(job: Job, robot: object, data: Measurements, first: Array) -> dict[str, Names]:
+def of_halves(job: Job, robot: Robot, data: Measurements, first: Array) -> dict[str, Names]:
     """What `compare` of both halves and `check` of the first by the second name, if they can."""
     if not {"compare", "check"} & set(job.commands):
         return {}

@@ -43,7 +43,7 @@ class Answer:
     data: mc.Measurements
 
 
-def asked(made: Sealed, **options: object) -> Answer:
+def asked(made: Sealed, **options: Any) -> Answer:
     """What `diagnose` makes of an arm's files; what is claimed of other poses is not asked."""
     with TemporaryDirectory() as name:
         write(made, Path(name))

@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.fitting.options import Options
     from minimax_cal.fitting.pixels.calibrate import calibrate_pixels
     from minimax_cal.fitting.several.kinds import relative
+    from minimax_cal.fitting.several.result import RelativeCalibration
     from minimax_cal.ground.errors import (
         CalibrationError,
         CalibrationWarning,
@@ -79,6 +80,7 @@ __all__ = [
     "MotionGap",
     "OptionError",
     "Options",
+    "RelativeCalibration",
     "RelativeDiagnosis",
     "Robot",
     "RobotError",
@@ -169,6 +171,7 @@ MODULES = {  # name: where it is defined
     "Diagnosis": "diagnosing.result",
     "diagnose": "diagnosing.diagnose",
     "diagnose_many": "diagnosing.many",
+    "RelativeCalibration": "fitting.several.result",
     "RelativeDiagnosis": "diagnosing.instruments_result",
     "diagnose_relative": "diagnosing.instruments",
     "Run": "dynamics.logs.table",

@@ -10,7 +10,7 @@ from copy import deepcopy
 from dataclasses import replace
 from functools import cache, partial
 from importlib import import_module, metadata, util
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -42,6 +42,12 @@ BACKENDS: dict[str, tuple[str, str]] = {  # name: (module, method)
     "cvxpy": ("via_cvxpy", ""),  # also "cvxpy:CLARABEL" and its other solvers
     "subgradient": ("subgradient", "restarted"),  # also "subgradient:raw", "subgradient:eliminated"
 }
+BackendName = Literal[  # every name of the table, and the choices of those that take one
+    "daqp", "daqp:direct", "quadprog", "quadprog:direct", "piqp", "clarabel", "proxqp", "highs",
+    "osqp", "scs", "ecos", "qpalm", "cvxopt", "kvxopt", "gurobi", "mosek", "copt", "qpoases",
+    "qpswift", "hpipm", "cvxpy", "cvxpy:CLARABEL", "cvxpy:OSQP", "cvxpy:SCS", "subgradient",
+    "subgradient:restarted", "subgradient:raw", "subgradient:eliminated",
+]  # fmt: skip
 DIRECT = {"daqp": "via_daqp", "quadprog": "via_quadprog"}  # "daqp:direct": without qpsolvers
 FRAIL = ("highs",)  # HiGHS 1.16 kills the process on P = diag(3e-14, 2e-4)
 CHOOSING = ("cvxpy", "subgradient", *DIRECT)  # those that take a choice after a colon

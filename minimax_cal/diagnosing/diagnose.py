@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -51,6 +51,7 @@ from minimax_cal.fitting.crossed import MIN_HELD_POSES
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.floor import DISTANCES, Floor, floor_of, noise_at_most, with_instrument
 from minimax_cal.fitting.judged import doubts
+from minimax_cal.fitting.jump_sizes import fit_jump_sizes
 from minimax_cal.fitting.options import Options, Progress, silent
 from minimax_cal.fitting.outcome import FileEvidence, missed_rows
 from minimax_cal.fitting.several.kinds import READ
@@ -64,8 +65,9 @@ from minimax_cal.ground.options import check_left_out, grouped, takes
 from minimax_cal.ground.stages import name_rung, number_step
 from minimax_cal.ground.threads import one_thread
 from minimax_cal.ground.words import name_first
-from minimax_cal.instruments.file import Given, taken
+from minimax_cal.instruments.file import Given, InstrumentData, taken
 from minimax_cal.instruments.images import Images
+from minimax_cal.instruments.tracker import Points
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.faults import find_faults, in_lines, mended, standing_out
 from minimax_cal.measuring.faults.fault import Fault
@@ -78,7 +80,10 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.modelling.effects.time import SESSION_JUMP, TARGET_SHIFT
 from minimax_cal.modelling.effects.words import name_step
-from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.robot import Robot, RobotSource, load_robot
+
+if TYPE_CHECKING:  # it is slow to import
+    from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
 
 FAULTY, CAUSES, BUDGET = "faults of the data", "testing causes", "error budget"
 PARTS, REMAINING = "regions held out", "remaining error"
@@ -124,6 +129,36 @@ class DiagnosisOptions:
 OF_OTHERS = ("offset", "known_distances", "lever", "noises", *Images.options)
 
 
+@overload
+def diagnose(
+    robot: RobotSource,
+    data: Measurements | Points,
+    *,
+    jobs: int = 1,
+    cluster: str = "",
+    progress: Progress = silent,
+    **options: Any,
+) -> Diagnosis: ...
+@overload
+def diagnose(
+    robot: RobotSource,
+    data: InstrumentData,
+    *,
+    jobs: int = 1,
+    cluster: str = "",
+    progress: Progress = silent,
+    **options: Any,
+) -> RelativeDiagnosis: ...
+@overload
+def diagnose(
+    robot: RobotSource,
+    data: Given | Sequence[Given],
+    *,
+    jobs: int = 1,
+    cluster: str = "",
+    progress: Progress = silent,
+    **options: Any,
+) -> Diagnosis | RelativeDiagnosis: ...
 @takes(
     options=DiagnosisOptions, others=(RelativeOptions, OF_OTHERS), read={**READ, "exclude": list}
 )
@@ -136,7 +171,7 @@ def diagnose(
     jobs: int = 1,
     cluster: str = "",
     progress: Progress = silent,
-) -> Diagnosis:
+) -> Diagnosis | RelativeDiagnosis:
     """Say what is still wrong with a calibrated robot, and why, as far as the data can tell.
 
     Parameters
@@ -158,7 +193,7 @@ def diagnose(
 
     Returns
     -------
-    Diagnosis
+    Diagnosis | RelativeDiagnosis
         The causes and the error budget. Its lengths are in m, in mm where a name says so.  A
         `RelativeDiagnosis` where the data are not points of trackers alone.
 
@@ -178,7 +213,7 @@ def diagnose(
         from minimax_cal.diagnosing.instruments import diagnosed
 
         chosen = with_others(given, replace(options, exclude=()), others)
-        return cast(Diagnosis, diagnosed(robot, given, options.exclude, chosen, progress))
+        return diagnosed(robot, given, options.exclude, chosen, progress)
     check_no_others(given, others)
     check_left_out(options.exclude, EFFECTS)
     given = checks.check_joints(robot, given)
@@ -482,7 +517,12 @@ def cleaned(asked: Asked, progress: Progress) -> Clean:
     more = (*more, *many)
     sound = mended(sound, more)
     sound = sound.take(np.asarray(sound.seen.any(axis=1)))
-    jumped = session_jumps(cell.placed(sound), cell.error(sound))
+    placed, held = cell.placed(sound), np.isin(sound.line, asked.data.line[asked.held])
+
+    def fit_sizes(rows: Array) -> Array:
+        return fit_jump_sizes(robot, placed, ~held, SUM, rows)
+
+    jumped = session_jumps(placed, cell.error(sound), fit_sizes)
     told = (*found, *more)
     remarks = tuple(fault.text for fault in told if fault.effect != TARGET_SHIFT.name)
     rows = np.concatenate([NO_ROWS, *(fault.rows for fault in jumped)])

@@ -32,6 +32,7 @@ from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.options import check_left_out, takes
 from minimax_cal.ground.threads import one_thread
 from minimax_cal.instruments.file import Given
+from minimax_cal.instruments.instrument import METRE
 from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
@@ -120,7 +121,7 @@ def examined(
     ladder = budget_of(asked, fit, often(causes.effects))
     effects = with_shares(scene, ladder)
     last = ladder.calibrations[-1]
-    known, file = known_noise(scene, ladder.fits[-1])
+    known, file, unit = known_noise(scene, ladder.fits[-1])
     failed = last.status is Status.FAILED or ladder.calibrations[0].status is Status.FAILED
     steps = [RelativeStep.of("nominal", ladder.calibrations[0], nominal=True)]
     names = ["geometric", *(found.term.step for found in ladder.findings)]
@@ -130,7 +131,8 @@ def examined(
         calibration=last,
         steps=tuple(steps),
         floor_file=file,
-        floor_mm=(known.remaining, known.highest),
+        floor=(known.remaining, known.highest),
+        floor_unit=unit,
         seconds=time.perf_counter() - began,
     )
 
@@ -260,23 +262,25 @@ def with_shares(scene: Scene, ladder: Budget) -> list[Finding]:
     return sorted(out, key=lambda found: -found.share)
 
 
-def known_noise(scene: Scene, fit: InstrumentFit) -> tuple[Known, str]:
+def known_noise(scene: Scene, fit: InstrumentFit) -> tuple[Known, str, str]:
     """What is known of the noise beneath the last step, of the file that exceeds it most.
 
-    Known is the noise of files that the user gave; sound joints add to it.  And the file's name.
+    Known is the noise of files that the user gave; sound joints add to it.  In
+    the unit of the file's rows [SI].  And the file's name and unit.
     """
     stack = fit.stack
     cost, spare = remaining(fit.problem, fit.state)
     looks = rows_of_all(scene, fit.stiff or fit).looks
-    worst, file = NOT_KNOWN, ""
+    worst, file, units = NOT_KNOWN, "", METRE
     for i, (one, look) in enumerate(zip(stack.instruments, looks, strict=True)):
         if not np.isfinite(stack.given[i]):
             continue
         arm = look.of(scene.jacobian[..., look.poses])
         own = (arm**2).sum(axis=0).mean() / (fit.stiff or fit).stack.precision[i]
-        unit = 1e3 / one.row_noise
+        unit = 1.0 / one.row_noise
         low = float(np.sqrt(cost[i] / chdtri(spare[i], 0.05)))
         most = float(np.sqrt(stack.given[i] + MAX_JOINT_JITTER**2 * own))
         if not worst.remaining / worst.highest > low / most:
-            worst, file = replace(worst, remaining=unit * low, highest=unit * most), stack.labels[i]
-    return worst, file
+            worst = replace(worst, remaining=unit * low, highest=unit * most)
+            file, units = stack.labels[i], one.unit
+    return worst, file, units

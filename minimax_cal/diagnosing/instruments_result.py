@@ -11,14 +11,16 @@ from minimax_cal.diagnosing.result import VERDICTS as VERDICTS  # in annotations
 from minimax_cal.diagnosing.result import Untestable as Untestable
 from minimax_cal.diagnosing.sentences import explained
 from minimax_cal.evidence.limits import LEVEL
-from minimax_cal.fitting.accuracy import Accuracy
 from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.fitting.several import RelativeCalibration
-from minimax_cal.ground.facts import APART, Fact, derived, in_file
+from minimax_cal.fitting.several.result import Scores
+from minimax_cal.ground.facts import APART, Fact, derived, in_digits, in_file
 from minimax_cal.ground.files import number, plain
 from minimax_cal.ground.records import reading, stored
 from minimax_cal.ground.results import Result, merged
 from minimax_cal.ground.tables import Table, filled
+from minimax_cal.ground.units import for_people, in_files
+from minimax_cal.instruments.instrument import METRE
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.solvers.status import Status as Status
 
@@ -30,8 +32,8 @@ class RelativeStep:
     """One step of the error budget.  holdout: of all files; files: held out, of each by name."""
 
     name: Annotated[str, Fact(key="step")]
-    holdout: Accuracy
-    files: Mapping[str, Accuracy]
+    holdout: Scores
+    files: Mapping[str, Scores]
 
     @staticmethod
     def of(name: str, found: RelativeCalibration, *, nominal: bool = False) -> RelativeStep:
@@ -47,8 +49,8 @@ class RelativeDiagnosis(Explained, Result):
     """What is still wrong with an arm that several instruments measured.
 
     calibration: with the effects that the budget took.  steps: nominal, geometric, then with each
-    effect.  floor_file: that exceeds the noise that was given most; floor_mm: what its numbers
-    leave at least, and what noise and sound joints may add up to [mm].
+    effect.  floor_file: that exceeds the noise that was given most; floor: what its numbers leave
+    at least, and what noise and sound joints may add up to, in its unit [SI].
     """
 
     KIND = RELATIVE
@@ -57,7 +59,8 @@ class RelativeDiagnosis(Explained, Result):
     calibration: Annotated[RelativeCalibration, APART]
     steps: Annotated[tuple[RelativeStep, ...], Fact(key="gap.ladder", fewest=2)]
     floor_file: Annotated[str, Fact(key="floor.file")]
-    floor_mm: Annotated[tuple[float, float], APART]
+    floor: Annotated[tuple[float, float], APART]
+    floor_unit: Annotated[str, APART]
     seconds: float
 
     def __repr__(self) -> str:
@@ -66,9 +69,11 @@ class RelativeDiagnosis(Explained, Result):
     @property
     def excess(self) -> str:
         """What the last step leaves, against the noise that was given."""
-        low, high = self.floor_mm
+        scale, unit = for_people(self.floor_unit)
+        spec = ".3f" if unit == "mm" else "#.3g"
+        low, high = (f"{scale * size:{spec}} {unit}" for size in self.floor)
         where = f"{self.floor_file}: " if self.floor_file else ""
-        return f"{where}at least {low:.3f} mm against at most {high:.3f} mm (given)"
+        return f"{where}at least {low} against at most {high} (given)"
 
     @property
     def reason(self) -> str:
@@ -94,22 +99,36 @@ class RelativeDiagnosis(Explained, Result):
 
     def headline(self) -> str:
         """The verdict in words, and the held-out errors."""
-        first, last = self.steps[1].holdout, self.steps[-1].holdout
-        fall = f" -> {last.rms_mm:.3f} mm with the effects" if len(self.steps) > 2 else ""
-        said = f"Held-out RMS error: geometry {first.rms_mm:.3f} mm{fall}."
-        return " ".join([*self.reasons, said])
+        first, last = (self.in_units(self.steps[i]) for i in (1, -1))
+        texts = []
+        for name, before in first.items():
+            rms, _, _, unit = before.for_display
+            spec = ".3f" if unit == "mm" else "#.3g"
+            after = f"{last[name].for_display[0]:{spec}} {unit}"
+            fall = f" -> {after} with the effects" if len(self.steps) > 2 else ""
+            texts.append(f"{name}{rms:{spec}} {unit}{fall}")
+        return " ".join([*self.reasons, f"Held-out RMS error: geometry {', '.join(texts)}."])
+
+    def in_units(self, step: RelativeStep) -> dict[str, Scores]:
+        """Errors of a step, each in one unit: of all files, or of each by name."""
+        if len(self.calibration.units) == 1:
+            return {"": step.holdout}
+        return {f"{name} ": scores for name, scores in step.files.items()}
 
     def steps_table(self) -> Table:
         """The error budget, step by step, by file."""
-        files = tuple(self.steps[0].files)
-        rows = (
-            (name_step(step.name), step.holdout.rms_mm, step.holdout.max_mm,
-             *(step.files[name].rms_mm for name in files))
-            for step in self.steps
-        )  # fmt: skip
-        of_files = (f"{name} RMS mm .4f" for name in files)
-        columns = "model | RMS mm .4f | max mm .4f"
-        return Table.made("error budget, held-out poses", rows, columns, *of_files)
+        files, is_common = tuple(self.steps[0].files), len(self.calibration.units) == 1
+        columns = ["model"]
+        rows: list[list[object]] = [[name_step(step.name)] for step in self.steps]
+        every = [[step.holdout for step in self.steps]] if is_common else []
+        every += [[step.files[name] for step in self.steps] for name in files]
+        for name, scores in zip([""] * is_common + [f"{n} " for n in files], every, strict=True):
+            unit = scores[0].for_display[-1]
+            spec = ".4f" if unit == "mm" else ".4g"
+            columns += [f"{name}RMS {unit} {spec}"] + [f"max {unit} {spec}"] * (not name)
+            for row, one in zip(rows, scores, strict=True):
+                row += one.for_display[: 1 if name else 2]
+        return Table.made("error budget, held-out poses", rows, *columns)
 
     def effects_table(self) -> Table:
         """The effects found, with what each does for held-out poses."""
@@ -136,10 +155,14 @@ class RelativeDiagnosis(Explained, Result):
 
     def to_dict(self, *, poses: bool = True) -> dict[str, Any]:
         """The JSON of the calibration, with the key diagnosis, as `Diagnosis` where it means so."""
-        remaining, highest = self.floor_mm
+        scale, unit = in_files(self.floor_unit)
+        remaining, highest = (in_digits(scale * size) for size in self.floor)
+        floor = {"remaining": remaining, "noise_floor": highest, "unit": unit}
+        if unit == "mm":
+            floor = {"remaining_mm": remaining, "noise_floor_mm": highest}
         more = {
             "floor_known": self.meets_floor is not None,
-            "floor": {"remaining_mm": remaining, "noise_floor_mm": highest},
+            "floor": floor,
             "effects": self.effects,
             "gap": {f"holdout_{kind}": ends for kind, ends in ends_of(self.steps).items()},
         }
@@ -159,5 +182,14 @@ class RelativeDiagnosis(Explained, Result):
                 **told,
                 calibration=calibration,
                 effects=tuple(Finding.told(one, f"effects[{i}]", terms) for i, one in each),
-                floor_mm=(number(floor["remaining_mm"]), number(floor["noise_floor_mm"])),
+                **floor_from(floor),
             )
+
+
+def floor_from(told: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a diagnosis from its floor in a file, in mm or in the unit that it names."""
+    if "unit" in told:
+        ends = number(told["remaining"]), number(told["noise_floor"])
+        return {"floor": ends, "floor_unit": str(told["unit"])}
+    ends = 1e-3 * number(told["remaining_mm"]), 1e-3 * number(told["noise_floor_mm"])
+    return {"floor": ends, "floor_unit": METRE}

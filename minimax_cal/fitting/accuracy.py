@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.special import ndtri
@@ -97,7 +97,10 @@ def by_key(nominal: Array, calibrated: Array, held: Array) -> dict[str, Array]:
     }
 
 
-def before_and_after(accuracies: Mapping[str, Accuracy]) -> tuple[Accuracy, Accuracy, str]:
+A = TypeVar("A", bound=Accuracy)
+
+
+def before_and_after(accuracies: Mapping[str, A]) -> tuple[A, A, str]:
     """Before and after a fit, at held-out poses where there are any, and which poses those are."""
     held, train = accuracies["holdout"], accuracies["train"]
     if held.poses:

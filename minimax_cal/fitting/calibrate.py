@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,8 +17,11 @@ from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.floor import with_instrument
 from minimax_cal.fitting.judged import Judged, Parts
 from minimax_cal.fitting.options import (
+    Loss,
+    Objective,
     Options,
     Progress,
+    QpChoice,
     check_options,
     objective_of,
     silent,
@@ -31,6 +34,7 @@ from minimax_cal.fitting.several.options import (
     only_others,
     with_others,
 )
+from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.fitting.solve import LEAST_POSES, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
@@ -38,7 +42,7 @@ from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.threads import one_thread
 from minimax_cal.instruments import file
-from minimax_cal.instruments.file import taken
+from minimax_cal.instruments.file import InstrumentData, JointsAndPoints, PointData, taken
 from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.faults import distance_faults
@@ -52,12 +56,45 @@ from minimax_cal.measuring.stations import seen_from
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.time import SESSION_JUMP
 from minimax_cal.modelling.start import EVERYWHERE
-from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.robot import Robot, RobotSource, load_robot
 
 JUMP = (SESSION_JUMP.name, f"{SESSION_JUMP.name}:frame")  # without its moment
-Given = file.Given | Sequence[file.Given] | tuple[ArrayLike, ArrayLike]
+Given = file.Given | Sequence[file.Given] | JointsAndPoints
 
 
+@overload
+def calibrate(
+    robot: RobotSource,
+    data: PointData,
+    objective: Objective = "minimax",
+    qp: QpChoice = "daqp",
+    *,
+    loss: Loss = "square",
+    progress: Progress = silent,
+    **options: Any,
+) -> Fit: ...
+@overload
+def calibrate(
+    robot: RobotSource,
+    data: InstrumentData,
+    objective: Objective = "minimax",
+    qp: QpChoice = "daqp",
+    *,
+    loss: Loss = "square",
+    progress: Progress = silent,
+    **options: Any,
+) -> RelativeCalibration: ...
+@overload
+def calibrate(
+    robot: RobotSource,
+    data: Given,
+    objective: Objective = "minimax",
+    qp: QpChoice = "daqp",
+    *,
+    loss: Loss = "square",
+    progress: Progress = silent,
+    **options: Any,
+) -> Fit | RelativeCalibration: ...
 @takes(
     "objective", "qp", options=Options, others=(RelativeOptions, only_others(Options)), read=READ
 )
@@ -68,7 +105,7 @@ def calibrate(
     options: Options,
     others: RelativeOptions,
     progress: Progress = silent,
-) -> Fit:
+) -> Fit | RelativeCalibration:
     """Calibrate a robot from measurements of any instruments.
 
     Parameters
@@ -86,9 +123,9 @@ def calibrate(
 
     Returns
     -------
-    Fit
+    Fit | RelativeCalibration
         The calibration; how the numbers ended is in its `status`.  A `RelativeCalibration`
-        where the data are not points of trackers alone.
+        where the data are not points of trackers alone: of files their columns decide.
 
     Raises
     ------
@@ -104,7 +141,7 @@ def calibrate(
         check_no_others(given, others)
         return calibrate_with(robot, given, options, progress)
     asked = with_others(given, options, others)
-    return cast(Fit, relative_with(robot, given, asked, progress))  # as nearly all data have it
+    return relative_with(robot, given, asked, progress)
 
 
 @one_thread()

@@ -13,6 +13,7 @@ from minimax_cal.fitting.coaxial import change_of_coaxial_zeros
 from minimax_cal.fitting.common_scale import LEAST_SHARE, scale_of, with_links
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.units import for_people
 from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.checks import best_orders, check_span, swapped
 from minimax_cal.measuring.measurements import Measurements
@@ -78,7 +79,8 @@ def check_mends(
     limit: float = 4.0,
     share: float = EXPLAINED,
     alike: float = 2.0,
-    said: str = "the nominal robot then misses by {:.3g} mm, not {:.3g} mm",
+    said: str = "the nominal robot then misses by {:.3g} {unit}, not {:.3g} {unit}",
+    unit: str = "m",
 ) -> None:
     """Raise DataError for the mend with which the drawn arm fits far better, of equals the first.
 
@@ -86,6 +88,7 @@ def check_mends(
     `fit`, which returns such a pair, takes: the data mended.  A table is tried where none before it
     fits to `good` [m], an RMS.  limit: times that, which may be left.  share: of the mean square.
     alike: factor between equals, as a mirrored arm and one with some joints reversed are.
+    unit: of the misses, in place of m.
     """
     trials: list[tuple[float, float, str]] = []
     for table in tables:
@@ -95,8 +98,9 @@ def check_mends(
     least = min(compared for _, compared, _ in trials)
     square, compared, text = next(trial for trial in trials if trial[1] <= alike * least)
     if np.sqrt(square) <= limit * good and compared < share * given[1]:
-        miss_mm = 1e3 * np.sqrt([square, given[0]])
-        raise DataError(f"{source}: {text} ({said.format(*miss_mm)})")
+        scale, name = for_people(unit)
+        misses = scale * np.sqrt([square, given[0]])
+        raise DataError(f"{source}: {text} ({said.format(*misses, unit=name)})")
 
 
 def check_plausible(robot: Robot, data: Measurements) -> BaseFit:

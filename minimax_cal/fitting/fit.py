@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, overload
 
 import numpy as np
 import scipy
@@ -61,6 +61,9 @@ from minimax_cal.robots.transforms import CONVENTION, Frame, frames_tables
 from minimax_cal.solvers.linearisation import Kkt
 from minimax_cal.solvers.minimax import Step
 from minimax_cal.solvers.status import Status
+
+if TYPE_CHECKING:  # it imports this module
+    from minimax_cal.fitting.several.result import RelativeCalibration
 
 POSE_BY_POSE = ("weights", "share", "crossed", "drawn crossed")  # arrays of a file
 PACKAGES = ("minimax-cal", "numpy", "scipy", "qpsolvers")
@@ -702,7 +705,11 @@ def identified(
     return Identification(active, {p.name: p.why for p in parameters if p.reason}, singular, scale)
 
 
-def load_fit(path: Fit | Path | str) -> Fit:
+@overload
+def load_fit(path: Fit) -> Fit: ...
+@overload
+def load_fit(path: Path | str) -> Fit | RelativeCalibration: ...
+def load_fit(path: Fit | Path | str) -> Fit | RelativeCalibration:
     """A calibration from its file, whole.
 
     Parameters
@@ -712,7 +719,7 @@ def load_fit(path: Fit | Path | str) -> Fit:
 
     Returns
     -------
-    Fit
+    Fit | RelativeCalibration
         The calibration, whole.  A `RelativeCalibration` where the data were not points of trackers
         alone.
 
@@ -731,5 +738,5 @@ def load_fit(path: Fit | Path | str) -> Fit:
     if "measured" in content and content.get("kind") != Fit.KIND:
         from minimax_cal.fitting.several.result import read_result  # it knows this file
 
-        return cast(Fit, read_result(content, str(path)))  # as nearly all files have it
+        return read_result(content, str(path))
     return Fit.from_dict(content, str(path))

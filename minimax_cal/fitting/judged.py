@@ -38,6 +38,7 @@ from minimax_cal.fitting.improvement import (
     rms_of,
     said_without,
 )
+from minimax_cal.fitting.jump_sizes import fit_jump_sizes
 from minimax_cal.fitting.minimax_problem import MIN_TRUSTED_WEIGHT
 from minimax_cal.fitting.options import Options, objective_of, qp_name
 from minimax_cal.fitting.outcome import (
@@ -246,7 +247,7 @@ class Judged:
             *remarks(self.options, self.poses),
             *checks.outliers(data, np.linalg.norm(after, axis=-1)),
             *contradictions(data, after),
-            *(fault.text for fault in session_jumps(data, after)),
+            *(fault.text for fault in session_jumps(data, after, self.fit_jumps)),
             *(change.sentence for change in self.moved),
             *self.alarming,
             *bad_rows(self.suspects, data),
@@ -255,6 +256,13 @@ class Judged:
             *([said_of_exchanged(data, self.swapped)] if swapped else []),
             *([said_without(better, rms_of(*self.unseen))] if better and better.wrong else []),
             *filter(None, [self.outcome.reason]),
+        )
+
+    def fit_jumps(self, rows: Array) -> Array:
+        """Sizes (j,) of jumps that start at some rows, fitted beside the arm [m]."""
+        poses = self.poses
+        return fit_jump_sizes(
+            self.robot, self.data, ~self.held, self.options, rows, near=poses.near
         )
 
     def fit(self, began: float) -> Fit:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from minimax_cal.solvers.least_squares import AUTO, JOINT, METHODS
 from minimax_cal.solvers.own_qp import QpFunction, adapt_qp_function
 from qp_backends import BackendError
 from qp_backends import solve as solve_qp
-from qp_backends.registry import backend
+from qp_backends.registry import BackendName, backend
 
 SEED = Fact(least=0)
 OFFSETS = "offsets"  # what `only` may ask for
@@ -41,7 +41,13 @@ UNITS = {"mm": 1e-3, "um": 1e-6, "m": 1.0, "mrad": 1e-3, "rad": 1.0, "deg": 0.01
 LENGTHS = ("mm", "um", "m")
 
 
-QpSolver = str | QpFunction
+Objective = Literal[
+    "sum", "minimax", "point", "pose",
+    "smr:1", "smr:2", "smr:3", "smr:4", "smr:5", "smr:6", "smr:7", "smr:8", "smr:9",
+]  # fmt: skip
+Loss = Literal["square", "huber", "cauchy", "tukey"]
+QpSolver = str | QpFunction  # the name may be that of a registered one
+QpChoice = BackendName | QpFunction
 T = TypeVar("T")
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
+from numpy.typing import NDArray
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
@@ -19,6 +20,10 @@ from minimax_cal.measuring.measurements import Measurements, file_column, measur
 from minimax_cal.reading.rows import TARGET, Rows, read_rows
 
 Given = Instrument | Measurements | str | Path
+Numbers = NDArray[Any] | Sequence[Sequence[float]] | Sequence[Sequence[Sequence[float]]]
+JointsAndPoints = tuple[Numbers, Numbers]  # (m, n) and (m, 3) or (m, k, 3)
+PointData = Measurements | Points | JointsAndPoints  # of trackers
+InstrumentData = Instrument | Sequence[Instrument | Measurements]  # of others, or of several
 
 
 def columns_of(path: Path | str, header: Sequence[str]) -> Columns:

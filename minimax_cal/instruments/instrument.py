@@ -1,7 +1,8 @@
 """An instrument: what was measured at some poses, what is unknown of it, and how it reads an arm.
 
-`names`, `starts` and `read` are the protocol.  The rest is policy and has a default: which unknowns
-redundancy takes first, what an instrument lacks, its columns in a file, its slips, its words.
+`names`, `starts`, `read` and the `unit` of the rows are the protocol.  The rest is policy and has a
+default: which unknowns redundancy takes first, what an instrument lacks, its columns in a file, its
+slips, its words.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from minimax_cal.reading.rows import Rows
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_joints
 
+METRE, RADIAN = "m", "rad"
 SPOT = tuple(f"{TARGET}_{axis}" for axis in "xyz")  # the point on the flange, or the ball
 FRAMELESS = "moves nothing that is measured"
 ANGLES = ("_rx", "_ry", "_rz", "_tilt1", "_tilt2")  # endings of names
@@ -81,7 +83,8 @@ class Instrument:
 
     at: the m poses (q, line, columns), with points where these were measured.
 
-    Of a class: kind: its name.  words: what is said of it.  by_row: fields with an entry for each
+    Of a class: kind: its name.  unit: of its rows in SI, as m, rad or px; noise and accuracy
+    are reported in it.  words: what is said of it.  by_row: fields with an entry for each
     pose; chosen: fields that `ready` fills.  file: its columns, None where it has none of its own.
     options: the fields of the options that are its own.  targets_at: where the points on the flange
     stand among its own parameters.  given_up: beginnings of those that redundancy takes first.
@@ -99,6 +102,7 @@ class Instrument:
     at: Measurements
 
     kind: ClassVar[str]
+    unit: ClassVar[str] = METRE
     words: ClassVar[Words]
     by_row: ClassVar[tuple[str, ...]] = ()
     chosen: ClassVar[tuple[str, ...]] = ()
@@ -302,11 +306,11 @@ class Instrument:
         return (self.kind,)
 
     def mean_square(self, arm: FlangePoses, own: Array) -> float:
-        """Of the misses of its points [m^2]."""
+        """Of the misses of its points [unit^2]."""
         return float((self.read(arm, own).residual ** 2).sum() / self.points)
 
     def errors(self, arm: FlangePoses, own: Array, held: Array) -> Array:
-        """(parts, m, 3), NaN where not measured [m]; numbers first."""
+        """(parts, m, 3), NaN where not measured [unit]; numbers first."""
         rows = self.read(arm, own)
         out = np.full((len(self.parts), self.poses, 3), np.nan)
         part = rows.part if len(rows.part) else np.zeros(len(rows.pose), dtype=int)
@@ -354,7 +358,7 @@ class Instrument:
         """Raise for what shows where the arm as drawn, `started`, fits it."""
 
     def remarks(self, parameters: Sequence[Any], noise: float) -> tuple[str, ...]:
-        """What the reader should know.  parameters: its own, found.  noise: of a number [m]."""
+        """What the reader should know.  parameters: its own, found.  noise: of a number [unit]."""
         return ()
 
     def wider(self) -> Mapping[str, object]:

@@ -45,8 +45,9 @@ class FlangePoses(NamedTuple):
 class ResidualRows(NamedTuple):
     """r rows: measured minus predicted, and the slopes of the prediction.
 
-    residual: (r,) [m].  pose: (r,).  point: (r, 3) looked at, in the base [m].  by_point,
-    by_rotation: (r, 3) slopes by that point and by a rotation of the flange.  by_own: (r, e).
+    residual: (r,) in the unit of the instrument.  pose: (r,).  point: (r, 3) looked at, in the base
+    [m].  by_point, by_rotation: (r, 3) slopes by that point and by a rotation of the flange.
+    by_own: (r, e).
     part: (r,) which of the instrument's parts it is of, or OF_NONE; empty for the first.
     about: (r,) numbers from 0; rows of one number are taken about their mean, as a place that they
     share is eliminated; empty for none.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.options import SI
 from minimax_cal.instruments.instrument import Instrument
 
 INSTRUMENTS: dict[str, str | type[Instrument]] = {  # name: where its class is, or the class
@@ -29,6 +30,8 @@ def instrument(name: str) -> type[Instrument]:
 def register_instrument(kind: type[Instrument]) -> type[Instrument]:
     """Make a class of instruments known, by its `kind`: a decorator.
 
+    Its `unit` says what its rows are in: m unless given.
+
     Parameters
     ----------
     kind
@@ -43,7 +46,7 @@ def register_instrument(kind: type[Instrument]) -> type[Instrument]:
     Raises
     ------
     OptionError
-        Where it has no kind of its own.
+        Where it has no kind of its own, or a unit that is not SI.
 
     Examples
     --------
@@ -53,6 +56,10 @@ def register_instrument(kind: type[Instrument]) -> type[Instrument]:
     if not name or isinstance(INSTRUMENTS.get(name), str):
         what = f"{name!r} is built in" if name else "it has none"
         raise OptionError(f"{kind.__name__}: give it a kind of its own: {what}")
+    if SI.get(kind.unit, 1.0) != 1.0 or not kind.unit:
+        raise OptionError(
+            f"{kind.__name__}: unit {kind.unit!r}: give its rows in SI: m, rad, px or another unit"
+        )
     INSTRUMENTS[name] = kind
     return kind
 

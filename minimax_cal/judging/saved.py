@@ -17,6 +17,7 @@ from minimax_cal.fitting.opened import Result as Given
 from minimax_cal.fitting.set_aside import aside_sentence, errors_of, with_them
 from minimax_cal.fitting.several.fit import allowed_of, stack_of, start_of
 from minimax_cal.fitting.several.options import RelativeOptions
+from minimax_cal.fitting.several.result import Scores
 from minimax_cal.fitting.spans import Span, narrow, outside, spans_in_words
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
@@ -26,7 +27,7 @@ from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table
 from minimax_cal.instruments.file import Given as Measured
 from minimax_cal.instruments.file import taken
-from minimax_cal.instruments.instrument import Instrument
+from minimax_cal.instruments.instrument import METRE, Instrument
 from minimax_cal.measuring.checks import check_joints, outliers
 from minimax_cal.measuring.grouping import REPEAT, groups
 from minimax_cal.measuring.measurements import Measurements, SetAside, read_measurements
@@ -122,7 +123,11 @@ class Evaluation(Result):
 
     def headline(self) -> str:
         """The error in a sentence."""
-        return f"RMS error {self.accuracy.rms_mm:.4f} mm on {self.data}."
+        rms, unit = f"{self.accuracy.rms_mm:.4f}", "mm"
+        if isinstance(self.accuracy, Scores) and self.accuracy.unit:
+            size, _, _, unit = self.accuracy.for_display
+            rms = f"{size:.4g}"
+        return f"RMS error {rms} {unit} on {self.data}."
 
     def tables(self) -> tuple[Table, ...]:
         """The error of all targets and of each."""
@@ -198,7 +203,7 @@ def of_instrument(source: Given, one: Instrument, rung: int | None) -> Evaluatio
     stack = stack_of(robot, {"": one}, options)
     x, block = start_of(robot, stack, allowed_of(stack, options)[0]), stack.blocks[0]
     error = block.instrument.errors(*block.at(x), np.zeros(one.poses, dtype=bool))
-    found, data = accuracy(error), one.at
+    found, data = Scores.of(error, [one.unit], int(one.numbers.sum())), one.at
     seen = bool(data.digest) and data.digest in opened.digest.split()
     said = [f"{data.source}: what the instrument has of its own is fitted to these rows"]
     said += [f"{data.source}: the fit was made of these rows"] * seen
@@ -218,9 +223,24 @@ def of_instrument(source: Given, one: Instrument, rung: int | None) -> Evaluatio
         accuracy=found,
         set_aside=data.set_aside,
         with_them=None,
-        shown=found.table(f"{one.words.quantity} on {data.source}", block.instrument.parts),
+        shown=part_errors(f"{one.words.quantity} on {data.source}", found, block.instrument, error),
         notices=(*data.notices, *said),
     )
+
+
+def part_errors(title: str, whole: Scores, one: Instrument, error: Array) -> Table:
+    """Errors of each part of an instrument, as of each wire, and of all, in its unit.
+
+    error: (parts, m, 3), NaN where not measured [unit].
+    """
+    if one.unit == METRE:
+        return whole.table(title, one.parts)
+    parts = [Scores.of(part[None], [one.unit]) for part in error]
+    every = zip((*one.parts, "all"), (*parts, whole), strict=True)
+    rows = ((n, sum(s.counts), *s.for_display[:3]) for n, s in every)
+    unit = whole.for_display[-1]
+    columns = f"part | numbers d | RMS {unit} .4g | max {unit} .4g | mean {unit} .4g"
+    return Table.made(title, rows, columns)
 
 
 def open_saved(

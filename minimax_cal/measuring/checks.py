@@ -10,6 +10,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.units import for_people
 from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.grouping import mislabelled
 from minimax_cal.measuring.measurements import Measurements
@@ -148,8 +149,12 @@ def swapped(least: Array, own: Array) -> Array:
     return np.flatnonzero(better & (own > 25.0 * float(np.median(least))))
 
 
-def outliers(data: Measurements, distance: Array) -> list[str]:
-    """Points that miss by far more than the others.  distance: (k, m), NaN where not measured."""
+def outliers(data: Measurements, distance: Array, unit: str = "m") -> list[str]:
+    """Points that miss by far more than the others.
+
+    distance: (k, m), NaN where not measured [unit].
+    """
+    scale, name = for_people(unit)
     known = np.where(np.isfinite(distance), distance, -1.0)
     given = known[known >= 0.0]
     usual = float(np.median(given)) if len(given) else 0.0
@@ -161,10 +166,10 @@ def outliers(data: Measurements, distance: Array) -> list[str]:
         return []
     named = [
         f"{data.called(data.line[pose])} {data.target_names[target]} "
-        f"{1e3 * distance[target, pose]:.3g} mm"
+        f"{scale * distance[target, pose]:.3g} {name}"
         for target, pose in sorted(found, key=lambda at: -distance[tuple(at)])
     ]
-    typical = f"outliers (typical error {1e3 * usual:.3g} mm)"
+    typical = f"outliers (typical error {scale * usual:.3g} {name})"
     return [f"{data.source}: {typical}: {name_first(named, 5)}"]
 
 

@@ -551,6 +551,9 @@ PARSERS: dict[str, tuple[Callable[[str], Any], type[Exception]]] = {
 }
 
 
+RobotSource = Robot | str | Path  # loaded, or what `load_robot` takes
+
+
 def load_robot(source: Robot | Path | str) -> Robot:
     """A built-in robot by name, or a file (.json, .toml, .yaml, .csv, .xlsx, .urdf, MJCF .xml).
 

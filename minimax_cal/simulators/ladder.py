@@ -126,7 +126,8 @@ def weighed(fit: Fit, chain: Chain, effects: Sequence[Term | str]) -> Fit:
     mass, com = own_masses(chain, nominal) or (nominal.mass, nominal.com)
     settings = {**vars(fit.options), "effects": tuple(effects)}
     rows = marked(fit.data, fit.held)
-    return calibrate(replace(nominal, mass=mass, com=com), rows, **settings)
+    found: Fit = calibrate(replace(nominal, mass=mass, com=com), rows, **settings)
+    return found
 
 
 def established(told: Diagnosis) -> tuple[Term, ...]:

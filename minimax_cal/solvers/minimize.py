@@ -30,6 +30,7 @@ from minimax_cal.solvers.minimax import Optimum, Sqp, Step
 from minimax_cal.solvers.own_qp import QpFunction, adapt_qp_function
 from minimax_cal.solvers.status import Status
 from qp_backends import solve as solve_qp
+from qp_backends.registry import BackendName
 
 Constraint = LinearConstraint | NonlinearConstraint
 ConstraintLike = Constraint | Mapping[str, Any]  # or as `scipy.optimize.minimize` takes it
@@ -59,7 +60,7 @@ def minimize_max(
     jac: Callable[..., Any] | Scheme | bool | None = "2-point",
     bounds: Bounds | Sequence[tuple[float | None, float | None]] | None = None,
     constraints: ConstraintLike | Sequence[ConstraintLike] = (),
-    qp: str | QpFunction = "daqp",
+    qp: BackendName | QpFunction = "daqp",
     *,
     args: tuple[Any, ...] = (),
     tol: float = 1e-8,

@@ -91,9 +91,9 @@ def test_what_no_law_finds_is_above_the_noise_that_is_given(title: str) -> None:
         found = diagnose_relative(arm.robot, data, noises=dict.fromkeys(names, NOISE))
         assert (found.verdict, found.meets_floor) == (verdict, meets)
         assert not [f for f in found.effects if f.established]
-        remaining, highest = found.floor_mm
+        remaining, highest = found.floor
         assert (remaining < 1.1 * highest) == meets
-        assert highest >= 1e3 * NOISE
+        assert highest >= NOISE
     assert found.headline().startswith("Unexplained")
 
 

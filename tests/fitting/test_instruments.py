@@ -700,6 +700,7 @@ class Level(mc_instruments.Instrument):
     lean: Array
 
     kind = "level"
+    unit = "rad"
     words = Words(quantity="lean")
     by_row = ("lean",)
     names = ("lean_zero_rx",)
@@ -732,7 +733,180 @@ def test_an_instrument_may_read_the_flange_itself(robot):
     found = mc.diagnose_relative(arm.robot, [points, level])
     assert {one.term.effect for one in found.effects} == {"joint_compliance"}
     told = found.calibration.instruments[1].accuracy
-    assert 1e-3 * told["holdout"].rms_mm < 3e-6 < 1e-5 < 1e-3 * told["nominal"].rms_mm
+    assert told["holdout"].rms_error < 3e-6 < 1e-5 < told["nominal"].rms_error
+
+
+# ---- units of rows -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Tilt(Level):
+    """The same, in a unit of the test's choice: its numbers are `per` times as large."""
+
+    per: float = 1.0
+    kind = "tilt"
+    unit = "rad"
+
+    def read(self, arm: FlangePoses, own: Array) -> ResidualRows:
+        rows = super().read(arm, own)
+        return rows._replace(
+            residual=self.per * rows.residual,
+            by_rotation=self.per * rows.by_rotation,
+            by_own=self.per * rows.by_own,
+        )
+
+
+LEVEL_NOISE = 20e-6  # [rad]
+
+
+@cache
+def tilts(unit: str, per: float, objective: str = "sum") -> tuple[RelativeCalibration, Array]:
+    """A tracker and a level whose rows have a unit; and the level's true errors at held-out poses.
+
+    These come from the rows themselves, asked at the calibrated arm.
+    """
+    kind = mc.register_instrument(type("Tilt", (Tilt,), {"unit": unit}))
+    arm, rng = Arm.of("irb2600", 1, 0.0), np.random.default_rng(0)
+    q, seen = random_poses(arm.robot, 200, rng), random_poses(arm.robot, 40, rng)
+    lean = arm.real.pose(q)[:, 0, 2] + 0.01 + LEVEL_NOISE * rng.normal(size=200)
+    points = mc.measurements(seen, arm.place(seen)[:, None] + 1e-5 * rng.normal(size=(40, 1, 3)))
+    level = kind(bare(q, {}), lean, per)
+    fit = mc.relative(arm.robot, [points, level], objective=objective)
+    assert fit.cell is None
+    zero = next(p.value for p in fit.parameters if p.name == "tilt.lean_zero_rx")
+    return fit, lean - fit.robot.pose(q)[:, 0, 2] - zero
+
+
+@pytest.mark.parametrize(
+    ("unit", "per", "scale", "shown"), [("rad", 1.0, 1e3, "mrad"), ("px", 2000.0, 1.0, "px")]
+)
+def test_noise_and_accuracy_are_in_the_unit_of_the_rows(unit, per, scale, shown, tmp_path):
+    fit, error = tilts(unit, per)
+    content = json.loads(fit.json())
+    level = next(one for one in content["instruments"] if one["kind"] == "tilt")
+    assert level["unit"] == unit
+    assert level["noise"] == pytest.approx(per * LEVEL_NOISE, rel=0.15)  # 5 % by 160 numbers
+    held, train = level["accuracy"]["holdout"], level["accuracy"]["train"]
+    assert held["unit"] == unit
+    square = held["numbers"] * held["rms"] ** 2 + train["numbers"] * train["rms"] ** 2
+    assert square == pytest.approx(per**2 * float(error @ error), rel=1e-9)
+    assert max(held["max"], train["max"]) == pytest.approx(per * np.abs(error).max(), rel=1e-9)
+    assert held["rms_ci95"][0] < held["rms"] < held["rms_ci95"][1]
+    assert held["rms_mm"] is None
+    assert held["sse_mm2"] == [None]
+    # people read the same numbers, and no length
+    table = fit.files_table()
+    row = dict(zip(table.header, next(r for r in table.rows if r[0] == "tilt"), strict=True))
+    assert row["unit"] == shown
+    assert row["noise"] == pytest.approx(scale * level["noise"])
+    assert row["RMS"] == pytest.approx(scale * held["rms"])
+    assert f"-> {scale * held['rms']:#.3g} {shown}" in fit.headline()
+    again = RelativeCalibration.from_dict(content)
+    assert again.headline() == fit.headline()
+    assert [t.cells() for t in again.first_tables()] == [t.cells() for t in fit.first_tables()]
+    assert json.loads(again.json())["instruments"] == content["instruments"]
+
+
+def test_errors_in_several_units_are_not_one_number():
+    fit, _ = tilts("rad", 1.0)
+    content = json.loads(fit.json())
+    for accuracy in content["accuracy"].values():
+        assert {accuracy[key] for key in ("rms_mm", "max_mm", "mean_mm")} == {None}
+        assert not {"rms", "max", "mean"} & set(accuracy)
+    points = next(one for one in content["instruments"] if one["kind"] == "points")
+    assert points["unit"] == "mm"
+    assert points["accuracy"]["holdout"]["rms_mm"] > 0.0
+    arm, rng = Arm.of("irb2600", 1, 0.0), np.random.default_rng(1)
+    q = random_poses(arm.robot, 40, rng)
+    wires = distances(q, np.linalg.norm(arm.place(q) - [2.0, 0.5, 0.1], axis=1)[:, None])
+    alike = mc.relative(arm.robot, [mc.measurements(q, arm.place(q)[:, None]), wires])
+    assert alike.accuracy["holdout"].rms_mm >= 0.0  # of lengths alone it is
+
+
+def test_a_minimax_over_several_units_compares_by_noise():
+    fit, _ = tilts("rad", 1.0, "minimax")
+    worst = json.loads(fit.json())["minimax"]
+    assert "rms_mm" not in worst
+    level = fit.instruments[1]
+    assert level.kind == "tilt"
+    sigma = worst["rms_over_noise"][worst["functions"].index("tilt tilt")]
+    assert sigma == pytest.approx(level.accuracy["train"].rms_error / level.noise, rel=1e-6)
+    assert RelativeCalibration.from_dict(json.loads(fit.json())).worst.table().rows
+
+
+def test_a_diagnosis_of_several_units_reports_each_file(tmp_path):
+    tilts("rad", 1.0)  # registers the kind
+    kind = mc_instruments.table.instrument("tilt")
+    arm, rng = Arm.of("irb2600", 1, 0.0), np.random.default_rng(0)
+    q, seen = random_poses(arm.robot, 60, rng), random_poses(arm.robot, 40, rng)
+    lean = arm.real.pose(q)[:, 0, 2] + LEVEL_NOISE * rng.normal(size=60)
+    points = mc.measurements(seen, arm.place(seen)[:, None] + 1e-5 * rng.normal(size=(40, 1, 3)))
+    level = kind(bare(q, {}), lean)
+    found = mc.diagnose_relative(arm.robot, [points, level], noises={"tilt": LEVEL_NOISE})
+    assert found.steps_table().header == ("model", "points RMS mm", "tilt RMS mrad")
+    last = found.calibration.instruments[1].accuracy["holdout"].rms_error
+    assert found.steps_table().rows[-1][-1] == pytest.approx(1e3 * last)
+    floor = json.loads(found.json())["diagnosis"]["floor"]
+    assert floor["unit"] == "rad"
+    # given noise and the jitter of sound joints, which turns a level by some urad
+    assert LEVEL_NOISE < floor["noise_floor"] < 2.0 * LEVEL_NOISE
+    again = mc.RelativeDiagnosis.from_dict(json.loads(found.json()))
+    assert (again.floor_unit, again.headline()) == ("rad", found.headline())
+
+
+def test_noise_is_given_in_the_unit_of_the_rows():
+    tilts("rad", 1.0)  # registers the kind
+    arm, rng = Arm.of("irb2600", 1, 0.0), np.random.default_rng(0)
+    q = random_poses(arm.robot, 60, rng)
+    lean = arm.real.pose(q)[:, 0, 2] + LEVEL_NOISE * rng.normal(size=60)
+    level = mc_instruments.table.instrument("tilt")(bare(q, {}), lean)
+    for text in ("0.02mrad", "20 urad"):
+        fit = mc.relative(arm.robot, level, noises={"tilt": text})
+        assert fit.instruments[0].noise == pytest.approx(20e-6)
+    for text in ("0.02", "0.02mm", "3 px"):
+        with pytest.raises(mc.OptionError, match=r"whose rows are in rad: .* in mrad"):
+            mc.relative(arm.robot, level, noises={"tilt": text})
+
+
+def test_report_and_evaluation_are_in_the_unit_of_the_rows(tmp_path):
+    fit, _ = tilts("rad", 1.0)
+    held = fit.instruments[1].accuracy["holdout"]
+    fit.save(tmp_path / "fit.json")
+    mc.report(tmp_path / "fit.json", path=tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert f"{1e3 * held.rms_error:.4g}" in page
+    assert not re.search(r"\bnan\b(?= mm)", page)
+    arm = Arm.of("irb2600", 1, 0.0)
+    q = random_poses(arm.robot, 60, np.random.default_rng(5))
+    kind = mc_instruments.table.instrument("tilt")
+    judged = mc.evaluate(
+        fit, kind(bare(q, {}), fit.robot.pose(q)[:, 0, 2] + 1e-4 * (-1.0) ** q[:, 0].argsort())
+    )
+    assert judged.unit == "rad"
+    assert judged.rms == pytest.approx(1e-4, rel=0.05)  # the zero takes the mean
+
+
+def test_a_unit_is_asked_for(robot):
+    for unit in ("mm", "deg", "mrad", ""):
+        with pytest.raises(mc.OptionError, match="rows in SI"):
+            mc.register_instrument(type("Mine", (Height,), {"unit": unit}))
+    mc.register_instrument(type("Tilt", (Tilt,), {"unit": "m"}))
+    arm, rng = Arm.of("irb2600", 1, 0.0), np.random.default_rng(0)
+    q = random_poses(arm.robot, 50, rng)
+    level = mc_instruments.table.instrument("tilt")(bare(q, {}), arm.real.pose(q)[:, 0, 2])
+    fit = mc.relative(arm.robot, level)
+    assert any('unit = "rad"' in one for one in fit.notices)
+
+
+def test_an_arm_that_misses_a_level_by_many_mrad_is_another_arm():
+    """As with rotations of whole poses: beyond 50 mrad RMS no calibrated arm."""
+    mc.register_instrument(type("Tilt", (Tilt,), {"unit": "rad"}))
+    arm, rng = Arm.of("irb2600", 1, 0.0), np.random.default_rng(0)
+    q = random_poses(arm.robot, 60, rng)
+    lean = arm.real.pose(q)[:, 0, 2] + 0.1 * rng.normal(size=60)
+    fit = mc.relative(arm.robot, mc_instruments.table.instrument("tilt")(bare(q, {}), lean))
+    assert fit.status is Status.FAILED
+    assert "mrad" in fit.reason
 
 
 # ---- open positions ------------------------------------------------------------------------------

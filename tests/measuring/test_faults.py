@@ -1,5 +1,6 @@
 """Faults of the data, found and mended; slips of the user, each a clear line."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -299,6 +300,44 @@ def test_a_base_that_jumps_is_found_at_its_rows(robot):
         assert visit[rows].tolist() == starts
         assert_allclose(sizes, np.abs([first, second][: len(starts)]), rtol=0.15)
         assert len(session_jumps(fit.data, fit.error)) == bool(starts)
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+@pytest.mark.parametrize("turn", [0.0, 2e-3])
+def test_a_jump_has_the_size_by_which_the_points_were_moved(robot, turn, numbered):
+    """Of the fitted effect in `calibrate`, its effect and `diagnose`; arm and base hide a part.
+
+    The truth is the RMS displacement of the points themselves.
+    """
+    stiff = replace(TRUTH, compliance=0.0)  # an arm that bends in no fit biases its jump, too
+    data = simulate(robot, 100, 3, seed=3, truth=stiff).data
+    late = np.arange(100) >= 60
+    step = np.array([2.0e-3, 1.5e-3, -1.8e-3]) + np.cross(turn * np.eye(3)[2], data.y)
+    true = float(np.sqrt((step**2).sum(axis=-1).mean()))
+    y = np.where(late[:, None, None], data.y + step, data.y)
+    columns = {k: v for k, v in data.columns.items() if k not in ("order", "time", "clock")}
+    columns |= {"order": np.arange(100.0)} if numbered else {}
+    moved = replace(data.with_y(y), columns=columns)
+
+    def told(notices):
+        found = [re.search(r"line 62 on by ([\d.]+) mm", one) for one in notices]
+        return [float(one[1]) for one in found if one]
+
+    for objective in ("sum", "minimax"):
+        fit = mc.calibrate(robot, moved, objective, holdout=0.2)
+        assert told(fit.notices) == [pytest.approx(1e3 * true, abs=0.02)]
+        _, (of_residual,) = jumps(fit.data, fit.error)
+        assert of_residual < 0.97 * true  # what the residual alone would say
+    diagnosis = mc.diagnose(robot, moved, quick=True, exclude=["session_jump"])
+    assert told(diagnosis.notices) == [pytest.approx(1e3 * true, abs=0.02)]
+    if numbered:
+        freed = mc.calibrate(robot, moved, "sum", effects="session_jump")
+        values = np.array([p.value for p in freed.parameters if "session_jump" in p.name])
+        base = freed.cell.predict(moved.q) @ freed.cell.base[:3, :3]  # in the base's axes
+        base = base - freed.cell.base[:3, 3] @ freed.cell.base[:3, :3]
+        size = np.sqrt(((values[:3] + np.cross(values[3:], base)) ** 2).sum(axis=-1).mean())
+        assert size == pytest.approx(true, abs=2e-5)
+        assert not told(freed.notices)
 
 
 @pytest.mark.parametrize("targets", [1, 3])

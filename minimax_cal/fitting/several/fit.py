@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import TypeVar, cast
 
 import numpy as np
@@ -36,11 +37,11 @@ from minimax_cal.fitting.several.options import (
 )
 from minimax_cal.fitting.several.robust import ALIKE, Shares, of_loss, with_loss
 from minimax_cal.fitting.several.stack import Known, Squares, Stack, started
-from minimax_cal.fitting.several.worst import Worst, least_worst
+from minimax_cal.fitting.several.worst import Worst, WorstOverNoise, least_worst
 from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS, without_resting
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.instruments.instrument import Instrument
+from minimax_cal.instruments.instrument import METRE, Instrument
 from minimax_cal.modelling.effects.table import Term, at_bounds
 from minimax_cal.modelling.near import between, is_kept
 from minimax_cal.modelling.parameters import State, links_of
@@ -232,7 +233,9 @@ def of_worst(fit: InstrumentFit, options: RelativeOptions) -> InstrumentFit:
     if options.objective == SUM or fit.found.status[0] is Status.FAILED:
         return fit
     of, names = fit.stack.part_of_rows(fit.state), fit.stack.parts
-    fit, share = at_worst(fit, of, names, 1, options.qp, LEAST_NOISE, Worst)
+    units = {one.unit for one in fit.stack.instruments}
+    kind = Worst if units == {METRE} else WorstOverNoise
+    fit, share = at_worst(fit, of, names, 1, options.qp, LEAST_NOISE, kind)
     shares = share, share**2
     covariance = covariance_of(fit.problem, fit.state, np.square(fit.noise), shares)
     return replace(fit, covariance=covariance)
@@ -253,9 +256,13 @@ def at_worst(
     of[some] = number
     best, share, notes = least_worst(fit.problem, of, numbers, fit.state, qp, rounding)
 
+    # Errors in other units than metres compare by the noises of their files.
+    units = fit.noise if kind is WorstOverNoise else repeat(1.0)
+
     def sizes(x: State) -> Array:
         none = np.zeros(fit.stack.names.count, dtype=bool)
-        error = np.concatenate([error for error, _ in fit.stack.rows_by_block(x, none)])
+        blocks = zip(units, fit.stack.rows_by_block(x, none), strict=False)
+        error = np.concatenate([error / unit for unit, (error, _) in blocks])
         square = numbers * np.bincount(number, error[some] ** 2)
         return np.asarray(np.sqrt(square / np.bincount(number)))
 

@@ -47,7 +47,7 @@ from minimax_cal.ground.options import takes
 from minimax_cal.ground.threads import one_thread
 from minimax_cal.instruments.check import check_instrument
 from minimax_cal.instruments.file import Given, as_instrument
-from minimax_cal.instruments.instrument import Instrument, checked
+from minimax_cal.instruments.instrument import METRE, RADIAN, Instrument, checked
 from minimax_cal.instruments.table import is_registered
 from minimax_cal.measuring.campaigns import session_names
 from minimax_cal.measuring.checks import arm_notices, check_joints
@@ -271,6 +271,7 @@ def judged(
           for remark in one.remarks(fit.own_parameters(robot, found, i), found.noise[i])),
         *plausible.of_beyond(result),
         *plausible.of_scale(found),
+        *plausible.of_lone_rotations(found),
         *plausible.weak(found, result, measured, sigma),
         *plausible.unlikely(result, measured),
         *evidence.doubts,
@@ -313,12 +314,14 @@ def evidence_of(
                 {what: (score, score) for what, score in seen.items()},
                 source=data.at.source if len(every) > 1 else "",
                 check=data.words.check,
-                rotations={PARTS[key]: one.turns[key][0] for key in PARTS if key in one.turns},
-                drawn={key: one.accuracy[key] for key in ("nominal_train", "nominal")},
+                rotations=missed_rotations(one),
+                drawn={key: one.accuracy[key] for key in ("nominal_train", "nominal")}
+                if data.unit == METRE
+                else {},
             )
         )
         drawn, calibrated, _ = one.before_and_after()
-        if mend and calibrated.rms_mm > drawn.rms_mm:
+        if mend and calibrated.rms_error > drawn.rms_error:
             objection = objection or f"the fit is worse than the arm as drawn: {mend}"
     better = improvement_of_files(
         [one.errors["nominal"] for one in measured],
@@ -367,7 +370,15 @@ def measured_by(
         numbers={key: counts[is_held] for key, is_held in HELD.items()},
         turns=extremes(turns),
         instrument=train.placed(stack.blocks[i].flange(x), own, drawn),
+        units=(data.unit,),
     )  # fmt: skip
+
+
+def missed_rotations(one: Measured) -> dict[str, float]:
+    """RMS error of orientation by part of the poses [rad], empty where none is measured."""
+    if one.units == (RADIAN,):
+        return {what: one.accuracy[key].rms_error for key, what in PARTS.items()}
+    return {what: one.turns[key][0] for key, what in PARTS.items() if key in one.turns}
 
 
 def extremes(sizes: Mapping[str, Array]) -> dict[str, tuple[float, float]]:
@@ -391,6 +402,7 @@ def together(parts: tuple[str, ...], measured: Sequence[Measured]) -> Measured:
         numbers={key: sum(each.numbers[key] for each in measured) for key in HELD},
         turns={},
         instrument={},
+        units=tuple(dict.fromkeys(unit for each in measured for unit in each.units)),
     )
 
 

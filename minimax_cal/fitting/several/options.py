@@ -20,9 +20,10 @@ from minimax_cal.fitting.options import (
 from minimax_cal.fitting.robust import SQUARE, check_robust
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
-from minimax_cal.ground.options import grouped
+from minimax_cal.ground.options import SI, grouped
 from minimax_cal.ground.stages import Progress as Progress
 from minimax_cal.ground.stages import silent as silent
+from minimax_cal.ground.units import for_people
 from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.instruments.options import InstrumentOptions, fitted
 from minimax_cal.instruments.table import INSTRUMENTS, instrument
@@ -32,20 +33,42 @@ from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.solvers.least_squares import AUTO, METHODS
 
+BASE_UNITS = {"mm": "m", "um": "m", "deg": "rad", "mrad": "rad", "urad": "rad"}  # SI
 SUM, WORST_TARGET = "sum", "minimax"  # what is minimised
 seen = grouped("Cameras")
 
 
+class StatedNoise(float):
+    """Sigma in SI, and the unit in which it was stated."""
+
+    unit: str
+
+    def __new__(cls, sigma: float, unit: str) -> StatedNoise:
+        """sigma: in SI.  unit: as stated, as mm or mrad."""
+        made = super().__new__(cls, sigma)
+        made.unit = unit
+        return made
+
+
 def noise_of(text: str) -> tuple[str, float]:
-    """FILE=SIGMA: a file by its stem, and how noisy its numbers are, in mm.  Raises OptionError."""
+    """FILE=SIGMA: a file by its stem, and how noisy its numbers are, in mm unless a unit is given.
+
+    Raises OptionError.
+    """
     name, _, size = text.rpartition("=")
-    number = size.strip().removesuffix("mm").strip()
-    if name.strip() and re.fullmatch(r"[-+.\deE]+", number):
+    found = re.fullmatch(r"([-+.\d]+(?:[eE][-+]?\d+)?)\s*([A-Za-z/]*)", size.strip())
+    if name.strip() and found:
+        number, unit = found.groups()
         try:
-            return name.strip(), 1e-3 * float(number)
+            return name.strip(), StatedNoise(
+                SI.get(unit or "mm", 1.0) * float(number), unit or "mm"
+            )
         except ValueError:
             pass
-    raise OptionError(f"noise {text!r}: write FILE=SIGMA in mm, as wires=0.2mm")
+    raise OptionError(
+        f"noise {text!r}: write FILE=SIGMA in mm or the instrument's unit, as wires=0.2mm or "
+        "level=0.02mrad"
+    )
 
 
 @dataclass(frozen=True)
@@ -54,9 +77,10 @@ class RelativeOptions(InstrumentOptions):
 
     holdout, seed, offset, known_distances, lever: see `InstrumentOptions`.  fix, free: names or
     patterns as ``beta*``.
-    noises: sigma of a number of a file by its name [m], or a text as 0.2mm; of others residuals
-    say it.  priors: sigma of a parameter's deviation from nominal, by name [m, rad], or a text as
-    5mm.  effects: of the arm beyond geometry, fitted with it, as joint_compliance:all; or a
+    noises: sigma of a number of a file by its name, in its unit [m, rad], or a text as 0.2mm; of
+    others residuals say it.
+    priors: sigma of a parameter's deviation from nominal, by name [m, rad], or a text as 5mm.
+    effects: of the arm beyond geometry, fitted with it, as joint_compliance:all; or a
     diagnosis, of which the confirmed effects are taken.
     camera_on, fix_camera, camera_prior: of pixels, as `calibrate_pixels` takes them.
     objective: sum, or minimax: the worst part of any file, as a wire or a contact.  qp: backend of
@@ -185,6 +209,12 @@ def check_noises(
         if not known[name].noise_given:
             raise OptionError(
                 f"noise {name}: of {known[name].kind} the residuals say it; leave it out"
+            )
+        rows = known[name].unit
+        if isinstance(sigma, StatedNoise) and BASE_UNITS.get(sigma.unit, sigma.unit) != rows:
+            raise OptionError(
+                f"noise {name}: {sigma.unit} is no unit of {known[name].kind}, whose rows are in "
+                f"{rows}: write FILE=SIGMA in {for_people(rows)[1]}"
             )
         if not (np.isfinite(sigma) and sigma > 0.0):
             raise OptionError(f"noise {name}: sigma {sigma:g} must be positive")

@@ -25,10 +25,11 @@ from minimax_cal.fitting.several.result import Measured, RelativeCalibration
 from minimax_cal.fitting.several.stack import Block, Stack, own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.instruments.instrument import Instrument, Slip
+from minimax_cal.instruments.instrument import METRE, RADIAN, Instrument, Slip
 from minimax_cal.instruments.options import FAR
 from minimax_cal.instruments.protocol import Arm, FlangePoses
 from minimax_cal.instruments.reflectors import LEVER
+from minimax_cal.instruments.table import is_registered
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.slips import of_joints, of_units
 from minimax_cal.modelling.model import TARGET
@@ -55,7 +56,8 @@ def check_slips(robot: Robot, data: Instrument, options: RelativeOptions) -> Non
         return block.instrument, *block.at(x)
 
     data.check_given(fitted)
-    some, good = data.tried(), POOR_FIT * robot.reach()
+    some, size = data.tried(), {METRE: robot.reach(), RADIAN: 1.0}
+    good = POOR_FIT * size.get(data.unit, np.inf)  # of other units nobody knows what is poor
     given = measured(*fitted(some))
     if np.sqrt(given[0]) <= good:
         data.check_start(fitted, partial(farthest, robot, options))
@@ -66,6 +68,7 @@ def check_slips(robot: Robot, data: Instrument, options: RelativeOptions) -> Non
         (some.slips(), slips_of_joints(robot, some)),
         lambda mended: measured(*fitted(mended)),
         good,
+        unit=data.unit,
     )
 
 
@@ -157,6 +160,18 @@ def of_scale(fit: InstrumentFit) -> tuple[str, ...]:
     )
 
 
+def of_lone_rotations(fit: InstrumentFit) -> Iterator[str]:
+    """That an instrument of the user's own reads rotations, and counts them as metres."""
+    for i, one in enumerate(fit.stack.instruments):
+        if is_registered(one) and one.unit == METRE:
+            rows = fit.stack.blocks[i].read(fit.stack.part(fit.state, i))
+            if rows.by_rotation.any() and not rows.by_point.any():
+                yield (
+                    f"{one.kind}: its rows depend on rotations alone, and its unit is m: give its "
+                    'class the unit of its rows, as unit = "rad"'
+                )
+
+
 def general(result: Measured, data: Instrument, held: Array) -> tuple[str, ...]:
     """What the reader should know: nothing held out, measurements that stand out."""
     notices = []
@@ -167,7 +182,8 @@ def general(result: Measured, data: Instrument, held: Array) -> tuple[str, ...]:
     distance = np.full((len(result.parts), len(held)), np.nan)
     distance[:, ~held] = np.linalg.norm(result.errors["train"], axis=-1)
     distance[:, held] = np.linalg.norm(result.errors["holdout"], axis=-1)
-    return (*notices, *checks.outliers(replace(data.at, target_names=result.parts), distance))
+    at = replace(data.at, target_names=result.parts)
+    return (*notices, *checks.outliers(at, distance, data.unit))
 
 
 def weak(
@@ -177,7 +193,8 @@ def weak(
 
     sigma: of a position, but for what is open [m].
     """
-    rms_mm = min(each.accuracy["train"].rms_mm for each in measured)
+    of_lengths = [one for one in measured if one.units == (METRE,)]
+    rms_mm = min((one.accuracy["train"].rms_mm for one in of_lengths), default=np.nan)
     expected_mm = 1e3 * sigma
     more = [one.words.more for one in fit.stack.instruments]
     untold = [
@@ -186,9 +203,10 @@ def weak(
     if not all(more) or not (expected_mm > WEAK * rms_mm or untold):
         return ()
     where = f" ({', '.join(untold)} not at all)" if untold else ""
+    fits = f"what was measured fits to {rms_mm:.3g} mm, " if of_lengths else ""
     return (
         f"positions are poorly determined{where}: by the sigmas to {expected_mm:.3g} mm, "
-        f"what was measured fits to {rms_mm:.3g} mm, and model error makes positions worse still; "
+        f"{fits}and model error makes positions worse still; "
         f"turn the flange more from pose to pose, and measure with {more[0]}",
     )
 
@@ -197,7 +215,8 @@ def unlikely(result: RelativeCalibration, measured: Sequence[Measured]) -> tuple
     """Notices where the result is no calibration of this robot but of another one."""
     notices, reach = [], result.nominal.reach()
     for key, what in (("nominal_train", "the nominal robot"), ("train", "the best fit")):
-        miss_mm = max(each.accuracy[key].rms_mm for each in measured)
+        lengths = [one.accuracy[key].rms_mm for one in measured if one.units == (METRE,)]
+        miss_mm = max(lengths, default=0.0)
         if miss_mm > 1e3 * POOR_FIT * reach:
             notices.append(
                 f"{what} misses by {miss_mm:.3g} mm: check that it is the robot of these "

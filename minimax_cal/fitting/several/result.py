@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Annotated, Any
@@ -13,6 +14,7 @@ from minimax_cal.fitting.accuracy import (
     HELD,
     NO_ENDS,
     Accuracy,
+    Ends,
     Interval,
     accuracy,
     before_and_after,
@@ -25,15 +27,16 @@ from minimax_cal.fitting.found import Parameter, parameter_table, table_of_effec
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.fitting.several.identify import Alone
-from minimax_cal.fitting.several.worst import Worst, WorstPixels
+from minimax_cal.fitting.several.worst import Worst, WorstOverNoise, WorstPixels
 from minimax_cal.ground.arrays import Array, rms
-from minimax_cal.ground.facts import APART, Fact, Mm, derived, in_file, scaled
+from minimax_cal.ground.facts import APART, Fact, Mm, derived, in_digits, in_file, scaled
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.records import as_kind, read, reading, stored
 from minimax_cal.ground.results import Result, merged
 from minimax_cal.ground.tables import Table, filled
+from minimax_cal.ground.units import for_people, in_files
 from minimax_cal.ground.words import capitalise, name_first
-from minimax_cal.instruments.instrument import Words
+from minimax_cal.instruments.instrument import METRE, Words
 from minimax_cal.instruments.table import INSTRUMENTS, instrument
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements, SetAside
@@ -52,13 +55,56 @@ ALL = Words(
 
 @dataclass(frozen=True)
 class Scores(Accuracy):
-    """Accuracy of lengths, closures or poses, with what else is told of the errors."""
+    """Accuracy of what an instrument measured, with what else is told of the errors.
+
+    unit: SI, of rms, max, mean and rms_ci95, where the errors are no lengths; those in mm are then
+    NaN, and so are all of errors in several units.
+    """
 
     numbers: int = 0
+    unit: Annotated[str, Fact(brief=True)] = ""
+    rms: Annotated[float | None, Fact(brief=True)] = None
+    max: Annotated[float | None, Fact(brief=True)] = None
+    mean: Annotated[float | None, Fact(brief=True)] = None
+    rms_ci95: Annotated[Ends | None, Fact(brief=True)] = None
     rms_mrad: Annotated[float | None, Fact(brief=True)] = None
     max_mrad: Annotated[float | None, Fact(brief=True)] = None
     rms_px: Annotated[float | None, Fact(brief=True)] = None
     max_px: Annotated[float | None, Fact(brief=True)] = None
+
+    @staticmethod
+    def of(error: Array, units: Sequence[str], numbers: int = 0) -> Scores:
+        """Of errors (k, m, 3), NaN where not measured.
+
+        units: SI, of all of them.  numbers: independent ones.
+        """
+        plain = Scores(**vars(accuracy(error)), numbers=numbers)
+        if tuple(units) == (METRE,):
+            return plain
+        sizes = scaled((plain.rms_mm, plain.max_mm, plain.mean_mm), 1e-3)
+        none = (math.nan,) * len(plain.counts)
+        no_lengths = replace(
+            plain, rms_mm=math.nan, max_mm=math.nan, mean_mm=math.nan, sse_mm2=none, means_mm=(),
+            largest_mm=(),
+        )  # fmt: skip
+        if len(units) > 1:
+            return no_lengths
+        return replace(no_lengths, unit=units[0], rms=sizes[0], max=sizes[1], mean=sizes[2])
+
+    @property
+    def for_display(self) -> tuple[float, float, float, str]:
+        """RMS, largest and mean error, and their unit: mm, mrad or the instrument's own."""
+        if not self.unit:
+            return self.rms_mm, self.max_mm, self.mean_mm, "mm"
+        scale, unit = for_people(self.unit)
+        sizes = (math.nan if size is None else size for size in (self.rms, self.max, self.mean))
+        rms, largest, mean = (scale * size for size in sizes)
+        return rms, largest, mean, unit
+
+    @property
+    def rms_error(self) -> float:
+        """RMS error in the unit of the rows [SI]."""
+        return 1e-3 * self.rms_mm if not self.unit else math.nan if self.rms is None else self.rms
 
 
 @dataclass(frozen=True)
@@ -79,9 +125,10 @@ class Measured:
 
     kind: name of an instrument, or `SEVERAL`.  parts: what each row of the errors is, as wire1.
     errors: by key nominal, holdout, nominal_train, train, (parts, m, 3) of the measured quantity,
-    NaN where not measured [m]; a length's error stands first of three.  numbers: independent
+    NaN where not measured [units]; a length's error stands first of three.  numbers: independent
     numbers behind each accuracy.  turns: RMS and largest error of orientation by key [rad], empty
-    but for poses.  instrument: what was fitted besides the robot, for JSON.
+    but for poses.  instrument: what was fitted besides the robot, for JSON.  units: SI, those of
+    the errors.
     """
 
     kind: Annotated[str, Fact(key="measured")]
@@ -91,6 +138,7 @@ class Measured:
     turns: Annotated[Mapping[str, tuple[float, float]], APART]
     instrument: Mapping[str, Any]
     stated: Annotated[Mapping[str, Scores] | None, APART] = None
+    units: Annotated[tuple[str, ...], APART] = (METRE,)
 
     @property
     def words(self) -> Words:
@@ -98,35 +146,61 @@ class Measured:
         return ALL if self.kind == SEVERAL else instrument(self.kind).words
 
     @cached_property
-    def accuracy(self) -> Mapping[str, Accuracy]:
+    def accuracy(self) -> Mapping[str, Scores]:
         """Of the errors, by their keys; as a file states it where it keeps no errors."""
         if self.stated is not None:
             return self.stated
-        return {key: accuracy(error) for key, error in self.errors.items()}
+        return {
+            key: Scores.of(error, self.units, self.numbers[key])
+            for key, error in self.errors.items()
+        }
 
-    def before_and_after(self) -> tuple[Accuracy, Accuracy, str]:
+    def before_and_after(self) -> tuple[Scores, Scores, str]:
         """On held-out poses where there are any, and which poses those are."""
         return before_and_after(self.accuracy)
 
+    def error_sentence(self) -> str:
+        """RMS and largest error before and after, and at which poses."""
+        before, after, where = self.before_and_after()
+        rms, largest, _, unit = before.for_display
+        rms_after, largest_after, *_ = after.for_display
+        spec = ".3f" if unit == "mm" else "#.3g"
+        return (
+            f"RMS error {rms:{spec}} {unit} -> {rms_after:{spec}} {unit}, largest "
+            f"{largest:{spec}} {unit} -> {largest_after:{spec}} {unit}, at {where}"
+        )
+
     def scores(self, title: str) -> Table:
         """Accuracy before and after, training and held out."""
-        rows = ((heading, self.scored(key)) for heading, key in ACCURACIES)
-        columns = (
-            "0=poses | 1.poses=count d | 1.numbers=numbers d | 1.rms_mm=RMS mm .4f | "
-            "1.mean_mm=mean mm .4f | 1.max_mm=max mm .4f"
+        unit, spec = self.display
+        rows = (
+            (heading, one.poses, one.numbers, rms, mean, largest, one.rms_mrad, one.max_mrad)
+            for heading, key in ACCURACIES
+            for one in [self.scored(key)]
+            for rms, largest, mean, _ in [one.for_display]
         )
-        turns = ("1.rms_mrad=RMS mrad .4f", "1.max_mrad=max mrad .4f") if self.turns else ()
-        return Table.of(title, rows, columns, *turns)
+        columns = "poses | count d | numbers d"
+        sizes = (f"{what} {unit} {spec}" for what in ("RMS", "mean", "max"))
+        turns = (f"{what} mrad .4f" for what in ("RMS", "max"))
+        table = Table.made(title, rows, columns, *sizes, *turns)
+        return table if self.turns else table.only(*range(len(table.header) - 2))
 
     def parts_table(self, title: str) -> Table:
         """RMS errors part by part, as wire by wire; empty for a single one."""
         titles, keys = zip(*ACCURACIES, strict=True)
+        (unit, spec), scale = self.display, for_people(self.units[0])[0]
         rows = (
-            (part, *(1e3 * rms(np.linalg.norm(self.errors[key][i], axis=-1)) for key in keys))
+            (part, *(scale * rms(np.linalg.norm(self.errors[key][i], axis=-1)) for key in keys))
             for i, part in enumerate(self.parts)
             if len(self.parts) > 1 and self.errors
         )
-        return Table.made(title, rows, "RMS mm", *(f"{each} .4f" for each in titles))
+        return Table.made(title, rows, f"RMS {unit}", *(f"{each} {spec}" for each in titles))
+
+    @property
+    def display(self) -> tuple[str, str]:
+        """Unit of the errors for people, and the format of a number in it."""
+        unit = for_people(self.units[0])[1]
+        return unit, ".4f" if unit == "mm" else ".4g"
 
     @property
     def frames(self) -> dict[str, Frame]:
@@ -142,9 +216,10 @@ class Measured:
 
     def scored(self, key: str) -> Scores:
         """An accuracy with all that is told beside it."""
-        turned = dict(zip(("rms_mrad", "max_mrad"), self.turns.get(key, ()), strict=False))
-        angles = {name: 1e3 * turn for name, turn in turned.items()}
-        return Scores(**{**vars(self.accuracy[key]), "numbers": self.numbers[key], **angles})
+        if key not in self.turns:
+            return self.accuracy[key]
+        turn, largest = self.turns[key]
+        return replace(self.accuracy[key], rms_mrad=1e3 * turn, max_mrad=1e3 * largest)
 
     def measured_beside(self) -> dict[str, Any]:
         """What of a file its fields do not tell."""
@@ -170,14 +245,19 @@ class Measured:
         if turns and len(turns) < len(told):
             raise ValueError(f"{at}accuracy: of some only tells angles")
         numbers = {key: each.numbers for key, each in told.items()}
-        return {"errors": {}, "numbers": numbers, "turns": turns, "stated": told}
+        files = content.get("instruments") or () if content["measured"] == SEVERAL else ()
+        kinds = [one["kind"] for one in files] or [content["measured"]]
+        units = tuple(dict.fromkeys(instrument(kind).unit for kind in kinds if kind in INSTRUMENTS))
+        return {"errors": {}, "numbers": numbers, "turns": turns, "stated": told,
+                "units": units or (METRE,)}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class InstrumentResult(Measured):
     """One of the files.
 
-    interval: 95 % of the held-out RMS [m].  noise: sigma of a number by what the fit leaves [m].
+    interval: 95 % of the held-out RMS.  noise: sigma of a number by what the fit leaves.  Both in
+    SI, in the unit of the instrument's rows.
     alone: link parameters that of several files only this one
     determines; directions_alone: the number of independent directions in which it does.
     """
@@ -186,7 +266,7 @@ class InstrumentResult(Measured):
     name: str
     file: str
     interval: Annotated[Interval, APART]
-    noise: Annotated[float, Fact(key="noise", scale=1e3)]
+    noise: float
     alone: tuple[str, ...]
     directions_alone: int
 
@@ -194,7 +274,7 @@ class InstrumentResult(Measured):
     def of(
         name: str, seen: Measured, at: Measurements, held: Array, noise: float, alone: Alone
     ) -> InstrumentResult:
-        """Of what was seen at poses.  at: with its source.  held: (m,).  noise: [m]."""
+        """Of what was seen at poses.  at: with its source.  held: (m,).  noise: [unit]."""
         own = {one.name: getattr(seen, one.name) for one in fields(Measured)}
         group, after = groups(at)[held], seen.accuracy["holdout"]
         interval = rms_interval(seen.errors["holdout"], group, rng=np.random.default_rng(0))
@@ -202,7 +282,7 @@ class InstrumentResult(Measured):
             **own,
             name=name,
             file=at.source,
-            interval=told(interval, 1e-3 * after.rms_mm),
+            interval=told(interval, after.rms_error),
             noise=noise,
             alone=alone.names,
             directions_alone=alone.directions,
@@ -210,13 +290,16 @@ class InstrumentResult(Measured):
 
     @derived()
     def unit(self) -> str:
-        """Of its noise in a file."""
-        return "mm"
+        """Of its noise in a file: mm, or that of the instrument's rows."""
+        return in_files(self.units[0])[1]
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         told = merged(in_file(self), self.measured_beside())
-        told["accuracy"]["holdout"]["rms_ci95_mm"] = list(scaled(self.interval, 1e3))
+        scale, unit = in_files(self.units[0])
+        told["noise"] = in_digits(scale * self.noise)
+        ends = "rms_ci95_mm" if unit == "mm" else "rms_ci95"
+        told["accuracy"]["holdout"][ends] = list(scaled(self.interval, scale))
         return dict(plain(told))
 
     @staticmethod
@@ -224,7 +307,9 @@ class InstrumentResult(Measured):
         """From `to_dict`.  Raises ValueError."""
         told = stored(InstrumentResult, content, at)
         apart = Measured.fields_of({**content, "measured": told["kind"]}, f"{at}.")
-        ends = scaled(apart["stated"]["holdout"].rms_ci95_mm or NO_ENDS, 1e-3)
+        scale, held = in_files(apart["units"][0])[0], apart["stated"]["holdout"]
+        told["noise"] /= scale
+        ends = scaled(held.rms_ci95 or held.rms_ci95_mm or NO_ENDS, 1.0 / scale)
         return InstrumentResult(**told, **apart, interval=Interval(*ends))
 
 
@@ -264,7 +349,7 @@ class RelativeCalibration(Measured, Result):
     qp: str = ""
     set_aside: tuple[SetAside, ...] = ()
     reason: str = ""
-    worst: Annotated[Worst | None, Fact(key="minimax")] = None
+    worst: Annotated[Worst | WorstOverNoise | None, Fact(key="minimax")] = None
     cell: Annotated[Cell | None, APART] = None
     contradictions: tuple[Contradiction, ...] = ()
     calibrated: Annotated[Robot | None, APART] = None
@@ -294,12 +379,26 @@ class RelativeCalibration(Measured, Result):
     def files_table(self) -> Table:
         """Each of several files: held-out RMS before and after, and what it alone determines."""
         rows = (
-            (one.name, before.rms_mm, after.rms_mm, *scaled(one.interval, 1e3), 1e3 * one.noise)
+            (one.name, unit, before.for_display[0], after.for_display[0],
+             *scaled(tuple(one.interval), scale), scale * one.noise)
             for one in self.instruments
+            for scale, unit in [for_people(one.units[0])]
             for before, after, _ in [one.before_and_after()]
-        )
-        columns = "file | nominal mm .4f | RMS mm .4f | 95 % from .4f | to .4f | noise mm .4f"
+        )  # fmt: skip
+        if self.units == (METRE,):
+            columns = (
+                "file | unit | nominal mm .4f | RMS mm .4f | 95 % from .4f | to .4f | noise mm .4f"
+            )
+            return Table.made("each file, RMS", rows, columns).only(0, *range(2, 7))
+        columns = "file | unit | nominal .4g | RMS .4g | 95 % from .4g | to .4g | noise .4g"
         return Table.made("each file, RMS", rows, columns)
+
+    def error_table(self) -> Table:
+        """RMS and largest error before and after, or the RMS of each file."""
+        if self.kind == SEVERAL:
+            return self.files_table()
+        unit, _ = self.display
+        return self.accuracy_table().brief("poses", "count", f"RMS {unit}", f"max {unit}")
 
     def alone_table(self) -> Table:
         """What only one of the files determines."""
@@ -309,9 +408,9 @@ class RelativeCalibration(Measured, Result):
 
     def first_tables(self) -> tuple[Table, ...]:
         """What stands on the first screen."""
-        first = [self.accuracy_table().brief("poses", "count", "RMS mm", "max mm")]
+        first = [self.error_table()]
         if self.kind == SEVERAL:
-            first = [self.files_table(), self.alone_table()]
+            first += [self.alone_table()]
         return filled(*first, table_of_effects(self.parameters))
 
     def tables(self) -> tuple[Table, ...]:
@@ -352,16 +451,18 @@ class RelativeCalibration(Measured, Result):
 
     def headline(self) -> str:
         """The result in some sentences, with what it does not say."""
-        before, after, where = self.before_and_after()
         text = f"{capitalise(self.reason)}. " if self.reason else ""
-        text += (
-            f"{self.words.quantity.capitalize()}: RMS error {before.rms_mm:.3f} mm -> "
-            f"{after.rms_mm:.3f} mm, largest {before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, "
-            f"at {where}."
-        )
+        if len(self.units) == 1:
+            text += f"{self.words.quantity.capitalize()}: {self.error_sentence()}."
+        else:  # no one number holds errors in several units
+            text += " ".join(
+                f"{capitalise(one.name)}, {one.words.quantity}: {one.error_sentence()}."
+                for one in self.instruments
+            )
         if self.status is Status.FAILED and self.reason:  # nothing follows but its mend
             return text
-        text += f" {self.words.caution}{self.position_claim} {self.outcome}"
+        caution = self.words.caution if len(self.units) == 1 else ""
+        text += f" {caution}{self.position_claim} {self.outcome}"
         advice = "" if self.reason else self.status.advice
         return text + (f" {advice}." if advice else "")
 

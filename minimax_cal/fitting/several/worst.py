@@ -159,6 +159,19 @@ class WorstPixels(Worst):
     before: Annotated[float, Fact(key="sum_largest_rms_px")]
 
 
+@dataclass(frozen=True, eq=False)
+class WorstOverNoise(Worst):
+    """What the minimax rests on where rows are in other units than metres.
+
+    size, before: errors over sigma, the noise of their file.
+    """
+
+    UNIT: ClassVar[tuple[str, float]] = ("sigma", 1.0)
+
+    size: Annotated[Array, Fact(key="rms_over_noise")]
+    before: Annotated[float, Fact(key="sum_largest_rms_over_noise")]
+
+
 def least_worst(
     problem: Squares, of: Array, numbers: int, start: State, qp: QpSolver, rounding: float
 ) -> tuple[Optimum[State], Array, tuple[str, ...]]:

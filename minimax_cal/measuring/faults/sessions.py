@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -64,13 +64,20 @@ def strange_ratios(
                 yield "joint values", "radians and degrees", ratio
 
 
-def session_jumps(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, ...]:
-    """A notice if the residual of a fit moves as a whole from some pose on; see `jumps`."""
+def session_jumps(
+    data: Measurements, error: Array = NO_ERROR, fit_sizes: Callable[[Array], Array] | None = None
+) -> tuple[Fault, ...]:
+    """A notice if the residual of a fit moves as a whole from some pose on; see `jumps`.
+
+    fit_sizes: sizes of the effects that start at some rows, fitted beside the arm [m], NaN where
+    that cannot be done; without it those of the residual, of which arm and base took a part.
+    """
     rows, sizes = jumps(data, error) if len(error) else (NONE, np.zeros(0))
     if not len(rows):
         return ()
+    sizes = fit_sizes(rows) if fit_sizes else sizes
     told = ", ".join(
-        f"{data.called(line)} on by {1e3 * size:.3g} mm"
+        f"{data.called(line)} on" + (f" by {1e3 * size:.3g} mm" if np.isfinite(size) else "")
         for line, size in zip(data.line[rows], sizes, strict=True)
     )
     return (

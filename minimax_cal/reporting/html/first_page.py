@@ -20,6 +20,7 @@ from minimax_cal.fitting.several import RelativeCalibration
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import capitalise, name_first
+from minimax_cal.instruments.instrument import METRE
 from minimax_cal.judging.tolerance import (
     KINDS,
     NOT_PASSED,
@@ -66,7 +67,8 @@ class Signed:
     the house; row: that of them which is judged, None where the result itself is.
     set_aside: points that take no part; with_them: the claim inside where they count, None without
     any; judged_with: the requirements against their bounds.  aside: what any of the results sets
-    aside, in sentences.  which: the claim that is judged.
+    aside, in sentences.  which: the claim that is judged.  errors: by file, where they are no
+    lengths.
     """
 
     model: str
@@ -80,6 +82,7 @@ class Signed:
     judged_with: tuple[Judgement, ...] = ()
     which: str = "inside"
     aside: tuple[str, ...] = ()
+    errors: Table | None = None
 
     @property
     def verdict(self) -> str:
@@ -193,7 +196,9 @@ def signed(
     if chosen is None:
         chosen = beyond(Beyond(reason="this result makes no such claim"))
     judged = tuple(judge(limit, chosen) for limit in limits)
-    found = Signed(model, claims, judged, odd, which=which, aside=aside)
+    told = sources.relative
+    errors = told.error_table() if told and told.units != (METRE,) else None
+    found = Signed(model, claims, judged, odd, which=which, aside=aside, errors=errors)
     return counting_all(found, sources, limits, which)
 
 
@@ -344,7 +349,7 @@ def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
     if sources.gap and not sources.fit:
         wrong = trouble(sources.gap.status, "")
     lines += [caveat(one.text) if kind == "passed" else one for one in wrong]
-    return (*lines, picture(sources, found))
+    return tuple(lines) if found.errors else (*lines, picture(sources, found))
 
 
 def because(sources: Sources) -> Iterator[Note]:
@@ -409,7 +414,12 @@ def picture(sources: Sources, found: Signed) -> Figure:
 
 
 def result_table(found: Signed) -> Table:
-    """Of each deliverable: before, result, its 95 % interval, what is required, verdict."""
+    """Of each deliverable: before, result, its 95 % interval, what is required, verdict.
+
+    Errors that are no lengths stand by file, in their units.
+    """
+    if found.errors:
+        return found.errors
     groups = [(row.short, row.claims, row.judged) for row in found.rows]
     groups = groups or [("", found.claims, found.judged)]
     rows: list[tuple[object, ...]] = []
