@@ -49,7 +49,6 @@ from minimax_cal.fitting.outcome import (
 )
 from minimax_cal.fitting.same_arm import computed, least_noise, residual
 from minimax_cal.fitting.set_aside import judged_with
-from minimax_cal.fitting.several.agreement import find_contradicting_sessions
 from minimax_cal.fitting.solve import PER, Solved
 from minimax_cal.fitting.stations import jumps
 from minimax_cal.fitting.suspects import Suspect, aside, contradictions
@@ -172,6 +171,10 @@ class Judged:
         known = any("session" in term.choice for term in self.solved.effects.causes)
         if len(self.solved.frames) < 2 or known:
             return ()
+        from minimax_cal.fitting.several.agreement import (  # slow to import
+            find_contradicting_sessions,
+        )
+
         trusted = self.solved.robust.weights > MIN_TRUSTED_WEIGHT
         return find_contradicting_sessions(self.robot, self.poses.train, trusted)
 
