@@ -19,7 +19,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from experiments.sweep import Study, study_options
-from minimax_cal.fitting.several import RelativeCalibration, relative
+from minimax_cal.fitting.several.kinds import relative
+from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
 from minimax_cal.instruments import Instrument, distances, flange_poses

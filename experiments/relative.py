@@ -27,7 +27,8 @@ from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.claims import position_sigma
 from minimax_cal.fitting.fit import Fit
-from minimax_cal.fitting.several import RelativeCalibration, relative
+from minimax_cal.fitting.several.kinds import relative
+from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.tables import Table
 from minimax_cal.instruments import Instrument, closures, distances, flange_poses

@@ -233,7 +233,11 @@ def convex(P: Matrix) -> bool:
     if not is_sparse(P):
         factor = P.copy()
         factor.flat[:: len(P) + 1] = ridged
-        return not P.size or bool(scipy.linalg.lapack.dpotrf(factor.T, overwrite_a=1)[1] == 0)
+        try:  # of NumPy, since `scipy.linalg` is slow to import
+            np.linalg.cholesky(factor)
+        except np.linalg.LinAlgError:
+            return False
+        return True
     if P.nnz == np.count_nonzero(diagonal):
         return True
     matrix: Any = scipy.sparse.csc_matrix(P, copy=True)

@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.cli.commands import ENTRIES, said_of
 from minimax_cal.cli.running import cli
-from minimax_cal.fitting.several import RelativeOptions
+from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.planning.options import PlanOptions
 
 FUNCTIONS = [name for name in mc.__all__ if inspect.isfunction(getattr(mc, name))]

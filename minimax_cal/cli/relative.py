@@ -21,7 +21,8 @@ from minimax_cal.cli.options import (
 from minimax_cal.diagnosing.diagnose import DiagnosisOptions
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.pixels.options import PixelFiles
-from minimax_cal.fitting.several import RelativeOptions, relative
+from minimax_cal.fitting.several.kinds import relative
+from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.ground.errors import OptionError
 
 

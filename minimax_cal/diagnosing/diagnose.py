@@ -54,8 +54,7 @@ from minimax_cal.fitting.judged import doubts
 from minimax_cal.fitting.jump_sizes import fit_jump_sizes
 from minimax_cal.fitting.options import Options, Progress, silent
 from minimax_cal.fitting.outcome import FileEvidence, missed_rows
-from minimax_cal.fitting.several.kinds import READ
-from minimax_cal.fitting.several.options import RelativeOptions, check_no_others, with_others
+from minimax_cal.fitting.several.options import READ, RelativeOptions, check_no_others, with_others
 from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.fitting.suspects import contradictions

@@ -22,10 +22,10 @@ from minimax_cal.evidence.remains import Remains
 from minimax_cal.evidence.selection import select
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.several.fit import InstrumentFit, remaining
-from minimax_cal.fitting.several.kinds import READ, Asked, asked_of, result_of
+from minimax_cal.fitting.several.kinds import Asked, asked_of, result_of
 from minimax_cal.fitting.several.laws import is_shared
 from minimax_cal.fitting.several.linear import rows_of_all, scene_of_all
-from minimax_cal.fitting.several.options import Progress, RelativeOptions, silent
+from minimax_cal.fitting.several.options import READ, Progress, RelativeOptions, silent
 from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError

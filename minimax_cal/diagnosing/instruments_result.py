@@ -12,8 +12,7 @@ from minimax_cal.diagnosing.result import Untestable as Untestable
 from minimax_cal.diagnosing.sentences import explained
 from minimax_cal.evidence.limits import LEVEL
 from minimax_cal.fitting.opened import RELATIVE
-from minimax_cal.fitting.several import RelativeCalibration
-from minimax_cal.fitting.several.result import Scores
+from minimax_cal.fitting.several.result import RelativeCalibration, Scores
 from minimax_cal.ground.facts import APART, Fact, derived, in_digits, in_file
 from minimax_cal.ground.files import number, plain
 from minimax_cal.ground.records import reading, stored

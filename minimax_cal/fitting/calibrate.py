@@ -27,8 +27,8 @@ from minimax_cal.fitting.options import (
     silent,
     usable,
 )
-from minimax_cal.fitting.several.kinds import READ, relative_with
 from minimax_cal.fitting.several.options import (
+    READ,
     RelativeOptions,
     check_no_others,
     only_others,
@@ -140,6 +140,8 @@ def calibrate(
     if isinstance(given, Measurements):
         check_no_others(given, others)
         return calibrate_with(robot, given, options, progress)
+    from minimax_cal.fitting.several.kinds import relative_with  # slow to import
+
     asked = with_others(given, options, others)
     return relative_with(robot, given, asked, progress)
 

@@ -50,7 +50,6 @@ from minimax_cal.fitting.outcome import (
 )
 from minimax_cal.fitting.same_arm import computed, least_noise, residual
 from minimax_cal.fitting.set_aside import judged_with
-from minimax_cal.fitting.several.agreement import find_contradicting_sessions, moved_bases_of
 from minimax_cal.fitting.solve import PER, Solved
 from minimax_cal.fitting.stations import jumps
 from minimax_cal.fitting.suspects import Suspect, aside, contradictions
@@ -173,8 +172,21 @@ class Judged:
         known = any("session" in term.choice for term in self.solved.effects.causes)
         if len(self.solved.frames) < 2 or known:
             return ()
+        from minimax_cal.fitting.several.agreement import (  # slow to import
+            find_contradicting_sessions,
+        )
+
         trusted = self.solved.robust.weights > MIN_TRUSTED_WEIGHT
         return find_contradicting_sessions(self.robot, self.poses.train, trusted)
+
+    @property
+    def moved_bases(self) -> tuple[Contradiction, ...]:
+        """Bases that moved between sessions of one instrument."""
+        if not self.moved:
+            return ()
+        from minimax_cal.fitting.several.agreement import moved_bases_of  # slow to import
+
+        return moved_bases_of(self.moved, next(iter(self.solved.frames), ""))
 
     @cached_property
     def evidence(self) -> FitEvidence:
@@ -308,8 +320,7 @@ class Judged:
             error_drawn_crossed=drawn_crossed,
             reason=self.outcome.reason,
             moved=self.moved,
-            contradictions=self.evidence.contradictions
-            or moved_bases_of(self.moved, next(iter(solved.frames), "")),
+            contradictions=self.evidence.contradictions or self.moved_bases,
             seconds=time.perf_counter() - began,
         )
 

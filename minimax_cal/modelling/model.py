@@ -314,20 +314,20 @@ class Model:
             links = block.links
             error = self.pulled(state, self.error_of(state, block)[0], block.rows)
             *batch, _, _, c = error.shape
-            axis, _ = block.screws
             base = np.broadcast_to(np.eye(3)[..., None], (*batch, 3, 3, c))
-            axis = np.concatenate([axis, base], axis=-3)  # theta, alpha, beta, base rotation
-            own = kinematics.cross(error[..., None, :, :], axis[..., None, :, :, :])
-            flat = np.swapaxes(own.reshape(*batch, k, 3 * n + 3, 3 * c), -1, -2)
-            fields = self.fields[..., block.rows].reshape(len(self.fields), k, 3 * c)
-            part = np.zeros((*batch, 2 * n + 3 + 3 * k + len(fields), 3 * n + 3))
-            lengths = np.concatenate([links.x, links.z], axis=-3).reshape(*batch, 2 * n, 3 * c)
-            part[..., : 2 * n, :] = lengths @ flat.sum(axis=-3)
-            spots = links.axes.reshape(*batch, 1, 3, 3 * c) @ flat
-            part[..., 2 * n + 3 : 2 * n + 3 + 3 * k, :] = spots.reshape(*batch, 3 * k, 3 * n + 3)
-            for i in range(k if len(fields) else 0):
-                part[..., 2 * n + 3 + 3 * k :, :] += fields[:, i] @ flat[..., i, :, :]
-            total = total + part
+            # the axes of theta, alpha, beta and of the base's turn
+            axis = np.concatenate([links.z, links.x, links.y, base], axis=-3)
+            # e . (w x d) = w . (d x e): of links all targets have the same d, of targets few d
+            lengths = np.concatenate([links.x, links.z], axis=-3)
+            moments = [kinematics.cross(lengths, error.sum(axis=-3)[..., None, :, :])]
+            spots = kinematics.cross(links.axes[..., None, :, :, :], error[..., None, :, :])
+            moments += [np.zeros((*batch, 3, 3, c)), spots.reshape(*batch, 3 * k, 3, c)]
+            if len(self.fields):
+                fields = np.moveaxis(self.fields[..., block.rows], 0, 1)  # (k, e, 3, c)
+                moments.append(kinematics.cross(fields, error[..., None, :, :]).sum(axis=-4))
+            turned = np.concatenate(moments, axis=-3)
+            flat = turned.reshape(*batch, -1, 3 * c), axis.reshape(*batch, 3 * n + 3, 3 * c)
+            total = total + flat[0] @ np.swapaxes(flat[1], -1, -2)
         coupled = total * precedes(n, k, len(self.fields))
         return np.asarray(coupled[..., active[linear], :][..., active[~linear]])
 

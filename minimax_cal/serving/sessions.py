@@ -276,7 +276,7 @@ def sessions(root: Path) -> list[Session]:
 def remove_parts(root: Path) -> None:
     """Remove files that a server began to write and that nobody has written to for long."""
     for one in sessions(root):
-        for path in (one.folder / GIVEN).glob(".*"):
+        for path in (*one.folder.glob(".*"), *(one.folder / GIVEN).glob(".*")):
             with suppress(OSError):
                 if time.time() - path.stat().st_mtime > ABANDONED:
                     path.unlink()

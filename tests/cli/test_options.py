@@ -15,7 +15,7 @@ from minimax_cal.cli.options import options_from, options_of
 from minimax_cal.cli.schemas import KINDS, schema_of
 from minimax_cal.correcting.compensate import compensate
 from minimax_cal.fitting.options import Options
-from minimax_cal.fitting.several import RelativeOptions
+from minimax_cal.fitting.several.options import RelativeOptions
 from minimax_cal.ground.options import Option
 from minimax_cal.judging.maps import Grid
 from minimax_cal.modelling.simulate import Truth

@@ -19,7 +19,7 @@ from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis
 from minimax_cal.diagnosing.verdict import ABOVE_NOISE
 from minimax_cal.dynamics.laws import USUAL
 from minimax_cal.fitting.opened import open_result
-from minimax_cal.fitting.several import relative
+from minimax_cal.fitting.several.kinds import relative
 from minimax_cal.ground.arrays import Array
 from tests.contradictions import contradictions
 

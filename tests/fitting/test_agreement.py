@@ -29,8 +29,8 @@ from experiments.agreement import (
 )
 from minimax_cal.fitting.disagreement import Cause, Contradiction
 from minimax_cal.fitting.outcome import FileEvidence, FitEvidence, judge
-from minimax_cal.fitting.several import relative
 from minimax_cal.fitting.several.agreement import ScoreTest
+from minimax_cal.fitting.several.kinds import relative
 from minimax_cal.fitting.several.lack import Components, FileRows
 from minimax_cal.instruments import Surface, contacts
 from minimax_cal.solvers.status import Status

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from experiments.relative import NOISE, SPOT, Arm, inside, position_errors
-from minimax_cal.fitting.several import RelativeCalibration, relative
+from minimax_cal.fitting.several.kinds import relative
+from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments import (
     Instrument,

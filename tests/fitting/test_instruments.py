@@ -34,9 +34,10 @@ from experiments.relative import (
 from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.robust import LOSSES
-from minimax_cal.fitting.several import RelativeCalibration, relative
 from minimax_cal.fitting.several.fit import InstrumentFit, fit_instruments
+from minimax_cal.fitting.several.kinds import relative
 from minimax_cal.fitting.several.options import RelativeOptions, check_options, silent, with_others
+from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.fitting.several.stack import Block, Stack, own_state
 from minimax_cal.ground.arrays import Array
 from minimax_cal.instruments import (

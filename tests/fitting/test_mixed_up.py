@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from experiments.agreement import SimulatedArm
-from minimax_cal.fitting.several import relative
+from minimax_cal.fitting.several.kinds import relative
 from minimax_cal.instruments import flange_poses
 from minimax_cal.instruments.poses import rotations_as
 

@@ -15,10 +15,11 @@ import minimax_cal as mc
 from experiments.relative import NOISE, SIMULATORS, Arm
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.fitting.opened import open_result
-from minimax_cal.fitting.several import RelativeCalibration, relative
 from minimax_cal.fitting.several.fit import InstrumentFit, fit_instruments, laws_of
+from minimax_cal.fitting.several.kinds import relative
 from minimax_cal.fitting.several.linear import rows_of_all, scene_of_all
 from minimax_cal.fitting.several.options import RelativeOptions, silent
+from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.instruments import (
     Instrument,
     Surface,

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import minimax_cal as mc
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults import find_faults, mended
-from minimax_cal.measuring.faults.fault import Fault
+from minimax_cal.measuring.faults.fault import Fault, between
 from minimax_cal.measuring.faults.joints import looks_read_back, read_back, unsettled
 from minimax_cal.measuring.faults.nests import ranked
 from minimax_cal.measuring.faults.points import noise, noise_between, swapped_rows
@@ -157,10 +157,11 @@ def test_a_fit_names_the_targets_of_an_even_triangle(robot):
     y = good.y.copy()
     y[40] = y[40][[1, 2, 0]]
     bad = good.with_y(y)
-    (fault,) = swapped_rows(bad, cell.error(bad))
+    (fault,) = swapped_rows(bad, between(bad), cell.error(bad))
     assert_array_equal(mended(bad, (fault,)).y, good.y)
     y[41] = y[41][[0, 2, 1]]  # the exchange of the alike ones shows in no distance
-    assert_array_equal(swapped_rows(good.with_y(y))[0].rows, [40])
+    exchanged = good.with_y(y)
+    assert_array_equal(swapped_rows(exchanged, between(exchanged))[0].rows, [40])
 
 
 def test_a_nest_that_moved_is_found_with_its_time_and_size(robot):

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from test_report import Seen
 
 import minimax_cal as mc
-from minimax_cal.fitting.several import RelativeCalibration, relative
+from minimax_cal.fitting.several.kinds import relative
+from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.instruments import flange_poses
 from minimax_cal.judging.bootstrap import bootstrap
 from minimax_cal.modelling.frames import frames_of, tables_of

@@ -26,8 +26,8 @@ from minimax_cal.fitting.pixels.judge import (
 from minimax_cal.fitting.pixels.options import FIELDS, WORST_CAMERA, PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import file_notices, objection, outlier_notices
 from minimax_cal.fitting.several.fit import at_worst
-from minimax_cal.fitting.several.kinds import READ, Asked, assembled, extremes, measured_by
-from minimax_cal.fitting.several.options import SUM
+from minimax_cal.fitting.several.kinds import Asked, assembled, extremes, measured_by
+from minimax_cal.fitting.several.options import READ, SUM
 from minimax_cal.fitting.several.result import Claim, PixelCalibration
 from minimax_cal.fitting.several.stack import Block, Stack
 from minimax_cal.fitting.several.worst import WorstPixels

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,8 +15,7 @@ from minimax_cal.fitting.accuracy import HELD, by_key
 from minimax_cal.fitting.claims import drawn_sigmas, lacking, position_sigma, positions_by
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.improvement import improvement_of_files, no_better
-from minimax_cal.fitting.opened import listed_effects
-from minimax_cal.fitting.options import listed, priors_of, qp_name
+from minimax_cal.fitting.options import qp_name
 from minimax_cal.fitting.outcome import FileEvidence, FitEvidence, judge
 from minimax_cal.fitting.several import fit, plausible
 from minimax_cal.fitting.several.agreement import (
@@ -28,12 +27,12 @@ from minimax_cal.fitting.several.fit import InstrumentFit
 from minimax_cal.fitting.several.identify import Alone
 from minimax_cal.fitting.several.lack import with_lack
 from minimax_cal.fitting.several.options import (
+    READ,
     Progress,
     RelativeOptions,
     check_given,
     check_noises,
     check_options,
-    read_noises,
     silent,
 )
 from minimax_cal.fitting.several.result import (
@@ -63,14 +62,6 @@ from minimax_cal.robots.robot import Robot, load_robot
 
 R = TypeVar("R", bound=RelativeCalibration)
 PARTS = {"train": "training", "holdout": "held-out"}  # of the poses, by the keys of accuracy
-READ: Mapping[str, Callable[[Any], Any]] = {  # what people give of an option, as its record has it
-    "fix": listed,
-    "free": listed,
-    "known_distances": tuple,
-    "noises": lambda given: read_noises(given or {}),
-    "priors": priors_of,
-    "effects": listed_effects,
-}
 
 
 @takes(options=RelativeOptions, read=READ)

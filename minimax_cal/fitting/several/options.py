@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
+from minimax_cal.fitting.opened import listed_effects
 from minimax_cal.fitting.options import (
     Options,
     QpSolver,
     check_priors,
     check_resolution,
     known_within,
+    listed,
+    priors_of,
     qp_name,
 )
 from minimax_cal.fitting.robust import SQUARE, check_robust
@@ -139,6 +142,16 @@ def read_noises(noises: Mapping[str, float | str]) -> dict[str, float]:
     """Noises in metres, from numbers or texts.  Raises OptionError."""
     pairs = (noise_of(f"{k}={v}") if isinstance(v, str) else (k, v) for k, v in noises.items())
     return dict(pairs)
+
+
+READ: Mapping[str, Callable[[Any], Any]] = {  # what people give of an option, as its record has it
+    "fix": listed,
+    "free": listed,
+    "known_distances": tuple,
+    "noises": lambda given: read_noises(given or {}),
+    "priors": priors_of,
+    "effects": listed_effects,
+}
 
 
 def sigmas_of(names: Names, options: RelativeOptions) -> Array:

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.faults.fault import NO_ERROR, Fault
+from minimax_cal.measuring.faults.fault import NO_ERROR, Between, Fault, between
 from minimax_cal.measuring.faults.joints import unsettled
 from minimax_cal.measuring.faults.nests import RESEAT, target_shifts
 from minimax_cal.measuring.faults.points import noise, outlying, swapped_rows
@@ -27,13 +27,12 @@ def find_faults(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, ...
     error: (k, m, 3) measured minus predicted by a fit, in the axes of the data as `Cell.error`
     gives them [m]; or of length 0 for none.
     """
-    swapped = swapped_rows(data, error)
-    mended_names = mended(data, swapped)
+    swapped, mended_names, apart = with_own_names(data, error)
     if swapped and len(error):
         error = error.copy()
         error[:, swapped[0].rows] = np.nan  # of the names as they stood
-    shifts = target_shifts(mended_names)
-    outliers = outlying(mended_names, error, shifts)
+    shifts = target_shifts(mended_names, apart)
+    outliers = outlying(mended_names, apart, error, shifts)
     good = mended(mended_names, outliers)
     notices = (*mixed_units(data), *session_jumps(good, error), *noise(good))
     return (*swapped, *shifts, *outliers, *unsettled(data), *notices)
@@ -43,9 +42,22 @@ def distance_faults(data: Measurements) -> tuple[Fault, ...]:
     """What the distances between targets show without any robot: re-seated nests, single points."""
     if len(data.target_names) < 2:
         return ()
-    good = mended(data, swapped_rows(data))
-    shifts = target_shifts(good)
-    return (*shifts, *outlying(good, shifts=shifts))
+    _, good, apart = with_own_names(data)
+    shifts = target_shifts(good, apart)
+    return (*shifts, *outlying(good, apart, shifts=shifts))
+
+
+def with_own_names(
+    data: Measurements, error: Array = NO_ERROR
+) -> tuple[tuple[Fault, ...], Measurements, Between]:
+    """Rows under other names, the data with these put right, and the distances of those data.
+
+    error: (k, m, 3) as `find_faults` takes it [m].
+    """
+    apart = between(data)
+    swapped = swapped_rows(data, apart, error)
+    good = mended(data, swapped)
+    return swapped, good, between(good) if swapped else apart
 
 
 def standing_out(data: Measurements, error: Array) -> tuple[Fault, ...]:

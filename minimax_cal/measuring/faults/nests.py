@@ -19,7 +19,6 @@ from minimax_cal.measuring.faults.fault import (
     Amount,
     Between,
     Fault,
-    between,
     scatter,
 )
 from minimax_cal.measuring.history import is_timed, sessions, visits
@@ -51,14 +50,13 @@ class Step:
     sigma: Array
 
 
-def target_shifts(data: Measurements) -> tuple[Fault, ...]:
+def target_shifts(data: Measurements, apart: Between) -> tuple[Fault, ...]:
     """Nests that moved during the session, as steps of their distances over the visits.
 
     Where nothing tells the visits, over the rows of the file: it is then a re-seat, which no effect
-    of time can hold.  Sessions follow each other.
+    of time can hold.  Sessions follow each other.  apart: the distances of these data, `between`.
     """
     timed = is_timed(data)
-    apart = between(data)
     order = visits(data)
     order = order[np.argsort(sessions(data)[order], kind="stable")]
     off = apart.off[:, order]

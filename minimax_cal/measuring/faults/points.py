@@ -44,14 +44,14 @@ OF_MEDIAN = 1.17  # over the root of m: relative standard error of a median devi
 
 
 def outlying(
-    data: Measurements, error: Array = NO_ERROR, shifts: tuple[Fault, ...] = ()
+    data: Measurements, apart: Between, error: Array = NO_ERROR, shifts: tuple[Fault, ...] = ()
 ) -> tuple[Fault, ...]:
     """Single points that are elsewhere, by their distances and by the residual of a fit.
 
-    error: (k, m, 3) [m], or of length 0.  shifts: nests that moved, so that the points after it
-    are not taken for outliers.
+    apart: the distances of these data, `between`.  error: (k, m, 3) [m], or of length 0.  shifts:
+    nests that moved, so that the points after it are not taken for outliers.
     """
-    found = dict.fromkeys(off_shape(data, error, shifts), "its distances to the others")
+    found = dict.fromkeys(off_shape(data, apart, error, shifts), "its distances to the others")
     if len(error):
         error = error.copy()
         for row, target in found:
@@ -109,13 +109,13 @@ def off_fit(error: Array, gross: float = GROSS, part: float = PART) -> list[tupl
 
 
 def off_shape(
-    data: Measurements, error: Array, shifts: tuple[Fault, ...] = ()
+    data: Measurements, apart: Between, error: Array, shifts: tuple[Fault, ...] = ()
 ) -> list[tuple[int, int]]:
     """(row, target) of points that do not fit the shape of the targets.
 
     Without the guilty point of a row the others are judged anew.
     """
-    apart = level(between(data), data, shifts)
+    apart = level(apart, data, shifts)
     if not len(apart.pairs):
         return []
     up = heights(data, error)
@@ -255,14 +255,13 @@ def floored(correlation: Array) -> Array:
     return np.asarray((vector * np.maximum(value, 0.1)) @ vector.T)
 
 
-def swapped_rows(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, ...]:
+def swapped_rows(data: Measurements, apart: Between, error: Array = NO_ERROR) -> tuple[Fault, ...]:
     """Rows whose distances fit under other names of their targets, and not under their own.
 
-    error: (k, m, 3) of a fit, in the axes of the data [m]; it tells orders apart whose distances
-    are alike.
+    apart: the distances of these data, `between`.  error: (k, m, 3) of a fit, in the axes of the
+    data [m]; it tells orders apart whose distances are alike.
     """
     predicted = data.y - np.moveaxis(error, 0, 1) if len(error) else np.zeros_like(data.y)
-    apart = between(data)
     if len(apart.pairs) < 3:
         return ()
     limit = outlier_limit(len(apart.pairs), data.poses, data.poses)
@@ -322,7 +321,8 @@ def noise_between(data: Measurements) -> tuple[float, float] | None:
     elsewhere do not count in a median.  What moves all targets alike, as the joints' repeatability,
     is not in it.
     """
-    apart = level(between(data), data, target_shifts(data))
+    apart = between(data)
+    apart = level(apart, data, target_shifts(data, apart))
     if not len(apart.pairs):
         return None
     many = float(np.isfinite(apart.off).sum(axis=1).max())

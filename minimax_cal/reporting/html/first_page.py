@@ -16,7 +16,7 @@ from minimax_cal.fitting.checks import wild
 from minimax_cal.fitting.crossed import few_poses, intervals_of
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.set_aside import aside_sentence
-from minimax_cal.fitting.several import RelativeCalibration
+from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import capitalise, name_first

@@ -16,7 +16,7 @@ from minimax_cal.diagnosing.sentences import away, causes_first
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.found import parameter_table
 from minimax_cal.fitting.identify import Because
-from minimax_cal.fitting.several import RelativeCalibration
+from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.ground.records import reading
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.words import capitalise, name_first

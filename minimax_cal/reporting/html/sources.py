@@ -18,8 +18,7 @@ from minimax_cal.dynamics.result import MotionDiagnosis
 from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.fitting.pose_rows import comes_back
-from minimax_cal.fitting.several import RelativeCalibration
-from minimax_cal.fitting.several.result import read_result
+from minimax_cal.fitting.several.result import RelativeCalibration, read_result
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import json_of, read_raw
