@@ -97,7 +97,7 @@ def test_every_command_runs_or_names_its_extra(installed):
     run("evaluate", "fit.json", "poses.csv")
     run("diagnose", "irb120", "poses.csv", "-o", "diagnosis.json")
     run("import", "poses.csv", "-o", "again.csv")
-    run("relative", "irb120", "wires.csv")
+    run("relative", "irb120", "wires.csv", code=1)  # no better than the drawn arm
     run("check", "fit.json", "poses.csv", "--tolerance", "rms 0.5")
     run("compare", "fit.json", "fit.json")
     run("compensate", "fit.json", "targets.csv")
@@ -106,6 +106,8 @@ def test_every_command_runs_or_names_its_extra(installed):
     run("plan", "irb120", "--poses", 8, "--candidates", 60, "-o", "next.csv")
     run("export", "fit.json", "--to", "urdf", "-o", "arm.urdf")
     run("export", "fit.json", "--to", "mjcf", "-o", "arm.xml")
+    run("identify", "nowhere.csv", "--joints", "revolute", "-o", "arm.json", code=2)
+    run("torques", "irb120", "nowhere.csv", code=2)
     run("effects")
     run("effects", "irb120", "poses.csv")
     run("backends")
