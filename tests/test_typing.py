@@ -68,6 +68,7 @@ def of_choices(data: mc.Measurements, name: str) -> None:
 """
 
 
+@pytest.mark.dev
 def test_a_script_has_the_types_that_the_verbs_return(tmp_path):
     """Errors stand where the script says so, of that kind, and nowhere else."""
     pytest.importorskip("mypy")

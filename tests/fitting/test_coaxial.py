@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from minimax_cal.fitting.checks import too_changed
-from minimax_cal.fitting.several import relative
+from minimax_cal.fitting.several.kinds import relative
 from minimax_cal.instruments import distances, flange_poses
 from minimax_cal.measuring.measurements import measurements
 from minimax_cal.robots.robot import robot_from_dict
