@@ -48,7 +48,8 @@ BackendName = Literal[  # every name of the table, and the choices of those that
     "qpswift", "hpipm", "cvxpy", "cvxpy:CLARABEL", "cvxpy:OSQP", "cvxpy:SCS", "subgradient",
     "subgradient:restarted", "subgradient:raw", "subgradient:eliminated",
 ]  # fmt: skip
-DIRECT = {"daqp": "via_daqp", "quadprog": "via_quadprog"}  # "daqp:direct": without qpsolvers
+# "quadprog:direct" goes without qpsolvers; "daqp:direct" is daqp, which always does.
+DIRECT = {"daqp": "via_daqp", "quadprog": "via_quadprog"}
 FRAIL = ("highs",)  # HiGHS 1.16 kills the process on P = diag(3e-14, 2e-4)
 CHOOSING = ("cvxpy", "subgradient", *DIRECT)  # those that take a choice after a colon
 PACKAGES = {  # where the package is not called like the backend: (module, distribution)

@@ -116,7 +116,7 @@ class Options:
     qp: QpSolver = solved(  # noqa: RUF009
         "daqp",
         "The backend of the quadratic programs of the minimax; `minimax-cal backends` lists them, "
-        "and daqp:direct is the fastest.",
+        "and daqp is the fastest for a calibration.",
     )
     holdout: float = held_out(
         InstrumentOptions.holdout,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,15 +10,28 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.derivatives import CountedFunction, CountedJacobian
 from minimax_cal.solvers.max_problem import MaxOfFunctions
+from minimax_cal.solvers.status import Status
 
 if TYPE_CHECKING:
     from minimax_cal.solvers.minimize import Search
 
 
-def find_feasible_point(problem: MaxOfFunctions, x: Array, search: Search) -> Array | None:
+@dataclass(frozen=True, eq=False)
+class FeasibilityAnswer:
+    """x: (n,) of the least violation found.  is_feasible: whether it is within the tolerance.
+
+    is_proven: whether, if not, the search for less converged; else it only ended.
+    """
+
+    x: Array
+    is_feasible: bool
+    is_proven: bool
+
+
+def find_feasible_point(problem: MaxOfFunctions, x: Array, search: Search) -> FeasibilityAnswer:
     """Minimise the largest violation, each relative to its row's terms, between the bounds.
 
-    The same search from x (n,).  None where the violations cannot be lowered to the tolerance.
+    The same search from x (n,), with the QPs that it has left; they count among its own.
     """
     rows = problem.rows
     c, normal = rows.values(x), rows.jacobian(x)
@@ -32,8 +45,8 @@ def find_feasible_point(problem: MaxOfFunctions, x: Array, search: Search) -> Ar
     above = above[above >= k]
     below = np.flatnonzero(np.isfinite(rows.lower))
     below = below[below >= k]
-    if not len(above) + len(below):
-        return None
+    if not len(above) + len(below):  # bounds alone, which no x0 between them breaks
+        return FeasibilityAnswer(x, is_feasible=False, is_proven=False)
 
     def violations(z: Array) -> Array:
         c = rows.values(z) / size
@@ -50,9 +63,13 @@ def find_feasible_point(problem: MaxOfFunctions, x: Array, search: Search) -> Ar
         problem.low, problem.high, 0, problem.lengths, problem.first_lengths,
     )  # fmt: skip
     bounded = np.clip(x, problem.low, problem.high)
-    answer = replace(search, callback=None).find_optimum(
-        phase_one.rescale(bounded), bounded, with_feasibility=False
-    )
+    phase = replace(search, callback=None, history=[])
+    answer = phase.find_optimum(phase_one.rescale(bounded), bounded, with_feasibility=False)
+    search.iteration_count = phase.iteration_count
     c, normal = rows.values(answer.optimum.x), rows.jacobian(answer.optimum.x)
     left = problem.relative_violations(answer.optimum.x, c, normal).max(initial=0.0)
-    return answer.optimum.x if left <= search.tolerance else None
+    return FeasibilityAnswer(
+        answer.optimum.x,
+        is_feasible=bool(left <= search.tolerance),
+        is_proven=answer.status == Status.CONVERGED,
+    )

@@ -106,7 +106,8 @@ def minimize_max(
         wrong_gradient), message, nit, nfev, njev, multipliers (m,) that sum to one,
         constraint_multipliers (one row a bound or constraint, > 0 at the upper side and < 0
         at the lower), kkt and violation (both measured at the answer; violation in the units of
-        the constraints), notes, history (one entry a QP: value, violation, kkt, step). A jac that
+        the constraints), notes, history (value, violation, kkt and step of each QP, but for those
+        that only looked for a point that meets the constraints). A jac that
         is given is checked against differences of fun in a few directions, at x0 and at the answer.
 
     Raises
@@ -224,7 +225,8 @@ class Search:
             lam = np.ldexp(optimum.lam, last_exponent - problem.exponent)
             optimum = replace(optimum, f=problem.values(x), lam=lam)
             check = check_answer(problem, x, optimum.mu, optimum.lam, start, self.tolerance)
-            value, violation = float(problem.function(x).max()), check.kkt.violation
+            value = float(np.ldexp(optimum.f.max(), problem.exponent))
+            violation = check.kkt.violation
             self.gained = start_value - value
             answer = SearchAnswer(problem, optimum, check, Status.CONVERGED)
 
@@ -245,13 +247,14 @@ class Search:
             # No optimum can be told from a point that breaks constraints: first one that does not.
             if violation > self.tolerance and with_feasibility:
                 nearer = min((x, start), key=lambda place: largest_violation(problem, place))
-                nearest = find_feasible_point(problem, nearer, self)
-                if nearest is None:
+                found = find_feasible_point(problem, nearer, self)
+                if found.is_proven and not found.is_feasible:
                     return replace(answer, status=Status.INFEASIBLE)
-                x, mu, with_feasibility = nearest, NO_MULTIPLIERS, False
-                problem = problem.rescale(x)
-                last_value, last_violation = np.inf, np.inf
-                continue
+                with_feasibility = False
+                if found.is_feasible:
+                    x, mu, problem = found.x, NO_MULTIPLIERS, problem.rescale(found.x)
+                    last_value = last_violation = largest_level = np.inf
+                    continue
 
             # From here again, as long as that gains anything.
             gain = (last_value - value) / np.ldexp(check.level, problem.exponent)
@@ -274,10 +277,13 @@ class Search:
 
     def falls_without_end(self, problem: MaxOfFunctions, start: Array, end: Array) -> bool:
         """Whether the functions fall on and on from a feasible point near a start to an end."""
-        anchor: Array | None = start
+        anchor = start
         if largest_violation(problem, start) > self.tolerance:
-            anchor = find_feasible_point(problem, start, self)
-        return anchor is not None and falls_without_end(problem, anchor, end, self.tolerance)
+            found = find_feasible_point(problem, start, self)
+            if not found.is_feasible:
+                return False
+            anchor = found.x
+        return falls_without_end(problem, anchor, end, self.tolerance)
 
     def run_sqp(
         self, problem: MaxOfFunctions, x: Array, mu: Array, largest_level: float
