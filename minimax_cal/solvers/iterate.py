@@ -26,6 +26,7 @@ NO_MULTIPLIERS: Array = np.zeros(0)
 
 VALUE_ROUNDING = 1e-12  # relative: a fall of the value by less is none
 INEXACT_VALUE_ROUNDING = 1e-8  # the same where QP answers are used though they missed the tolerance
+SMALLEST_LEVEL = float(np.finfo(float).tiny)  # of a value: what is divided by less overflows
 ZERO_VALUE = 1e-12  # of the value at the start: what is as good as zero
 MAX_VALUE_GROWTH = 1e32  # times that: a value so large belongs to what falls without end
 MIN_VALUE_OF_TERMS = 1e-7  # a value below this share of the terms that make it is known no better
@@ -143,7 +144,7 @@ class Iterate(Generic[X]):
         """Of the value as large as it is, of variables as far as they have gone."""
         size = min(abs(float(self.here.f.max())), self.largest_level)
         zero_level = min(self.zero_level, self.largest_level)
-        level = max(size, MIN_VALUE_OF_TERMS * self.value_terms, zero_level)
+        level = max(size, MIN_VALUE_OF_TERMS * self.value_terms, zero_level, SMALLEST_LEVEL)
         return Scaling(level, self.reach, self.terms.constraint_units)
 
     @property

@@ -409,6 +409,12 @@ def test_patience_and_damping_have_an_end(residual, violation, state, ended, rou
     assert end(1e-8, is_exact=False) is rough
 
 
+def test_values_that_have_all_underflowed_are_optimal():
+    nothing = np.zeros(0)
+    at = standing(linear([0.0], [[0.0]]), np.ones(1), nothing, nothing)
+    assert replace(at, zero_level=0.0).kkt.residual == 0.0
+
+
 def test_damping_grows_and_falls_tenfold():
     at = begun(parabola(), 1.0)
     assert at.damp().damping == 1e-3
