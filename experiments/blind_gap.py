@@ -227,7 +227,7 @@ def oracle(case: Case, truth: Truth, robot: mc.Robot, data: mc.Measurements) -> 
     if case.condition not in FITTED:
         return {}
     effects = [spec(case.robot, cause) for cause in case.causes]
-    freed = data.with_y(data.y - np.moveaxis(truth.displacement, 0, 1))
+    freed = data.with_y(data.y - truth.displacement)
     told = mc.calibrate(robot, data, objective="sum", effects=effects)
     known = mc.calibrate(robot, freed, objective="sum")
     return {

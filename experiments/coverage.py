@@ -287,11 +287,11 @@ def judged(cell: Cell, arm: Cell, case: Case, rng: np.random.Generator) -> Array
 def held_out(error: Array, n: int, rms: float, rng: np.random.Generator) -> tuple[bool, bool, bool]:
     """Whether n poses tell the RMS, the largest of n further ones; and whether one is worse.
 
-    error: (k, m, 3) of many poses, the first n held out, the next n new.
+    error: (m, k, 3) of many poses, the first n held out, the next n new.
     """
-    held, new = error[:, :n], error[:, n : 2 * n]
+    held, new = error[:n], error[n : 2 * n]
     middle, most = (f(held, level=LEVEL, rng=rng) for f in (rms_interval, max_interval))
-    worst = [float(np.linalg.norm(part, axis=-1).max()) for part in (held, new, new[:, :1])]
+    worst = [float(np.linalg.norm(part, axis=-1).max()) for part in (held, new, new[:1])]
     return middle.low <= rms <= middle.high, most.low <= worst[1] <= most.high, worst[2] > worst[0]
 
 
@@ -301,8 +301,8 @@ def drawn(draws: Draws) -> Array:
     rms = float(np.sqrt(MEANS[draws.law]))
     out = []
     for _ in range(draws.count):
-        error = np.zeros((1, 2 * draws.poses, 3))
-        error[0, :, 0] = np.sqrt(LAWS[draws.law](rng.uniform(size=2 * draws.poses)))
+        error = np.zeros((2 * draws.poses, 1, 3))
+        error[:, 0, 0] = np.sqrt(LAWS[draws.law](rng.uniform(size=2 * draws.poses)))
         out.append(held_out(error, draws.poses, rms, rng))
     return np.array(out)
 

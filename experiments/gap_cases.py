@@ -127,8 +127,8 @@ class Truth:
     """What is wrong with an arm.
 
     truth: (effect, place) of every cause of the case.  background: those of the background.
-    displacement: (k, m, 3) of the points by all effects, in the measurement frame [m].
-    parts: (c, k, m, 3) the same by each cause of the case alone [m].  powers: (c,) lambda of each.
+    displacement: (m, k, 3) of the points by all effects, in the measurement frame [m].
+    parts: (c, m, k, 3) the same by each cause of the case alone [m].  powers: (c,) lambda of each.
     power: lambda of all.  amplitudes: (c,) of the laws, in the law's own unit.
     floor: RMS that the noise and the jitter alone leave on the held-out poses [m].
     """
@@ -868,8 +868,8 @@ def sealed(
         true=world.robot,
         truth=names[:count],
         background=names[count:],
-        displacement=np.moveaxis(moved, 1, 0),
-        parts=np.moveaxis(np.array(parts[:count]).reshape(count, *moved.shape), 2, 1),
+        displacement=moved,
+        parts=np.array(parts[:count]).reshape(count, *moved.shape),
         powers=tuple(map(ruler.power, parts[:count])),
         power=ruler.power(moved),
         amplitudes=tuple(amplitudes[:count]),

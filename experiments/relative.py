@@ -421,7 +421,7 @@ def run_real(job: RealJob) -> RealOutcome:
     fit = calibrate(robot, train, objective="sum", holdout=0.0)
     nominal = after_base(held, robot, fit.nominal.target_positions[0])
     if job.kind == "tracker":
-        held_mm = rms_mm(np.linalg.norm(fit.cell.error(held)[0], axis=1))
+        held_mm = rms_mm(np.linalg.norm(fit.cell.error(held)[:, 0], axis=1))
         after = after_base(held, fit.robot, fit.cell.target_positions[0])
         return RealOutcome(train.poses, count_of(fit), held_mm, (nominal, after))
     other = relative(robot, seen_from(data, job.kind), seed=job.seed, holdout=job.held)

@@ -27,7 +27,7 @@ def resemblance(
 ) -> dict[tuple[str, str], float]:
     """rho^2 between a known displacement and every effect that the data can test.
 
-    displacement: (k, m, 3) of the points of all rows in the measurement frame [m].  Both are seen
+    displacement: (m, k, 3) of the points of all rows in the measurement frame [m].  Both are seen
     by the training poses, after projection on what geometry cannot imitate.
     """
     robot = load_robot(robot)
@@ -35,7 +35,7 @@ def resemblance(
     train, _, _ = split(data, 0.2, 0)
     study = studied(robot, train, fit_cell(robot, train, SUM, silent))
     rows = np.isin(data.line, train.line)
-    moved = np.einsum("ab,kma->kbm", study.fit.state.rotation, displacement[:, rows])
+    moved = np.einsum("ab,mka->kbm", study.fit.state.rotation, displacement[rows])
     clock = np.unique(study.scene.column("clock"))  # a jump may be at any moment
     study = replace(study, moments=clock[EARLIEST : len(clock) - EARLIEST])
     lib = with_jumps(arm_library(study.scene, study.rows), study)

@@ -160,7 +160,7 @@ def test_every_public_name_is_in_the_reference(site, package):
 def test_docstrings_keep_their_words(site):
     page = re.sub(r"<[^>]+>", "", (site / "api" / "minimax_cal.html").read_text())
     assert "Names or patterns as beta*" in page  # a star is no emphasis here
-    assert "Errors (k, m, 3) by the keys of accuracy [m]" in page  # quoted, with its brackets
+    assert "Errors (m, k, 3) by the keys of accuracy [m]" in page  # quoted, with its brackets
     page = re.sub(r"<[^>]+>", "", (site / "api" / "qp_backends.html").read_text())
     assert "|xᵀPx + qᵀx + uᵀy⁺ - lᵀy⁻|, primal minus dual objective" in page  # nor is a bar a link
 

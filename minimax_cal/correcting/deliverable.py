@@ -76,7 +76,7 @@ class Figures:
         if not known.held.any():
             return Figures(math.nan, math.nan, *outside)
         seen = known.data.take(known.held)
-        error = rung.error[:, known.held] if rung.error is not None else None
+        error = rung.error[known.held] if rung.error is not None else None
         inside = accuracy(known.cell.error(with_history(seen)) if error is None else error)
         return Figures(inside.rms_mm, inside.max_mm, *outside)
 

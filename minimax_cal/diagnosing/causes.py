@@ -174,10 +174,10 @@ def read_back_fault(study: Study, choice: Choice) -> list[Fault]:
     if not any(EFFECTS[c.term.effect].of_move for c in choice.chosen):
         return []
     rest = rest_of(study.rows, choice.noise, choice.known, study.rows.turn)
-    error = np.moveaxis(study.rows.back(rest.rows / rest.root), -1, 1)
-    error = np.where(study.model.seen[..., None], error, np.nan)
+    error = np.moveaxis(study.rows.back(rest.rows / rest.root), -1, 0)
+    error = np.where(study.model.seen.T[..., None], error, np.nan)
     error = error @ study.fit.state.rotation.T
-    push = np.einsum("ab,nkbm->kman", study.fit.state.rotation, study.scene.jacobian)
+    push = np.einsum("ab,nkbm->mkan", study.fit.state.rotation, study.scene.jacobian)
     found = looks_read_back(study.data, error, push * study.robot.sign)
     return in_lines(study.data, found, "readback")
 

@@ -27,7 +27,8 @@ FLAT = 1e-6  # of its size: what varies less does not vary
 class Curve:
     """Something against something.
 
-    x: (m,) or (k, m).  y: of each of VIEWS, or of the first ones, the shape of x.
+    x: (m,), or (k, m) a line a target, as files hold it.  y: of each of VIEWS, or of the first
+    ones, the shape of x.
     """
 
     title: str
@@ -63,9 +64,9 @@ class Leftover:
 
     data: with its history.  held: (m,) True where held out.  noise: of a coordinate [m].
     effects: as fitted.
-    errors: (k, m, 3) of the first views in base axes, NaN where not measured [m].
+    errors: (m, k, 3) of the first views in base axes, NaN where not measured [m].
     law: as errors, of the fit with effects once the first effect is taken out; None without one.
-    points: (k, m, 3) measured, in base axes [m].  term: the first effect that was fitted, if any.
+    points: (m, k, 3) measured, in base axes [m].  term: the first effect that was fitted, if any.
     """
 
     data: Measurements
@@ -98,7 +99,7 @@ class Leftover:
             scene=first.scene(data),
             errors=tuple(cell.error(data) @ axes for cell in cells),
             law=bare.error(data) @ axes if bare else None,
-            points=np.moveaxis((data.y - origin) @ axes, 1, 0),
+            points=(data.y - origin) @ axes,
             term=term,
         )
 
@@ -108,7 +109,7 @@ class Leftover:
         return self.errors if self.law is None else (*self.errors, self.law)
 
     def distances(self) -> list[Array]:
-        """(k, m) sizes of the errors of each view [mm]."""
+        """(m, k) sizes of the errors of each view [mm]."""
         return [1e3 * np.linalg.norm(error, axis=-1) for error in self.errors]
 
 
@@ -127,7 +128,7 @@ def turns(left: Leftover) -> list[Array]:
     """
     count = len(left.views)
     jacobian = np.concatenate([left.scene.jacobian] * count, axis=-1)
-    together = np.concatenate(left.views, axis=1)
+    together = np.concatenate(left.views, axis=0)
     return np.split(joint_equivalent(together, jacobian, left.noise), count, axis=0)
 
 
@@ -138,11 +139,11 @@ def joint_equivalent(error: Array, jacobian: Array, noise: float) -> Array:
     is the RMS turn that would make all of the error if every joint had its part.  Without ridge a
     wrist in line, or a single target, would ask for endless turns.
 
-    error: (k, m, 3), NaN where not measured [m].  jacobian: (n, k, 3, m) by the joints.  noise: of
+    error: (m, k, 3), NaN where not measured [m].  jacobian: (n, k, 3, m) by the joints.  noise: of
     a coordinate, NaN unknown [m].
     """
     n, k, _, m = jacobian.shape
-    rows = np.moveaxis(error, 0, 1).reshape(m, 3 * k)
+    rows = error.reshape(m, 3 * k)
     seen = np.isfinite(rows)
     rows = np.where(seen, rows, 0.0)
     motion = jacobian.transpose(3, 1, 2, 0).reshape(m, 3 * k, n) * seen[..., None]
@@ -186,7 +187,7 @@ def along_motion(left: Leftover, term: Term) -> Curve:
     """What is left of the targets along the motion that an effect gives them."""
     scene, names = left.scene, left.scene.data.target_names
     chosen = [names.index(term.place)] if term.place in names else list(range(len(names)))
-    sight = np.moveaxis(left.points, -1, 1) - scene.instrument[:, None]  # (k, 3, m)
+    sight = np.moveaxis(left.points, 0, -1) - scene.instrument[:, None]  # (k, 3, m)
     if follows_of(term) == "sight":
         motion, words = sight, "along the line of sight"
         xlabel, x = "distance from the instrument (m)", np.linalg.norm(sight, axis=1)
@@ -195,7 +196,7 @@ def along_motion(left: Leftover, term: Term) -> Curve:
         xlabel, time = axis_of(scene, term, 0)
         x = np.broadcast_to(time, (len(names), len(time)))
     along = motion / np.maximum(np.linalg.norm(motion, axis=1, keepdims=True), 1e-12)
-    y = tuple(1e3 * np.einsum("kma,kam->km", error, along)[chosen] for error in left.views)
+    y = tuple(1e3 * np.einsum("mka,kam->km", error, along)[chosen] for error in left.views)
     whose = names[chosen[0]] if len(chosen) == 1 else "all targets"
     title = f"error of {whose}, for {name_effect(term.effect, term.place)}"
     return Curve(title, xlabel, f"error {words} (mm)", x[chosen], y)
@@ -237,7 +238,7 @@ def order_curve(left: Leftover) -> Curve:
     place[visits(data)] = np.arange(1, data.poses + 1)
     told = numbered(data)
     rms = tuple(
-        np.sqrt(np.nansum(d**2, axis=0) / np.maximum(np.isfinite(d).sum(axis=0), 1))
+        np.sqrt(np.nansum(d**2, axis=1) / np.maximum(np.isfinite(d).sum(axis=1), 1))
         for d in left.distances()
     )
     title = "error by visit order" if told else "error by row (the file tells no order)"

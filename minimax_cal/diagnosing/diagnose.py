@@ -444,8 +444,8 @@ def judges_of(asked: Asked, clean: Clean, train: Measurements) -> Judges:
     held = asked.data.take(asked.held)
     right = dict(zip(clean.given.line, clean.given.y, strict=True))
     held = held.with_y(np.array([right.get(line, held.y[i]) for i, line in enumerate(held.line)]))
-    sound = of_lines(held.line, clean.data.line, clean.data.seen).T
-    return Judges(train, held, held.seen.T & ~sound, asked.options.holdout_by)
+    sound = of_lines(held.line, clean.data.line, clean.data.seen)
+    return Judges(train, held, held.seen & ~sound, asked.options.holdout_by)
 
 
 def against(robot: Robot, floor: Floor, last: Step) -> str:

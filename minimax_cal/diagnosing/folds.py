@@ -43,7 +43,7 @@ def fold_of(study: Study, causes: Causes, rows: Array, state: State) -> Ladder:
 def fold_errors(
     study: Study, causes: Causes, rows: Array, state: State, left: Measurements
 ) -> tuple[Array, Array]:
-    """Errors (k, f, 3) at poses left out, of the model sought without them and of its geometry [m].
+    """Errors (f, k, 3) at poses left out, of the model sought without them and of its geometry [m].
 
     As `fold_of`; left: the poses left out.
     """

@@ -247,7 +247,7 @@ def motions(scene: Scene, finding: Finding) -> tuple[float, ...]:
 class Judges:
     """Poses that judge: those of the fit, those held out, and points held out that stand out.
 
-    far: (k, m) True for points of `held` that no sound arm shows.  by: whose groups are left out
+    far: (m, k) True for points of `held` that no sound arm shows.  by: whose groups are left out
     in turn, as in `grouping.parts`.
     """
 
@@ -259,7 +259,7 @@ class Judges:
     @property
     def whole(self) -> Measurements:
         """All poses in the order of the file, held-out points that stand out NaN."""
-        y = np.where(self.far.T[..., None], np.nan, self.held.y)
+        y = np.where(self.far[..., None], np.nan, self.held.y)
         every = self.train.followed_by(self.held.with_y(y))
         return every.take(np.argsort(every.line, kind="stable"))
 
@@ -279,12 +279,12 @@ class Judges:
         before, error = (cell.error(whole) for cell in (first, last))
         sound = mended(whole, standing_out(last.placed(whole), error)).seen
         alike = (before * error).sum(axis=-1) > SEEN_BEFORE * (error**2).sum(axis=-1)
-        far = whole.seen & ~sound & alike.T
+        far = whole.seen & ~sound & alike
         points = [
             f"{whole.called(whole.line[row])} {whole.target_names[i]}"
             for row, i in np.argwhere(far)
         ]
-        more = of_lines(self.held.line, whole.line, far).T
+        more = of_lines(self.held.line, whole.line, far)
         return replace(self, far=self.far | more), tuple(points)
 
     def step(self, name: str, cell: Cell) -> Step:
@@ -293,7 +293,7 @@ class Judges:
         return Step(name, accuracy(cell.error(self.train)), accuracy(every), accuracy(trusted))
 
     def errors(self, cell: Cell) -> Array:
-        """(k, m, 3) of a cell at the held-out poses, NaN for what stands out [m]."""
+        """(m, k, 3) of a cell at the held-out poses, NaN for what stands out [m]."""
         return np.where(self.far[..., None], np.nan, cell.error(self.held))
 
 
@@ -361,7 +361,7 @@ def closed_share(
 
     1 - (after^2 - floor^2) / (before^2 - floor^2) of the RMS distances; NaN where there is no gap.
     Groups of poses and the floor are drawn anew; what other poses of the fit would change is the
-    variance.  before, after: (k, m, 3) errors of the same poses [m].  group: (m,).
+    variance.  before, after: (m, k, 3) errors of the same poses [m].  group: (m,).
     """
     pair = [sums(error) for error in (before, after)]
     share = float(share_of([part.sum(axis=1) for part in pair], np.array([floor.least]))[0])
@@ -382,9 +382,9 @@ def closed_share(
 
 
 def sums(error: Array) -> Array:
-    """(2, m) sum of squares [mm^2] and number of points of each pose.  error: (k, m, 3) [m]."""
-    squares = np.nansum(1e6 * (error**2).sum(axis=-1), axis=0)
-    return np.stack([squares, np.isfinite(error[..., 0]).sum(axis=0)])
+    """(2, m) sum of squares [mm^2] and number of points of each pose.  error: (m, k, 3) [m]."""
+    squares = np.nansum(1e6 * (error**2).sum(axis=-1), axis=1)
+    return np.stack([squares, np.isfinite(error[..., 0]).sum(axis=1)])
 
 
 def share_of(pair: Sequence[Array], floor: Array) -> Array:

@@ -130,7 +130,7 @@ class Site:
         if free := of_sessions(self.plan.data.frames):
             fields = fields_of(free, self.whole)
             model = replace(model, fields=fields, moved=np.zeros((0, 0, 0)))
-        return self.turned.of(np.moveaxis(model.jacobian(self.state), (3, 1), (0, 3)))
+        return self.turned.of(np.moveaxis(model.jacobian(self.state), (3, 0), (0, 3)))
 
     def lines(self, poses: slice) -> slice:
         """The rows of some poses."""

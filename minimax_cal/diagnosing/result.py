@@ -579,7 +579,7 @@ class Diagnosis(Explained, Result):
 
     @cached_property
     def errors(self) -> tuple[Array, Array]:
-        """(k, m, 3) of all poses, geometry alone and with the effects, NaN not measured [m]."""
+        """(m, k, 3) of all poses, geometry alone and with the effects, NaN not measured [m]."""
         if self.stated_errors is not None:
             return self.stated_errors
         told = with_history(self.data)

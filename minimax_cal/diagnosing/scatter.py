@@ -158,20 +158,20 @@ def wrong_rows(data: Measurements, error: Array) -> Array:
 
     Judged by the errors of a fit, and by the distances between targets, each against Student's t
     with as heavy tails as the other points show.  Where the errors' tails are heavy no point is
-    wrong for being far off.  error: (k, m, 3) of all points [m].
+    wrong for being far off.  error: (m, k, 3) of all points [m].
     """
     out = np.zeros(data.poses, dtype=bool)
     spread, far = judged(np.linalg.norm(error, axis=-1), 3)
     if spread.dof <= HEAVY:
         return out
-    off = np.abs(between(data).off)
+    off = np.abs(between(data).off.T)
     return np.asarray(far | judged(off, 1)[1] if off.size else far)
 
 
 def unpulled(error: Array, again: Callable[[], Array], data: Measurements) -> tuple[Fault, ...]:
     """Points that are wrong where so many are that they pull the fit.
 
-    error: (k, m, 3) of a plain fit [m].  again: that of one which wrong points do not pull, asked
+    error: (m, k, 3) of a plain fit [m].  again: that of one which wrong points do not pull, asked
     where an error is larger than those of Gaussian noise are.  Its heavy tails are no wrong points,
     nor are poses that were visited one after the other.
     """
@@ -190,11 +190,11 @@ def scattered(data: Measurements, far: Array) -> bool:
 
 
 def judged(size: Array, directions: int) -> tuple[Spread, Array]:
-    """How sizes (s, m) scatter, and (m,) True where one stands out.  NaN is unknown."""
+    """How sizes (m, s) scatter, and (m,) True where one stands out.  NaN is unknown."""
     seen = np.isfinite(size)
     scores = Scores(np.where(seen, size, 0.0) ** 2, directions * seen)
     spread = spread_of(scores, float(directions * seen.sum()))
-    return spread, np.asarray(spread.far(scores).any(axis=0))
+    return spread, np.asarray(spread.far(scores).any(axis=1))
 
 
 def are_wrong(fault: Fault, rows: Array, line: Array) -> bool:

@@ -46,9 +46,9 @@ def judged_with(
     aside = without.aside
     if aside is None:
         return without.set_aside, None
-    judges = of_lines(aside.line, held.line, held.seen).T
+    judges = of_lines(aside.line, held.line, held.seen)
     error = np.where(judges[..., None], np.nan, errors_of(cell, without))
-    error = error[:, np.isfinite(error).any(axis=(0, 2))]
+    error = error[np.isfinite(error).any(axis=(1, 2))]
     group = np.unique(clusters(held), return_inverse=True)[1].reshape(-1)
     share = float(held.seen.sum() / data.seen.sum())
     found = with_them(cell.error(held), group, error, share)
@@ -108,7 +108,7 @@ def sized(fault: Fault, cell: Cell, data: Measurements) -> Fault:
     if fault.effect != RESEAT:
         return fault
     (rows, target), *_ = spoilt(data, [fault])
-    error = cell.error(data)[target, rows]
+    error = cell.error(data)[rows, target]
     flange = cell.robot.pose(data.q[rows])[:, :3, :3]
     along = np.einsum("mji,mj->mi", flange, error @ cell.base[:3, :3])
     size = float(np.linalg.norm(np.median(along, axis=0)))

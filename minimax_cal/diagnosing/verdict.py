@@ -105,7 +105,7 @@ def least_visits(data: Measurements, error: Array) -> float:
     """Lower 97.5 % limit of the RMS distance by which visits to one pose differ [mm].
 
     By the mean of the squares, which sees a scatter of two peaks where a median does not; a pose
-    counts as one number, for what joints do moves all of its points.  error: (k, m, 3) [m].
+    counts as one number, for what joints do moves all of its points.  error: (m, k, 3) [m].
     """
     again = least_scatter(data, error)
     if again is None:

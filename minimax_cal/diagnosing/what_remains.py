@@ -98,7 +98,7 @@ def remaining_of(
     """What remains, and whether all noise beneath it is known.
 
     left: what the last step leaves, as asked of its poses.  last: RMS distance that it leaves at
-    held-out poses [mm].  data: without faults; error: (k, m, 3) of its arm at them [m].  most: what
+    held-out poses [mm].  data: without faults; error: (m, k, 3) of its arm at them [m].  most: what
     noise is said to be at most, which few visits that are far off do not change [mm].
     """
     again = least_scatter(data, error)

@@ -122,7 +122,7 @@ def where(study: Study) -> Where:
     """Where the errors of a study's geometric fit lie."""
     data, base = study.data, study.geometric.base
     error = study.model.error(study.fit.state)
-    point, sight = np.moveaxis((data.y - base[:3, 3]) @ base[:3, :3], 1, 0), in_sight(study)
+    point, sight = (data.y - base[:3, 3]) @ base[:3, :3], in_sight(study)
     given, between = instrument_noise(data), noise_between(data)
     noise = between[0] if between and not math.isfinite(given) else given
     turn = joint_equivalent(error, study.scene.jacobian, noise)
@@ -136,8 +136,8 @@ def where(study: Study) -> Where:
 
     return Where(
         by_target=tuple(
-            of_target(name, rows, away, at(name))
-            for name, rows, away in zip(data.target_names, error, sight, strict=True)
+            of_target(name, error[:, i], sight[:, i], at(name))
+            for i, name in enumerate(data.target_names)
         ),
         by_joint=tuple(
             JointGap(f"J{j + 1}", bool(slides), rms(turn[:, j]), at(f"J{j + 1}"))
@@ -151,10 +151,10 @@ def where(study: Study) -> Where:
 
 
 def in_sight(study: Study) -> Array:
-    """(k, m, 3) unit vectors from the instrument to the targets, in base axes."""
+    """(m, k, 3) unit vectors from the instrument to the targets, in base axes."""
     seen = study.data.y - stood(study.data)[:, None]
-    sight = seen / np.linalg.norm(seen, axis=-1, keepdims=True) @ study.geometric.base[:3, :3]
-    return np.moveaxis(sight, 1, 0)
+    away = np.linalg.norm(seen, axis=-1, keepdims=True)
+    return np.asarray(seen / away @ study.geometric.base[:3, :3])
 
 
 def loudest(every: Asked, chosen: Callable[[Component], bool]) -> Follows | None:
@@ -183,7 +183,7 @@ def of_target(name: str, error: Array, sight: Array, what: Follows) -> TargetGap
 def by_region(error: Array, point: Array, up: Array) -> tuple[Region, ...]:
     """Cells of the workspace by radius and height, each with as many points; few have fewer cells.
 
-    error, point: (k, m, 3) in base axes.
+    error, point: (m, k, 3) in base axes.
     """
     axis, seen = up / np.linalg.norm(up), np.isfinite(error[..., 0])
     spots, square = point[seen], (error[seen] ** 2).sum(-1)

@@ -66,8 +66,9 @@ class Accuracy(Record):
 
 
 def accuracy(error: Array) -> Accuracy:
-    """Summary of point errors (k, m, 3), NaN where not measured [m]; NaN without any point."""
-    error = np.ascontiguousarray(error)  # sums are then the same, however it is stored
+    """Summary of point errors (m, k, 3), NaN where not measured [m]; NaN without any point."""
+    # sums target by target, pose by pose: the same however the errors are stored
+    error = np.ascontiguousarray(np.swapaxes(error, 0, 1))
     distance = 1e3 * np.sqrt(np.einsum("kmi,kmi->km", error, error))
     seen = np.isfinite(distance)
     known = np.where(seen, distance, 0.0)
@@ -90,9 +91,9 @@ def accuracy(error: Array) -> Accuracy:
 
 
 def by_key(nominal: Array, calibrated: Array, held: Array) -> dict[str, Array]:
-    """Errors (k, m, ...) of all poses by the keys of a result.  held: (m,)."""
+    """Errors (m, ...) of all poses by the keys of a result.  held: (m,)."""
     return {
-        key: (nominal if key.startswith("nominal") else calibrated)[:, held == is_held]
+        key: (nominal if key.startswith("nominal") else calibrated)[held == is_held]
         for key, is_held in HELD.items()
     }
 
@@ -156,12 +157,12 @@ def rms_interval(
 
     Studentised bootstrap of the log mean square over poses [Davison and Hinkley 1997, ch. 5], its
     samples spread by a kernel in the logarithm: without it the skewness of few squares is missed.
-    error: (k, m, 3) measured minus predicted, NaN where not measured [m].  group: (m,) poses with
+    error: (m, k, 3) measured minus predicted, NaN where not measured [m].  group: (m,) poses with
     one number are drawn together.
     """
     square = (error**2).sum(axis=-1)
     seen = np.isfinite(square)
-    total, count = np.where(seen, square, 0.0).sum(axis=0), seen.sum(axis=0)
+    total, count = np.where(seen, square, 0.0).sum(axis=1), seen.sum(axis=1)
     total, count = (np.bincount(members(error, group), of) for of in (total, count))
     total, count = total[count > 0], count[count > 0]
     bundle = np.arange(len(count)) % BUNDLES
@@ -200,7 +201,7 @@ def log_mean(total: Array, count: Array) -> tuple[Array, Array]:
 def members(error: Array, group: Array | None) -> Array:
     """(m,) number of each pose's group, counted from 0 in the order of their first poses."""
     if group is None:
-        return np.arange(error.shape[1])
+        return np.arange(len(error))
     _, first, inverse = np.unique(group, return_index=True, return_inverse=True)
     return np.asarray(np.argsort(np.argsort(first))[inverse.reshape(-1)])
 
@@ -213,13 +214,13 @@ def max_interval(
     A prediction interval: exact where the logarithms of the larger half of the poses' largest
     distances are the upper half of a normal sample; a little too wide for lighter tails, as those
     of tracker noise.  It is wide: no method without such an assumption has an upper end at all, for
-    the new poses exceed the largest distance seen with probability 1/2.  error: (k, m, 3) measured
+    the new poses exceed the largest distance seen with probability 1/2.  error: (m, k, 3) measured
     minus predicted, NaN where not measured [m].  group: (m,) poses with one number count as one.
     """
     distance = np.linalg.norm(error, axis=-1)
     seen = np.isfinite(distance)
-    group = members(error, group)[seen.any(axis=0)]
-    each = np.where(seen, distance, 0.0).max(axis=0, initial=0.0)[seen.any(axis=0)]
+    group = members(error, group)[seen.any(axis=1)]
+    each = np.where(seen, distance, 0.0).max(axis=1, initial=0.0)[seen.any(axis=1)]
     largest = np.full(group.max(initial=-1) + 1, -1.0)
     np.maximum.at(largest, group, each)
     largest = largest[largest >= 0.0]

@@ -189,7 +189,7 @@ def not_claimed(robot: Robot, data: Measurements) -> Beyond:
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Errors of parts that were left out: names, and (k, m_i, 3) of each [m].
+    """Errors of parts that were left out: names, and (m_i, k, 3) of each [m].
 
     trusted: the same without points that stand out, NaN there.  missed: parts that cannot judge.
     """
@@ -201,7 +201,7 @@ class Errors:
     missed: list[str] = field(default_factory=list)
 
     def add(self, name: str, final: Array, geometric: Array, doubted: Array | None = None) -> None:
-        """One part.  doubted: (k, m_i) True for points that stand out."""
+        """One part.  doubted: (m_i, k) True for points that stand out."""
         self.names.append(name)
         self.final.append(final)
         self.geometric.append(geometric)
@@ -384,8 +384,8 @@ def left_out(
 ) -> Beyond:
     """Every part judges the fit of the training poses outside it.
 
-    train: (m,) True for training poses, of all.  error_of: errors (k, r, 3) of a state at some rows
-    of all poses [m].  doubted: (k, m) True for points that stand out.  geometric: the fit without
+    train: (m,) True for training poses, of all.  error_of: errors (r, k, 3) of a state at some rows
+    of all poses [m].  doubted: (m, k) True for points that stand out.  geometric: the fit without
     effects, where the fit has some.  frames: as `without`.
     """
     masks = [part.rows[train] for part in parts]
@@ -396,7 +396,7 @@ def left_out(
         if fit and other:
             final = error_of(fit, part.rows)
             alone = error_of(other, part.rows) if geometric else final
-            errors.add(part.name, final, alone, doubted[:, part.rows])
+            errors.add(part.name, final, alone, doubted[part.rows])
         else:
             errors.missed.append(part.name)
     if not parts:

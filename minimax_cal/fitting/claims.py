@@ -206,7 +206,7 @@ def bad_rows(suspects: Sequence[Suspect], data: Measurements) -> Iterator[str]:
 def other_points(robot: Robot, solved: Solved, error: Array) -> Iterator[str]:
     """Notice where other points of the tool are known far worse than these targets.
 
-    A tool's offset is measured wherever it is put to work, as a base is.  error: (k, m, 3) [m].
+    A tool's offset is measured wherever it is put to work, as a base is.  error: (m, k, 3) [m].
     """
     known, n, spots = solved.identification, 5 * robot.joints, solved.state.target_positions
     if len(spots) > 2:  # they tell the whole flange
@@ -233,10 +233,10 @@ def other_points(robot: Robot, solved: Solved, error: Array) -> Iterator[str]:
 def unjudged(data: Measurements, crossed: Array) -> Iterator[str]:
     """Notice of poses that the fit cannot do without, so that none judges them.
 
-    crossed: (k, m, 3) errors by a fit without each pose, NaN where there is none; may be empty.
+    crossed: (m, k, 3) errors by a fit without each pose, NaN where there is none; may be empty.
     """
     if crossed.size:
-        lost = data.seen.any(axis=1) & ~np.isfinite(crossed).any(axis=(0, 2))
+        lost = data.seen.any(axis=1) & ~np.isfinite(crossed).any(axis=(1, 2))
         if lost.any():
             named = data.list_rows(np.flatnonzero(lost), MAX_NAMED)
             yield (
@@ -246,7 +246,7 @@ def unjudged(data: Measurements, crossed: Array) -> Iterator[str]:
 
 
 def errors_of(robot: Robot, data: Measurements, solved: Solved) -> Callable[[State, Array], Array]:
-    """Errors (k, r, 3) of a state near the solution at some rows of all poses [m].
+    """Errors (r, k, 3) of a state near the solution at some rows of all poses [m].
 
     data: in the first frame of the fit's sessions (`Cell.placed`).
     """
@@ -273,7 +273,7 @@ def is_crossed(options: Options, held: Measurements) -> bool:
 def crossed_of(
     robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
 ) -> tuple[Array, Array]:
-    """Errors (k, m, 3) of every pose by fits without it, of the drawn and the calibrated arm [m].
+    """Errors (m, k, 3) of every pose by fits without it, of the drawn and the calibrated arm [m].
 
     Of the drawn one base, targets and frames are fitted without each pose.
     """
@@ -303,8 +303,7 @@ def beyond_of(
     known = not_claimed(robot, data.take(~held))
     if known.narrow:
         return known
-    points = np.moveaxis(data.y, 1, 0)
-    doubted = np.isnan(aside(points, data, suspects)).any(axis=-1) & data.seen.T
+    doubted = np.isnan(aside(data.y, data, suspects)).any(axis=-1) & data.seen
     every, free = solved.effects.terms, of_sessions(data.frames)
     geometric = None
     if len(every) > len(free):

@@ -103,9 +103,9 @@ def with_lack(robot: Robot, model: Model, state: State) -> tuple[Array, Array]:
     """
     n, active = robot.joints, model.active[: model.names.geometric]
     seen = np.broadcast_to(model.seen.T[..., None], (*model.seen.T.shape, 3)).reshape(-1)
-    every = np.moveaxis(model.jacobian(state), 0, 1)[..., : model.names.geometric]
+    every = model.jacobian(state)[..., : model.names.geometric]
     m, k, _, p = every.shape
-    error = np.moveaxis(model.error(state), 0, 1).reshape(-1)[seen]
+    error = model.error(state).reshape(-1)[seen]
     arm = every.reshape(m, 3 * k, p)[..., zero_positions(robot.prismatic)]
     columns, kind = by_pose(robot.with_mdh(state.mdh), model.q, arm)
     lack = columns.reshape(3 * k * m, -1)[seen]
@@ -139,12 +139,12 @@ def scale_of(robot: Robot, data: Measurements, at: State) -> Scale:
     rows = np.linspace(0, data.poses - 1, min(data.poses, POSES)).astype(int)
     model = model_of(robot, data.take(rows))
     n, p = 5 * robot.joints, model.names.geometric
-    seen = np.broadcast_to(model.seen[..., None], (*model.seen.shape, 3)).reshape(-1)
+    seen = np.broadcast_to(model.seen.T[..., None], (*model.seen.T.shape, 3)).reshape(-1)
     every = model.jacobian(at).reshape(-1, p)[seen]
     error = model.error(at).reshape(-1)[seen] + every[:, :n] @ links_of(at.mdh - robot.mdh)
     links_at = kinematics.chain(at.mdh, model.q, model.prismatic)
     drawn = kinematics.points(links_at, at.target_positions)  # measured ones hold error
-    points = np.swapaxes(drawn, -1, -2).reshape(-1)[seen]
+    points = np.moveaxis(drawn, -1, 0).reshape(-1)[seen]
     sigma = off_by(robot)
     columns = np.column_stack([every[:, n:], every[:, :n] * sigma, points, error])
     triangle = np.asarray(np.linalg.qr(columns, mode="r"))

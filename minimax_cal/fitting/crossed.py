@@ -62,10 +62,10 @@ def crossed(
     seed: int,
     frames: int,
 ) -> Array:
-    """(k, m, 3) errors of every pose by a fit without it, NaN where no fit can do without [m].
+    """(m, k, 3) errors of every pose by a fit without it, NaN where no fit can do without [m].
 
     Fits without a part are those of `beyond.without`.  held: (m,) True where the fit has not seen
-    the pose.  group: (m,) poses with one number are left out together.  error_of: errors (k, r, 3)
+    the pose.  group: (m,) poses with one number are left out together.  error_of: errors (r, k, 3)
     of a state at some rows [m].  frames: as `beyond.without`.
     """
     names = np.unique(group[~held])
@@ -73,17 +73,17 @@ def crossed(
     fold = np.where(held, -1, drawn[np.minimum(np.searchsorted(names, group), len(names) - 1)])
     masks = [fold == number for number in range(int(drawn.max(initial=-1)) + 1)]
     fits = without(estimator, state, [mask[~held] for mask in masks], frames)
-    out = np.full((len(estimator.model.y), len(held), 3), np.nan)
+    out = np.full((len(held), len(estimator.model.y), 3), np.nan)
     for mask, fit in zip([held, *masks], [state, *fits], strict=True):
         if fit:
-            out[:, mask] = error_of(fit, mask)
+            out[mask] = error_of(fit, mask)
     return out
 
 
 def intervals_of(
     error: Array, group: Array, seed: int | np.random.Generator
 ) -> tuple[Interval, Interval]:
-    """95 % intervals of the RMS and of the largest of errors (k, m, 3) [m], as they are told.
+    """95 % intervals of the RMS and of the largest of errors (m, k, 3) [m], as they are told.
 
     group: (m,).
     """

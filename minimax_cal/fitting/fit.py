@@ -180,13 +180,13 @@ class Fit(Result):
     is from its optimum.  trace: cost at each iterate of the least squares [m^2].
     data: all m poses, with their history where effects need it; none where the file was written
     without them.
-    held: (m,) True where held out.  error_nominal, error: (k, m, 3) measured minus predicted, NaN
+    held: (m,) True where held out.  error_nominal, error: (m, k, 3) measured minus predicted, NaN
     where not measured [m].
     loss: of the least squares.  suspects: training points that are outliers of the fit.
     weights: (k, training poses) of the points besides their u95, 0 where set aside.  share: (k,)
     weight of each target, or (k, training poses) of each point, in the objective.  prior: (p,)
     weight of each parameter's nominal value.  widening: what a robust loss adds to all sigmas.
-    error_crossed: (k, m, 3) of every pose by a fit without it [m], empty unless cross-validated;
+    error_crossed: (m, k, 3) of every pose by a fit without it [m], empty unless cross-validated;
     error_drawn_crossed: the same of the drawn arm.
     reason: why it failed or keeps the drawn arm, and what to do; empty where neither.
     contradictions: of the files, each a session.
@@ -289,13 +289,13 @@ class Fit(Result):
 
     @property
     def errors(self) -> Mapping[str, Array]:
-        """Errors (k, m, 3) by the keys of `accuracy` [m]."""
+        """Errors (m, k, 3) by the keys of `accuracy` [m]."""
         return by_key(self.error_nominal, self.error, self.held)
 
     @property
     def trusted(self) -> Accuracy:
         """On the held-out points that do not stand out."""
-        return accuracy(aside(self.error, self.data, self.suspects)[:, self.held])
+        return accuracy(aside(self.error, self.data, self.suspects)[self.held])
 
     @property
     def with_them(self) -> Accuracy | None:
@@ -371,7 +371,7 @@ class Fit(Result):
         if not self.error_crossed.size:
             return np.zeros(0, dtype=int)
         told, judged = (
-            np.isfinite(error).any(axis=(0, 2)) for error in (self.error, self.error_crossed)
+            np.isfinite(error).any(axis=(1, 2)) for error in (self.error, self.error_crossed)
         )
         return np.asarray(self.data.line[told & ~judged])
 
@@ -380,7 +380,7 @@ class Fit(Result):
         """Before and after on poses that the fit had not seen: cross-validated, or held out."""
         group = grouped(self.data, self.options.holdout_by) if self.data.poses else np.zeros(0)
         if self.error_crossed.size:
-            judged = np.isfinite(self.error_crossed).any(axis=(0, 2))
+            judged = np.isfinite(self.error_crossed).any(axis=(1, 2))
             after = accuracy(self.error_crossed)
             drawn = self.error_drawn_crossed
             before = accuracy(np.where(np.isfinite(self.error_crossed), drawn, np.nan))
@@ -586,7 +586,8 @@ class Fit(Result):
             "prior": self.prior,
             **({"share": self.share} if poses or self.share.ndim == 1 else {}),
             **({"weights": self.weights} if poses else {}),
-            **({"crossed": self.error_crossed, "drawn crossed": self.error_drawn_crossed}
+            **({"crossed": np.swapaxes(self.error_crossed, 0, 1),  # files have targets first
+                "drawn crossed": np.swapaxes(self.error_drawn_crossed, 0, 1)}
                if poses and crossed else {}),
         }  # fmt: skip
         errors = {"nominal": self.error_nominal, "final": self.error}
@@ -633,6 +634,10 @@ class Fit(Result):
         beyond = read(Beyond, content["accuracy"]["beyond"], "accuracy.beyond")
         arrays = {name: array(value, name) for name, value in content["arrays"].items()}
         check_shapes(arrays, names.count, data.take(~held), data)
+        crossed, drawn_crossed = (
+            np.swapaxes(arrays.get(name, NOT_CROSSED), 0, 1)
+            for name in ("crossed", "drawn crossed")
+        )
         kept = told["status"].keeps_drawn or not cell.effects.causes
         found = identified(parameters, names, arrays["singular"], arrays["sensitivity"])
         return {
@@ -650,8 +655,8 @@ class Fit(Result):
             "weights": arrays.get("weights", data.take(~held).seen.T.astype(float)),
             "share": arrays.get("share", np.ones(len(cell.target_names))),
             "prior": arrays["prior"],
-            "error_crossed": arrays.get("crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
-            "error_drawn_crossed": arrays.get("drawn crossed", NOT_CROSSED),
+            "error_crossed": crossed if data.poses else NOT_CROSSED,
+            "error_drawn_crossed": drawn_crossed,
             "stated_geometric": None if kept else cell_from_dict({**content, "cell": {}}, source),
         }
 

@@ -86,7 +86,7 @@ def floor_of(data: Measurements, error: Array, repeatability: float, most: float
     Where there is nothing of these, what a fit leaves at most.  The distances are asked too where
     one part of what is declared is missing.
 
-    error: (k, m, 3) of the best model [m].  repeatability: of the arm by ISO 9283, NaN unknown [m].
+    error: (m, k, 3) of the best model [m].  repeatability: of the arm by ISO 9283, NaN unknown [m].
     most: RMS distance that noise leaves at most, as the fit tells it [mm].
     """
     again = least_scatter(data, error)
@@ -132,11 +132,11 @@ def wider(relative: float) -> float:
 def noise_at_most(error: Array, dof: float) -> float:
     """RMS distance of the noise, 97.5 times in 100 less than this, by what a fit leaves [mm].
 
-    What the fit lacks only adds to it.  error: (k, m, 3) of its points, NaN unknown [m].  dof:
+    What the fit lacks only adds to it.  error: (m, k, 3) of its points, NaN unknown [m].  dof:
     coordinates less parameters; they tell as much as the poses' squares vary little, since what
     joints do moves all points of a pose together [Satterthwaite 1946].
     """
-    square = 1e6 * np.nansum(error**2, axis=(0, 2))
+    square = 1e6 * np.nansum(error**2, axis=(1, 2))
     count = 3.0 * np.count_nonzero(np.isfinite(error[..., 0]))
     told = 2.0 * float(square.sum()) ** 2 / max(len(square) * float(np.var(square)), 1e-300)
     free = max(dof * min(told / count, 1.0), 1.0)
@@ -184,7 +184,7 @@ def least_scatter(data: Measurements, error: Array) -> tuple[Array, Array] | Non
 
     Moves between visits are in the points, noise of joints that were read back in the errors.
     """
-    both = (visited(data, part) for part in (error, np.moveaxis(data.y, 1, 0)))
+    both = (visited(data, part) for part in (error, data.y))
     return min((one for one in both if one), key=lambda one: rms_mm(one[0]), default=None)
 
 
@@ -220,10 +220,10 @@ def deviations(error: Array, group: Array) -> tuple[Array, Array]:
     """Squared distances of visits from their pose's middle, each as large as a point's own scatter
     is expected to be [m^2], and the group of each.
 
-    error: (k, m, 3), NaN unknown [m].  group: (m,).
+    error: (m, k, 3), NaN unknown [m].  group: (m,).
     """  # fmt: skip
     square, member = [np.zeros(0)], [np.zeros(0, dtype=int)]
-    for points in error:
+    for points in np.swapaxes(error, 0, 1):
         off, free = from_means(points, group)
         again = free[:, 0] > 0.0
         square.append((off[again] ** 2).sum(axis=1) / free[again, 0])

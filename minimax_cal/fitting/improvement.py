@@ -51,7 +51,7 @@ class Improvement:
 
 
 def compare_arms(drawn: Array, calibrated: Array, group: Array) -> Improvement:
-    """The paired comparison of errors (k, m, 3) at the points that both have [m].
+    """The paired comparison of errors (m, k, 3) at the points that both have [m].
 
     group: (m,) poses with one number belong together and count once.
     """
@@ -59,7 +59,7 @@ def compare_arms(drawn: Array, calibrated: Array, group: Array) -> Improvement:
     each = [np.where(both, 1e6 * (error**2).sum(axis=-1), 0.0) for error in (drawn, calibrated)]
     names, member = np.unique(group, return_inverse=True)
     parts = (both, each[0] - each[1])
-    count, lower = (np.bincount(member, part.sum(axis=0), len(names)) for part in parts)
+    count, lower = (np.bincount(member, part.sum(axis=1), len(names)) for part in parts)
     lower, count = lower[count > 0.0], count[count > 0.0]
     points, poses = count.sum(), len(count)
     before, after = (float(np.sqrt(square.sum() / points)) if poses else np.nan for square in each)
@@ -80,7 +80,7 @@ def improvement(
 ) -> Improvement:
     """The comparison of all points; without wrong points where these alone hide what is better.
 
-    drawn, calibrated: (k, m, 3) errors [m], NaN where not judged.  group: (m,).  suspects: points
+    drawn, calibrated: (m, k, 3) errors [m], NaN where not judged.  group: (m,).  suspects: points
     that stand out from the calibrated arm.
     """
     whole = compare_arms(drawn, calibrated, group)
@@ -98,11 +98,11 @@ def improvement(
 
 
 def points_of(data: Measurements, which: Array, error: Array) -> str:
-    """Points in words.  which: (k, m).  error: (k, m, 3) [m]."""
+    """Points in words, target by target.  which: (m, k).  error: (m, k, 3) [m]."""
     size = 1e3 * np.linalg.norm(error, axis=-1)
     shown = [
-        f"{data.called(data.line[pose])} {data.target_names[target]} {size[target, pose]:.3g} mm"
-        for target, pose in np.argwhere(which).tolist()
+        f"{data.called(data.line[pose])} {data.target_names[target]} {size[pose, target]:.3g} mm"
+        for target, pose in np.argwhere(which.T).tolist()
     ]
     return name_first(shown, MAX_NAMED)
 
@@ -113,16 +113,16 @@ def improvement_of_files(
 ) -> Improvement | None:  # fmt: skip
     """The comparison of all rows of several files; None where no row judges.
 
-    drawn, calibrated: (k, m, 3) of each file [m].  groups: (m,) of each.  noises: of each, by which
+    drawn, calibrated: (m, k, 3) of each file [m].  groups: (m,) of each.  noises: of each, by which
     its rows count beside those of the others [m].
     """
     unit, first, every, pairs = min(noises), 0, [], []
     for before, after, group, noise in zip(drawn, calibrated, groups, noises, strict=True):
-        for part in range(before.shape[0]):
-            pairs.append(unit / noise * np.stack([before[part], after[part]]))
+        for part in range(before.shape[1]):
+            pairs.append(unit / noise * np.stack([before[:, part], after[:, part]]))
             every.append(first + group)
         first += int(group.max(initial=-1)) + 1
-    both = np.concatenate(pairs, axis=1)[:, None]
+    both = np.concatenate(pairs, axis=1)[:, :, None]
     if not np.isfinite(both).any():
         return None
     return compare_arms(both[0], both[1], np.concatenate(every))
@@ -160,6 +160,6 @@ def rms_of(drawn: Array, calibrated: Array) -> tuple[float, float]:
 
 
 def hidden(drawn: Array, calibrated: Array, which: Array) -> tuple[Array, Array]:
-    """Errors (k, m, 3) of two arms without some points.  which: (k, m), or what broadcasts."""
+    """Errors (m, k, 3) of two arms without some points.  which: (m, k), or what broadcasts."""
     gone = np.broadcast_to(which, drawn.shape[:2])[..., None]
     return np.where(gone, np.nan, drawn), np.where(gone, np.nan, calibrated)

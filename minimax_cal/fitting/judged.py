@@ -116,12 +116,12 @@ class Judged:
 
     @cached_property
     def before(self) -> Array:
-        """(k, m, 3) errors of the drawn arm [m]."""
+        """(m, k, 3) errors of the drawn arm [m]."""
         return self.nominal.error(self.data)
 
     @cached_property
     def after(self) -> Array:
-        """(k, m, 3) errors of the calibrated arm [m]."""
+        """(m, k, 3) errors of the calibrated arm [m]."""
         return self.cell.error(self.data)
 
     @cached_property
@@ -132,15 +132,17 @@ class Judged:
 
     @cached_property
     def crossed(self) -> tuple[Array, Array]:
-        """(k, m, 3) errors of both arms by fits without each pose, where so judged [m]."""
+        """(m, k, 3) errors of both arms by fits without each pose, where so judged [m]."""
         if not is_crossed(self.options, self.poses.held):
             return NOT_CROSSED, NOT_CROSSED
         return crossed_of(self.robot, self.options, self.data, self.held, self.solved)
 
     @cached_property
     def unseen(self) -> tuple[Array, Array]:
-        """(k, m, 3) errors of both arms on poses that neither has seen, NaN elsewhere [m]."""
-        return self.crossed if self.crossed[1].size else hidden(self.before, self.after, ~self.held)
+        """(m, k, 3) errors of both arms on poses that neither has seen, NaN elsewhere [m]."""
+        if self.crossed[1].size:
+            return self.crossed
+        return hidden(self.before, self.after, ~self.held[:, None])
 
     @cached_property
     def swapped(self) -> Array:
@@ -161,7 +163,7 @@ class Judged:
         if (fixed and not solved.effects.terms) or not np.isfinite(unseen[1]).any():
             return None
         if (target := objective_of(self.options.objective, self.data)) >= 0:
-            others = np.arange(len(self.data.target_names))[:, None] != target
+            others = np.arange(len(self.data.target_names)) != target
             unseen = hidden(*unseen, others)
         group = grouped(self.data, self.options.holdout_by)
         return improvement(*unseen, group, self.data, self.suspects)
@@ -212,9 +214,9 @@ class Judged:
             active[:links],
             [
                 FileEvidence(
-                    {k: (accuracy(self.after[:, rows]), accuracy(rest[:, rows]))
+                    {k: (accuracy(self.after[rows]), accuracy(rest[rows]))
                      for k, rows in parts.items()},
-                    drawn={k: accuracy(self.before[:, rows]) for k, rows in parts.items()},
+                    drawn={k: accuracy(self.before[rows]) for k, rows in parts.items()},
                     floor=known_floor(data, rest, robot.repeatability),
                 )
             ],
@@ -246,7 +248,7 @@ class Judged:
     @cached_property
     def alarming(self) -> tuple[str, ...]:
         """Why the result should not be used as it is."""
-        return tuple(alarms(self.robot, self.poses, self.solved, self.before[:, ~self.held]))
+        return tuple(alarms(self.robot, self.poses, self.solved, self.before[~self.held]))
 
     @property
     def notices(self) -> tuple[str, ...]:
@@ -297,7 +299,7 @@ class Judged:
             },
             identification=solved.identification,
             uncertainty=solved.uncertainty,
-            minimax=worst_case(options.objective, solved, self.poses.train, after[:, ~held]),
+            minimax=worst_case(options.objective, solved, self.poses.train, after[~held]),
             certificate=solved.certificate,
             trace=tuple(float(value) for value in solved.squares.trace[:, 0]),
             data=data,
@@ -344,7 +346,7 @@ def work_of(solved: Solved) -> Work:
 
 
 def alarms(robot: Robot, poses: Parts, solved: Solved, nominal_error: Array) -> Iterator[str]:
-    """Why the result should not be used as it is.  nominal_error: (k, training poses, 3) [m]."""
+    """Why the result should not be used as it is.  nominal_error: (training poses, k, 3) [m]."""
     free = solved.identification.active & (solved.estimator.model.prior.weight == 0.0)
     if few := few_poses(poses.train, int(free.sum())):
         yield f"too few poses: {few}"
@@ -430,18 +432,18 @@ def worst_case(
 ) -> WorstCase | None:
     """What the minimax rests on: every target, or the points that decide.
 
-    error: (k, m, 3) of the training poses [m].
+    error: (m, k, 3) of the training poses [m].
     """
     best, weights = solved.optimum, solved.robust.weights
     if best is None:
         return None
     labels = train.target_names
-    size = np.array(accuracy(np.sqrt(weights)[..., None] * error).sse_mm2)
+    size = np.array(accuracy(np.sqrt(weights).T[..., None] * error).sse_mm2)
     chosen = np.arange(len(best.mu))
     if PER[objective] == "point":
         points = np.argwhere(weights > 0.0)
         labels = tuple(f"{labels[k]}, {train.called(train.line[i])}" for k, i in points)
-        size = 1e3 * np.linalg.norm(error, axis=-1)[weights > 0.0]
+        size = 1e3 * np.linalg.norm(error, axis=-1).T[weights > 0.0]  # as `points`
         chosen = np.argsort(-best.mu)
         chosen = chosen[best.mu[chosen] > MIN_MULTIPLIER]
     active = np.flatnonzero(best.f >= best.f.max() * (1 - ACTIVE_TOLERANCE))

@@ -400,9 +400,9 @@ def certify(problem: MinimaxProblem, best: Optimum[State], line: Array) -> Certi
     chosen = np.flatnonzero((norms >= norms.max() * (1.0 - ACTIVE)) | (mu > ACTIVE))
     chosen = chosen[np.argsort(-mu[chosen], kind="stable")]
     target, pose = np.argwhere(model.seen)[chosen].T
-    distance = np.linalg.norm(model.error(best.x), axis=-1)
+    distance = np.linalg.norm(model.error(best.x), axis=-1)  # (m, k)
     names = (model.names.target_names[i] for i in target)
-    numbers = (part.tolist() for part in (line[pose], distance[target, pose], mu[chosen]))
+    numbers = (part.tolist() for part in (line[pose], distance[pose, target], mu[chosen]))
     return Certificate(
         value=float(size * norms.max()),
         bound=float(size * lower_bound(rows, problem.lower, problem.upper, given)),

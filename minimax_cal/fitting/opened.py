@@ -59,7 +59,7 @@ Result = Fit | Cell | Writes | Path | str
 class Rung:
     """A state of the arm.
 
-    error: (k, m, 3) of its poses as the file tells them [m], None where it does not.
+    error: (m, k, 3) of its poses as the file tells them [m], None where it does not.
     """
 
     name: str
@@ -142,7 +142,7 @@ def in_new_frame(cell: Cell, data: Measurements) -> Cell:
     if len(np.unique(labels(data))) > 1:
         raise DataError(f"{data.source}: holds several sessions; evaluate them one by one")
     alone = replace(cell, sessions=replace(cell.sessions, frames={}))
-    error = np.moveaxis(alone.error(data), 0, 1)
+    error = alone.error(data)
     here = data.y[data.seen]
     if len(here) < MIN_FRAME_POINTS:
         raise DataError(f"{data.source}: {len(here)} points do not place a frame; measure more")

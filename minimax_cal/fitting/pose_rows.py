@@ -23,7 +23,7 @@ TOLD = ("split", "order")  # columns that stand under names of their own
 def pose_rows(data: Measurements, held: Array, errors: Mapping[str, Array]) -> dict[str, Any]:
     """For JSON: every pose as measured, with its errors by name; null where not measured.
 
-    held: (m,) True where held out.  errors: (k, m, 3) measured minus predicted [m].
+    held: (m,) True where held out.  errors: (m, k, 3) measured minus predicted [m].
     """
     place = np.empty(data.poses, dtype=int)
     place[visits(data)] = np.arange(1, data.poses + 1)
@@ -42,7 +42,7 @@ def pose_rows(data: Measurements, held: Array, errors: Mapping[str, Array]) -> d
         "q_units": ["m" if sliding else "rad" for sliding in data.sliding],
         "targets": data.target_names,
         "measured_mm": 1e3 * data.y,
-        "errors_mm": {name: 1e3 * np.moveaxis(error, 0, 1) for name, error in errors.items()},
+        "errors_mm": {name: 1e3 * error for name, error in errors.items()},
         "columns": columns,
         **({"simulated": True} if data.simulated else {}),
     }
@@ -83,7 +83,7 @@ NEAR = 1e-6  # a file's own errors come back to this, or it lacks columns of the
 def measured_poses(
     content: Mapping[str, Any], source: str, cell: Cell | None, first: str
 ) -> tuple[Measurements, Array, tuple[Array, Array]]:
-    """The poses of a result file, (m,) which are held out, and errors (k, m, 3) of `first` and
+    """The poses of a result file, (m,) which are held out, and errors (m, k, 3) of `first` and
     `final` as they stand there [m].  None where the file has none.  Raises CalibrationError.
     """  # fmt: skip
     if content.get("poses") is None or cell is None:
@@ -92,8 +92,7 @@ def measured_poses(
         nothing, lines = np.zeros((0, joints)), np.zeros(0, dtype=int)
         names = cell.target_names if cell else ()
         data = Measurements(nothing, nowhere, names, np.zeros(joints, dtype=bool), lines, {})
-        none = np.moveaxis(nowhere, 1, 0)
-        return replace(data, source=source), np.zeros(0, dtype=bool), (none, none)
+        return replace(data, source=source), np.zeros(0, dtype=bool), (nowhere, nowhere)
     given = content["poses"]
     data, held = read_poses(given, source)
     try:
@@ -109,17 +108,17 @@ def measured_poses(
 
 
 def told_errors(given: Mapping[str, Any], name: str, data: Measurements) -> Array:
-    """(k, m, 3) errors of a name as they stand in a file [m].  Raises ValueError."""
+    """(m, k, 3) errors of a name as they stand in a file [m].  Raises ValueError."""
     told = 1e-3 * numbers(given["errors_mm"][name])
     if told.shape != data.y.shape:
         raise ValueError(f"errors_mm.{name} differs in length")
     if np.nanmax(np.abs(told), initial=0.0) > FARTHEST:
         raise ValueError(f"errors_mm.{name} holds a distance that no instrument measures")
-    return np.moveaxis(np.where(np.isfinite(told), told, np.nan), 1, 0)
+    return np.where(np.isfinite(told), told, np.nan)
 
 
 def errors_of(cell: Cell, data: Measurements, told: Array) -> Array:
-    """(k, m, 3) errors of a cell [m]: worked out, or as they stand in a file that lacks columns of
+    """(m, k, 3) errors of a cell [m]: worked out, or as they stand in a file that lacks columns of
     the measurements which its effects look at.
     """  # fmt: skip
     if not data.poses:
@@ -129,5 +128,5 @@ def errors_of(cell: Cell, data: Measurements, told: Array) -> Array:
 
 
 def comes_back(exact: Array, told: Array) -> bool:
-    """Whether errors (k, m, 3), worked out from a file's columns, are those that it tells [m]."""
+    """Whether errors (m, k, 3), worked out from a file's columns, are those that it tells [m]."""
     return bool(np.nanmax(np.abs(exact - told), initial=0.0) <= NEAR)

@@ -64,7 +64,7 @@ def least_noise(data: Measurements, repeatability: float) -> tuple[float, str]:
 
 
 def residual(error: Array, paid: float = 0.0) -> float:
-    """RMS distance of errors (k, m, 3), NaN unknown, with what parameters took put back [m].
+    """RMS distance of errors (m, k, 3), NaN unknown, with what parameters took put back [m].
 
     paid: coordinates that the parameters took up.
     """

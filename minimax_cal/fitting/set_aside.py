@@ -28,19 +28,19 @@ def with_them(
 
     No fit has seen these either.  Each weighs as the share of the other points that is held out, so
     that they count as they would among all.
-    error: (k, h, 3) at poses that judge, group: (h,) of them.  aside: (k, a, 3) at the points set
+    error: (h, k, 3) at poses that judge, group: (h,) of them.  aside: (a, k, 3) at the points set
     aside, NaN elsewhere [m].  share: of all other points that judge.
     """
-    both = np.concatenate([error, aside], axis=1)
+    both = np.concatenate([error, aside])
     found = accuracy(both)
     seen, gone = (int(np.isfinite(part[..., 0]).sum()) for part in (error, aside))
     if not (seen and gone):
         share = 1.0
     even = (seen + gone) / max(seen + share * gone, 1e-300)
-    root = np.sqrt(np.repeat([even, even * share], [error.shape[1], aside.shape[1]]))
-    weighed = accuracy(root[:, None] * both)
+    root = np.sqrt(np.repeat([even, even * share], [len(error), len(aside)]))
+    weighed = accuracy(root[:, None, None] * both)
     size = np.linalg.norm(both, axis=-1)
-    means = [1e3 * float(np.nansum(root**2 * row)) for row in size]
+    means = [1e3 * float(np.nansum(root**2 * row)) for row in size.T]
     counts = found.counts
     whole = Accuracy(
         rms_mm=weighed.rms_mm,
@@ -53,8 +53,8 @@ def with_them(
     if not sum(counts):
         return whole
     last = int(group.max(initial=-1)) + 1
-    every = np.concatenate([group, last + np.arange(aside.shape[1])])
-    rms, _ = intervals_of(root[:, None] * both, every, seed)
+    every = np.concatenate([group, last + np.arange(len(aside))])
+    rms, _ = intervals_of(root[:, None, None] * both, every, seed)
     _, largest = intervals_of(both, every, seed)
     return with_ends(whole, rms, largest)
 
@@ -82,7 +82,7 @@ def judged_with(
 ) -> tuple[tuple[SetAside, ...], Accuracy | None]:
     """The points set aside for a fit, and the accuracy with them; None where there are none.
 
-    data: all poses.  held: (m,).  error: (k, m, 3) of the fit; crossed: of every pose by a fit
+    data: all poses.  held: (m,).  error: (m, k, 3) of the fit; crossed: of every pose by a fit
     without it, or empty [m].
     """
     trimmed = with_trimmed(data, held, solved, options)
@@ -94,21 +94,21 @@ def judged_with(
         return trimmed.set_aside, found
     share = float(data.seen[held].sum() / max(int(trimmed.seen.sum()), 1))
     aside = errors_of(cell, trimmed)
-    return trimmed.set_aside, with_them(error[:, held], group[held], aside, share, options.seed)
+    return trimmed.set_aside, with_them(error[held], group[held], aside, share, options.seed)
 
 
 def errors_of(cell: Cell, data: Measurements) -> Array:
-    """(k, a, 3) errors of a cell at the points of data that were set aside [m].
+    """(a, k, 3) errors of a cell at the points of data that were set aside [m].
 
-    With all poses, for these were visited between them; (k, 0, 3) where there are none.
+    With all poses, for these were visited between them; (0, k, 3) where there are none.
     """
     if data.aside is None:
-        return np.zeros((len(data.target_names), 0, 3))
+        return np.zeros((0, len(data.target_names), 3))
     aside = seen_from(data.aside, data.frames)
     every = merged(replace(data, aside=None, set_aside=()), aside)
     rows = np.searchsorted(every.line, aside.line)
-    error = cell.error(every)[:, rows]
-    return np.where(aside.seen.T[..., None], error, np.nan)
+    error = cell.error(every)[rows]
+    return np.where(aside.seen[..., None], error, np.nan)
 
 
 def aside_sentence(points: Sequence[SetAside], found: Accuracy | None) -> str:

@@ -283,7 +283,7 @@ def suspects_of(
     if not far.any():
         return ()
     p_value = spread.p_value(found)
-    distance = np.linalg.norm(model.error(state), axis=-1)
+    distance = np.linalg.norm(model.error(state), axis=-1)  # (m, k), beside scores (k, m)
     score = np.sqrt(found.square) / spread.scale
     together = (far == model.seen).all(axis=0) & (model.seen.sum(axis=0) > 1)
     where = sorted(np.argwhere(far).tolist(), key=lambda at: (p_value[*at], -score[*at]))
@@ -291,7 +291,7 @@ def suspects_of(
         Suspect(
             line=int(line[pose]),
             target=model.names.target_names[target],
-            distance=float(distance[target, pose]),
+            distance=float(distance[pose, target]),
             score=float(score[target, pose]),
             p_value=float(p_value[target, pose]),
             together=bool(together[pose]),
@@ -320,10 +320,10 @@ def held_suspects(
 
 
 def aside(error: Array, data: Measurements, suspects: Sequence[Suspect]) -> Array:
-    """Errors (k, m, 3) without those of suspects, NaN there [m]."""
+    """Errors (m, k, 3) without those of suspects, NaN there [m]."""
     out = error.copy()
     for one in suspects:
-        out[data.target_names.index(one.target), data.line == one.line] = np.nan
+        out[data.line == one.line, data.target_names.index(one.target)] = np.nan
     return out
 
 
@@ -357,12 +357,12 @@ def contradictions(data: Measurements, error: Array) -> Iterator[str]:
     were read back in the errors.  By far: beside how far visits are from half of the others of
     their pose, for joints that stop on either side part them into two groups.  Fewer than five
     poses that were visited again tell nothing.
-    error: (k, m, 3), NaN unknown [m].
+    error: (m, k, 3), NaN unknown [m].
     """
     group = visits(data)
-    near = [nearest(part, group) for part in (error, np.moveaxis(data.y, 1, 0))]
+    near = [nearest(part, group) for part in (error, data.y)]
     known = np.isfinite(near[0][0])
-    if len(np.unique(group[known.any(axis=0)])) < FEWEST:
+    if len(np.unique(group[known.any(axis=1)])) < FEWEST:
         return
     apart, other, amid = min(near, key=lambda visit: float(np.median(visit[0][known])))
     scores = Scores(np.where(known, apart, 0.0) ** 2, 3 * known)
@@ -373,11 +373,11 @@ def contradictions(data: Measurements, error: Array) -> Iterator[str]:
         return
     size = np.linalg.norm(error, axis=-1)
     told: dict[tuple[int, int, int], str] = {}
-    for target, row in sorted(np.argwhere(far), key=lambda at: -apart[tuple(at)]):
-        pair = sorted((row, other[target, row]), key=lambda i: size[target, i])
+    for row, target in sorted(np.argwhere(far), key=lambda at: -apart[tuple(at)]):
+        pair = sorted((row, other[row, target]), key=lambda i: size[i, target])
         right, wrong = (data.called(data.line[i]) for i in pair)
-        name, off = data.target_names[target], 1e3 * apart[target, row]
-        guilty = size[target, pair[1]] > MIN_GUILTY_RATIO * size[target, pair[0]]
+        name, off = data.target_names[target], 1e3 * apart[row, target]
+        guilty = size[pair[1], target] > MIN_GUILTY_RATIO * size[pair[0], target]
         text = f"{wrong} {name} is {off:.2g} mm from {right}"
         told.setdefault((*sorted(pair), target), text + (", which fits" if guilty else ""))
     yield (
@@ -391,18 +391,18 @@ def nearest(points: Array, group: Array) -> tuple[Array, Array, Array]:
     """Of every visit its distance to the nearest other to the same pose, the row of that, and its
     median distance to the others.
 
-    (k, m) [m], NaN where there is none.  points: (k, m, 3), NaN unknown.  group: (m,).
+    (m, k) [m], NaN where there is none.  points: (m, k, 3), NaN unknown.  group: (m,).
     """  # fmt: skip
     apart, amid = np.full((2, *points.shape[:2]), np.inf)
     other = np.zeros(points.shape[:2], dtype=int)
     names, counts = np.unique(group, return_counts=True)
     for name in names[counts > 1]:
         rows = np.flatnonzero(group == name)
-        between = np.linalg.norm(points[:, rows, None] - points[:, None, rows], axis=-1)
-        between[:, range(len(rows)), range(len(rows))] = np.nan
-        seen = np.isfinite(between).any(axis=2, keepdims=True)
-        half = np.nanmedian(np.where(seen, between, 0.0), axis=2)
-        amid[:, rows] = np.where(seen[..., 0], half, np.inf)
+        between = np.linalg.norm(points[rows, None] - points[rows], axis=-1)  # (r, r, k)
+        between[range(len(rows)), range(len(rows))] = np.nan
+        seen = np.isfinite(between).any(axis=1, keepdims=True)
+        half = np.nanmedian(np.where(seen, between, 0.0), axis=1)
+        amid[rows] = np.where(seen[:, 0], half, np.inf)
         between = np.where(np.isfinite(between), between, np.inf)
-        apart[:, rows], other[:, rows] = between.min(axis=2), rows[between.argmin(axis=2)]
+        apart[rows], other[rows] = between.min(axis=1), rows[between.argmin(axis=1)]
     return np.where(np.isfinite(apart), apart, np.nan), other, amid

@@ -505,7 +505,7 @@ def position_factor(
         raise OptionError(f"no frame {frame!r}; choose {' or '.join(FRAMES)}")
     model, state = model_at(cell, q)
     n = model.names.joints
-    jacobian = np.swapaxes(model.jacobian(state), 0, 1)
+    jacobian = model.jacobian(state)
     if frame == "measurement":
         jacobian = state.rotation @ jacobian
     root = known.root

@@ -362,8 +362,8 @@ class Images(Instrument):
         return float((self.at_targets(arm, own)[:, self.counted] ** 2).sum(axis=0).mean())
 
     def table(self, arm: FlangePoses, own: Array, counts: Array) -> Array:
-        """(parts, m, 3) errors at the targets, NaN where not measured [m].  counts: (N,) mask."""
+        """(m, parts, 3) errors at the targets, NaN where not measured [m].  counts: (N,) mask."""
         pixels, error = self.pixels, self.at_targets(arm, own)[:, counts].T
-        out = np.full((len(pixels.parts), self.poses, 3), np.nan)
-        out[pixels.part[counts], pixels.pose[counts]] = np.pad(error, ((0, 0), (0, 1)))
+        out = np.full((self.poses, len(pixels.parts), 3), np.nan)
+        out[pixels.pose[counts], pixels.part[counts]] = np.pad(error, ((0, 0), (0, 1)))
         return out

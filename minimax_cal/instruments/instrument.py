@@ -310,12 +310,12 @@ class Instrument:
         return float((self.read(arm, own).residual ** 2).sum() / self.points)
 
     def errors(self, arm: FlangePoses, own: Array, held: Array) -> Array:
-        """(parts, m, 3), NaN where not measured [unit]; numbers first."""
+        """(m, parts, 3), NaN where not measured [unit]; numbers first."""
         rows = self.read(arm, own)
-        out = np.full((len(self.parts), self.poses, 3), np.nan)
+        out = np.full((self.poses, len(self.parts), 3), np.nan)
         part = rows.part if len(rows.part) else np.zeros(len(rows.pose), dtype=int)
-        out[part, rows.pose] = 0.0
-        out[part, rows.pose, 0] = rows.residual
+        out[rows.pose, part] = 0.0
+        out[rows.pose, part, 0] = rows.residual
         return out
 
     def turns(self, arm: FlangePoses, own: Array) -> Array:

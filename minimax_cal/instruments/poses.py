@@ -165,7 +165,7 @@ class WholePoses(Points):
 
     def errors(self, arm: FlangePoses, own: Array, held: Array) -> Array:
         """Of positions, in the measurement frame."""
-        return self.missed(arm, own)[0][None]
+        return self.missed(arm, own)[0][:, None]
 
     def turns(self, arm: FlangePoses, own: Array) -> Array:
         """(m,) angles between orientations [rad]."""

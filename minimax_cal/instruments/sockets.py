@@ -279,7 +279,7 @@ class Visits(Instrument):
 
     def errors(self, arm: FlangePoses, own: Array, held: Array) -> Array:
         """Of visits about their socket."""
-        return misclosures(arm.place(own[:3]), self.socket, held)[None]
+        return misclosures(arm.place(own[:3]), self.socket, held)[:, None]
 
     def placed(self, arm: FlangePoses, own: Array, drawn: Array) -> dict[str, Any]:
         """Ball in the last frame, sockets in the robot's base."""

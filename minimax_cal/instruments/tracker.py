@@ -95,10 +95,10 @@ class Points(Instrument):
         return axes @ rotation(own[3:6]), axes @ own[:3]
 
     def placed_at(self, arm: FlangePoses, own: Array) -> tuple[Array, Array]:
-        """(k, m, 3) measured minus predicted, and predicted, along the axes of the base [m]."""
+        """(m, k, 3) measured minus predicted, and predicted, along the axes of the base [m]."""
         turn, origin = self.base(own)
-        place = np.moveaxis(arm.place(self.targets(own)), 1, 0)
-        return (np.moveaxis(self.seen.y, 1, 0) - origin) @ turn - place, place
+        place = arm.place(self.targets(own))
+        return (self.seen.y - origin) @ turn - place, place
 
     def read(self, arm: FlangePoses, own: Array) -> ResidualRows:
         """Three rows for each target at each pose, axis by axis, 0 where it was not measured."""
@@ -107,7 +107,7 @@ class Points(Instrument):
         root = np.sqrt(point_weights(seen))
         off, place = self.placed_at(arm, own)
         part, axis, pose = (each.reshape(-1) for each in np.indices((k, 3, m)))
-        point = place[part, pose]
+        point = place[pose, part]
         by_point = np.eye(3)[axis] * root[part, pose][:, None]
         by_own = np.zeros((3 * k * m, len(own)))
         by_own[:, :3] = by_point @ rotation(own[3:6]).T
@@ -115,7 +115,7 @@ class Points(Instrument):
         spots = np.einsum("ri,rij->rj", by_point, arm.rotation[pose])
         for column in range(3):
             by_own[np.arange(len(part)), 6 + 3 * part + column] = spots[:, column]
-        error = np.nan_to_num(np.swapaxes(off * root[..., None], 1, 2))
+        error = np.nan_to_num(np.moveaxis(off * root.T[..., None], 0, -1))  # (k, 3, m) as the rows
         return ResidualRows(
             error.reshape(-1), pose, point, by_point, np.zeros_like(by_point), by_own, part
         )

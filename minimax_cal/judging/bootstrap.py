@@ -79,7 +79,7 @@ class Bootstrap:
         To first order about the fit.  q: (m, n) joints as the controller gives them [rad, m].
         """
         model, state = model_at(self.fit.cell, q)
-        jacobian = state.rotation @ np.swapaxes(model.jacobian(state), 0, 1)
+        jacobian = state.rotation @ model.jacobian(state)
         return np.asarray(
             self.fit.predict(q) + np.einsum("mkcp,bp->bmkc", jacobian[..., self.place], self.change)
         )
@@ -309,8 +309,8 @@ def between(start: State, end: State) -> Array:
 def unseen(fit: Fit, change: Array, draws: Draws, good: Array) -> Array:
     """(B,) RMS distance of each replicate on the poses that it has not seen, to first order [m]."""
     model, state = fit.estimator.model, fit.cell.state
-    error = np.swapaxes(np.nan_to_num(model.error(state)), 0, 1)
-    jacobian = np.swapaxes(model.jacobian(state), 0, 1)[..., model.active]
+    error = np.nan_to_num(model.error(state))
+    jacobian = model.jacobian(state)[..., model.active]
     out = np.full(len(change), np.nan)
     for i, number in enumerate(np.flatnonzero(good).tolist()):
         left = draws.rows(number) == 0

@@ -351,11 +351,11 @@ def sections_of(
 
 def seen_of(saved: Saved) -> Seen:
     """What was observed at the poses that were measured."""
-    data, there = saved.data, saved.data.seen.T[..., None]
+    data, there = saved.data, saved.data.seen[..., None]
 
     def off(cell: Cell) -> Array:
-        total = np.where(there, cell.error(data), 0.0).sum(axis=0)
-        return np.asarray(np.linalg.norm(total, axis=-1) / there.sum(axis=(0, 2)))
+        total = np.where(there, cell.error(data), 0.0).sum(axis=1)
+        return np.asarray(np.linalg.norm(total, axis=-1) / there.sum(axis=(1, 2)))
 
     before, after = (off(saved.cells[name]) for name in (BEFORE, AFTER))
     return Seen(tcp_place(saved.cells[AFTER], data.q), before, after, saved.held)

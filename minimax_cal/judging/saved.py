@@ -231,11 +231,11 @@ def of_instrument(source: Given, one: Instrument, rung: int | None) -> Evaluatio
 def part_errors(title: str, whole: Scores, one: Instrument, error: Array) -> Table:
     """Errors of each part of an instrument, as of each wire, and of all, in its unit.
 
-    error: (parts, m, 3), NaN where not measured [unit].
+    error: (m, parts, 3), NaN where not measured [unit].
     """
     if one.unit == METRE:
         return whole.table(title, one.parts)
-    parts = [Scores.of(part[None], [one.unit]) for part in error]
+    parts = [Scores.of(part[:, None], [one.unit]) for part in np.swapaxes(error, 0, 1)]
     every = zip((*one.parts, "all"), (*parts, whole), strict=True)
     rows = ((n, sum(s.counts), *s.for_display[:3]) for n, s in every)
     unit = whole.for_display[-1]
@@ -309,7 +309,7 @@ def unseen(data: Measurements, known: Opened) -> tuple[Array, tuple[str, ...]]:
 def training_poses(data: Measurements, known: Opened, error: Array) -> tuple[int, tuple[str, ...]]:
     """How many of the poses a fit was made of, and a notice that they are no new ones.
 
-    error: (k, m, 3) of the poses [m].
+    error: (m, k, 3) of the poses [m].
     """
     if not known.data.poses:
         return 0, ()
@@ -320,7 +320,7 @@ def training_poses(data: Measurements, known: Opened, error: Array) -> tuple[int
     said = f"{data.source}: {count} of {data.poses} poses are training poses of the fit, which it "
     said += "meets better than new ones"
     if held.any():
-        others = accuracy(error[:, held])
+        others = accuracy(error[held])
         said += f"; the others: RMS {others.rms_mm:.4f} mm, largest {others.max_mm:.4f} mm"
     return count, (said,)
 

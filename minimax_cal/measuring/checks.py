@@ -152,7 +152,7 @@ def swapped(least: Array, own: Array) -> Array:
 def outliers(data: Measurements, distance: Array, unit: str = "m") -> list[str]:
     """Points that miss by far more than the others.
 
-    distance: (k, m), NaN where not measured [unit].
+    distance: (m, k), NaN where not measured [unit].
     """
     scale, name = for_people(unit)
     known = np.where(np.isfinite(distance), distance, -1.0)
@@ -166,8 +166,8 @@ def outliers(data: Measurements, distance: Array, unit: str = "m") -> list[str]:
         return []
     named = [
         f"{data.called(data.line[pose])} {data.target_names[target]} "
-        f"{scale * distance[target, pose]:.3g} {name}"
-        for target, pose in sorted(found, key=lambda at: -distance[tuple(at)])
+        f"{scale * distance[pose, target]:.3g} {name}"
+        for pose, target in sorted(found, key=lambda at: -distance[tuple(at)])
     ]
     typical = f"outliers (typical error {scale * usual:.3g} {name})"
     return [f"{data.source}: {typical}: {name_first(named, 5)}"]

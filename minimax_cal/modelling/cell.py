@@ -121,7 +121,7 @@ class Cell:
         return np.asarray(points @ self.base[:3, :3].T + self.base[:3, 3])
 
     def error(self, data: Measurements) -> Array:
-        """Measured minus predicted: (k, m, 3), for the targets of the data [m].
+        """Measured minus predicted: (m, k, 3), for the targets of the data [m].
 
         In the axes of the first session.
         """
@@ -133,7 +133,7 @@ class Cell:
                 f"({', '.join(self.target_names)})"
             )
         chosen = [self.target_names.index(name) for name in data.target_names]
-        return np.asarray(np.moveaxis(self.placed(data).y - self.seen(data)[:, chosen], 1, 0))
+        return np.asarray(self.placed(data).y - self.seen(data)[:, chosen])
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: millimetres and a rotation vector in radians."""

@@ -77,6 +77,9 @@ class Prior:
 class Model:
     """A robot at given poses, and what was measured there.
 
+    Points and their weights lie target by target, poses last, for the kernels sum over poses:
+    `error` and `jacobian` turn them, without a copy, into (m, k, 3), as points are everywhere else.
+
     q: (m, n) joint values with signs applied.  prismatic: (n,).
     y: (k, 3, m) measured points, 0 where not measured [m].
     weight: (k, m) weight of each point, 0 where not measured.
@@ -141,22 +144,22 @@ class Model:
         return replace(self, weight=self.weight * share[:, None])
 
     def error(self, state: State) -> Array:
-        """Measured minus predicted, in base axes: (..., k, m, 3), NaN where not measured [m]."""
+        """Measured minus predicted, in base axes: (..., m, k, 3), NaN where not measured [m]."""
         links = kinematics.chain(state.mdh, self.q, self.prismatic)
         point = self.displaced(state, kinematics.points(links, state.target_positions), slice(None))
-        error = np.swapaxes(in_base(state, self.y) - point, -1, -2)
-        error[..., ~self.seen, :] = np.nan
+        error = np.moveaxis(in_base(state, self.y) - point, -1, -3)
+        error[..., ~self.seen.T, :] = np.nan
         return np.asarray(error)
 
     def jacobian(self, state: State) -> Array:
-        """Derivative of every point, in base axes, by every parameter: (..., k, m, 3, p)."""
+        """Derivative of every point, in base axes, by every parameter: (..., m, k, 3, p)."""
         links = kinematics.chain(state.mdh, self.q, self.prismatic)
         point = kinematics.points(links, state.target_positions)
         every = np.ones(self.names.count, dtype=bool)
         block = Block(slice(len(self.q)), links)
         swung = self.displaced(state, point, slice(None))
         turned = Columns.of(self.names, every).jacobian(block, point, swung, self.fields)
-        return np.asarray(np.swapaxes(np.moveaxis(turned, -3, -1), -3, -2))
+        return np.asarray(np.moveaxis(turned, (-1, -3), (-4, -1)))
 
     def blocks(self, state: State) -> list[Block]:
         """The poses cut into blocks that fit the cache, each with its chain."""

@@ -114,8 +114,8 @@ def rows_of(error: Array, jacobian: Array, joint_jacobian: Array, weight: Array)
 
 def linearised(model: Model, state: State, joint_jacobian: Array) -> Rows:
     """The rows of a model at a fitted state.  joint_jacobian: (n, k, 3, m) as `Scene.jacobian`."""
-    error = np.nan_to_num(np.swapaxes(model.error(state), -1, -2))
-    jacobian = np.moveaxis(model.jacobian(state), (1, 2, 3), (3, 2, 1))
+    error = np.nan_to_num(np.moveaxis(model.error(state), 0, -1))
+    jacobian = np.moveaxis(model.jacobian(state), (0, 2, 3), (3, 2, 1))
     return rows_of(error, jacobian, joint_jacobian, model.weight)
 
 

@@ -108,7 +108,7 @@ class Prospect:
 def motions(cell: Cell, data: Measurements) -> tuple[Array, Scene]:
     """Derivative of every target by every parameter, (m, k, 3, p) in base axes, and the scene."""
     model, state = model_at(cell, data)
-    jacobian = np.moveaxis(model.jacobian(state), 0, 1)
+    jacobian = model.jacobian(state)
     return np.asarray(jacobian), cell.scene(data)
 
 

@@ -61,17 +61,17 @@ def points_of(
         cell, *_ = open_result(fit).placed_by(whole)
         outside = 1e3 * np.linalg.norm(cell.error(whole), axis=-1)
     except CalibrationError:  # the poses of other measurements
-        outside = np.full((len(whole.target_names), whole.poses), np.nan)
+        outside = np.full((whole.poses, len(whole.target_names)), np.nan)
     poses_called = [whole.row_called(row) for row in range(whole.poses)]
     names = {name: target_called(whole, name) for name in whole.target_names}
     out = []
     for row, column in np.argwhere(whole.seen):
         line, target = int(whole.line[row]), whole.target_names[column]
-        at = (columns.get(target, -1), rows.get(line, -1))
+        at = (rows.get(line, -1), columns.get(target, -1))
         used = min(at) >= 0 and np.isfinite(size["after"][at])
         before, after = (float(size[n][at]) for n in size) if used else (
-            np.nan, float(outside[column, row]))  # fmt: skip
-        use = ("held out" if found.held[at[1]] else "training") if used else "left out"
+            np.nan, float(outside[row, column]))  # fmt: skip
+        use = ("held out" if found.held[at[0]] else "training") if used else "left out"
         suspect = (line, target) in suspects
         name = names[target]
         out.append(Point(line, target, before, after, use, suspect, poses_called[row], name))

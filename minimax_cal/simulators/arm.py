@@ -374,10 +374,10 @@ def imitated(
     laws = Fitted.of((*parts.soft, *parts.sagging))
     plain = replace(cell, effects=NOTHING)
     model = model_of(cell.robot, replace(scene.data, y=plain.predict(scene.data.q)))
-    geometry = np.moveaxis(model.jacobian(plain.state), 1, 2)
+    geometry = np.moveaxis(model.jacobian(plain.state), 0, 2)
     left = np.zeros(scene.points.shape)
     if measured is not None:
-        left = np.moveaxis(cell.error(measured) @ cell.base[:3, :3], 1, 2)
+        left = np.moveaxis(cell.error(measured) @ cell.base[:3, :3], 0, 2)
     firm = [term for term, _ in parts.firm]
     masses = (parts.arm.mass, parts.arm.com)
     return springs_of(scene, laws, left, geometry, firm, masses, fixed=fixed), plain.state

@@ -309,7 +309,7 @@ class Written:
     base: Array
 
     def off(self, data: Measurements) -> Array:
-        """(k, m, 3) from where the targets stand to where the cell says, as the instrument sees it.
+        """(m, k, 3) from where the targets stand to where the cell says, as the instrument sees it.
 
         Its command map corrects the commands [m].
         """
@@ -318,7 +318,7 @@ class Written:
         to = self.cell.base @ inverse(self.base)
         chosen = [self.cell.target_names.index(name) for name in data.target_names]
         said = self.cell.seen(data)[:, chosen]
-        return np.moveaxis(said - points @ to[:3, :3].T - to[:3, 3], 1, 0)
+        return np.asarray(said - points @ to[:3, :3].T - to[:3, 3])
 
 
 def resting(arm: Arm, data: Measurements) -> Array | None:
@@ -375,7 +375,7 @@ PLACINGS = 30  # of Gauss and Newton, until a step is none
 def placed_error(
     poses: Array, data: Measurements, train: Array, start: tuple[Array, Array]
 ) -> Array:
-    """Measured minus predicted (k, m, 3), NaN where not measured [m].
+    """Measured minus predicted (m, k, 3), NaN where not measured [m].
 
     poses: (m, 4, 4) of the flange in some base frame [m].  train: (m,) mask of the poses that place
     base and targets.  start: base (4, 4) in the measurement frame and targets (k, 3) in the flange.
@@ -394,7 +394,7 @@ def placed_error(
         if np.abs(step).max() < CLOSE:
             break
     error, _ = linear(poses, data.y, turn, origin, spots)
-    return np.moveaxis(error, 1, 0)
+    return error
 
 
 def linear(poses: Array, y: Array, turn: Array, origin: Array, spots: Array) -> tuple[Array, Array]:

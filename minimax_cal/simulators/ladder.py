@@ -446,7 +446,7 @@ class Run:
         error = placed_error(
             driven.poses, self.data, judge & ~self.held, guess(start, driven.poses[0], q[0])
         )
-        held, train = (accuracy(error[:, judge & rows]) for rows in (self.held, ~self.held))
+        held, train = (accuracy(error[judge & rows]) for rows in (self.held, ~self.held))
         off = np.abs(driven.q - asked)[judge][:, ~chain.robot.prismatic]
         return Rung(
             name, held.rms_mm, held.max_mm, train.rms_mm, train.max_mm,
@@ -458,7 +458,7 @@ class Run:
         """RMS of some driven poses by the formulas of a fit, NaN where it has others."""
         if fit is None or not self.causes.same:
             return np.nan
-        return accuracy(fit.cell.error(self.data)[:, rows]).rms_mm
+        return accuracy(fit.cell.error(self.data)[rows]).rms_mm
 
     def tell(self, what: str, data: Measurements, rows: Array, judge: Array) -> None:
         """A notice on poses that do not judge.  rows: (m,) where; judge: (m,) those that do."""

@@ -174,7 +174,7 @@ def test_the_squares_of_the_parts_are_those_of_the_whole(u95, share):
         Remains("J1", "its load", 9.0, 0.002, share, 3),
         Remains("J2", "time", 9.0, 0.002, 0.1, 4),
     ]
-    told, known = remaining_of(left, 0.1, data, np.zeros((1, 30, 3)))
+    told, known = remaining_of(left, 0.1, data, np.zeros((30, 1, 3)))
     parts = [told.noise_mm, told.dependent_mm, told.unexplained_mm]
     assert np.hypot.reduce(parts) == pytest.approx(0.1)
     assert known == (u95 == 1e-3)
@@ -186,10 +186,9 @@ def test_few_visits_that_are_far_off_are_no_noise_of_the_others():
     rng = np.random.default_rng(2)
     q, y = np.repeat(rng.normal(size=(40, 6)), 2, axis=0), 1e-5 * rng.normal(size=(80, 1, 3))
     y[:2, 0, 0] += 1e-3, -1e-3
-    error = np.moveaxis(y, 1, 0)
     data = mc.measurements(q, 1.0 + y)
-    whole, _ = remaining_of([], 0.1, data, error)
-    told, known = remaining_of([], 0.1, data, error, 0.02)
+    whole, _ = remaining_of([], 0.1, data, y)
+    told, known = remaining_of([], 0.1, data, y, 0.02)
     assert (whole.noise_mm, told.noise_mm, known) == (0.1, 0.02, True)
     assert np.hypot(told.noise_mm, told.unexplained_mm) == pytest.approx(0.1)
 
@@ -252,7 +251,7 @@ def judges(play: Study) -> Judges:
     """The poses of the fit, and as many others."""
     held = replace(play.data, q=play.data.q + 0.02, line=play.data.line + 1000)
     held = held.take(np.arange(0, held.poses, 4))
-    return Judges(play.data, held, np.zeros((len(held.target_names), held.poses), dtype=bool))
+    return Judges(play.data, held, np.zeros((held.poses, len(held.target_names)), dtype=bool))
 
 
 def test_every_part_is_left_out_and_judges(
@@ -278,7 +277,7 @@ def test_every_part_is_left_out_and_judges(
         assert_array_equal(rows, ~np.isin(play.data.line, here.line))
         assert one.rms_mm == accuracy(cells[0].error(here)).rms_mm
         assert one.geometric_mm == accuracy(cells[1].error(here)).rms_mm
-        squares = [np.nansum(play.model.error(s)[:, rows] ** 2) for s in (state, play.fit.state)]
+        squares = [np.nansum(play.model.error(s)[rows] ** 2) for s in (state, play.fit.state)]
         assert squares[0] < squares[1]  # the fit of the others alone
 
 
@@ -314,7 +313,7 @@ def test_a_session_left_out_has_no_frame(monkeypatch: pytest.MonkeyPatch) -> Non
     data = replace(made.data.with_y(y), columns={**made.data.columns, "session": session})
     data = stationed(robot, with_history(data), np.ones(90, dtype=bool))
     study = studied(robot, data, fit_cell(robot, data, SUM, silent))
-    judges = Judges(data, data.take(np.zeros(0, dtype=int)), np.zeros((2, 0), dtype=bool))
+    judges = Judges(data, data.take(np.zeros(0, dtype=int)), np.zeros((0, 2), dtype=bool))
 
     def fold(*given: Any) -> Any:
         return SimpleNamespace(fits=[SimpleNamespace(cell=study.geometric)])

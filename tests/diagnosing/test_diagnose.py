@@ -226,7 +226,7 @@ def test_rows_find_their_own_points_again() -> None:
 
 def test_closed_share_is_of_squares_above_the_floor() -> None:
     rng = np.random.default_rng(0)
-    before, after = (s * rng.normal(size=(3, 4000, 3)) for s in (2e-3, 1e-3))
+    before, after = (s * rng.normal(size=(4000, 3, 3)) for s in (2e-3, 1e-3))
     floor, group = Floor(np.sqrt(3.0) * 0.5, 0.8, 0.9, REPEATS), np.arange(4000)
     share, (low, high) = closed_share(before, after, group, floor, 0.0, rng)
     assert abs(share - (4.0 - 1.0) / (4.0 - 0.25)) < 0.02

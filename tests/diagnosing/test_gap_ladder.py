@@ -86,8 +86,8 @@ def judges_of(play: Study) -> Judges:
     data = play.data
     odd = np.arange(data.poses) % 2 > 0
     held = data.take(~odd)
-    far = np.zeros((len(data.target_names), held.poses), dtype=bool)
-    far[0, 1] = far[-1, 4] = True
+    far = np.zeros((held.poses, len(data.target_names)), dtype=bool)
+    far[1, 0] = far[4, -1] = True
     return Judges(data.take(odd), held, far)
 
 
@@ -230,13 +230,13 @@ def test_what_a_gap_hid_is_marked_once_it_is_closed() -> None:
     y[4] += np.sqrt(limits[0] * limits[1]) * np.array([0.6, 0.0, 0.8])  # distances stay
     odd = np.arange(long.data.poses) % 2 > 0
     held = long.data.with_y(y).take(~odd)
-    judges = Judges(long.data.take(odd), held, np.zeros_like(held.seen.T))
+    judges = Judges(long.data.take(odd), held, np.zeros_like(held.seen))
     same, none = judges.marked(first, first)
     assert_array_equal(same.far, judges.far)
     assert none == ()
     marked, found = judges.marked(first, last)
-    assert np.argwhere(marked.far.any(axis=0)).tolist() == [[2]]
-    assert marked.far[:, 2].all()
+    assert np.argwhere(marked.far.any(axis=1)).tolist() == [[2]]
+    assert marked.far[2].all()
     assert found == tuple(f"{held.called(int(held.line[2]))} {name}" for name in held.target_names)
     step = marked.step("last", last)
     assert step.holdout.max_mm > 5.0 * step.trusted.max_mm
@@ -269,7 +269,7 @@ def test_everyone_is_both_parts_in_order_without_what_stands_out(play: Study) ->
     assert_array_equal(everyone.y, y)
     for name, column in everyone.columns.items():
         assert_array_equal(column, play.data.columns[name][order])
-    lost = replace(judges, far=judges.far | (np.arange(judges.held.poses) == 7))
+    lost = replace(judges, far=judges.far | (np.arange(judges.held.poses) == 7)[:, None])
     assert judges.held.line[7] not in lost.everyone.line
     assert lost.everyone.poses == play.data.poses - 1
 
@@ -334,8 +334,8 @@ def test_faults_that_are_mended_share_the_first_rung() -> None:
 
 
 def test_sums_are_of_the_points_that_were_measured() -> None:
-    error = np.full((2, 3, 3), np.nan)
-    error[0, 0], error[1, 0], error[0, 2] = (1e-3, 2e-3, 2e-3), (0.0, 0.0, 1e-3), (3e-3, 0.0, 0.0)
+    error = np.full((3, 2, 3), np.nan)
+    error[0, 0], error[0, 1], error[2, 0] = (1e-3, 2e-3, 2e-3), (0.0, 0.0, 1e-3), (3e-3, 0.0, 0.0)
     assert_allclose(sums(error), [[10.0, 0.0, 9.0], [2.0, 0.0, 1.0]], rtol=1e-12)
 
 
@@ -348,11 +348,11 @@ def test_the_share_is_of_mean_squares_above_the_floor() -> None:
 def test_the_interval_is_that_of_groups_drawn_anew() -> None:
     """Against a bootstrap written out, with the same draws."""
     rng = np.random.default_rng(3)
-    before, after = (s * rng.normal(size=(2, 30, 3)) for s in (2e-3, 1e-3))
+    before, after = (s * rng.normal(size=(30, 2, 3)) for s in (2e-3, 1e-3))
     group = np.repeat(np.arange(10) * 7, 3)  # whatever their numbers are
     floor = Floor(0.5, 0.4, 0.6, REPEATS)
     share, ends = closed_share(before, after, group, floor, 0.0, np.random.default_rng(5))
-    squares = [1e6 * (e**2).sum(axis=(0, 2)).reshape(10, 3).sum(axis=1) for e in (before, after)]
+    squares = [1e6 * (e**2).sum(axis=(1, 2)).reshape(10, 3).sum(axis=1) for e in (before, after)]
 
     def closing(rows: Array, floors: Array) -> Array:
         one, two = (s[rows].sum(axis=-1) / (6.0 * rows.shape[-1]) for s in squares)
@@ -375,7 +375,7 @@ def test_few_draws_with_a_gap_give_no_interval(
     most: int, told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The floor as drawn leaves a gap so often."""
-    error = np.full((1, 40, 3), 1e-3)
+    error = np.full((40, 1, 3), 1e-3)
     floors = np.where(np.arange(RESAMPLES) < most, 1.0, 2.0)  # beside an RMS of sqrt(3) mm
     monkeypatch.setattr(Floor, "drawn", lambda self, count, rng: floors)
     floor = Floor(1.0, 1.0, 1.0, REPEATS)
@@ -405,7 +405,7 @@ def test_what_other_training_poses_would_close_is_a_jackknife(play: Study) -> No
     """Against fits made anew without each tenth."""
     fits = (joint(play, ()), joint(play, (PLAY,)))
     held = play.data.take(np.arange(play.data.poses) < 30)
-    judges = Judges(play.data, held, np.zeros((len(held.target_names), 30), dtype=bool))
+    judges = Judges(play.data, held, np.zeros((30, len(held.target_names)), dtype=bool))
     floor = Floor(0.01, 0.0, 0.02, REPEATS)
     part, shares = folds(play.data, SPARED), []
     for number in range(SPARED):

@@ -67,7 +67,7 @@ def test_compliances_are_not_negative() -> None:
     pulled = joint(study, (SOFT,))
     assert pulled.state.effects[0] > 0.0
     left = study.geometric.error(study.data)
-    mirrored = study.data.with_y(study.data.y - 2.0 * np.moveaxis(left, 0, 1))
+    mirrored = study.data.with_y(study.data.y - 2.0 * left)
     pushed = joint(studied(study.robot, mirrored, study.fit), (SOFT,))
     assert pushed.state.effects[0] == 0.0
     assert pushed.rests.tolist() == [True]
@@ -186,7 +186,7 @@ def test_noise_is_at_most_what_is_said(robot: Robot, targets: int, jitter: float
         fit = joint(studied(robot, data, fit_cell(robot, data, SUM, silent)), ())
         left.append(fit.train.rms_mm)
         said.append(noise_at_most(fit.cell.error(data), fit.poses.left_free))
-        true.append(accuracy(np.moveaxis(data.y - ideal.data.y, 1, 0)).rms_mm)
+        true.append(accuracy(data.y - ideal.data.y).rms_mm)
     assert np.mean(np.array(left) < true) > 0.9
     assert np.count_nonzero(np.array(said) < true) <= 3  # of 24; more by chance once in 300
     assert 1.0 < np.median(np.array(said) / true) < 1.4

@@ -93,7 +93,7 @@ def by_hand(
     model = model_of(place.scene.robot, data)
     scene = scene_of(place.scene.robot, data, model, place.state)
     k, _, m = scene.points.shape
-    jacobian = np.moveaxis(model.jacobian(place.state), (1, 2), (0, 2)).reshape(m, 3 * k, -1)
+    jacobian = model.jacobian(place.state).reshape(m, 3 * k, -1)
 
     def rowed(fields: Array) -> Array:  # (d, k, 3, m) -> (m, 3k, d)
         return np.moveaxis(fields.reshape(-1, 3 * k, m), (0, 1, 2), (2, 1, 0))

@@ -86,7 +86,7 @@ def made() -> Diagnosis:
     play, soft = np.array([3e-5]), np.array([2e-6])
     cells = [base, replace(base, effects=Fitted((PLAY,), (play,))),
              replace(base, effects=Fitted((PLAY, SOFT), (play, soft)))]  # fmt: skip
-    error = np.zeros((2, 30, 3))
+    error = np.zeros((30, 2, 3))
     return Diagnosis(
         "arm", RUNGS, Floor(0.1, 0.05, 0.2, DECLARED), 0.9, (0.8, 0.95), Beyond(), 2e-5, {},
         ("a notice",), Provenance("arm"), 1.5, sim.data, np.arange(30) % 5 == 0, tuple(cells),
@@ -585,12 +585,12 @@ def test_views_are_geometry_effects_and_all_but_the_first() -> None:
     plain, whole, bare = left.views
     measured = left.data.y - cell_of(left.scene.robot).predict(left.data.q)
     axes = cell_of(left.scene.robot).base[:3, :3]
-    assert_allclose(plain, np.moveaxis(measured, 1, 0) @ axes, rtol=0, atol=1e-12)
+    assert_allclose(plain, measured @ axes, rtol=0, atol=1e-12)
     assert_allclose(whole, 0.0, atol=1e-12)
     assert_allclose(bare, plain, rtol=0, atol=1e-12)
-    assert_allclose(left.distances()[0], 1e3 * np.linalg.norm(measured, axis=-1).T, atol=1e-9)
+    assert_allclose(left.distances()[0], 1e3 * np.linalg.norm(measured, axis=-1), atol=1e-9)
     there = left.scene.robot.pose(left.data.q) @ np.append(SPOTS[1], 1.0)
-    assert_allclose(left.points[1] - left.views[0][1], there[:, :3], rtol=0, atol=1e-12)
+    assert_allclose(left.points[:, 1] - left.views[0][:, 1], there[:, :3], rtol=0, atol=1e-12)
     alone = left_by(NOTHING)
     assert len(alone.views) == 1
     assert alone.law is None
@@ -681,7 +681,7 @@ def test_time_and_heat_are_drawn_along_their_motion() -> None:
     assert curve.xlabel == "temperature (°C)"
     assert_array_equal(curve.x, np.broadcast_to(heat, (3, M)))
     assert curve.ylabel == "error along its growth (mm)"
-    assert_allclose(np.abs(curve.y[0]), warm.distances()[0], rtol=0, atol=1e-6)
+    assert_allclose(np.abs(curve.y[0]), warm.distances()[0].T, rtol=0, atol=1e-6)
     jump = left_by(fitted("session_jump", "frame", [1e-3, 0, 0, 0, 0, 0], since=0.5))
     curve = residual_curve(jump)
     assert curve.title == "error of all targets, for session jump"
@@ -714,14 +714,14 @@ def test_a_slide_is_shown_in_millimetres() -> None:
 def test_errors_in_the_order_of_the_visits(told: bool) -> None:
     left = left_by(LOOSE, told=told)
     curve = order_curve(left)
-    rms = np.sqrt(np.mean(left.distances()[0] ** 2, axis=0))
+    rms = np.sqrt(np.mean(left.distances()[0] ** 2, axis=1))
     assert_allclose(curve.y[0], rms, rtol=1e-12)
     if told:
         assert_array_equal(curve.x, np.arange(M)[::-1] + 1.0)
     assert (curve.xlabel == "visit (first to last)") == told
-    some = replace(left, errors=tuple(np.where(np.arange(3)[:, None, None] == 1, np.nan, e)
+    some = replace(left, errors=tuple(np.where(np.arange(3)[:, None] == 1, np.nan, e)
                                       for e in left.errors))  # fmt: skip
-    rms = np.sqrt(np.mean(left.distances()[0][[0, 2]] ** 2, axis=0))
+    rms = np.sqrt(np.mean(left.distances()[0][:, [0, 2]] ** 2, axis=1))
     assert_allclose(order_curve(some).y[0], rms, rtol=1e-12)
 
 
@@ -738,7 +738,7 @@ def test_a_curve_names_its_views() -> None:
 def test_joint_equivalent_is_the_turn():
     scene = left_by(NOTHING).scene
     turn = 1e-3 * np.random.default_rng(0).normal(size=(scene.poses, scene.joints))
-    error = np.einsum("nkcm,mn->kmc", scene.jacobian, turn)
+    error = np.einsum("nkcm,mn->mkc", scene.jacobian, turn)
     off = np.abs(joint_equivalent(error, scene.jacobian, 1e-7) - turn)
     assert np.median(off) < 1e-5  # large only where the wrist or the arm is stretched
     assert np.quantile(off[:, :3], 0.9) < 1e-4

@@ -280,7 +280,7 @@ def test_one_target_has_a_mean_along_the_line_of_sight_and_a_region():
 
 
 def test_the_worst_region_is_where_the_error_is():
-    point = np.random.default_rng(0).normal(size=(3, 100, 3))
+    point = np.random.default_rng(0).normal(size=(100, 3, 3))
     far = np.hypot(point[..., 0], point[..., 1])
     size = np.where(far > np.quantile(far, 2 / 3), 5e-5, 1e-5)
     cells = by_region(size[..., None] * np.array([1.0, 0.0, 0.0]), point, np.array([0.0, 0.0, 1.0]))

@@ -48,7 +48,7 @@ def test_lambda_is_what_was_asked_for(law, robot):
         if law not in FAULTS:
             assert_allclose(sealed.powers, [70.0], rtol=1e-6)
         assert_allclose(sealed.parts[0], sealed.displacement, rtol=0, atol=1e-12)
-        assert sealed.displacement.shape == (3, sealed.data.poses, 3)
+        assert sealed.displacement.shape == (sealed.data.poses, 3, 3)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -210,7 +210,7 @@ def test_the_same_case_is_the_same_file():
 
 
 def truth_of(*names: tuple[str, str], power: float = 100.0, **more: object) -> Truth:
-    none = np.zeros((len(names), 3, 1, 3))
+    none = np.zeros((len(names), 1, 3, 3))
     fields: dict[str, object] = dict(
         truth=names, background=(), displacement=none.sum(0), parts=none,
         powers=(power,) * len(names), power=power, amplitudes=(), floor=4e-5,
@@ -315,4 +315,4 @@ def test_lambda_is_what_was_asked_for_in_shops(law):
         place = machines.places(law, robot, 3)[-1]
         made = machines.make(Asked(robot, "test", (Cause(law, place, 70.0, 1),), poses=60))
         assert_allclose(made.powers, [70.0], rtol=1e-5)
-        assert made.parts.shape == (1, 3, made.data.poses, 3)
+        assert made.parts.shape == (1, made.data.poses, 3, 3)

@@ -118,7 +118,7 @@ def test_parts_that_effects_alone_need_are_judged_as_a_calibration_of_the_rest_w
         rows = every[fold.where]
         labels = {"split": np.where(rows | fit.held, "holdout", "train")}
         again = mc.calibrate(robot, replace(data, columns=labels), "sum", effects=gear)
-        error = again.cell.error(again.data)[:, rows]
+        error = again.cell.error(again.data)[rows]
         assert_allclose(fold.rms_mm, 1e3 * np.sqrt((error**2).sum(axis=-1).mean()), rtol=0.01)
     assert "with the same effects" in fit.headline()
     assert fit.within.missed == 0
@@ -240,7 +240,7 @@ ONE_STEP = 0.02  # of an error's size: a fit without a fold is one Gauss-Newton 
 def test_every_pose_is_judged_by_a_fit_without_it(robot, noisy):
     """One held-out pose each, so that a fold's own fit can be had by `split`."""
     fit = mc.calibrate(robot, noisy.data, "sum", cv=True, seed=3)
-    held = fit.error_crossed[:, fit.held]
+    held = fit.error_crossed[fit.held]
     assert_allclose(held, fit.errors["holdout"], rtol=0, atol=1e-12)
     folds = np.random.default_rng(3).permutation(48) % 10
     for number in (0, 7):
@@ -249,7 +249,7 @@ def test_every_pose_is_judged_by_a_fit_without_it(robot, noisy):
         other = mc.Measurements(**{**vars(noisy.data), "columns": {"split": label}})
         again = mc.calibrate(robot, other, "sum").cell.error(noisy.data.take(rows))
         assert_allclose(
-            accuracy(fit.error_crossed[:, rows]).rms_mm, accuracy(again).rms_mm, rtol=ONE_STEP
+            accuracy(fit.error_crossed[rows]).rms_mm, accuracy(again).rms_mm, rtol=ONE_STEP
         )
 
 
@@ -310,7 +310,7 @@ def both(error: Array, seed: int = 0) -> Array:
 @settings(max_examples=40)
 @given(st.integers(3, 40), st.integers(1, 4), st.floats(1e-7, 1e3), st.integers(0, 99))
 def test_intervals_scale_with_the_errors(m, k, size, seed):
-    error = rng_of(seed).normal(size=(k, m, 3))
+    error = rng_of(seed).normal(size=(m, k, 3))
     low, high, least, most = both(error)
     rms = np.sqrt((error**2).sum(-1).mean())
     assert 0.0 < low < rms < high
@@ -319,31 +319,31 @@ def test_intervals_scale_with_the_errors(m, k, size, seed):
 
 
 def test_targets_of_a_pose_are_no_further_poses(rng):
-    error = rng.normal(size=(1, 20, 3))
-    assert_allclose(both(np.repeat(error, 3, axis=0)), both(error), rtol=1e-12)
+    error = rng.normal(size=(20, 1, 3))
+    assert_allclose(both(np.repeat(error, 3, axis=1)), both(error), rtol=1e-12)
 
 
 def test_what_was_not_measured_does_not_count(rng):
-    error = rng.normal(size=(3, 20, 3))
-    error[1, ::2] = np.nan
-    padded = np.concatenate([error, np.full((3, 7, 3), np.nan)], axis=1)
+    error = rng.normal(size=(20, 3, 3))
+    error[::2, 1] = np.nan
+    padded = np.concatenate([error, np.full((7, 3, 3), np.nan)])
     assert_allclose(both(padded), both(error), rtol=1e-12)
-    turned = error[::-1] @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turned = error[:, ::-1] @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
     assert_allclose(both(turned), both(error), rtol=1e-9)
 
 
 def test_too_few_poses_tell_nothing():
     for m in range(3):
-        assert np.isnan(both(np.ones((2, m, 3)))).all()
-    assert rms_interval(np.zeros((1, 5, 3)), rng=rng_of()) == Interval(0.0, 0.0)
-    assert max_interval(np.zeros((1, 5, 3)), rng=rng_of()) == Interval(0.0, 0.0)
+        assert np.isnan(both(np.ones((m, 2, 3)))).all()
+    assert rms_interval(np.zeros((5, 1, 3)), rng=rng_of()) == Interval(0.0, 0.0)
+    assert max_interval(np.zeros((5, 1, 3)), rng=rng_of()) == Interval(0.0, 0.0)
 
 
 @pytest.mark.parametrize(("m", "zero"), [(12, 6), (7, 6), (400, 399)])
 def test_exact_zeros_are_the_smallest_errors(m, zero):
     """Bootstrap samples may hold nothing but zeros: no warning, and the ends of tiny errors."""
-    error = rng_of(5).normal(size=(1, m, 3))
-    error[:, :zero] = 0.0
+    error = rng_of(5).normal(size=(m, 1, 3))
+    error[:zero] = 0.0
     found, tiny = (
         rms_interval(errors, rng=rng_of())
         for errors in (error, np.where(error == 0.0, 1e-12, error))
@@ -356,8 +356,8 @@ def test_exact_zeros_are_the_smallest_errors(m, zero):
 
 def test_an_upper_end_of_the_law_alone_is_not_told():
     """Seven poses of which one is nearly all of the error: no sample without it tells anything."""
-    error = np.zeros((1, 7, 3))
-    error[0, :, 0] = [2.09, 0.31, 0.35, 0.4, 0.29, 0.38, 0.33]
+    error = np.zeros((7, 1, 3))
+    error[:, 0, 0] = [2.09, 0.31, 0.35, 0.4, 0.29, 0.38, 0.33]
     for interval, seen in ((rms_interval, np.sqrt((error**2).sum() / 7)), (max_interval, 2.09)):
         found = interval(error, rng=rng_of())
         assert found.high > 10.0 * seen
@@ -372,18 +372,18 @@ def test_an_upper_end_of_the_law_alone_is_not_told():
 def test_exact_poses_count_as_nearly_exact_ones(m, data):
     """Bootstrap samples of exact poses alone have no logarithm; the limit of small errors does."""
     exact = data.draw(st.integers(1, m - 1))
-    error = rng_of(m).normal(size=(2, m, 3))
-    error[:, :exact] = 0.0
+    error = rng_of(m).normal(size=(m, 2, 3))
+    error[:exact] = 0.0
     low, high, least, most = found = both(error)
     assert 0.0 < low <= np.sqrt((error**2).sum(-1).mean()) <= high < np.inf
     assert 0.0 < least <= most < np.inf
-    error[:, :exact] = 1e-9
+    error[:exact] = 1e-9
     assert_allclose(both(error), found, rtol=1e-6)
 
 
 def test_many_normal_errors_give_the_chi_square_interval(rng):
     """3m normal coordinates of one variance: its exact interval, within 10 % of its width."""
-    error = rng.normal(size=(1, 2000, 3))
+    error = rng.normal(size=(2000, 1, 3))
     found = rms_interval(error, rng=rng_of())
     total, free = float((error**2).sum()), 6000
     exact = np.sqrt(total / stats.chi2.ppf([0.975, 0.025], free) * 3.0)
@@ -391,7 +391,7 @@ def test_many_normal_errors_give_the_chi_square_interval(rng):
 
 
 def test_a_wider_level_is_wider(rng):
-    error = rng.normal(size=(3, 12, 3))
+    error = rng.normal(size=(12, 3, 3))
     for interval in (rms_interval, max_interval):
         wide, narrow = (interval(error, level=v, rng=rng_of()) for v in (0.99, 0.8))
         assert wide.low < narrow.low < narrow.high < wide.high
@@ -414,8 +414,8 @@ def test_the_rms_interval_covers(name):
     law, mean, poses, loss = LAWS[name]
     rng, held = rng_of(1), 0
     for _ in range(RUNS):
-        error = np.zeros((1, poses, 3))
-        error[0, :, 1] = np.sqrt(law(rng, poses))
+        error = np.zeros((poses, 1, 3))
+        error[:, 0, 1] = np.sqrt(law(rng, poses))
         found = rms_interval(error, rng=rng)
         held += found.low <= np.sqrt(mean) <= found.high
     assert 0.95 - loss - CHANCE < held / RUNS < 0.95 + loss + CHANCE
@@ -430,8 +430,8 @@ def test_the_largest_of_new_poses_is_covered(name, poses):
             distance = np.exp(0.6 * rng.normal(size=2 * poses))
         else:
             distance = np.sqrt(rng.chisquare(3, 2 * poses))
-        error = np.zeros((1, poses, 3))
-        error[0, :, 2] = distance[:poses]
+        error = np.zeros((poses, 1, 3))
+        error[:, 0, 2] = distance[:poses]
         found = max_interval(error, rng=rng)
         held += found.low <= distance[poses:].max() <= found.high
     more = 0.0 if name == "exact" else 0.03
@@ -489,8 +489,9 @@ def test_the_largest_of_normal_samples_follow_their_law():
 # Two targets at three poses [m]; distances 5, 0, - and 1, 2, 2 mm.
 ERROR = 1e-3 * np.array(
     [
-        [[3.0, 0.0, 4.0], [0.0, 0.0, 0.0], [np.nan] * 3],
-        [[0.0, 1.0, 0.0], [0.0, 0.0, -2.0], [2.0, 0.0, 0.0]],
+        [[3.0, 0.0, 4.0], [0.0, 1.0, 0.0]],
+        [[0.0, 0.0, 0.0], [0.0, 0.0, -2.0]],
+        [[np.nan] * 3, [2.0, 0.0, 0.0]],
     ]
 )
 
@@ -511,7 +512,7 @@ def test_all_points_and_each_target():
 
 
 def test_no_point_is_no_number():
-    found = accuracy(np.full((2, 0, 3), np.nan))
+    found = accuracy(np.full((0, 2, 3), np.nan))
     assert (found.poses, found.counts, found.worst) == (0, (0, 0), (-1, -1))
     assert all(map(math.isnan, (found.rms_mm, found.max_mm, *found.by_target())))
 
@@ -597,9 +598,9 @@ def visited(
     """Poses visited several times, and errors of three targets."""
     q = np.repeat(rng.uniform(-2.0, 2.0, (poses, 6)), times, axis=0)
     q += 1e-5 * rng.normal(size=q.shape)
-    error = SIGMA * rng.normal(size=(3, len(q), 3))
-    error += 1e-3 * np.repeat(rng.normal(size=(3, poses, 3)), times, axis=1)  # of the model
-    return mc.measurements(q, np.moveaxis(error, 0, 1)), error
+    error = SIGMA * rng.normal(size=(len(q), 3, 3))
+    error += 1e-3 * np.repeat(rng.normal(size=(poses, 3, 3)), times, axis=0)  # of the model
+    return mc.measurements(q, error), error
 
 
 @pytest.mark.parametrize("times", [2, 3, 5])
@@ -614,7 +615,7 @@ def test_visits_tell_the_noise_whatever_the_model(rng, times):
 
 def test_a_few_wrong_visits_do_not_set_the_floor(rng):
     data, error = visited(rng, 2)
-    error[:, :20] += 2e-3 * rng.normal(size=(3, 20, 3))
+    error[:20] += 2e-3 * rng.normal(size=(20, 3, 3))
     found = floor_of(data, error, np.nan, 10.0)
     assert found.source == REPEATS
     assert_allclose(found.value, 1e3 * np.sqrt(3.0) * SIGMA, rtol=0.12)
@@ -623,7 +624,7 @@ def test_a_few_wrong_visits_do_not_set_the_floor(rng):
 def test_without_visits_or_promises_the_fit_tells_at_most(rng):
     q = rng.uniform(-2.0, 2.0, (30, 6))
     data = mc.measurements(q, rng.normal(size=(30, 1, 3)))
-    error = SIGMA * rng.normal(size=(1, 30, 3))
+    error = SIGMA * rng.normal(size=(30, 1, 3))
     assert floor_of(data, error, np.nan, 0.3) == Floor(0.3, 0.0, 0.3, AT_MOST)
     assert floor_of(data, error, 1e-4, 0.3) == Floor(0.3, 0.0, 0.3, AT_MOST)
     assert floor_of(data, error, 1e-3, 0.3) == Floor(0.3, 0.0, 0.3, AT_MOST)

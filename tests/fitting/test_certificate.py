@@ -187,7 +187,7 @@ def test_the_points_that_decide_are_named(robot, noisy):
     for one in proof.points:
         assert_allclose(one.distance, proof.value, rtol=1e-6)  # every active point is a largest one
         pose = int(np.flatnonzero(data.line == one.line)[0])
-        assert_allclose(one.distance, distance[data.target_names.index(one.target), pose])
+        assert_allclose(one.distance, distance[pose, data.target_names.index(one.target)])
     assert np.all(np.diff([one.multiplier for one in proof.points]) <= 0)
     assert np.count_nonzero(distance > proof.value * (1 - 1e-6)) == len(proof.points)
     text = proof.table().text()

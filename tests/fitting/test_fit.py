@@ -242,16 +242,16 @@ def unticked(data: Measurements, lines: Array) -> Measurements:
 
 def test_points_weigh_as_much_as_they_would_among_all(rng):
     """Where a fifth is held out, a point set aside counts a fifth of a held-out one."""
-    held, aside = rng.normal(size=(2, 40, 3)), 3.0 * rng.normal(size=(2, 10, 3))
+    held, aside = rng.normal(size=(40, 2, 3)), 3.0 * rng.normal(size=(10, 2, 3))
     found = with_them(held, np.arange(40), aside, 0.2)
     squares = [np.sum(part**2, axis=(1, 2)) for part in (held, aside)]
     mean_square = (squares[0].sum() + 0.2 * squares[1].sum()) / (80 + 0.2 * 20)
     assert_allclose(found.rms_mm, 1e3 * np.sqrt(mean_square), rtol=1e-12)
     assert_allclose(sum(found.sse_mm2) / sum(found.counts), found.rms_mm**2, rtol=1e-12)
-    both = np.linalg.norm(np.concatenate([held, aside], axis=1), axis=-1)
+    both = np.linalg.norm(np.concatenate([held, aside]), axis=-1)
     assert found.max_mm == 1e3 * both.max()
     assert (found.poses, found.counts) == (50, (50, 50))
-    alone = with_them(held, np.arange(40), aside[:, :0], 0.2)
+    alone = with_them(held, np.arange(40), aside[:0], 0.2)
     assert_allclose(alone.rms_mm, 1e3 * np.sqrt((held**2).sum(-1).mean()), rtol=1e-12)
 
 

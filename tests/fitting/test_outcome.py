@@ -243,8 +243,8 @@ def test_before_and_after_are_of_the_same_poses_by_the_same_rule(robot):
     fit = mc.calibrate(robot, data, "sum")
     drawn = fit.error_drawn_crossed
     assert drawn.shape == fit.error_crossed.shape
-    assert_allclose(drawn[:, fit.held], fit.error_nominal[:, fit.held], rtol=0, atol=1e-9)
-    assert accuracy(drawn[:, ~fit.held]).rms_mm > accuracy(fit.error_nominal[:, ~fit.held]).rms_mm
+    assert_allclose(drawn[fit.held], fit.error_nominal[fit.held], rtol=0, atol=1e-9)
+    assert accuracy(drawn[~fit.held]).rms_mm > accuracy(fit.error_nominal[~fit.held]).rms_mm
     assert_allclose(fit.within.before.rms_mm, accuracy(drawn).rms_mm, rtol=1e-12)
     assert fit.within.before.counts == fit.within.after.counts
     told_first = fit.accuracy_table().rows[0]
@@ -259,23 +259,23 @@ def test_before_and_after_are_of_the_same_poses_by_the_same_rule(robot):
     rest = data.take(train[fold != fold[0]])
     state = fit_base(model_of(robot, rest), robot.mdh).state
     own = Cell.of(robot, state, data.target_names).error(data.take(np.array([row])))
-    assert_allclose(accuracy(drawn[:, [row]]).rms_mm, accuracy(own).rms_mm, rtol=0.02)
+    assert_allclose(accuracy(drawn[[row]]).rms_mm, accuracy(own).rms_mm, rtol=0.02)
 
 
 def test_the_comparison_is_paired(rng):
-    drawn = rng.normal(size=(2, 50, 3))
+    drawn = rng.normal(size=(50, 2, 3))
     group = np.arange(50)
     same = compare_arms(drawn, drawn, group)
     assert same.gain == same.error == 0.0
     assert not same.is_better
     found = compare_arms(drawn, 0.9 * drawn, group)
-    square = (1e6 * drawn**2).sum(axis=(0, 2)) * (1.0 - 0.81) / 2.0
+    square = (1e6 * drawn**2).sum(axis=(1, 2)) * (1.0 - 0.81) / 2.0
     assert_allclose(found.gain, square.mean(), rtol=1e-12)
     assert_allclose(found.error, square.std(ddof=1) / np.sqrt(50), rtol=1e-12)
-    twice = np.concatenate([drawn, drawn], axis=1)  # visits again count once
+    twice = np.concatenate([drawn, drawn])  # visits again count once
     again = compare_arms(twice, 0.9 * twice, np.tile(group, 2))
     assert_allclose([again.gain, again.error], [found.gain, found.error], rtol=1e-12)
-    assert compare_arms(drawn[:, :1], drawn[:, :1], group[:1]).is_better  # nobody can say
+    assert compare_arms(drawn[:1], drawn[:1], group[:1]).is_better  # nobody can say
 
 
 def test_a_held_out_outlier_does_not_hide_a_better_arm(robot):
@@ -303,10 +303,10 @@ def test_a_point_that_only_the_calibrated_arm_misses_counts(robot):
     fit = mc.calibrate(robot, simulate(robot, 120, 2, seed=4).data, "sum")
     row = int(np.flatnonzero(fit.held)[0])
     drawn, after = fit.error_nominal.copy(), fit.error.copy()
-    after[0, row] += 0.1
+    after[row, 0] += 0.1
     one = mc.calibrate(robot, fit.data, "sum").suspects
     off = Suspect(int(fit.data.line[row]), "smr1", 0.1, 99.0, 0.0, False, True)
-    hidden = np.where(fit.held[:, None], 1.0, np.nan)
+    hidden = np.where(fit.held[:, None, None], 1.0, np.nan)
     found = improvement(drawn * hidden, after * hidden, np.arange(120), fit.data, (*one, off))
     assert not found.is_better
     assert not found.wrong

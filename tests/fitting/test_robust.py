@@ -111,7 +111,7 @@ def slopes(case: Case, x: Array, unit: float) -> Array:
     rows = model.jacobian(state)[..., model.active]
     error = model.error(state)
     along = error / np.linalg.norm(error, axis=-1, keepdims=True)
-    far = -np.einsum("kmcp,kmc->kmp", rows, along)[model.seen]
+    far = -np.einsum("mkcp,mkc->kmp", rows, along)[model.seen]
     prior = np.diag(np.sqrt(model.prior.weight))[:, model.active]
     return np.concatenate([far, prior]) * 1e-4 / unit
 
@@ -422,7 +422,7 @@ def test_suspects_reach_table_and_json(robot):
     assert (fit.weights == 0.0).sum() == 9
     # the points that decide are named among those that were kept
     assert (fit.weights > 0.0).sum() == 171
-    kept = np.linalg.norm(fit.errors["train"], axis=-1)[fit.weights > 0.0]
+    kept = np.linalg.norm(fit.errors["train"], axis=-1)[fit.weights.T > 0.0]
     assert 1e3 * kept.max() == pytest.approx(fit.minimax.table().rows[0][1], rel=1e-6)
     aside = {(s.target, s.line) for s in fit.suspects[:9]}
     assert not aside & {tuple(name.split(" line ")) for name in fit.minimax.functions}

@@ -90,7 +90,7 @@ def test_a_saved_fit_places_each_session(saved):
     # predictions are in the frame of each row's session
     assert_allclose(
         np.linalg.norm(TWO.y - cell.follow(TWO), axis=-1),
-        np.linalg.norm(fit.error, axis=-1).T,
+        np.linalg.norm(fit.error, axis=-1),
         rtol=0,
         atol=1e-9,
     )
@@ -194,7 +194,7 @@ def test_a_part_read_as_a_file_of_its_own_has_the_time_of_the_fit(tmp_path):
     fit.save(tmp_path / "fit.json")
     cell = mc.load_cell(tmp_path / "fit.json")
     late = np.arange(120) >= 96
-    assert_allclose(cell.error(ONE.take(late)), fit.error[:, late], rtol=0, atol=1e-9)
+    assert_allclose(cell.error(ONE.take(late)), fit.error[late], rtol=0, atol=1e-9)
     assert strangers(cell, ONE.take(late)) == ()
     later = replace(ONE, columns={"order": ONE.columns["order"] + 1000})
     (said,) = strangers(cell, later)

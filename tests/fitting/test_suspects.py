@@ -53,14 +53,16 @@ def test_covariance_is_that_of_the_whole_hat_matrix(robot):
     state = state_of(case.found)
     found = scores(model, state, weights)
 
-    rows = model.jacobian(state)[..., model.active] * np.sqrt(quality)[..., None, None]
+    rows = np.swapaxes(model.jacobian(state)[..., model.active], 0, 1)  # as scores: targets first
+    rows = rows * np.sqrt(quality)[..., None, None]
     rows = rows.reshape(-1, model.active.sum())
     w = np.repeat(weights.reshape(-1), 3)
     known = np.diag(prior[model.active])
     cover = np.linalg.inv(rows.T @ (w[:, None] * rows) + known)
     left = np.eye(len(rows)) - rows @ cover @ rows.T * w
     whole = left @ left.T + rows @ cover @ known @ cover @ rows.T
-    error = (model.error(state) * np.sqrt(quality)[..., None]).reshape(-1, 3)
+    error = np.swapaxes(model.error(state), 0, 1) * np.sqrt(quality)[..., None]
+    error = error.reshape(-1, 3)
     blocks = np.stack([whole[i : i + 3, i : i + 3] for i in range(0, len(rows), 3)])
     expected = np.einsum("na,nab,nb->n", error, np.linalg.inv(blocks), error)
     full = found.directions.reshape(-1) == 3
@@ -213,7 +215,7 @@ def test_a_list_tells_where_and_how_far(robot):
         assert all(s.together for s in by_pose[int(pose)])
     for one in found.suspects:
         target, pose = case.data.target_names.index(one.target), list(line).index(one.line)
-        assert one.distance == pytest.approx(distance[target, pose])
+        assert one.distance == pytest.approx(distance[pose, target])
         assert one.score == pytest.approx(one.distance / found.scale, rel=0.3)
     order = [one.p_value for one in found.suspects]
     assert order == sorted(order)
@@ -229,38 +231,38 @@ VISIT_NOISE = 0.02e-3  # [m]
 
 
 def visited(robot: mc.Robot, *, twice: int = 12, seed: int = 0) -> tuple[Measurements, Array]:
-    """40 poses of which some stand twice in the file, and the errors of the true arm (k, m, 3)."""
+    """40 poses of which some stand twice in the file, and the errors of the true arm (m, k, 3)."""
     data = simulate(robot, 40, 2, seed, Truth(compliance=0.0, noise=0.0, noise_per_metre=0.0)).data
     rows = np.r_[0:40, 0:twice]
     data = data.take(rows)
     data = replace(data, line=np.arange(2, 2 + len(rows)), columns={})
     noise = np.random.default_rng(seed).normal(0.0, VISIT_NOISE, data.y.shape)
-    return data.with_y(data.y + noise), np.moveaxis(noise, 1, 0)
+    return data.with_y(data.y + noise), noise
 
 
 def moved(data: Measurements, error: Array, row: int, off: float) -> tuple[Measurements, Array]:
     """The same, a point of the first target elsewhere [m]."""
     y, error = data.y.copy(), error.copy()
     y[row, 0, 2] += off
-    error[0, row, 2] += off
+    error[row, 0, 2] += off
     return data.with_y(y), error
 
 
 def test_the_nearest_other_visit_by_brute_force():
     rng = np.random.default_rng(4)
-    points, group = rng.normal(size=(2, 9, 3)), np.array([0, 1, 0, 2, 0, 1, 3, 4, 4])
-    points[1, 8] = np.nan
+    points, group = rng.normal(size=(9, 2, 3)), np.array([0, 1, 0, 2, 0, 1, 3, 4, 4])
+    points[8, 1] = np.nan
     apart, other, amid = nearest(points, group)
     for target in range(2):
         for row in range(9):
             rest = [i for i in np.flatnonzero(group == group[row]) if i != row]
-            far = [np.linalg.norm(points[target, row] - points[target, i]) for i in rest]
+            far = [np.linalg.norm(points[row, target] - points[i, target]) for i in rest]
             if not rest or np.isnan(far).all():
-                assert np.isnan(apart[target, row])
+                assert np.isnan(apart[row, target])
             else:
-                assert_allclose(apart[target, row], np.nanmin(far), rtol=1e-12)
-                assert_allclose(amid[target, row], np.nanmedian(far), rtol=1e-12)
-                assert other[target, row] == rest[int(np.nanargmin(far))]
+                assert_allclose(apart[row, target], np.nanmin(far), rtol=1e-12)
+                assert_allclose(amid[row, target], np.nanmedian(far), rtol=1e-12)
+                assert other[row, target] == rest[int(np.nanargmin(far))]
 
 
 def test_a_point_that_its_own_second_visit_contradicts(robot):
@@ -287,8 +289,8 @@ def test_three_visits_tell_without_a_fit(robot):
     fresh = np.random.default_rng(9).normal(0.0, VISIT_NOISE, (12, *data.y.shape[1:]))
     y = data.y.copy()
     y[52:] += fresh
-    error = error[:, rows] + 1e-3
-    error[:, 52:] += np.moveaxis(fresh, 1, 0)
+    error = error[rows] + 1e-3
+    error[52:] += fresh
     (text,) = contradictions(*moved(data.with_y(y), error, 43, 30.0 * VISIT_NOISE))
     assert "line 45 smr1" in text or "from line 45" in text
     assert text.count("smr") == 1

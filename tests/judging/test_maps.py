@@ -196,14 +196,14 @@ def test_other_arms(name):
 def test_observed_errors_are_those_of_the_cells(saved):
     found = workspace_map(saved, unknown, SMALL)
     for name, cell in saved.cells.items():
-        told = np.linalg.norm(cell.error(saved.data).mean(axis=0), axis=-1)
+        told = np.linalg.norm(cell.error(saved.data).mean(axis=1), axis=-1)
         assert_allclose(getattr(found.seen, name), told, atol=1e-15)
     assert found.seen.after.mean() < found.seen.before.mean()
     assert_array_equal(found.seen.held, saved.held)
     gap = saved.data.y.copy()
     gap[3, 1] = np.nan
     part = workspace_map(replace(saved, data=saved.data.with_y(gap)), unknown, SMALL).seen
-    one = saved.cells["after"].error(saved.data)[[0, 2], 3].mean(axis=0)
+    one = saved.cells["after"].error(saved.data)[3, [0, 2]].mean(axis=0)
     assert_allclose(part.after[3], np.linalg.norm(one), atol=1e-15)
 
 

@@ -57,10 +57,10 @@ def displaced(data: Measurements, rows: int | slice, target: int, by: Array) -> 
 
 
 def pushes(sim: Simulation, data: Measurements) -> Array:
-    """(k, m, 3, n) displacement of each target per joint, by central differences."""
+    """(m, k, 3, n) displacement of each target per joint, by central differences."""
     step = 1e-6 * np.eye(data.q.shape[1])
     sides = [(sim.cell.predict(data.q + s), sim.cell.predict(data.q - s)) for s in step]
-    return np.moveaxis(np.stack([(a - b) / 2e-6 for a, b in sides], axis=-1), 1, 0)
+    return np.stack([(a - b) / 2e-6 for a, b in sides], axis=-1)
 
 
 def test_ranks_are_those_of_scipy_to_the_bit(rng):
@@ -252,9 +252,9 @@ def test_irb120_tells_commanded_from_read_joints_by_its_errors(which):
 def test_backlash_is_not_taken_for_read_back_joints(robot):
     sim = simulate(robot, 150, 3, seed=1, truth=TRUTH)
     data, push = sim.data, pushes(sim, sim.data)
-    slack = np.einsum("kmcj,mj->mkc", push, 150e-6 * np.sign(moves(data)))
+    slack = np.einsum("mkcj,mj->mkc", push, 150e-6 * np.sign(moves(data)))
     fraction = np.random.default_rng(0).gamma(1.0, 6e-4, size=(150, 1))
-    late = np.einsum("kmcj,mj->mkc", push, fraction * moves(data))
+    late = np.einsum("mkcj,mj->mkc", push, fraction * moves(data))
     for by, expected in ((slack, 0), (late, 1)):
         bad = data.with_y(data.y + by)
         error = left_by(robot, bad)

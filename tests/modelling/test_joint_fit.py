@@ -425,7 +425,7 @@ def test_the_model_at_its_values_is_the_cell():
 def test_columns_are_the_derivative_of_the_error():
     """Central differences of every parameter, where the error is zero (paper S, eq. 12 ff.)."""
     _, _, state, model = joined(LARGE)
-    off = np.einsum("ij,kmj->kim", state.rotation, model.error(state))
+    off = np.einsum("ij,mkj->kim", state.rotation, model.error(state))
     model = replace(model, y=model.y - off)
     jacobian = model.jacobian(state)
     for i in range(model.names.count):

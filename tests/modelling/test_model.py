@@ -68,10 +68,10 @@ def test_full_golub_pereyra_matrix_is_the_square_of_the_projected_jacobian(kind,
         step = np.zeros(names.count)
         step[angles] = dw
         at = x.step(step)
-        matrix = np.einsum("ab,kmbp->kmap", at.rotation, this.jacobian(at)[..., linear])
-        matrix = root @ np.moveaxis(matrix, 0, 1).reshape(30, 9, -1)
+        matrix = np.einsum("ab,mkbp->mkap", at.rotation, this.jacobian(at)[..., linear])
+        matrix = root @ matrix.reshape(30, 9, -1)
         matrix = matrix.reshape(-1, linear.sum())
-        error = np.moveaxis(this.error(at) @ at.rotation.T, 0, 1).reshape(30, 9, 1)
+        error = (this.error(at) @ at.rotation.T).reshape(30, 9, 1)
         error = (root @ error).reshape(-1)
         return np.asarray(error - matrix @ np.linalg.lstsq(matrix, error, rcond=None)[0])
 

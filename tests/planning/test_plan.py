@@ -329,7 +329,7 @@ def test_information_is_that_of_dense_covariances(robot):
     rows = ahead.ahead(q, seen)
     for pose in (0, 7, 23):
         chosen = np.flatnonzero(seen[pose])
-        j = jacobian[chosen, pose].reshape(3 * len(chosen), -1)[:, ahead.active] / ahead.scale
+        j = jacobian[pose, chosen].reshape(3 * len(chosen), -1)[:, ahead.active] / ahead.scale
         s = scene.jacobian[..., pose][:, chosen].reshape(6, -1).T
         away = np.linalg.norm(cell.predict(q[pose])[0, chosen], axis=-1)  # tracker at its origin
         v = np.diag(np.repeat((12e-6 + 3e-6 * away) ** 2, 3)) + (20e-6) ** 2 * s @ s.T

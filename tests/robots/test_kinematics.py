@@ -44,7 +44,7 @@ def test_jacobian_is_the_complex_step_derivative(name, rng):
         dx[i] = 1e-30j  # exact to rounding: no difference is taken
         moved = state.step(dx)
         links = kinematics.chain(moved.mdh, model.q, model.prismatic)
-        point = np.swapaxes(kinematics.points(links, moved.target_positions), -1, -2)
+        point = np.moveaxis(kinematics.points(links, moved.target_positions), -1, 0)
         seen = point @ moved.rotation.T + moved.origin
         slope = (seen.imag / 1e-30) @ state.rotation  # from measurement into base axes
         assert_allclose(analytic[..., i], slope, rtol=0, atol=1e-14, err_msg=model.names.all[i])
@@ -209,13 +209,13 @@ def test_normal_equations_are_those_of_the_jacobian(name, robots, effects, rng):
     which = np.flatnonzero(rng.random(model.names.count) < 0.8)
     cost, gradient, gram = sums.normal(plain, arrays_of(state), model.sight, which)
     error, J = np.nan_to_num(model.error(state)), model.jacobian(state)[..., which]
-    weight = model.weight[..., None]
+    weight = model.weight.T[..., None]
     near(
         (cost, gradient, gram),
         (
-            (weight * error**2).sum(axis=(-1, -2)),
-            np.einsum("km,bkmi,bkmip->bkp", model.weight, error, J),
-            np.einsum("km,bkmip,bkmiq->bkpq", model.weight, J, J),
+            (weight * error**2).sum(axis=(-1, -3)),
+            np.einsum("km,bmki,bmkip->bkp", model.weight, error, J),
+            np.einsum("km,bmkip,bmkiq->bkpq", model.weight, J, J),
         ),
     )
     near((sums.cost(plain, arrays_of(state), model.sight),), (cost,))

@@ -55,7 +55,7 @@ class Export:
     """A file's content, and what people should know about it.
 
     beside: contents of files that belong to it, by the ending that takes the place of its own.
-    off: how far (k, m, 3) its targets stand from the formulas of the fit at measured poses, as the
+    off: how far (m, k, 3) its targets stand from the formulas of the fit at measured poses, as the
     instrument sees it [m]; None where they stand where these say, or no simulator is there.
     """
 

@@ -171,7 +171,7 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
     asked, every = Asked(robot, [plain], options, [(held, one.notices)]), images.at_rows_of(plain)
     counts, wrong = every.counting(held)
     arms = [Block.of(robot, every).at(x) for x in (fit.nominal, fit.state)]
-    before, after = (np.linalg.norm(every.off(*arm), axis=0)[None, counts] for arm in arms)
+    before, after = (np.linalg.norm(every.off(*arm), axis=0)[counts] for arm in arms)
     measured = measured_by(robot, found, 0, plain, held)
     scaled = {"lengths_over_drawn": {"share": scale.share, "sigma": scale.sigma}} if scale else {}
     measured = replace(
@@ -212,7 +212,7 @@ def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCali
         pixels=extremes(by_key(before, after, held[data.pose][counts])),
         claim=claim,
         set_aside=set_aside(data, aside),
-        with_them=accuracy(every.table(*arms[1], counts | wrong)[:, held]) if len(aside) else None,
+        with_them=accuracy(every.table(*arms[1], counts | wrong)[held]) if len(aside) else None,
         reason=ended.reason,
     )  # fmt: skip
 

@@ -233,7 +233,7 @@ def by_pose(
     targets = seen_reflectors(data, on_flange, rows, pose)
     for _ in range(REWEIGHED):  # images that the arm contradicts are left out
         found = fit_base(model_of(robot, targets), robot.mdh).state
-        error = np.linalg.norm(model_of(robot, targets).error(found), axis=-1).max(axis=0)
+        error = np.linalg.norm(model_of(robot, targets).error(found), axis=-1).max(axis=1)
         kept = error <= 2.0 * ROBUST * np.median(error)
         if kept.all() or kept.sum() < IMAGES:
             break

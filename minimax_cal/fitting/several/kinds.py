@@ -350,7 +350,7 @@ def measured_by(
         block = stack.blocks[i].at_rows_of(robot, data, stack.laws, x)
         seen.append((block.instrument, *block.at(x)))
     nominal, calibrated = (one.errors(arm, own, held) for one, arm, own in seen)
-    turned = [one.turns(arm, own)[None] for one, arm, own in seen]
+    turned = [one.turns(arm, own) for one, arm, own in seen]
     turns = by_key(turned[0], turned[1], held) if turned[0].size else {}
     train, drawn, own = stack.instruments[i], seen[0][2], seen[1][2]
     counts = data.count(held)
@@ -384,8 +384,8 @@ def together(parts: tuple[str, ...], measured: Sequence[Measured]) -> Measured:
         every = [each.errors[key] for each in measured]
         ends = np.cumsum([[0, 0], *(part.shape[:2] for part in every)], axis=0)
         errors[key] = np.full((*ends[-1], 3), np.nan)
-        for part, (row, pose) in zip(every, ends, strict=False):
-            errors[key][row : row + part.shape[0], pose : pose + part.shape[1]] = part
+        for part, (pose, row) in zip(every, ends, strict=False):
+            errors[key][pose : pose + part.shape[0], row : row + part.shape[1]] = part
     return Measured(
         kind=SEVERAL,
         parts=parts,

@@ -179,9 +179,9 @@ def general(result: Measured, data: Instrument, held: Array) -> tuple[str, ...]:
         notices.append("no pose is held out: nothing here says how the fit does on new poses")
     elif not result.accuracy["holdout"].poses:
         notices.append("the held-out rows close with nothing: no held-out accuracy")
-    distance = np.full((len(result.parts), len(held)), np.nan)
-    distance[:, ~held] = np.linalg.norm(result.errors["train"], axis=-1)
-    distance[:, held] = np.linalg.norm(result.errors["holdout"], axis=-1)
+    distance = np.full((len(held), len(result.parts)), np.nan)
+    distance[~held] = np.linalg.norm(result.errors["train"], axis=-1)
+    distance[held] = np.linalg.norm(result.errors["holdout"], axis=-1)
     at = replace(data.at, target_names=result.parts)
     return (*notices, *checks.outliers(at, distance, data.unit))
 

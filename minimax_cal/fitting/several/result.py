@@ -74,7 +74,7 @@ class Scores(Accuracy):
 
     @staticmethod
     def of(error: Array, units: Sequence[str], numbers: int = 0) -> Scores:
-        """Of errors (k, m, 3), NaN where not measured.
+        """Of errors (m, k, 3), NaN where not measured.
 
         units: SI, of all of them.  numbers: independent ones.
         """
@@ -190,7 +190,7 @@ class Measured:
         titles, keys = zip(*ACCURACIES, strict=True)
         (unit, spec), scale = self.display, for_people(self.units[0])[0]
         rows = (
-            (part, *(scale * rms(np.linalg.norm(self.errors[key][i], axis=-1)) for key in keys))
+            (part, *(scale * rms(np.linalg.norm(self.errors[key][:, i], axis=-1)) for key in keys))
             for i, part in enumerate(self.parts)
             if len(self.parts) > 1 and self.errors
         )

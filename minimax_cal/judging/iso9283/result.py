@@ -294,7 +294,7 @@ def iso9283(
     # in the order of the file where nothing tells another: a row measured again is no new visit
     data = with_history(data if ordered(data) else data.in_visit_order())
     chosen, told = tcp_of(data, tcp)
-    commanded = {name: data.y - np.moveaxis(c.error(data), 0, 1) for name, c in cells.items()}
+    commanded = {name: data.y - c.error(data) for name, c in cells.items()}
     stops = stops_of(data, commanded, np.asarray(held, dtype=bool))
     parts = {
         key: part_of(cells, stops.take(mask), data.target_names, chosen)

@@ -231,7 +231,7 @@ def refused(fit: Fit, data: Measurements, missed: float) -> str:
 
 
 def left(watched: Watched, placed: Placing) -> Array:
-    """(k, m, 3) errors as placed [m]."""
+    """(m, k, 3) errors as placed [m]."""
     state = placed.state
     model, _ = watched.fitted(np.zeros(watched.names.count, dtype=bool), state)
     return model.error(state) @ state.rotation.T
@@ -245,20 +245,20 @@ def counting_all(watched: Watched, placed: Placing, seed: int) -> Accuracy:
 
 
 def grown(error: Array, used: float) -> Array:
-    """Errors (k, m, 3) with what placing took off them put back; used: as of `Placing`."""
+    """Errors (m, k, 3) with what placing took off them put back; used: as of `Placing`."""
     count = 3 * int(np.isfinite(error[..., 0]).sum())
     return np.asarray(error * math.sqrt(count / max(count - used, 1.0)))
 
 
 def verdict(limit: Limit, error: Array, data: Measurements, used: float, seed: int) -> Verdict:
-    """One requirement against errors (k, m, 3) that placing took up `used` coordinates of."""
+    """One requirement against errors (m, k, 3) that placing took up `used` coordinates of."""
     larger = grown(error, used)
     group, rms = groups(data), limit.kind == "rms"
     kind = rms_interval if rms else max_interval
 
     def interval(level: float, copies: int = 1) -> Interval:
         each = np.add.outer(len(group) * np.arange(copies), group).ravel()
-        error = np.tile(larger, (1, copies, 1))
+        error = np.tile(larger, (copies, 1, 1))
         return kind(error, each, level, rng=np.random.default_rng(seed))
 
     found = accuracy(larger)

@@ -49,9 +49,9 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
         iterations=1,
         parameters=parameters_of(fit, nominal, cell, sure, known),
         accuracy={
-            "nominal": accuracy(before[:, nobody]),
+            "nominal": accuracy(before[nobody]),
             "train": accuracy(after),
-            "holdout": accuracy(after[:, nobody]),
+            "holdout": accuracy(after[nobody]),
             "nominal_train": accuracy(before),
         },
         identification=known,

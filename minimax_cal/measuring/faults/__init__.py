@@ -24,13 +24,13 @@ from minimax_cal.measuring.measurements import Measurements
 def find_faults(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, ...]:
     """Everything found; each test looks at data mended by those before it.
 
-    error: (k, m, 3) measured minus predicted by a fit, in the axes of the data as `Cell.error`
+    error: (m, k, 3) measured minus predicted by a fit, in the axes of the data as `Cell.error`
     gives them [m]; or of length 0 for none.
     """
     swapped, mended_names, apart = with_own_names(data, error)
     if swapped and len(error):
         error = error.copy()
-        error[:, swapped[0].rows] = np.nan  # of the names as they stood
+        error[swapped[0].rows] = np.nan  # of the names as they stood
     shifts = target_shifts(mended_names, apart)
     outliers = outlying(mended_names, apart, error, shifts)
     good = mended(mended_names, outliers)
@@ -52,7 +52,7 @@ def with_own_names(
 ) -> tuple[tuple[Fault, ...], Measurements, Between]:
     """Rows under other names, the data with these put right, and the distances of those data.
 
-    error: (k, m, 3) as `find_faults` takes it [m].
+    error: (m, k, 3) as `find_faults` takes it [m].
     """
     apart = between(data)
     swapped = swapped_rows(data, apart, error)

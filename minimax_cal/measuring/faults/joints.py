@@ -105,14 +105,14 @@ def looks_read_back(data: Measurements, error: Array, push: Array) -> tuple[Faul
     Errors of points then lie along each row's last move, by a fraction of its own; with backlash
     they lie better along the signs of the moves [irb120 read back: 77 % against 68 %; simulated
     backlash: 49 % against 62 %].
-    error: (k, m, 3) of a fit [m].  push: (k, m, 3, n) displacement of each target per joint
+    error: (m, k, 3) of a fit [m].  push: (m, k, 3, n) displacement of each target per joint
     [m/rad], in the same axes.
     """
     move, sign_of = moves(data), np.sign(moves(data))
     rows = np.flatnonzero(followed(data) & move.any(axis=1))
     seen = np.asarray(np.isfinite(error).all(axis=-1))[..., None]
-    flat = np.moveaxis(np.where(seen, error, 0.0), 1, 0).reshape(data.poses, -1)[rows]
-    matrix = np.moveaxis(np.where(seen[..., None], push, 0.0), 1, 0)
+    flat = np.where(seen, error, 0.0).reshape(data.poses, -1)[rows]
+    matrix = np.where(seen[..., None], push, 0.0)
     matrix = matrix.reshape(data.poses, flat.shape[1], -1)[rows]
     own, sign = (lag(flat, (matrix @ way[rows][:, :, None])[..., 0]) for way in (move, sign_of))
     if own.p > 1e-3 or own.explained < max(sign.explained, 0.5) + 0.02:

@@ -48,14 +48,14 @@ def outlying(
 ) -> tuple[Fault, ...]:
     """Single points that are elsewhere, by their distances and by the residual of a fit.
 
-    apart: the distances of these data, `between`.  error: (k, m, 3) [m], or of length 0.  shifts:
+    apart: the distances of these data, `between`.  error: (m, k, 3) [m], or of length 0.  shifts:
     nests that moved, so that the points after it are not taken for outliers.
     """
     found = dict.fromkeys(off_shape(data, apart, error, shifts), "its distances to the others")
     if len(error):
         error = error.copy()
         for row, target in found:
-            error[target, row] = np.nan
+            error[row, target] = np.nan
         found |= dict.fromkeys(off_fit(error), "the fit")
     return told(data, found)
 
@@ -63,7 +63,7 @@ def outlying(
 def far_off(data: Measurements, error: Array, rows: Array) -> tuple[Fault, ...]:
     """Points that are elsewhere by a fit that up to a quarter of wrong points do not pull.
 
-    error: (k, m, 3) of it [m].  rows: (m,) True where points may be named.
+    error: (m, k, 3) of it [m].  rows: (m,) True where points may be named.
     """
     found = [at for at in off_fit(error, ROBUST_GROSS, ROBUST_PART) if rows[at[0]]]
     return told(data, dict.fromkeys(found, "a robust fit"))
@@ -93,7 +93,7 @@ def told(data: Measurements, found: Mapping[tuple[int, int], str]) -> tuple[Faul
 
 
 def off_fit(error: Array, gross: float = GROSS, part: float = PART) -> list[tuple[int, int]]:
-    """(row, target) of points that a fit misses grossly.  error: (k, m, 3) [m].
+    """(row, target) of points that a fit misses grossly.  error: (m, k, 3) [m].
 
     A real arm's errors have tails, but bounded ones: far beyond what a part of them keeps to, and
     the typical.
@@ -105,7 +105,7 @@ def off_fit(error: Array, gross: float = GROSS, part: float = PART) -> list[tupl
     limit = max(gross * float(np.quantile(known, part)), GROSS_TYPICAL * float(np.median(known)))
     with np.errstate(invalid="ignore"):
         far = np.argwhere(size > max(limit, FAINT))
-    return [(int(row), int(target)) for target, row in far]
+    return [(int(row), int(target)) for row, target in far]
 
 
 def off_shape(
@@ -126,8 +126,8 @@ def off_shape(
         rows = np.flatnonzero(far.max(axis=0) > 1.0)
         for row in rows:
             which = guilty(apart, far[:, row], every[:, row], int(row))
-            if len(which) > 1 and len(error) and np.isfinite(error[every[:, row], row]).all():
-                which = which[[relative(error[:, row], every[:, row])[which].argmax()]]
+            if len(which) > 1 and len(error) and np.isfinite(error[row, every[:, row]]).all():
+                which = which[[relative(error[row], every[:, row])[which].argmax()]]
             found += [(int(row), int(target)) for target in which]
             every[which, row] = False
         judged = np.isin(np.arange(data.poses), rows)
@@ -186,12 +186,12 @@ def heights(data: Measurements, error: Array) -> Array:
     k = len(data.target_names)
     if k < 3 or not len(error):
         return np.full((k, data.poses), np.nan)
-    whole = data.seen.all(axis=1) & np.isfinite(error).all(axis=(0, 2))
+    whole = data.seen.all(axis=1) & np.isfinite(error).all(axis=(1, 2))
     arm = data.y[whole] - data.y[whole].mean(axis=1, keepdims=True)
     across = np.linalg.svd(arm, full_matrices=False)[2][:, 2]
     sense = np.cross(arm[:, 0], arm[:, 1])
     across *= np.where((across * sense).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
-    up = np.einsum("kmc,mc->km", error[:, whole], across)
+    up = np.einsum("mkc,mc->km", error[whole], across)
     out = np.full((k, data.poses), np.nan)
     out[:, whole] = (up - up.mean(axis=0)) * k / (k - 1)
     return out
@@ -258,10 +258,10 @@ def floored(correlation: Array) -> Array:
 def swapped_rows(data: Measurements, apart: Between, error: Array = NO_ERROR) -> tuple[Fault, ...]:
     """Rows whose distances fit under other names of their targets, and not under their own.
 
-    apart: the distances of these data, `between`.  error: (k, m, 3) of a fit, in the axes of the
+    apart: the distances of these data, `between`.  error: (m, k, 3) of a fit, in the axes of the
     data [m]; it tells orders apart whose distances are alike.
     """
-    predicted = data.y - np.moveaxis(error, 0, 1) if len(error) else np.zeros_like(data.y)
+    predicted = data.y - error if len(error) else np.zeros_like(data.y)
     if len(apart.pairs) < 3:
         return ()
     limit = outlier_limit(len(apart.pairs), data.poses, data.poses)

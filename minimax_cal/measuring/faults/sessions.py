@@ -98,15 +98,15 @@ def jumps(data: Measurements, error: Array) -> tuple[Array, Array]:
 
     The mean errors of the poses' targets are explained by one small displacement (6) for all, or
     by another one from some pose on: the best such pose is tried against chance (F-test times the
-    poses tried), and so are both sides (`jumps_in`).  error: (k, m, 3) of a fit, in the axes of
+    poses tried), and so are both sides (`jumps_in`).  error: (m, k, 3) of a fit, in the axes of
     the data [m].
     """
-    known = np.isfinite(error[..., 0]) & data.seen.T
+    known = np.isfinite(error[..., 0]) & data.seen
     order = visits(data)
-    order = order[np.asarray(known.any(axis=0))[order]]
-    count = known.sum(axis=0)[order, None]
-    mean = np.where(known[..., None], error, 0.0).sum(axis=0)[order] / count
-    place = np.where(known.T[..., None], data.y, 0.0).sum(axis=1)[order] / count
+    order = order[np.asarray(known.any(axis=1))[order]]
+    count = known.sum(axis=1)[order, None]
+    mean = np.where(known[..., None], error, 0.0).sum(axis=1)[order] / count
+    place = np.where(known[..., None], data.y, 0.0).sum(axis=1)[order] / count
     begins = new_poses(data, order)
     often = np.diff([*begins, len(order)])[:, None]  # visits in a row, which are one pose
     poses = Rigid.of(*(np.add.reduceat(part, begins) / often for part in (place, mean)))

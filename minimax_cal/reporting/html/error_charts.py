@@ -32,13 +32,13 @@ FAR = 100.0  # ratio of the largest to the smallest error that asks for a logari
 FINE = 1e-7  # errors below are rounding [mm]
 
 Names = tuple[str, str]
-Draw = Callable[[str, str, Array, int], dict[str, Any]]  # look, name, sizes (k, m), panel
+Draw = Callable[[str, str, Array, int], dict[str, Any]]  # look, name, sizes (m, k), panel
 SIZE = "position error (mm)"
 HELD, TRAIN = "held-out poses", "training poses"
 
 
 def distances(error: Array) -> Array:
-    """(k, m) sizes of errors (k, m, 3), NaN where not measured."""
+    """(m, k) sizes of errors (m, k, 3), NaN where not measured."""
     return np.asarray(np.linalg.norm(error, axis=-1))
 
 
@@ -46,15 +46,15 @@ def of_poses(error: Array) -> Array:
     """(m,) RMS of the targets of each pose."""
     square = distances(error) ** 2
     seen = np.isfinite(square)
-    return np.asarray(np.sqrt(np.nansum(square, axis=0) / np.maximum(seen.sum(axis=0), 1)))
+    return np.asarray(np.sqrt(np.nansum(square, axis=1) / np.maximum(seen.sum(axis=1), 1)))
 
 
 def groups(poses: Poses) -> list[tuple[str, Array, Array]]:
     """Held-out and training poses, those that there are, each with sizes before and after."""
     before, after = distances(poses.before), distances(poses.after)
     parts = ((HELD, poses.held), (TRAIN, ~poses.held))
-    seen = np.isfinite(after).any(axis=0)
-    return [(name, before[:, rows], after[:, rows]) for name, rows in parts if (rows & seen).any()]
+    seen = np.isfinite(after).any(axis=1)
+    return [(name, before[rows], after[rows]) for name, rows in parts if (rows & seen).any()]
 
 
 def known(values: Array) -> Array:
@@ -133,8 +133,8 @@ def boxes(poses: Poses, names: Names) -> Figure:
 
 def box(look: str, name: str, targets: list[str], values: Array, *, panel: int) -> dict[str, Any]:
     """Boxes of one look: quartiles, and whiskers to the extremes; none where nothing was seen."""
-    seen = [i for i, row in enumerate(values) if np.isfinite(row).any()]
-    at = np.array([np.percentile(known(values[i]), [0, 25, 50, 75, 100]) for i in seen])
+    seen = np.flatnonzero(np.isfinite(values).any(axis=0)).tolist()
+    at = np.array([np.percentile(known(values[:, i]), [0, 25, 50, 75, 100]) for i in seen])
     low, q1, median, q3, high = at.reshape(-1, 5).T
     colour, symbol, _, soft = LOOKS[look]
     fill = "back" if symbol.endswith("open") else soft

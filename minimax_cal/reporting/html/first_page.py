@@ -295,10 +295,10 @@ def claims_at(gap: Diagnosis, rung: int | None) -> tuple[str, tuple[Claim, ...]]
     at = last if rung is None else rung
     step = gap.ladder[0] if rungs and at == 0 else gap.ladder[len(gap.ladder) - 1 - (last - at)]
     if rungs and gap.data.poses:
-        error = rungs[at][1].error(with_history(gap.data))[:, gap.held]
+        error = rungs[at][1].error(with_history(gap.data))[gap.held]
     else:
-        error = gap.errors[1][:, gap.held] if gap.data.poses else np.zeros((1, 0, 3))
-    group = clusters(gap.data)[gap.held] if error.shape[1] else np.zeros(0)
+        error = gap.errors[1][gap.held] if gap.data.poses else np.zeros((0, 1, 3))
+    group = clusters(gap.data)[gap.held] if len(error) else np.zeros(0)
     ends = intervals_of(error, group, 0)
     where = f"{step.holdout.poses} poses that were not used for the fit"
     poses = len(np.unique(group)) or step.holdout.poses

@@ -68,7 +68,7 @@ def space_of(poses: Poses, cell: Cell) -> Space:
     chosen = some(of_poses(poses.after))
     turn, origin = cell.base[:3, :3], 1e3 * cell.base[:3, 3]
     points = (1e3 * poses.data.y[chosen] - origin) @ turn
-    before, after = (np.moveaxis(e, 0, 1)[chosen] @ turn for e in (poses.before, poses.after))
+    before, after = (e[chosen] @ turn for e in (poses.before, poses.after))
     arms, corners = skeleton(cell.robot, poses.data.q[chosen])
     tracker = -origin @ turn
     space = Space(chosen, points, before, after, arms, corners, tracker,

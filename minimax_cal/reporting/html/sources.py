@@ -46,7 +46,7 @@ Result = (
 class Poses:
     """Measured poses with their errors before and after.
 
-    held: (m,) True where held out.  before, after: (k, m, 3) measured minus predicted, NaN where
+    held: (m,) True where held out.  before, after: (m, k, 3) measured minus predicted, NaN where
     not measured [mm].  told: whether the file told the visit order.
     """
 

@@ -137,7 +137,7 @@ def plot_errors(fit: Fit) -> Figure:
     for key, colour, name in zip(keys, (BEFORE, AFTER), ("nominal", "calibrated"), strict=True):
         distance = 1e3 * np.linalg.norm(fit.errors[key], axis=-1)
         a = fit.accuracy[key]
-        pose = np.broadcast_to(np.arange(1, distance.shape[1] + 1), distance.shape)
+        pose = np.broadcast_to(np.arange(1, len(distance) + 1)[:, None], distance.shape)
         seen = np.isfinite(distance)
         text = f"{name}: RMS {a.rms_mm:.3f} mm, max {a.max_mm:.3f} mm"
         left.plot(pose[seen], distance[seen], ".", color=colour, label=text)
