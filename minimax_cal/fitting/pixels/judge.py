@@ -193,7 +193,7 @@ def free_motion(robot: Robot, q: Array) -> tuple[Array, Array, Array]:
     (3m, 5n) by the links, (3m, f) by the functions of `modelling.lack`, (3m, n) by the joints [m].
     """
     arm = model_of(robot, still(q, (TARGET,), robot))
-    every = arm.jacobian(State(robot.mdh, np.eye(3), np.zeros(3), TOOL[None]))[0]
+    every = arm.jacobian(State(robot.mdh, np.eye(3), np.zeros(3), TOOL[None]))[:, 0]
     joints = every[..., zero_positions(robot.prismatic)]
     turned, _ = by_pose(robot, arm.q, joints)
     every, turned, joints = (part.reshape(3 * len(q), -1) for part in (every, turned, joints))
