@@ -28,8 +28,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
 from minimax_cal.robots.mjcf import mujoco, numbers
 from minimax_cal.simulators.chain import chain_of, fill_history
-from minimax_cal.simulators.elements import parents_of
-from minimax_cal.simulators.mjcf import largest_inertia
+from minimax_cal.simulators.mjcf_tree import MjcfTree
 from minimax_cal.simulators.motion.drives import serve
 from minimax_cal.simulators.motion.judge import Judge
 from minimax_cal.simulators.motion.numbers import open_model
@@ -80,7 +79,7 @@ class Servoed:
             joint.set("damping", numbers([lacks.damping[j]]))
             joint.set("armature", numbers([lacks.armature[j]]))
         if self.spring.any():
-            parents = parents_of(root)
+            parents = MjcfTree(root).find_parents()
             for j, joint in enumerate(joints):
                 sprung(parents, joint, float(self.spring[j]), j)
         return mujoco().MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
@@ -165,7 +164,7 @@ def drawn(name: str, seed: int, *, elastic: bool, sound: bool = False) -> Servoe
 def largest(arm: DrivenArm) -> Array:
     """(n,) largest inertia about each joint of the file [kg m^2]."""
     model = arm.known
-    return largest_inertia(chain_of(model, arm.robot.joints, arm.robot.name))
+    return chain_of(model, arm.robot.joints, arm.robot.name).find_largest_inertias()
 
 
 @dataclass(frozen=True)

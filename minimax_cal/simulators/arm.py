@@ -6,7 +6,7 @@ c does.  What has no element, but turns joints only, goes into a command map; th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
@@ -29,7 +29,6 @@ from minimax_cal.modelling.effects.scene import Effect, Scene, joint_of, mask_of
 from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Fitted, Term
 from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.gravity import LEAST_MASS, masses_of, weighed
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_poses
@@ -89,6 +88,8 @@ def springs_of(
     firm: effects that elements hold exactly; their values change with the springs.
     masses: to begin with, or to keep where they are fixed.
     """
+    # Displacements of the points [mm] that the laws want, by springs of compliance 1, and by what
+    # is fitted with them: geometry, effects that elements hold, the sag of the tool.
     wanted = sum(
         (np.tensordot(v, t.columns(scene).displacement(scene), 1)
          for t, v in laws.pairs),
@@ -99,23 +100,33 @@ def springs_of(
     fields = 1e3 * np.array([per_moment(scene, *kind) for kind in kinds])
     fields = fields.reshape(len(kinds), 4 * scene.joints, wanted.size)[..., seen]
     right = 1e3 * (wanted + left).reshape(-1)[seen]
-    parts = [1e3 * part.reshape(wanted.size, -1)[seen]
-             for part in beside(scene, laws, geometry, firm)]  # fmt: skip
-    columns, count = np.hstack(parts), parts[0].shape[1]
+    beside = [geometry]
+    beside += [np.moveaxis(term.columns(scene).displacement(scene), 0, -1) for term in firm]
+    if any(EFFECTS[term.effect].moves == "tool" for term in laws.terms):
+        beside.append(tool_columns(scene))
+    parts = [1e3 * part.reshape(wanted.size, -1)[seen] for part in beside]
+    count = parts[0].shape[1]
     tool = count + sum(part.shape[1] for part in parts[1 : 1 + len(firm)])
-    u, size, back = np.linalg.svd(columns, full_matrices=False)
+
+    # What these can take over is projected out; QR leaves as many rows as there are fields.
+    u, size, back = np.linalg.svd(np.hstack(parts), full_matrices=False)
     kept = size > RESOLVED * size[0]
     u, inverse = u[:, kept], (back[kept].T / size[kept]) @ u[:, kept].T
+    clear, goal = fields - (fields @ u) @ u.T, right - u @ (u.T @ right)
+    rows = np.vstack([clear.reshape(-1, len(goal)), goal]).T
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
+    clear = triangle[:, :-1].T.reshape(*clear.shape[:2], len(triangle))
+    goal = triangle[:, -1]
+
+    # Compliances by non-negative least squares, then with masses and centres; idle springs go.
     mass, com = masses
-    clear, goal = condensed(fields - (fields @ u) @ u.T, right - u @ (u.T @ right))
     points, soft = len(right) / 3.0, np.zeros(0)
     if kinds:
         each = np.einsum("l,elr->re", moments(mass, com), clear)
         felt = np.linalg.norm(each, axis=0)
         soft = scipy.optimize.nnls(each * (felt > FELT * felt.max()), goal)[0]
     if kinds and not fixed:
-        soft = started(soft, [kind for kind, _ in kinds])
-        soft, mass, com = together(clear, goal, soft, masses, points)
+        soft, mass, com = together(clear, goal, soft, [kind for kind, _ in kinds], masses, points)
         felt = np.linalg.norm(np.einsum("l,elr->er", moments(mass, com), clear), axis=1) * soft
         soft = np.where(felt > FELT * felt.max(), soft, 0.0)
     sizes = np.einsum("e,l->el", soft, moments(mass, com))
@@ -131,15 +142,6 @@ def springs_of(
     *turns, drawn = np.append(change[tool:], np.zeros(9))[:9].tolist()
     sag = (TRACELESS @ turns).reshape(3, 3)
     return Springs(held, sag, drawn, change[:count], change[count:tool])
-
-
-def beside(scene: Scene, laws: Fitted, geometry: Array, firm: Sequence[Term]) -> Iterator[Array]:
-    """Motions (k, 3, m, d) of what is fitted with the springs: geometry, firm effects, the tool."""
-    yield geometry
-    for term in firm:
-        yield np.moveaxis(term.columns(scene).displacement(scene), 0, -1)
-    if any(EFFECTS[term.effect].moves == "tool" for term in laws.terms):
-        yield tool_columns(scene)
 
 
 def places_of(scene: Scene, laws: Fitted) -> list[tuple[str, int]]:
@@ -192,28 +194,22 @@ def turned(scene: Scene, mass: Array, com: Array, joint: int) -> Array:
     return np.asarray(scene.torque(mass, com)[joint] * scene.jacobian[joint])
 
 
-def condensed(fields: Array, right: Array) -> tuple[Array, Array]:
-    """The same least squares in as many rows as there are fields.
-
-    fields: (e, l, rows).  right: (rows,).
-    """
-    e, moments_, rows = fields.shape
-    every = np.vstack([fields.reshape(-1, rows), right]).T
-    triangle = np.asarray(np.linalg.qr(every, mode="r"))
-    return triangle[:, :-1].T.reshape(e, moments_, len(triangle)), triangle[:, -1]
-
-
 def together(
-    fields: Array, right: Array, soft: Array, masses: Masses, points: float
+    fields: Array, right: Array, soft: Array, kinds: Sequence[str], masses: Masses, points: float
 ) -> tuple[Array, Array, Array]:
     """Compliances, masses and centres that imitate displacements best [mm].
 
     fields: (e, 4 n, rows) per unit of compliance and moment.  right: (rows,).  soft: (e,) to begin
-    with.  points: how many there are.
+    with, kinds of its springs: those of 0 begin like the others of their kind.
+    points: how many there are.
     """
     mass, com = masses
     e, n = len(soft), len(mass)
-    start = np.concatenate([np.log(soft), np.zeros(4 * n)])
+    known, first = soft > LEAST, soft.copy()
+    for i in np.flatnonzero(~known):
+        alike = [j for j in range(e) if known[j] and kinds[j] == kinds[int(i)]]
+        first[i] = np.exp(np.log(soft[alike or known]).mean()) if known.any() else LEAST
+    start = np.concatenate([np.log(first), np.zeros(4 * n)])
     weight = BELIEF * np.sqrt(points / (e + 4.0 * n))
 
     def split(x: Array) -> tuple[Array, Array, Array]:
@@ -238,16 +234,6 @@ def together(
         residual, start, jacobian, bounds=(start - ends, start + ends), max_nfev=300
     )
     return split(found.x)
-
-
-def started(soft: Array, kinds: Sequence[str]) -> Array:
-    """Compliances to begin with: those of 0 like the others of their kind."""
-    out = soft.copy()
-    known = soft > LEAST
-    for i in np.flatnonzero(~known):
-        alike = [j for j in range(len(kinds)) if known[j] and kinds[j] == kinds[int(i)]]
-        out[i] = np.exp(np.log(soft[alike or known]).mean()) if known.any() else LEAST
-    return out
 
 
 # ---- the arm -------------------------------------------------------------------------------------
@@ -303,6 +289,13 @@ class Arm:
     left_out: tuple[str, ...] = ()
     remainder: float = 0.0
 
+    @staticmethod
+    def rigid(robot: Robot, masses: Masses | None = None) -> Arm:
+        """An arm that nothing bends.  masses: as the robot tells, or assumed, unless given."""
+        zeros = np.zeros(robot.joints)
+        mass, com = masses or masses_of(robot, LEAST_MASS)
+        return Arm(robot, mass, com, turn=zeros, gain=zeros, play=zeros)
+
     @cached_property
     def reach(self) -> Array:
         """(n,) largest lever of what is beyond each joint [m]."""
@@ -320,12 +313,6 @@ class Arm:
 def assumed(robot: Robot) -> bool:
     """Whether masses have to be assumed: the robot does not tell all of them."""
     return not bool(weighed(robot).all())
-
-
-def stiff(robot: Robot, masses: tuple[Array, Array]) -> Arm:
-    """An arm that nothing bends.  masses: (n,) [kg] and (n, 3) centres in the link frames [m]."""
-    n = robot.joints
-    return Arm(robot, *masses, turn=np.zeros(n), gain=np.zeros(n), play=np.zeros(n))
 
 
 def sample(robot: Robot) -> Array:
@@ -351,48 +338,36 @@ def arm_of(
     q = sample(robot) if q is None or not len(q) else q
     poses = still(q, cell.target_names, robot) if measured is None else measured
     scene = cell.scene(poses)
-    begun = stiff(robot, masses or masses_of(robot, LEAST_MASS))
-    parts = parts_of(cell, scene, replace(begun, spots=cell.target_positions))
+    parts = parts_of(cell, scene, replace(Arm.rigid(robot, masses), spots=cell.target_positions))
     change = np.zeros(sum(len(values) for _, values in parts.firm))
-    if parts.exact and not (parts.soft and masses):
+    about = max((abs(float(np.trace(sag))) for sag, _ in parts.tools), default=0.0)
+    is_exact = not parts.grouped and about <= NEGLIGIBLE
+    if is_exact and not (parts.soft and masses):
         for sag, drawn in parts.tools:
             parts.arm = with_tool(parts.arm, sag, drawn)
     else:
-        found, plain = imitated(cell, scene, parts, measured, fixed=bool(masses))
-        parts.arm = with_springs(parts.arm, found, plain)
-        change = found.firm
+        # Springs and masses that imitate the laws; geometry, base and targets change with them.
+        plain = replace(cell, effects=NOTHING)
+        state = plain.state
+        model = model_of(robot, replace(scene.data, y=plain.predict(scene.data.q)))
+        geometry = np.moveaxis(model.jacobian(state), 1, 2)
+        left = np.zeros(scene.points.shape)
+        if measured is not None:
+            left = np.moveaxis(cell.error(measured) @ cell.base[:3, :3], 1, 2)
+        laws, firm = Fitted.of((*parts.soft, *parts.sagging)), [term for term, _ in parts.firm]
+        begun = (parts.arm.mass, parts.arm.com)
+        found = springs_of(scene, laws, left, geometry, firm, begun, fixed=bool(masses))
+        change, after = found.firm, state.step(found.change)
+        arm = with_tool(parts.arm, found.sag, found.drawn)
+        mount = inverse(state.base) @ after.base @ arm.mount
+        parts.arm = replace(
+            arm, robot=arm.robot.with_mdh(after.mdh), spots=after.target_positions, mount=mount,
+            **found.held,
+        )  # fmt: skip
     for term, values in parts.firm:
         FIRM[term.effect](parts, scene, term, values + change[: len(values)])
         change = change[len(values) :]
-    return parts.whole()
-
-
-def imitated(
-    cell: Cell, scene: Scene, parts: Parts, measured: Measurements | None, *, fixed: bool
-) -> tuple[Springs, State]:
-    """Springs that do what laws do, and the geometry that they begin from."""
-    laws = Fitted.of((*parts.soft, *parts.sagging))
-    plain = replace(cell, effects=NOTHING)
-    model = model_of(cell.robot, replace(scene.data, y=plain.predict(scene.data.q)))
-    geometry = np.moveaxis(model.jacobian(plain.state), 0, 2)
-    left = np.zeros(scene.points.shape)
-    if measured is not None:
-        left = np.moveaxis(cell.error(measured) @ cell.base[:3, :3], 0, 2)
-    firm = [term for term, _ in parts.firm]
-    masses = (parts.arm.mass, parts.arm.com)
-    return springs_of(scene, laws, left, geometry, firm, masses, fixed=fixed), plain.state
-
-
-def with_springs(arm: Arm, found: Springs, state: State) -> Arm:
-    """The arm with springs and masses that imitate laws, and what geometry took over.
-
-    state: geometry, base and targets of the fit.
-    """
-    after = state.step(found.change)
-    mount = inverse(state.base) @ after.base
-    arm = with_tool(arm, found.sag, found.drawn)
-    robot, spots = arm.robot.with_mdh(after.mdh), after.target_positions
-    return replace(arm, robot=robot, spots=spots, mount=mount @ arm.mount, **found.held)
+    return replace(parts.arm, mapped=Fitted.of(parts.mapped), left_out=tuple(parts.left_out))
 
 
 def with_tool(arm: Arm, sag: Array, drawn: float) -> Arm:
@@ -430,16 +405,6 @@ class Parts:
         """Change fields of the arm."""
         self.arm = replace(self.arm, **changes)
 
-    @property
-    def exact(self) -> bool:
-        """Whether elements do exactly what the laws do."""
-        about = [abs(float(np.trace(sag))) for sag, _ in self.tools]
-        return not self.grouped and max(about, default=0.0) <= NEGLIGIBLE
-
-    def whole(self) -> Arm:
-        """The arm with what no element holds."""
-        return replace(self.arm, mapped=Fitted.of(self.mapped), left_out=tuple(self.left_out))
-
 
 def parts_of(cell: Cell, scene: Scene, arm: Arm) -> Parts:
     """What is to hold each effect of a cell; those of 0 need nothing.  arm: to begin with."""
@@ -466,7 +431,7 @@ def unheld(cell: Cell, data: Measurements) -> tuple[Term, ...]:
 
 def bare_parts(cell: Cell, data: Measurements) -> Parts:
     """What is to hold each effect of a cell at some poses, whatever the arm weighs."""
-    return parts_of(cell, cell.scene(data), stiff(cell.robot, masses_of(cell.robot, LEAST_MASS)))
+    return parts_of(cell, cell.scene(data), Arm.rigid(cell.robot))
 
 
 Element = Callable[[Parts, Scene, Term, Array], None]

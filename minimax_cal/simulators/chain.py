@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,19 +11,45 @@ from scipy.spatial.transform import Rotation
 
 from minimax_cal.correcting.exporters.correct import match
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationError, OptionError, RobotError
+from minimax_cal.ground.errors import CalibrationError, RobotError
 from minimax_cal.ground.files import json_of
-from minimax_cal.robots.mjcf import body_name, drives, is_driven, mujoco, tree_of, way_to
+from minimax_cal.robots.mjcf import body_name, body_pose, drives, is_driven, mujoco, tree_of, way_to
 from minimax_cal.robots.robot import Robot, robot_from_dict
+from minimax_cal.robots.sampling import random_joints
 from minimax_cal.robots.transforms import transform
 from minimax_cal.robots.urdf import UrdfRobot, both_ends, to_robot
 
 ROBOT = "minimax_cal_robot"  # the text under which a file of ours holds its robot whole
 SAME_ROBOT = 1e-6  # a file's own robot may differ from its bodies by no more [m, rad]
-UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # the quaternion of no turn, as MuJoCo has it
-TURNS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")  # forms of an orientation
-Bodies = Sequence[int]
-SHORTEST = 1e-5  # timestep with which an arm comes to rest in seconds [s]
+ORIENTATION_ATTRIBUTES = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
+IMPLICIT_INTEGRATORS = (2, 3)  # mjINT_IMPLICIT, mjINT_IMPLICITFAST
+MIN_TIMESTEP = 1e-5  # with which an arm comes to rest in seconds of computation [s]
+INERTIA_SAMPLES = 200  # poses at which the largest inertia is looked for
+
+
+@dataclass(frozen=True, eq=False)
+class ModelServos:
+    """The position servos of a model, reduced to the joints; zeros where a joint has none.
+
+    gain, damper: (n,) of the servos [N m/rad, N m s/rad].  joint_damping: (n,) of the joints.
+    limits: (n, 2) of the torque of each joint's actuators [N m].
+    damped_by_joint: (n,) True where the joint is to hold its servo's damper: MuJoCo integrates that
+    implicitly, whatever the integrator.
+    gravity_free: whether actuators carry no gravity because the model's bodies float already.
+    """
+
+    gain: Array
+    damper: Array
+    joint_damping: Array
+    limits: Array
+    damped_by_joint: Array
+    gravity_free: bool = False
+
+    @staticmethod
+    def none(joint_count: int) -> ModelServos:
+        """Of a new file."""
+        zeros, limits = np.zeros(joint_count), np.array([[-np.inf, np.inf]] * joint_count)
+        return ModelServos(zeros, zeros, zeros, limits, np.ones(joint_count, dtype=bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +124,91 @@ class Chain:
                 return i
         return -1
 
+    def read_servos(self) -> ModelServos:
+        """The servos with their gains, dampers and force limits, as MuJoCo has compiled them."""
+        model, joints, n = self.model, list(self.joints), len(self.joints)
+        gain, damper, limits = np.zeros(n), np.zeros(n), np.array([[-np.inf, np.inf]] * n)
+        for i, (joint, servo) in enumerate(zip(joints, self.servos, strict=True)):
+            if model.jnt_actfrclimited[joint]:
+                limits[i] = model.jnt_actfrcrange[joint]
+            if servo < 0:
+                continue
+            gear = model.actuator_gear[servo, 0]
+            gain[i], damper[i] = -model.actuator_biasprm[servo, 1:3] * gear**2
+            if model.actuator_forcelimited[servo]:
+                ends = np.sort(model.actuator_forcerange[servo] * gear)
+                limits[i] = max(limits[i, 0], ends[0]), min(limits[i, 1], ends[1])
+        is_explicit = model.opt.integrator not in IMPLICIT_INTEGRATORS
+        is_floating = (model.body_gravcomp[list(self.bodies)] > 0.0).any()
+        gravity_free = bool(is_floating and not model.jnt_actgravcomp[joints].any())
+        return ModelServos(gain, damper, model.dof_damping[self.dofs], limits,
+                           self.has_servo_dampers() | is_explicit, gravity_free)  # fmt: skip
+
+    def has_servo_dampers(self) -> Array:
+        """(n,) True where a joint holds the damper of its servo, as those of a new file of ours do.
+
+        Whatever the integrator of the scene that the file is attached to, it takes that implicitly.
+        """
+        model = self.model
+        ours, bias = find_id(model, "TEXT", ROBOT) >= 0, model.actuator_biasprm
+        bare = [i for i in range(model.nu) if ours and bias[i, 1] < 0.0 and bias[i, 2] == 0.0]
+        return np.array([any(drives(model, i, j) for i in bare) for j in self.joints], dtype=bool)
+
+    def find_feed_forward(self) -> dict[int, int]:
+        """Ids of actuators that take the commanded speed of a joint, and which joint (from 0)."""
+        ids = (find_id(self.model, "ACTUATOR", f"{name}_ahead") for name in self.names)
+        return {number: j for j, number in enumerate(ids) if number >= 0}
+
+    def find_plays(self) -> dict[int, int]:
+        """Joints (from 0) whose gear has play, and where the position in it is in qpos."""
+        ids = (find_id(self.model, "JOINT", f"play{i + 1}") for i in range(len(self.joints)))
+        return {i: int(self.model.jnt_qposadr[k]) for i, k in enumerate(ids) if k >= 0}
+
+    def find_carrying_joints(self) -> Array:
+        """(nbody,) which joint (from 0), of several the last, carries a body; -1 for none."""
+        model, bodies = self.model, self.bodies
+        joint = np.full(model.nbody, -1)
+        for body in range(1, model.nbody):
+            own = bodies.index(body) if body in bodies else -1
+            joint[body] = max(own, int(joint[model.body_parentid[body]]))
+        return joint
+
+    @property
+    def carrier(self) -> int:
+        """Id of the body that carries the targets: a tool of ours that sags, else the last one."""
+        tool, last = find_id(self.model, "BODY", "tool"), len(self.joints) - 1
+        is_ours = tool >= 0 and self.find_carrying_joints()[tool] == last
+        return tool if is_ours else self.bodies[-1]
+
+    def data_at_zero(self) -> Any:
+        """The model's data with the arm at joint values 0, all else as the file has it."""
+        mj, model, data, at, _ = self.fresh()
+        data.qpos[at] = 0.0
+        mj.mj_kinematics(model, data)
+        return data
+
+    def find_poses_at_zero(self) -> Array:
+        """(nbody, 4, 4) poses of all bodies in the world, the arm at joint values 0 [m]."""
+        data = self.data_at_zero()
+        return np.array([body_pose(data, body) for body in range(self.model.nbody)])
+
+    def compiled_pose(self, body: int) -> Array:
+        """(4, 4) of a body in its parent body, as the file has it [m]."""
+        turn = Rotation.from_quat(self.model.body_quat[body], scalar_first=True).as_matrix()
+        return transform(turn, np.array(self.model.body_pos[body]))
+
+    def find_largest_inertias(self) -> Array:
+        """(n,) about each joint, its motor's with it, all over the workspace [kg m^2]."""
+        mj, model, data, at, dofs = self.fresh()
+        column, out = np.zeros(model.nv), np.zeros(len(dofs))
+        for row in random_joints(self.robot, (INERTIA_SAMPLES,), np.random.default_rng(0)):
+            data.qpos[at] = row
+            mj.mj_forward(model, data)
+            for i, unit in enumerate(np.eye(model.nv)[dofs]):
+                mj.mj_mulM(model, data, column, unit)
+                out[i] = max(out[i], column[dofs[i]])
+        return out
+
 
 def chain_of(model: Any, count: int, source: str, tip: str = "", *, unknown: bool = False) -> Chain:
     """The arm of so many joints in a model.
@@ -106,10 +216,10 @@ def chain_of(model: Any, count: int, source: str, tip: str = "", *, unknown: boo
     tip: its last body.  unknown: whether its masses are assumed.  Raises RobotError.
     """
     step = model.opt.timestep
-    if step < SHORTEST:
+    if step < MIN_TIMESTEP:
         raise RobotError(
             f"{source}: its timestep of {step:g} s is too short for an arm to come to rest; give "
-            f'<option timestep="..."> of {SHORTEST:g} s or more'
+            f'<option timestep="..."> of {MIN_TIMESTEP:g} s or more'
         )
     return chain_along(model, joints_of(model, count, source, tip), source, unknown=unknown)
 
@@ -117,42 +227,35 @@ def chain_of(model: Any, count: int, source: str, tip: str = "", *, unknown: boo
 def chain_along(
     model: Any, joints: tuple[int, ...], source: str, *, unknown: bool = False
 ) -> Chain:
-    """The arm of some joints (n,) of a model, by their ids from the foot.  Raises RobotError."""
+    """The arm of some joints (n,) of a model, by their ids from the foot.
+
+    A file of ours holds its robot whole, as text: that counts, where the bodies still have it.
+    unknown: whether its masses are assumed.  Raises RobotError.
+    """
     tip = body_name(model, int(model.jnt_bodyid[joints[-1]]))
     seen = to_robot(tree_of(model, source, joints), tip)
-    down = model.opt.gravity
-    size = float(np.linalg.norm(down))
-    robot = robot_from_dict(seen.content, source)
-    if size > 0.0:
-        robot = replace(robot, up=-(seen.base[:3, :3].T @ down) / size)
+    gravity = float(np.linalg.norm(model.opt.gravity))
+    robot, base = robot_from_dict(seen.content, source), seen.base
+    if gravity > 0.0:
+        robot = replace(robot, up=-(base[:3, :3].T @ model.opt.gravity) / gravity)
     if unknown:
         robot = replace(robot, mass=robot.mass * np.nan, com=robot.com * np.nan)
-    base = seen.base
-    told = told_robot(model, source)
-    if told is not None and told.joints == len(joints):
-        with suppress(OptionError):  # the bodies were moved since: then they count
-            place, off = match(told, seen)
-            if off < SAME_ROBOT:
-                robot, base = told, place
-    return Chain(model, joints, seen, robot, base, size)
+    text = find_id(model, "TEXT", ROBOT)
+    if text >= 0:
+        start, size = int(model.text_adr[text]), int(model.text_size[text])
+        with suppress(ValueError, CalibrationError):  # no robot, or bodies were moved since
+            raw = bytes(model.text_data[start : start + size]).rstrip(b"\0")
+            ours = robot_from_dict(json_of(raw), source)
+            if ours.joints == len(joints):
+                place, misfit = match(ours, seen)
+                if misfit < SAME_ROBOT:
+                    robot, base = ours, place
+    return Chain(model, joints, seen, robot, base, gravity)
 
 
-def id_of(model: Any, kind: str, name: str) -> int:
-    """Of an element of a name, -1 where there is none.  kind: as `JOINT`."""
+def find_id(model: Any, kind: str, name: str) -> int:
+    """Id of the element of a name, -1 where there is none.  kind: as in mjOBJ_JOINT."""
     return int(mujoco().mj_name2id(model, getattr(mujoco().mjtObj, f"mjOBJ_{kind}"), name))
-
-
-def told_robot(model: Any, source: str) -> Robot | None:
-    """The robot that a file of ours holds whole."""
-    number = id_of(model, "TEXT", ROBOT)
-    if number < 0:
-        return None
-    start, size = int(model.text_adr[number]), int(model.text_size[number])
-    try:
-        raw = bytes(model.text_data[start : start + size]).rstrip(b"\0")
-        return robot_from_dict(json_of(raw), source)
-    except (ValueError, CalibrationError):
-        return None
 
 
 def joints_of(model: Any, count: int, source: str, tip: str) -> tuple[int, ...]:
@@ -188,61 +291,8 @@ def joints_of(model: Any, count: int, source: str, tip: str) -> tuple[int, ...]:
     raise RobotError(f"{source}: several arms of {count} joints ({ends}); name a body as tip=")
 
 
-def braked(model: Any) -> Array:
-    """(njnt,) True where a joint holds the damper of its servo, as those of a new file of ours do.
-
-    Whatever the integrator of the scene that the file is attached to, it takes that implicitly.
-    """
-    ours = id_of(model, "TEXT", ROBOT) >= 0
-    bias = model.actuator_biasprm
-    bare = [i for i in range(model.nu) if ours and bias[i, 1] < 0.0 and bias[i, 2] == 0.0]
-    joints = range(model.njnt)
-    return np.array([any(drives(model, i, j) for i in bare) for j in joints], dtype=bool)
-
-
-def carrier(chain: Chain) -> int:
-    """Id of the body that carries the targets: a tool of ours that sags, else the last one."""
-    found, bodies = id_of(chain.model, "BODY", "tool"), chain.bodies
-    ours = found >= 0 and holders(chain.model, bodies)[found] == len(bodies) - 1
-    return found if ours else bodies[-1]
-
-
 def fill_history(model: Any, data: Any) -> None:
     """Let delayed actuators have had their commands all the time: MuJoCo begins with 0."""
     for k, (count, _) in enumerate(getattr(model, "actuator_history", ())):
         if count:
             mujoco().mj_initCtrlHistory(model, data, k, None, np.full(count, data.ctrl[k]))
-
-
-def at_zero(model: Any, joints: Sequence[int]) -> Any:
-    """The model's data with the arm at joint values 0, all else as the file has it."""
-    data = mujoco().MjData(model)
-    for joint in joints:
-        data.qpos[model.jnt_qposadr[joint]] = 0.0
-    mujoco().mj_kinematics(model, data)
-    return data
-
-
-def holders(model: Any, bodies: Bodies) -> Array:
-    """(nbody,) which joint, from 0, alone carries a body; -1 for none."""
-    holder = np.full(model.nbody, -1)
-    for body in range(1, model.nbody):
-        own = bodies.index(body) if body in bodies else -1
-        holder[body] = max(own, int(holder[model.body_parentid[body]]))
-    return holder
-
-
-def pose_at(position: Array, quaternion: Array = UPRIGHT) -> Array:
-    """(4, 4) of a position and MuJoCo's quaternion, w first."""
-    turn = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-    return transform(turn, np.array(position))
-
-
-def own_pose(attributes: dict[str, str], compiler: dict[str, str]) -> Array:
-    """(4, 4) that position and orientation of an element mean, in whatever form they stand."""
-    kept = " ".join(f'{k}="{attributes[k]}"' for k in ("pos", *TURNS) if k in attributes)
-    told = " ".join(f'{k}="{compiler[k]}"' for k in ("angle", "eulerseq") if k in compiler)
-    model = mujoco().MjModel.from_xml_string(
-        f"<mujoco><compiler {told}/><worldbody><body {kept}/></worldbody></mujoco>"
-    )
-    return pose_at(model.body_pos[1], model.body_quat[1])

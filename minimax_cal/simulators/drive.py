@@ -31,7 +31,7 @@ from minimax_cal.robots.kinematics import hat, rotation
 from minimax_cal.robots.mjcf import body_pose, mujoco, way_to
 from minimax_cal.robots.transforms import inverse
 from minimax_cal.simulators.arm import Arm
-from minimax_cal.simulators.chain import Chain, carrier, fill_history, holders, id_of
+from minimax_cal.simulators.chain import Chain, fill_history
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,8 +165,8 @@ def visits(
 ) -> list[Visit]:
     """A run of moves, one after the other, with a model of its own: a row each of `Driven`."""
     chain = replace(chain, model=copy(chain.model))
-    (mj, model, data, at, _), sides = chain.fresh(), plays(chain)
-    moved = way_to(model, carrier(chain))
+    (mj, model, data, at, _), sides = chain.fresh(), chain.find_plays()
+    moved = way_to(model, chain.carrier)
     dofs, kinds = model.jnt_dofadr[list(moved)], model.jnt_type[list(moved)]
     rest = np.where(kinds == 2, STILL_SLIDE, STILL)
     limits, step, start = Limits.of(chain), chain.step, commands[rows[0] - 1]
@@ -183,7 +183,7 @@ def visits(
         check_stable(mj, data, source)
         share = at_limit / (len(path) + count)
         speed = float((np.abs(data.qvel[dofs]) / rest).max())
-        out.append((body_pose(data, carrier(chain)), data.qpos[at], speed, share))
+        out.append((body_pose(data, chain.carrier), data.qpos[at], speed, share))
         start = commands[row]
         heard()
     return out
@@ -259,10 +259,10 @@ def set_joints(chain: Chain, commands: Array, play: Array | None) -> Driven:
     (mj, model, data, at, _), out = chain.fresh(), []
     for row in range(len(commands)):
         data.qpos[at] = commands[row]
-        for joint, place in plays(chain).items():
+        for joint, place in chain.find_plays().items():
             data.qpos[place] = 0.0 if play is None else play[row, joint]
         mj.mj_kinematics(model, data)
-        out.append(body_pose(data, carrier(chain)))
+        out.append(body_pose(data, chain.carrier))
     still, limited = np.zeros(len(commands)), np.zeros(commands.shape[1])
     return Driven(np.array(out), commands, still, limited)
 
@@ -272,23 +272,13 @@ def touching(chain: Chain, model: Any, q: Array) -> Array:
 
     model: that of the chain, with its contacts.
     """
-    mj, carried = mujoco(), holders(model, chain.bodies) >= 0
+    mj, carried = mujoco(), chain.find_carrying_joints() >= 0
     data, out = mj.MjData(model), np.zeros(len(q), dtype=bool)
     for row, values in enumerate(q):
         data.qpos[chain.places] = values
         mj.mj_fwdPosition(model, data)
         sides = carried[model.geom_bodyid[data.contact.geom]].any(axis=-1)
         out[row] = (sides & (data.contact.dist < 0.0)).any()
-    return out
-
-
-def plays(chain: Chain) -> dict[int, int]:
-    """Joint, and where the position in its play is in qpos."""
-    model, out = chain.model, {}
-    for i in range(len(chain.joints)):
-        found = id_of(model, "JOINT", f"play{i + 1}")
-        if found >= 0:
-            out[i] = int(model.jnt_qposadr[found])
     return out
 
 
@@ -299,26 +289,20 @@ ROUNDS, CLOSE = 20, 1e-12  # of Newton's method, and the largest step that is no
 SMALL = 1e-7  # to find slopes of forces [rad, m]
 
 
-@dataclass(frozen=True, eq=False)
-class Written:
-    """An arm in a written model.  cell: which it is to be.  base: (4, 4) of it in the world [m]."""
+def measure_target_offsets(
+    chain: Chain, cell: Cell, arm: Arm, base: Array, data: Measurements
+) -> Array:
+    """(k, m, 3) from where the targets of a written model stand to where the cell says [m].
 
-    chain: Chain
-    cell: Cell
-    arm: Arm
-    base: Array
-
-    def off(self, data: Measurements) -> Array:
-        """(m, k, 3) from where the targets stand to where the cell says, as the instrument sees it.
-
-        Its command map corrects the commands [m].
-        """
-        asked = Commands(replace(self.cell, effects=self.arm.mapped)).follow(data)
-        points = stand(self.chain, data.target_names, asked, resting(self.arm, data))
-        to = self.cell.base @ inverse(self.base)
-        chosen = [self.cell.target_names.index(name) for name in data.target_names]
-        said = self.cell.seen(data)[:, chosen]
-        return np.asarray(said - points @ to[:3, :3].T - to[:3, 3])
+    As the instrument sees it; the command map of the arm corrects the commands.
+    base: (4, 4) of the arm in the model's world [m].
+    """
+    commands = Commands(replace(cell, effects=arm.mapped)).follow(data)
+    points = stand(chain, data.target_names, commands, resting(arm, data))
+    to = cell.base @ inverse(base)
+    chosen = [cell.target_names.index(name) for name in data.target_names]
+    expected = cell.seen(data)[:, chosen]
+    return np.moveaxis(expected - points @ to[:3, :3].T - to[:3, 3], 1, 0)
 
 
 def resting(arm: Arm, data: Measurements) -> Array | None:
@@ -335,7 +319,7 @@ def stand(chain: Chain, names: tuple[str, ...], commands: Array, play: Array | N
     commands: (m, n) [rad, m].  play: (m, n) where each joint rests in its play [rad].
     """
     mj, model = mujoco(), copy(chain.model)
-    data, sides, servos = mj.MjData(model), plays(chain), chain.servos
+    data, sides, servos = mj.MjData(model), chain.find_plays(), chain.servos
     joints = list(way_to(model, int(model.site(names[0]).bodyid[0])))
     at, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
     states = model.actuator_actadr[servos]

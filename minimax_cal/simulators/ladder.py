@@ -36,15 +36,14 @@ from minimax_cal.robots.transforms import inverse
 from minimax_cal.robots.urdf import MODELS
 from minimax_cal.simulators.arm import ELEMENTS, Arm, arm_of, assumed, unheld, why_not
 from minimax_cal.simulators.chain import Chain, chain_of
-from minimax_cal.simulators.drive import Commands, Driven, drive, placed_error, resting, touching
-from minimax_cal.simulators.mjcf import (
-    beside,
-    check_limits,
-    corrected,
-    own_masses,
-    told,
-    write_document,
+from minimax_cal.simulators.corrected_model import (
+    CorrectedModel,
+    check_force_limits,
+    correct_model,
+    masses_in_links,
 )
+from minimax_cal.simulators.drive import Commands, drive, placed_error, resting, touching
+from minimax_cal.simulators.mjcf import format_command_map, list_limitations, write_document
 from minimax_cal.simulators.result import Rung, SimulatorGap
 from minimax_cal.solvers.status import Status
 
@@ -77,116 +76,100 @@ class Causes:
         return again(self.given, effects=tuple(t if t.choice else t.label for t in terms))
 
 
-def causes_of(
+def find_causes(
     chain: Chain,
     data: Measurements,
     fit: Fit | Path | str | None,
     diagnosis: Diagnosis | Path | str | None,
-    chosen: tuple[float, int],
+    holdout: float,
+    seed: int,
     progress: Progress,
 ) -> Causes:
-    """From a fit, a diagnosis, or both; without either a diagnosis is made.
+    """Fits and effects of a ladder, from a fit, a diagnosis, or both; else from a new diagnosis.
 
-    chain: the arm in the model.  A fit without masses is made again with those of the model: then
-    its springs are the model's.  chosen: share and seed of the held-out poses, for a new diagnosis.
+    chain: the arm in the model.  holdout, seed: of the poses kept out, for a new diagnosis.
+    Raises DataError for poses that cannot be of the arm of the fit.
     """
     robot = chain.robot
     fit = Fit.load(fit) if isinstance(fit, Path | str) else fit
-    told = load_diagnosis(diagnosis) if isinstance(diagnosis, Path | str) else diagnosis
-    if fit is None and told is None:
-        told = diagnose(robot, data, holdout=chosen[0], seed=chosen[1], progress=progress)
-    terms = established(told) if told else fit.cell.effects.terms if fit else ()
-    if fit is None:
-        assert told is not None
+    found = load_diagnosis(diagnosis) if isinstance(diagnosis, Path | str) else diagnosis
+    if fit is None and found is None:
+        found = diagnose(robot, data, holdout=holdout, seed=seed, progress=progress)
+
+    # Effects: those that the diagnosis is sure of, in the order of its ladder, or those of the fit.
+    terms = fit.cell.effects.terms if fit else ()
+    if found is not None:
+        sure = {term.text for finding in found.effects if finding.established
+                for term in finding.terms if term.effect in EFFECTS}  # fmt: skip
+        steps = found.cells[-1].effects.terms if found.cells else ()
+        terms = tuple(term for term in steps if term.text in sure)
+
+    # A fit of the poses of the diagnosis; a fit without masses is made again with those of the
+    # model: then its springs are the model's.
+    needs_masses = fit is not None and not assumed(robot) and assumed(fit.nominal.robot)
+    if found is not None and fit is None:
         terms = carried_over(terms, robot)
-        rows = replace(told.data, digest=told.provenance.data_sha256)
-        fit = calibrate(robot, marked(rows, told.held), objective="sum")
-    elif not assumed(robot) and assumed(fit.nominal.robot):
+        rows = replace(found.data, digest=found.provenance.data_sha256)
+        fit = calibrate(robot, with_split(rows, found.held), objective="sum")
+    assert fit is not None
+    if needs_masses:
         progress("fit with the masses of the model")
+        nominal = fit.nominal.robot
+        mass, com = masses_in_links(chain, nominal) or (nominal.mass, nominal.com)
         terms = carried_over(terms, robot)
-        fit = weighed(fit, chain, [t.label if not t.choice else t for t in terms])
+        effects = tuple(term if term.choice else term.label for term in terms)
+        settings = {**vars(fit.options), "effects": effects}
+        rows = with_split(fit.data, fit.held)
+        fit = calibrate(replace(nominal, mass=mass, com=com), rows, **settings)
         terms = fit.cell.effects.terms
     geometry = fit if not fit.cell.effects.terms else again(fit, effects=())
+
+    # What a simulator may have an element for, what a command map may hold, and what neither does.
+    history, turning, left_out = with_history(fit.data), list[Term](), list[str]()
+    for term in terms:
+        if term.effect in ELEMENTS:
+            continue
+        if term.columns(fit.cell.scene(history)).only_turns:
+            turning.append(term)
+        else:
+            left_out.append(f"{name_effect(*term.key)}: {why_not(EFFECTS[term.effect])}")
     firm = tuple(term for term in terms if term.effect in ELEMENTS)
-    others = [term for term in terms if term.effect not in ELEMENTS]
-    turning = tuple(term for term in others if maps(term, fit))
-    left_out = tuple(
-        f"{name_effect(*term.key)}: {why_not(EFFECTS[term.effect])}"
-        for term in others
-        if term not in turning
-    )
-    rows, held, same = judged_by(fit, data, chosen)
-    floor = told.floor if told else None
-    return Causes(fit, geometry, firm, turning, left_out, rows, held, floor, same)
+
+    # The poses that judge: those of the fit with what it held out, or others with some held out.
+    is_same = bool(fit.data.poses) and fit.provenance.data_sha256 == data.digest
+    held = fit.held
+    if not is_same:
+        data = check_joints(fit.cell.robot, data)
+        check_arm(fit.cell.robot, data)
+        history = with_history(data)
+        held = held_out(history, holdout, seed)[0]
+    floor = found.floor if found else None
+    return Causes(fit, geometry, firm, tuple(turning), tuple(left_out), history, held, floor,
+                  is_same)  # fmt: skip
 
 
-def weighed(fit: Fit, chain: Chain, effects: Sequence[Term | str]) -> Fit:
-    """The same fit, effects given, of a robot that has the masses of a simulator's model."""
-    nominal = fit.nominal.robot
-    mass, com = own_masses(chain, nominal) or (nominal.mass, nominal.com)
-    settings = {**vars(fit.options), "effects": tuple(effects)}
-    rows = marked(fit.data, fit.held)
-    found: Fit = calibrate(replace(nominal, mass=mass, com=com), rows, **settings)
-    return found
-
-
-def established(told: Diagnosis) -> tuple[Term, ...]:
-    """The effects that a diagnosis is sure of, in the order of its ladder."""
-    sure = {
-        term.text
-        for finding in told.effects
-        if finding.established
-        for term in finding.terms
-        if term.effect in EFFECTS
-    }
-    fitted_terms = told.cells[-1].effects.terms if told.cells else ()
-    return tuple(term for term in fitted_terms if term.text in sure)
+def with_split(data: Measurements, held: Array) -> Measurements:
+    """The measurements with a split column.  held: (m,) True where held out."""
+    column = np.where(held, "holdout", "train")
+    return replace(data, columns={**data.columns, "split": column})
 
 
 def carried_over(terms: Sequence[Term], robot: Robot) -> tuple[Term, ...]:
     """Terms for a robot whose masses may be known: then each joint has one torque.
 
-    Those of all joints come first: what one of them has besides is chosen beside it.
+    A law that was chosen for masses that nobody told is chosen again.  Those of all joints come
+    first: what one of them has besides is chosen beside it.
     """
-    if assumed(robot) or not any(rests_on_guesses(term) for term in terms):
+    is_guess = [
+        bool({"assumed", "tool"} & term.choice.keys())
+        or any(part % 4 != WHOLE for part in unmasked(term.choice.get("parts", 0.0)))
+        for term in terms
+    ]
+    if assumed(robot) or not any(is_guess):
         return tuple(terms)
-    new = [replace(term, choice={}) if rests_on_guesses(term) else term for term in terms]
+    new = [replace(term, choice={}) if guess else term
+           for term, guess in zip(terms, is_guess, strict=True)]  # fmt: skip
     return tuple(sorted(new, key=lambda term: term.place != "all"))
-
-
-def rests_on_guesses(term: Term) -> bool:
-    """Whether its law was chosen for masses that nobody told."""
-    parts = unmasked(term.choice.get("parts", 0.0))
-    return bool({"assumed", "tool"} & term.choice.keys()) or any(
-        part % 4 != WHOLE for part in parts
-    )
-
-
-def maps(term: Term, fit: Fit) -> bool:
-    """Whether an effect without an element turns joints only."""
-    told = with_history(fit.data)
-    return term.columns(fit.cell.scene(told)).only_turns
-
-
-def marked(data: Measurements, held: Array) -> Measurements:
-    """The measurements with a split column that says what is held out."""
-    column = np.where(held, "holdout", "train")
-    return replace(data, columns={**data.columns, "split": column})
-
-
-def judged_by(
-    fit: Fit, data: Measurements, chosen: tuple[float, int]
-) -> tuple[Measurements, Array, bool]:
-    """The poses to judge by, which of them are held out, and whether they are those of the fit.
-
-    Raises DataError for poses that cannot be of its arm.
-    """
-    if fit.data.poses and fit.provenance.data_sha256 == data.digest:
-        return with_history(fit.data), fit.held, True
-    data = check_joints(fit.cell.robot, data)
-    check_arm(fit.cell.robot, data)
-    data = with_history(data)
-    return data, held_out(data, *chosen)[0], False
 
 
 # ---- the ladder ----------------------------------------------------------------------------------
@@ -255,8 +238,10 @@ def simulator_gap(
     given = read_model(model)
     chain = chain_of(given.compiled(), rows.q.shape[1], given.source, tip, unknown=given.assumed)
     check_joints(chain.robot, rows)
-    check_model(chain, rows.q, given.source)
-    causes = causes_of(chain, rows, fit, diagnosis, (holdout, seed), progress)
+    if (chain.servos >= 0).all():  # before anything that takes long
+        check_force_limits(chain, rows.q, given.source)
+        drive(chain, rows.q[:FIRST_MOVES], given.source)  # some moves show whether it is stable
+    causes = find_causes(chain, rows, fit, diagnosis, holdout, seed, progress)
     if not causes.held.any():
         raise OptionError(f"{causes.data.source}: no pose is held out; give holdout=0.2")
     run = Run(given, chain, causes, progress)
@@ -284,17 +269,6 @@ def simulator_gap(
         provenance=Provenance.of(chain.robot, rows, {"model": str(model), "holdout": holdout,
                                                      "seed": seed}),
     )  # fmt: skip
-
-
-def check_model(chain: Chain, q: Array, source: str) -> None:
-    """Raise RobotError for a model that cannot hold its own weight, or is unstable.
-
-    Before anything that takes long: some moves show it.
-    """
-    if (chain.servos < 0).any():
-        return
-    check_limits(chain, q, source)
-    drive(chain, q[:FIRST_MOVES], source)
 
 
 class Run:
@@ -326,9 +300,9 @@ class Run:
                 "driven, in the model as given"
             )
             return [replace(first, why="joints set, not driven")]
-        document, notices = corrected(self.given, self.chain, self.nominal.robot, None)
-        self.notices += notices
-        stiff = self.rung("servo sag removed", self.of(document), self.nominal)
+        made = correct_model(self.given, self.chain, self.nominal.robot, None)
+        self.notices += made.notices
+        stiff = self.rung("servo sag removed", self.compile(made.document), self.nominal)
         return [
             replace(first, why=f"servos sag by up to {first.sag_mrad:.3g} mrad"),
             replace(stiff, why="gains that hold the arm where it is commanded"),
@@ -343,81 +317,75 @@ class Run:
         fit, taken = self.causes.geometry, list[Term]()
         rungs = [self.fitted("calibrated geometry", fit)]
         for term in self.causes.firm:
-            self.progress(f"fit with {name_effect(*term.key)}")
+            label = name_effect(*term.key)
+            self.progress(f"fit with {label}")
             more = self.causes.fitted([*taken, term])
             if unheld(more.cell, more.train):
                 self.mapped.append(term)
                 continue
-            rung = self.fitted(term.step, more)
-            if worse(rung, rungs[-1]):
-                change = f"{rungs[-1].holdout_rms_mm:.4f} -> {rung.holdout_rms_mm:.4f} mm"
-                self.left_out.append(
-                    f"{name_effect(*term.key)}: the simulated arm is worse with it ({change})"
-                )
+            before, rung = rungs[-1], self.fitted(term.step, more)
+            if (
+                rung.train_rms_mm > (1.0 + WORSE) * before.train_rms_mm
+                or rung.holdout_rms_mm > (1.0 + WORSE) * before.holdout_rms_mm
+            ):
+                change = f"{before.holdout_rms_mm:.4f} -> {rung.holdout_rms_mm:.4f} mm"
+                self.left_out.append(f"{label}: the simulated arm is worse with it ({change})")
                 continue
             fit, taken = more, [*taken, term]
             rungs.append(rung)
         return rungs, fit
 
     def last(self, before: Rung, fit: Fit, path: Path | None) -> tuple[Rung, Rung | None]:
-        """The last rung from its file, with targets, and what a command map does."""
-        arm, commands = self.arm(fit), None
-        document, notices = self.with_arm(arm, fit)
-        rung = self.rung(before.name, self.saved(document, path), fit.cell, arm, fit)
+        """The last rung from its file, with targets, and what a command map does.
+
+        The arm with a command map is another one, in a file of its own: what commands take over
+        changes the rest.
+        """
+        arm, with_map = self.arm(fit), None
+        made = self.with_arm(arm, fit)
+        rung = self.rung(before.name, self.compile(made.document, path), fit.cell, arm, fit)
         if self.mapped:
             fit = self.causes.fitted([*fit.cell.effects.terms, *self.mapped])
             arm = self.arm(fit)
         if arm.mapped.terms:
-            commands = self.with_commands(arm, fit, path)
+            model = None if path is None else path.with_suffix(COMMANDED)
+            chain = self.compile(self.with_arm(arm, fit).document, model)
+            if path is not None:
+                for ending, content in format_command_map(fit.cell, arm).items():
+                    write_whole(path.with_suffix(ending), content)
+                self.notices.append(f"{model}: the model that the command map belongs to; {path} "
+                                    "is the best without")  # fmt: skip
+            commands = Commands(replace(fit.cell, effects=arm.mapped)).follow(self.data)
+            with_map = self.rung("with its command map", chain, fit.cell, arm, fit, commands)
+            labels = dict.fromkeys(name_effect(*term.key) for term in arm.mapped.terms)
+            with_map = replace(with_map, why="commands corrected for " + ", ".join(labels))
         self.left_out += arm.left_out
         whole = replace(arm, remainder=0.0, left_out=tuple(self.left_out))
-        self.notices += (*notices, *told(whole))
-        return replace(rung, why=before.why), commands
+        self.notices += (*made.notices, *list_limitations(whole))
+        return replace(rung, why=before.why), with_map
 
-    def saved(self, document: Document, path: Path | None) -> Chain:
-        """The arm in a changed tree, from the file where one is written."""
+    def compile(self, document: Document, path: Path | None = None) -> Chain:
+        """The arm in a changed document, from the file where one is written."""
         if path is None:
-            return self.of(document)
+            return self.chain.in_model(self.given.compiled(document.root))
         write_document(document, self.given.folder, path)
         return self.chain.in_model(mujoco().MjModel.from_xml_path(str(path)))
 
-    def with_commands(self, whole: Arm, fit: Fit, path: Path | None) -> Rung:
-        """The arm with all effects, driven with mapped commands.
-
-        It is another arm than that of the last rung: what commands take over changes the rest.
-        """
-        model = None if path is None else path.with_suffix(COMMANDED)
-        chain = self.saved(self.with_arm(whole, fit)[0], model)
-        if path is not None and model is not None:
-            for ending, content in beside(fit.cell, whole).items():
-                write_whole(path.with_suffix(ending), content)
-            self.notices.append(
-                f"{model}: the model that the command map belongs to; {path} is the best without"
-            )
-        commands = Commands(replace(fit.cell, effects=whole.mapped)).follow(self.data)
-        rung = self.rung("with its command map", chain, fit.cell, whole, fit, commands)
-        return replace(rung, why="commands corrected for " + ", ".join(
-            dict.fromkeys(name_effect(*term.key) for term in whole.mapped.terms)))  # fmt: skip
-
     def arm(self, fit: Fit) -> Arm:
         """The elements of a fit, with the model's own masses unless those are assumed."""
-        own = own_masses(self.chain, self.nominal.robot)
+        own = masses_in_links(self.chain, self.nominal.robot)
         some = fit.train.take(np.arange(0, fit.train.poses, max(1, fit.train.poses // TRAINING)))
         return arm_of(fit.cell, masses=own, measured=some)
 
     def fitted(self, name: str, fit: Fit) -> Rung:
         """The simulator with the arm of a fit."""
         arm = self.arm(fit)
-        return self.rung(name, self.of(self.with_arm(arm, fit)[0]), fit.cell, arm, fit)
+        return self.rung(name, self.compile(self.with_arm(arm, fit).document), fit.cell, arm, fit)
 
-    def with_arm(self, arm: Arm, fit: Fit) -> tuple[Document, tuple[str, ...]]:
-        """The model with an arm and its targets in it, and notices."""
+    def with_arm(self, arm: Arm, fit: Fit) -> CorrectedModel:
+        """The model with an arm and its targets in it."""
         names = fit.cell.target_names
-        return corrected(self.given, self.chain, self.nominal.robot, arm, names)
-
-    def of(self, document: Document) -> Chain:
-        """The arm in a changed tree."""
-        return self.chain.in_model(self.given.compiled(document.root))
+        return correct_model(self.given, self.chain, self.nominal.robot, arm, names)
 
     def rung(
         self,
@@ -428,51 +396,50 @@ class Run:
         fit: Fit | None = None,
         commands: Array | None = None,
     ) -> Rung:
-        """Drive a model to every pose and judge where it comes to rest."""
+        """Drive a model to every pose and judge where it comes to rest.
+
+        start: base and targets to begin with.  arm, fit: that the model is to do, if any.
+        commands: (m, n) where they are other than the joint values of the poses.
+        """
         q = self.data.q
-        asked = q if commands is None else commands
+        commands = q if commands is None else commands
         play = None if arm is None else resting(arm, self.data)
         count = len(q)
 
-        def heard(done: int) -> None:
+        def report(done: int) -> None:
             if done % 20 == 0 or done == count:
                 self.progress(f"{name}: {done} of {count} poses")
 
-        driven = drive(chain, asked, self.given.source, play, heard)
+        driven = drive(chain, commands, self.given.source, play, report)
         judge = judging(self.held, driven.moving)
         self.tell(f"{name}: the simulated arm did not come to rest within 1.5 s of its move",
                   self.data, driven.moving, judge)  # fmt: skip
-        self.tell_limits(name, driven)
-        error = placed_error(
-            driven.poses, self.data, judge & ~self.held, guess(start, driven.poses[0], q[0])
-        )
-        held, train = (accuracy(error[judge & rows]) for rows in (self.held, ~self.held))
-        off = np.abs(driven.q - asked)[judge][:, ~chain.robot.prismatic]
+        for i in np.flatnonzero(driven.limited > AT_LIMIT):
+            self.notices.append(
+                f"{name}: joint {i + 1} is at its force limit in {driven.limited[i]:.0%} of the "
+                "timesteps: raise the limit, or drive more slowly"
+            )
+
+        # Base and targets from the training poses, begun where the cell has them.
+        end = inverse(driven.poses[0]) @ start.robot.pose(q[0])
+        spots = start.target_positions @ end[:3, :3].T + end[:3, 3]
+        error = placed_error(driven.poses, self.data, judge & ~self.held, (start.base, spots))
+        held, train = (accuracy(error[:, judge & rows]) for rows in (self.held, ~self.held))
+        off = np.abs(driven.q - commands)[judge][:, ~chain.robot.prismatic]
+        predicted = np.nan
+        if fit is not None and self.causes.same:
+            predicted = accuracy(fit.cell.error(self.data)[:, judge & self.held]).rms_mm
         return Rung(
             name, held.rms_mm, held.max_mm, train.rms_mm, train.max_mm,
-            1e3 * off.max(initial=0.0), self.predicted(fit, judge & self.held),
+            1e3 * off.max(initial=0.0), predicted,
             moving_poses=int(driven.moving.sum()), at_limit=driven.limited.max(),
         )  # fmt: skip
-
-    def predicted(self, fit: Fit | None, rows: Array) -> float:
-        """RMS of some driven poses by the formulas of a fit, NaN where it has others."""
-        if fit is None or not self.causes.same:
-            return np.nan
-        return accuracy(fit.cell.error(self.data)[rows]).rms_mm
 
     def tell(self, what: str, data: Measurements, rows: Array, judge: Array) -> None:
         """A notice on poses that do not judge.  rows: (m,) where; judge: (m,) those that do."""
         if rows.any():
             how = "they count, too few would be left" if judge.all() else "they are left out"
             self.notices.append(f"{what} at {rows.sum()} poses ({data.list_rows(rows)}): {how}")
-
-    def tell_limits(self, name: str, driven: Driven) -> None:
-        """Notices on joints that were at their force limits."""
-        for i in np.flatnonzero(driven.limited > AT_LIMIT):
-            self.notices.append(
-                f"{name}: joint {i + 1} is at its force limit in {driven.limited[i]:.0%} of the "
-                "timesteps: raise the limit, or drive more slowly"
-            )
 
 
 def disagreement(rungs: Sequence[Rung]) -> list[str]:
@@ -491,17 +458,3 @@ def judging(held: Array, out: Array) -> Array:
     left = ~out
     enough = (left & held).any() and (left & ~held).sum() >= FEWEST
     return left if enough else np.ones_like(left)
-
-
-def worse(rung: Rung, before: Rung) -> bool:
-    """Whether the simulator misses by more than before, on the training poses or the others."""
-    return (
-        rung.train_rms_mm > (1.0 + WORSE) * before.train_rms_mm
-        or rung.holdout_rms_mm > (1.0 + WORSE) * before.holdout_rms_mm
-    )
-
-
-def guess(cell: Cell, pose: Array, q: Array) -> tuple[Array, Array]:
-    """Base and targets to begin with, from those of a cell.  pose: of the carrier at q, near it."""
-    end = inverse(pose) @ cell.robot.pose(q)
-    return cell.base, cell.target_positions @ end[:3, :3].T + end[:3, 3]

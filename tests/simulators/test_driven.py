@@ -14,7 +14,7 @@ import minimax_cal as mc
 from minimax_cal.correcting.export import exported, written
 from minimax_cal.correcting.exporters.job import job_of
 from minimax_cal.modelling.cell import still
-from minimax_cal.simulators.mjcf import correct, write
+from minimax_cal.simulators.mjcf import write
 from minimax_cal.simulators.result import SimulatorGap
 from tests.conftest import run
 from tests.problems_mjcf import drive_alone, published_like, ur10_like
@@ -272,7 +272,7 @@ def test_a_scene_stays_and_the_arm_that_it_includes_is_beside_it(folder, tmp_pat
     made = {}
     for given, name in ((scene, "new_scene.xml"), (model, "new_arm.xml")):
         path = tmp_path / folder / name
-        written(correct(replace(job_of("cell", cell), nominal=weighs, fitted=True, model=given,
+        written(write(replace(job_of("cell", cell), nominal=weighs, fitted=True, model=given,
                                 path=path)), path)  # fmt: skip
         made[name] = mujoco.MjModel.from_xml_path(str(path))
     text = (tmp_path / folder / "new_scene.xml").read_text()

@@ -18,8 +18,8 @@ from minimax_cal.robots.mjcf import is_driven
 from minimax_cal.simulators.motion.fit import Asked, Study, fit_numbers
 from minimax_cal.simulators.motion.judge import Judge, Missed
 from minimax_cal.simulators.motion.numbers import (
+    MIN_DELAY_TIMESTEPS,
     POWERS,
-    SHORTEST,
     Numbers,
     Opened,
     has_powers,
@@ -115,7 +115,7 @@ def asked_of(found: MotionDiagnosis, bench: Bench) -> Asked:
     late = found.models[-1].delay
     late += sum(float(term.value[0]) for term in terms if term.effect == "delay")
     of_command = late < 0.0 and bench.judge.commanded  # which the commands themselves show
-    if abs(late) < SHORTEST * chain.step or of_command:
+    if abs(late) < MIN_DELAY_TIMESTEPS * chain.step or of_command:
         late = 0.0
     pairs = zip(chain.joints, chain.servos, strict=True)
     motors = [is_driven(chain.model, joint) and servo < 0 for joint, servo in pairs]

@@ -8,7 +8,6 @@ from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree as ET
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -41,19 +40,18 @@ from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.measuring.faults.fault import Amount
 from minimax_cal.robots.document import Document
 from minimax_cal.robots.mjcf import numbers
-from minimax_cal.simulators.chain import Chain, braked
-from minimax_cal.simulators.elements import forget, known, parents_of, section, tune
-from minimax_cal.simulators.mjcf import IMPLICIT, elements_of, servos_of
+from minimax_cal.simulators.chain import IMPLICIT_INTEGRATORS, Chain
+from minimax_cal.simulators.elements import set_servo_gains
+from minimax_cal.simulators.mjcf_tree import MjcfTree, set_element
 from minimax_cal.simulators.motion.correct import HISTORY_FIRST, Candidate, Corrected, mean_log
 from minimax_cal.simulators.motion.fit import Study, fit_numbers
-from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge, ahead_of
+from minimax_cal.simulators.motion.judge import OWN_SERVOS, Judge
 from minimax_cal.simulators.motion.numbers import (
-    SHORTEST,
+    MIN_DELAY_TIMESTEPS,
     Bodies,
     Numbers,
     Opened,
-    actuators_of,
-    delayed,
+    delay_attributes,
     given_numbers,
     write_numbers,
 )
@@ -109,12 +107,12 @@ def own_drives(chain: Chain) -> tuple[Drive, ...]:
     """(n) the position servos of a model."""
     model, out = chain.model, []
     late = getattr(model, "actuator_delay", np.zeros(model.nu))[chain.servos].tolist()
-    gain, damper, limits = servos_of(chain)
-    for j, name in enumerate(chain.names):
-        ahead = sum(float(model.actuator_gainprm[k, 0]) for k in ahead_of(model, (name,)))
-        whole = float(damper[j]) + ahead
-        out.append(Drive(float(gain[j]), whole, ahead / whole if ahead else 0.0, late[j],
-                         float(np.abs(limits[j]).min())))  # fmt: skip
+    servos, forward = chain.read_servos(), chain.find_feed_forward()
+    for j in range(len(chain.joints)):
+        ahead = sum(float(model.actuator_gainprm[k, 0]) for k, i in forward.items() if i == j)
+        whole = float(servos.damper[j]) + ahead
+        out.append(Drive(float(servos.gain[j]), whole, ahead / whole if ahead else 0.0, late[j],
+                         float(np.abs(servos.limits[j]).min())))  # fmt: skip
     return tuple(out)
 
 
@@ -158,7 +156,7 @@ def serve(judge: Judge, opened: Opened, *, plain: bool = False) -> Served:
 
     plain: without delays, which other simulators do not read.
     """
-    chain, least = opened.chain, SHORTEST * opened.chain.step
+    chain, least = opened.chain, MIN_DELAY_TIMESTEPS * opened.chain.step
     own, damping, first = own_drives(chain), np.zeros(len(chain.dofs)), share_of(chain)
     if judge.held.unit == NOTHING:
         damping = chain.model.dof_damping[chain.dofs]
@@ -188,7 +186,7 @@ def damped_by_joints(judge: Judge, opened: Opened) -> bool:
     So they do where the same file, simulated, made the log.
     """
     chain = opened.chain
-    damping, held = chain.model.dof_damping[chain.dofs], braked(chain.model)[list(chain.joints)]
+    damping, held = chain.model.dof_damping[chain.dofs], chain.has_servo_dampers()
     if not held.all():
         return False
     body = body_of(chain)
@@ -275,64 +273,56 @@ def steps_with(
 def with_drives(opened: Opened, served: Served, kinds: Sequence[str] = KINDS) -> Opened:
     """The model with what is told of its drives, of some kinds."""
     document = opened.given.document.copy()
-    write_drives(document, opened.chain, served.drives(kinds))
-    if served.share[1] != share_of(opened.chain):
-        write_share(document.root, opened.chain, served.share[1])
+    write_drives(document, opened.chain, served.drives(kinds), served.share[1])
     return opened.again(document)
 
 
-def write_drives(document: Document, chain: Chain, drives: Sequence[Drive]) -> None:
-    """Give the servos of a model the numbers of drives, where these are others than it has."""
-    root, model = document.root, chain.model
-    step, floating = chain.step, bool(model.body_gravcomp[chain.bodies[0]])
-    joints = elements_of(root, chain)
+def write_drives(
+    document: Document, chain: Chain, drives: Sequence[Drive], gravity_share: float
+) -> None:
+    """Give the servos of a model the numbers of drives, where these are others than it has.
+
+    gravity_share: of gravity, that the actuators carry.
+    """
+    tree, model, step = MjcfTree(document.root), chain.model, chain.step
+    floating, joints = bool(model.body_gravcomp[chain.bodies[0]]), tree.find_joints(chain)
     for j, (drive, own) in enumerate(zip(drives, own_drives(chain), strict=True)):
-        name, number = chain.names[j], chain.joints[j]
-        servo = next(e for e in actuators_of(root, name) if e.tag in ("position", "general"))
-        gear = model.actuator_gear[chain.servo(number), 0]
-        regulated = drive.taking(own, GAINS) != drive
-        if regulated:
-            tune(servo, drive.stiffness / gear**2, (1.0 - drive.ahead) * drive.damper / gear**2)
-            write_ahead(root, name, drive.ahead * drive.damper)
+        # Gains at the motor; a velocity actuator takes the commanded speed.
+        name, gear = chain.names[j], model.actuator_gear[chain.servos[j], 0]
+        servo = next(e for e in tree.find_actuators(name) if e.tag in ("position", "general"))
+        has_other_gains = drive.taking(own, GAINS) != drive
+        if has_other_gains:
+            damper = (1.0 - drive.ahead) * drive.damper
+            set_servo_gains(servo, drive.stiffness / gear**2, damper / gear**2)
+            if forward := drive.ahead * drive.damper:
+                set_element(tree.section("actuator"), "velocity", f"{name}_ahead", joint=name,
+                            kv=forward)  # fmt: skip
+            else:
+                tree.remove("actuator", "velocity", f"{name}_ahead")
+
+        # Torque limit: of the joint where actuators carry gravity, else of the servo.
         if drive.torque != own.torque:
-            where, what = (joints[j], "actuatorfrc") if floating else (servo, "force")
-            write_limit(where, what, drive.torque / (1.0 if floating else abs(gear)))
-        for actuator in actuators_of(root, name) if regulated or drive.delay != own.delay else ():
-            write_late(actuator, drive.delay, step)
-    shaken = np.array([d.damper for d in drives]) * step * model.dof_invweight0[chain.dofs]
-    if model.opt.integrator not in IMPLICIT and shaken.max() > SHAKES:
-        section(root, "option").set("integrator", "implicitfast")
+            element, what = (joints[j], "actuatorfrc") if floating else (servo, "force")
+            is_limited = math.isfinite(drive.torque)
+            element.set(f"{what}limited", "true" if is_limited else "false")
+            if is_limited:
+                limit = drive.torque / (1.0 if floating else abs(gear))
+                element.set(f"{what}range", numbers([-limit, limit]))
 
-
-def write_limit(element: ET.Element, what: str, size: float) -> None:
-    """Limit a force on both sides, or let it be without limits."""
-    element.set(f"{what}limited", "true" if math.isfinite(size) else "false")
-    if math.isfinite(size):
-        element.set(f"{what}range", numbers([-size, size]))
-
-
-def write_ahead(root: ET.Element, joint: str, gain: float) -> None:
-    """Give a joint an actuator that takes the commanded speed, or none."""
-    if gain:
-        known(section(root, "actuator"), "velocity", f"{joint}_ahead", joint=joint, kv=gain)
-        return
-    forget(root, "actuator", "velocity", f"{joint}_ahead")
-
-
-def write_late(actuator: ET.Element, late: float, step: float) -> None:
-    """Let an actuator take its command late."""
-    for name in ("delay", "nsample", "interp"):
-        actuator.attrib.pop(name, None)
-    actuator.attrib |= delayed(late, step)
-
-
-def write_share(root: ET.Element, chain: Chain, share: float) -> None:
-    """Let the actuators of an arm carry a share of gravity."""
-    joints, parents = elements_of(root, chain), parents_of(root)
-    for body in parents[joints[0]].iter("body"):
-        body.set("gravcomp", numbers([share]))
-    for joint in joints:
-        joint.set("actuatorgravcomp", "true" if share else "false")
+        # Delay of the command, of all actuators of the joint.
+        if has_other_gains or drive.delay != own.delay:
+            for actuator in tree.find_actuators(name):
+                for attribute in ("delay", "nsample", "interp"):
+                    actuator.attrib.pop(attribute, None)
+                actuator.attrib |= delay_attributes(drive.delay, step)
+    damping = np.array([d.damper for d in drives]) * step * model.dof_invweight0[chain.dofs]
+    if model.opt.integrator not in IMPLICIT_INTEGRATORS and damping.max() > SHAKES:
+        tree.section("option").set("integrator", "implicitfast")
+    if gravity_share != share_of(chain):
+        for body in tree.find_parents()[joints[0]].iter("body"):
+            body.set("gravcomp", numbers([gravity_share]))
+        for joint in joints:
+            joint.set("actuatorgravcomp", "true" if gravity_share else "false")
 
 
 def filtered_servos(chain: Chain) -> str:
@@ -343,8 +333,8 @@ def filtered_servos(chain: Chain) -> str:
 
 def can_write(opened: Opened) -> bool:
     """Whether every joint has a servo of its own that can be given other numbers."""
-    chain, root = opened.chain, opened.given.document.root
-    tags = [{e.tag for e in actuators_of(root, name)} for name in chain.names]
+    chain, tree = opened.chain, MjcfTree(opened.given.document.root)
+    tags = [{e.tag for e in tree.find_actuators(name)} for name in chain.names]
     named = all({"position", "general"} & some for some in tags)
     return named and not chain.model.actuator_dyntype[chain.servos].any()
 

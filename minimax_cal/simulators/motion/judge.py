@@ -26,9 +26,8 @@ from minimax_cal.dynamics.rows import (
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.simulators.chain import Chain, fill_history, id_of
+from minimax_cal.simulators.chain import Chain, fill_history
 from minimax_cal.simulators.drive import check_stable
-from minimax_cal.simulators.mjcf import largest_inertia
 from minimax_cal.simulators.motion.numbers import Numbers, Opened, in_its_gravity
 from minimax_cal.simulators.result import COMMANDS, MotionRung
 
@@ -70,7 +69,7 @@ def follow_commands(chain: Chain, run: Run, commands: Array, source: str) -> Arr
     commands: (m, n) at the times of the run [rad, m].  Raises RobotError for an unstable model.
     """
     servos = chain.servos
-    speeds = ahead_of(chain.model, chain.names)
+    speeds = chain.find_feed_forward()
 
     def drive(data: Any, now: int) -> None:
         data.ctrl[servos] = path[now]
@@ -83,12 +82,6 @@ def follow_commands(chain: Chain, run: Run, commands: Array, source: str) -> Arr
     path = at_times(steps_of(run.time, chain), run.time, commands)
     rates = np.gradient(path, chain.step, axis=0)
     return stepped(chain, run, drive, source)
-
-
-def ahead_of(model: Any, names: Sequence[str]) -> dict[int, int]:
-    """Ids of actuators that take the commanded speed of some joints, and of which (from 0)."""
-    ids = (id_of(model, "ACTUATOR", f"{name}_ahead") for name in names)
-    return {number: j for j, number in enumerate(ids) if number >= 0}
 
 
 def follow_torques(chain: Chain, run: Run, torque: Array, pull: Pull, source: str) -> Array:
@@ -233,7 +226,7 @@ class Judge:
         learning, held = divided(known.loaded(runs), known.holdout, known.holdout_run)
         logs = prepare([*learning, *held])
         arm = Arm.of(robot, gains, known.ratios(robot), known.load, logs)
-        return Judge(arm, largest_inertia(opened.chain), prepare(learning), tuple(learning),
+        return Judge(arm, opened.chain.find_largest_inertias(), prepare(learning), tuple(learning),
                      prepare(held), tuple(held), opened.given.source)  # fmt: skip
 
     def driving(self, opened: Opened, gains: Pair | None) -> Judge:

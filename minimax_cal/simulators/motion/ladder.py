@@ -22,7 +22,6 @@ from minimax_cal.ground.threads import one_thread
 from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.robots.urdf import MODELS
-from minimax_cal.simulators.mjcf import largest_inertia
 from minimax_cal.simulators.motion import drives
 from minimax_cal.simulators.motion.correct import STAYS, Bench, asked_of, correct, mean_log
 from minimax_cal.simulators.motion.fit import PRIOR, PRIOR_ASSUMED, Study
@@ -240,6 +239,6 @@ def bench_of(judge: Judge, opened: Opened, found: MotionDiagnosis, *, plain: boo
     """Where corrections of a model are fitted and judged.  plain: as of `Bench`."""
     assumed = opened.given.assumed or not weighed(opened.chain.robot).all()
     study = Study.of(opened.chain, judge.arm, judge.learning, found.models[-1].terms,
-                     largest_inertia(opened.chain),
+                     opened.chain.find_largest_inertias(),
                      PRIOR_ASSUMED if assumed else PRIOR)  # fmt: skip
     return Bench(judge, opened, study, plain)

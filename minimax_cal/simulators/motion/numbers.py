@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -31,25 +32,17 @@ from minimax_cal.robots.mjcf import Given, body_pose, mujoco, numbers, read_mode
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.transforms import inverse, tail, transform
 from minimax_cal.robots.urdf import MODELS, is_urdf
-from minimax_cal.simulators.arm import arm_of, stiff
+from minimax_cal.simulators.arm import Arm, arm_of
 from minimax_cal.simulators.chain import (
-    TURNS,
+    ORIENTATION_ATTRIBUTES,
     Chain,
-    at_zero,
-    braked,
     chain_along,
     chain_of,
-    holders,
 )
-from minimax_cal.simulators.elements import STEPS, known, parents_of, section, tune
-from minimax_cal.simulators.mjcf import (
-    corrected,
-    counts_degrees,
-    elements_of,
-    new_tree,
-    own_masses,
-    write_document,
-)
+from minimax_cal.simulators.corrected_model import correct_model, masses_in_links
+from minimax_cal.simulators.elements import MIN_DAMPER_TIMESTEPS, set_servo_gains
+from minimax_cal.simulators.mjcf import build_new_tree, write_document
+from minimax_cal.simulators.mjcf_tree import MjcfTree, format_attributes, set_element
 
 ROWS, COLUMNS = np.triu_indices(4)  # places of the ten coordinates in U
 THINNEST = 1e-6  # of a body's largest second moment: no principal one is smaller
@@ -119,9 +112,9 @@ class Bodies:
     @staticmethod
     def of(chain: Chain) -> Bodies:
         """Of an arm in a compiled model."""
-        model, data = chain.model, at_zero(chain.model, chain.joints)
+        model, data = chain.model, chain.data_at_zero()
         links = laid(chain.robot, chain.base)[1:]
-        holder, bodies = holders(model, chain.bodies), chain.bodies
+        holder, bodies = chain.find_carrying_joints(), chain.bodies
         drawn, beside, to_link = [], [], []
         for i, body in enumerate(bodies):
             here = body_pose(data, body)
@@ -228,27 +221,22 @@ class Numbers:
 
 
 def given_numbers(chain: Chain, bodies: Bodies) -> Numbers:
-    """Those of a model."""
-    model, dofs, joints = chain.model, chain.dofs, np.array(chain.joints)
-    damping = np.column_stack([model.dof_damping[dofs], of_powers(model, "dof_dampingpoly", dofs)])
-    spring = np.column_stack(
-        [model.jnt_stiffness[joints], of_powers(model, "jnt_stiffnesspoly", joints)]
-    )
+    """Those of a model; a MuJoCo without polynomials of speed and angle has 0 for them."""
+    model, dofs, joints, n = chain.model, chain.dofs, np.array(chain.joints), len(chain.joints)
+    damping, stiffness = np.zeros((2, n, POWERS))
+    damping[:, 0], stiffness[:, 0] = model.dof_damping[dofs], model.jnt_stiffness[joints]
+    if has_powers(model):
+        damping[:, 1:] = model.dof_dampingpoly[dofs]
+        stiffness[:, 1:] = model.jnt_stiffnesspoly[joints]
     return Numbers(
         bodies=bodies.drawn,
         armature=model.dof_armature[dofs],
         friction=model.dof_frictionloss[dofs],
         damping=damping,
-        stiffness=spring,
+        stiffness=stiffness,
         rest=model.qpos_spring[chain.places],
-        gain=np.ones(len(dofs)),
+        gain=np.ones(n),
     )
-
-
-def of_powers(model: Any, name: str, places: Array) -> Array:
-    """(n, 2) of the higher powers, 0 in a MuJoCo that has none."""
-    found = getattr(model, name, None)
-    return np.zeros((len(places), POWERS - 1)) if found is None else np.array(found[places])
 
 
 def has_powers(model: Any) -> bool:
@@ -261,96 +249,69 @@ def has_powers(model: Any) -> bool:
 
 SAME = 1e-12  # relative change of a number that is none
 STOPS = 4e-6  # friction moves the tool of a new file, at each joint, by no more [m]
-HISTORY = 2  # samples of a delayed signal beyond those of the delay
-SHORTEST = 0.5  # of a timestep: a shorter delay is none
+HISTORY_MARGIN = 2  # samples of a delayed signal beyond those of the delay
+MIN_DELAY_TIMESTEPS = 0.5  # a shorter delay is none
 
 
 def write_numbers(document: Document, chain: Chain, given: Numbers, found: Numbers) -> None:
-    """Change a model's elements to what was found, where that differs from what it has.
+    """Change a model's elements to the numbers found, where they differ from those given.
 
     Raises RobotError.
     """
-    parents = parents_of(document.root)
-    for i, joint in enumerate(elements_of(document.root, chain)):
-        if differs(found.bodies[i], given.bodies[i]):
-            weigh(parents[joint], found.bodies[i])
-        put(joint, "armature", found.armature[i], given.armature[i])
-        put(joint, "frictionloss", found.friction[i], given.friction[i])
-        put(joint, "damping", powers(found.damping[i]), powers(given.damping[i]))
-        put(joint, "stiffness", powers(found.stiffness[i]), powers(given.stiffness[i]))
-        if differs(found.stiffness[i], given.stiffness[i]):
-            rest = found.rest[i]
-            turns = chain.model.jnt_type[chain.joints[i]] != 2 and counts_degrees(document.root)
-            joint.set("springref", numbers([np.degrees(rest) if turns else rest]))
-    write_gains(document.root, chain, found)
-    write_delay(document.root, chain, found)
+    tree, is_same = MjcfTree(document.root), partial(np.allclose, rtol=SAME, atol=0.0)
+    parents = tree.find_parents()
+    for i, joint in enumerate(tree.find_joints(chain)):
+        # Masses and joints; the coefficients of a polynomial without zeros at their end.
+        if not is_same(found.bodies[i], given.bodies[i]):
+            set_inertia(parents[joint], found.bodies[i])
+        pairs = {
+            "armature": (found.armature[[i]], given.armature[[i]]),
+            "frictionloss": (found.friction[[i]], given.friction[[i]]),
+            "damping": (found.damping[i], given.damping[i]),
+            "stiffness": (found.stiffness[i], given.stiffness[i]),
+        }
+        for attribute, pair in pairs.items():
+            new, old = (v[: 1 + np.flatnonzero(v).max(initial=0)] for v in pair)
+            if new.shape != old.shape or not is_same(new, old):
+                joint.set(attribute, numbers(new))
+        if not is_same(found.stiffness[i], given.stiffness[i]):
+            is_angle = chain.model.jnt_type[chain.joints[i]] != 2 and tree.uses_degrees
+            joint.set("springref", numbers(np.degrees(found.rest[i]) if is_angle
+                                           else found.rest[i]))  # fmt: skip
+
+    # Motors of a joint put out what its drive does, of what is commanded.  A delay is of commands
+    # that act late, or of torques that are read late.
+    delay = delay_attributes(abs(found.late), chain.step)
+    for name, gain in zip(chain.names, found.gain, strict=True):
+        actuators = tree.find_actuators(name)
+        for actuator in actuators if gain != 1.0 else ():
+            old_gear = [float(v) for v in actuator.get("gear", "1").split()]
+            actuator.set("gear", numbers([old_gear[0] / gain, *old_gear[1:]]))
+        if delay and found.late > 0.0:
+            sensors = tree.section("sensor")
+            set_element(sensors, "jointactuatorfrc", f"{name}_torque", joint=name, **delay)
+        elif delay:
+            for actuator in actuators:
+                actuator.attrib |= delay
 
 
-def differs(found: Array, given: Array) -> bool:
-    """Whether a number changes."""
-    return not np.allclose(found, given, rtol=SAME, atol=0.0)
-
-
-def powers(values: Array) -> Array:
-    """Numbers without zeros at their end, one at least."""
-    last = int(np.flatnonzero(values)[-1]) + 1 if values.any() else 1
-    return values[:last]
-
-
-def put(joint: ET.Element, name: str, found: Array | float, given: Array | float) -> None:
-    """Set an attribute, where its number changes."""
-    new, old = np.atleast_1d(found), np.atleast_1d(given)
-    if new.shape != old.shape or differs(new, old):
-        joint.set(name, numbers(new))
-
-
-def weigh(body: ET.Element, pseudo: Array) -> None:
-    """Give a body its mass and inertia."""
-    values = inertial(pseudo)
-    element = known(body, "inertial")
-    for name in (*TURNS, "fullinertia"):
+def set_inertia(body: ET.Element, pseudo: Array) -> None:
+    """Give a body the mass and inertia of a pseudo-inertia (4, 4), as its first element."""
+    element = set_element(body, "inertial")
+    for name in (*ORIENTATION_ATTRIBUTES, "fullinertia"):
         element.attrib.pop(name, None)
-    for name, value in values.items():
-        element.set(name, numbers(value))
+    element.attrib |= format_attributes(inertial(pseudo))
     if list(body).index(element) and body.find("joint") is not None:
         body.remove(element)
         body.insert(0, element)
 
 
-def write_gains(root: ET.Element, chain: Chain, found: Numbers) -> None:
-    """Let motors of a joint put out what its drive does, of what is commanded."""
-    for name, gain in zip(chain.names, found.gain, strict=True):
-        if gain == 1.0:
-            continue
-        for actuator in actuators_of(root, name):
-            old = [float(v) for v in actuator.get("gear", "1").split()]
-            actuator.set("gear", numbers([old[0] / gain, *old[1:]]))
-
-
-def actuators_of(root: ET.Element, joint: str) -> list[ET.Element]:
-    """The actuators that drive a joint."""
-    every = [e for part in root.iter("actuator") for e in part]
-    return [e for e in every if e.get("joint") == joint]
-
-
-def write_delay(root: ET.Element, chain: Chain, found: Numbers) -> None:
-    """A command that acts late, or a torque that is read late."""
-    late = delayed(abs(found.late), chain.step)
-    for name in chain.names if late else ():
-        if found.late > 0.0:
-            sensors = section(root, "sensor")
-            known(sensors, "jointactuatorfrc", f"{name}_torque", joint=name, **late)
-            continue
-        for actuator in actuators_of(root, name):
-            actuator.attrib |= late
-
-
-def delayed(late: float, step: float) -> dict[str, str]:
-    """Attributes of what is so late [s]; none where that is no delay.  step: of time [s]."""
-    if late < SHORTEST * step:
+def delay_attributes(delay: float, timestep: float) -> dict[str, str]:
+    """Attributes of a signal with a delay [s]; none where it is no delay at that timestep [s]."""
+    if delay < MIN_DELAY_TIMESTEPS * timestep:
         return {}
-    count = math.ceil(late / step) + HISTORY
-    return {"delay": numbers([late]), "nsample": str(count), "interp": "linear"}
+    count = math.ceil(delay / timestep) + HISTORY_MARGIN
+    return {"delay": numbers([delay]), "nsample": str(count), "interp": "linear"}
 
 
 def stiffen(root: ET.Element, chain: Chain, found: Numbers) -> None:
@@ -358,33 +319,21 @@ def stiffen(root: ET.Element, chain: Chain, found: Numbers) -> None:
 
     A servo of gain k stops within friction / k of its command.
     """
-    arm = stiff(chain.robot, masses_of(chain.robot, LEAST_MASS))
+    arm, tree = Arm.rigid(chain.robot), MjcfTree(root)
     needed = found.friction * np.where(chain.robot.prismatic, 1.0, arm.reach) / STOPS
     for i, name in enumerate(chain.names):
-        for servo in actuators_of(root, name):
+        for servo in tree.find_actuators(name):
             if servo.tag != "position" or needed[i] <= float(servo.get("kp", "0")):
                 continue
             inertia = float(servo.get("kv", "0")) ** 2 / (4.0 * float(servo.get("kp", "1")))
             damper = 2.0 * np.sqrt(needed[i] * inertia)
             step = chain.step
-            tune(servo, needed[i], max(damper, STEPS * step * needed[i]))
-
-
-def free_joints(root: ET.Element, chain: Chain) -> None:
-    """Give servos the dampers that joints of a new file hold for them.
-
-    Along logs the damping of a joint is friction, and a servo's damper is part of its torque.
-    """
-    for number, joint in zip(chain.joints, elements_of(root, chain), strict=True):
-        if braked(chain.model)[number]:
-            servo = chain.model.actuator(chain.servo(number))
-            damper = float(joint.attrib.pop("damping")) / float(servo.gear[0]) ** 2
-            known(section(root, "actuator"), "position", str(servo.name), kv=damper)
+            set_servo_gains(servo, needed[i], max(damper, MIN_DAMPER_TIMESTEPS * step * needed[i]))
 
 
 def new_model(robot: Robot) -> Document:
     """A new file of a robot: its masses as drawn, position servos that hold it."""
-    root = new_tree(stiff(robot, masses_of(robot, LEAST_MASS)), ())
+    root = build_new_tree(Arm.rigid(robot), ())
     weigh_drawn(root, robot)
     return Document(root)
 
@@ -397,7 +346,7 @@ def weigh_drawn(root: ET.Element, robot: Robot) -> None:
         place = tail(robot.mdh[i])  # of the link's frame in that of its joint, the body's
         moved = place @ pseudo_inertia(drawn[i]) @ place.T
         if drawn[i, 0] > LEAST_MASS and np.linalg.eigvalsh(moved)[0] > 0.0:
-            weigh(bodies[f"link{i + 1}"], moved)
+            set_inertia(bodies[f"link{i + 1}"], moved)
 
 
 def unwritten(chain: Chain, wanted: Array, names: Sequence[str]) -> list[str]:
@@ -432,8 +381,17 @@ class Opened:
         return replace(self, given=given, chain=chain)
 
     def with_free_joints(self) -> Opened:
-        """The same with the dampers of servos in the servos."""
-        free_joints(self.given.document.root, self.chain)
+        """The same, its servos with the dampers that joints of a new file hold for them.
+
+        Along logs the damping of a joint is friction, and a servo's damper is part of its torque.
+        """
+        chain, tree = self.chain, MjcfTree(self.given.document.root)
+        is_held = chain.has_servo_dampers()
+        for i, joint in enumerate(tree.find_joints(chain)):
+            if is_held[i]:
+                servo = chain.model.actuator(chain.servos[i])
+                damper = float(joint.attrib.pop("damping")) / float(servo.gear[0]) ** 2
+                set_element(tree.section("actuator"), "position", str(servo.name), kv=damper)
         return self.again(self.given.document)
 
     def write(self, path: Path) -> None:
@@ -472,19 +430,20 @@ def calibrated(opened: Opened, fit: Fit) -> tuple[Opened, tuple[str, ...]]:
     names = fit.cell.target_names
     if opened.new:
         arm = arm_of(fit.cell, fit.train.q, masses_of(fit.cell.robot, LEAST_MASS))
-        document = Document(new_tree(arm, names, springs=True))
+        document = Document(build_new_tree(arm, names, with_springs=True))
         weigh_drawn(document.root, fit.cell.robot)
         given = replace(opened.given, document=document)
         return opened.rebuilt(given).with_free_joints(), ()
     nominal = fit.nominal.robot
-    arm = arm_of(fit.cell, fit.train.q, own_masses(opened.chain, nominal))
+    arm = arm_of(fit.cell, fit.train.q, masses_in_links(opened.chain, nominal))
     driven = bool((opened.chain.servos >= 0).any())
-    document, notices = corrected(opened.given, opened.chain, nominal, arm, names, driven=driven)
+    made = correct_model(opened.given, opened.chain, nominal, arm, names, with_servos=driven)
+    notices = made.notices
     if not driven and (arm.gain.any() or arm.coupled):
         notices += (
             "not in the model: encoder gains and couplings, which only position servos hold",
         )
-    return opened.rebuilt(replace(opened.given, document=document)), notices
+    return opened.rebuilt(replace(opened.given, document=made.document)), notices
 
 
 def in_its_gravity(chain: Chain) -> Robot:
