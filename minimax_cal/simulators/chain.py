@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from minimax_cal.correcting.exporters.correct import match
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationError, RobotError
+from minimax_cal.ground.errors import CalibrationError, OptionError, RobotError
 from minimax_cal.ground.files import json_of
+from minimax_cal.robots.gravity import G
 from minimax_cal.robots.mjcf import body_name, body_pose, drives, is_driven, mujoco, tree_of, way_to
 from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.robots.sampling import random_joints
@@ -153,6 +154,22 @@ class Chain:
         ours, bias = find_id(model, "TEXT", ROBOT) >= 0, model.actuator_biasprm
         bare = [i for i in range(model.nu) if ours and bias[i, 1] < 0.0 and bias[i, 2] == 0.0]
         return np.array([any(drives(model, i, j) for i in bare) for j in self.joints], dtype=bool)
+
+    def find_filtered_servos(self) -> str:
+        """The joints whose servos filter their commands, in words; empty where none does."""
+        is_filtered = self.model.actuator_dyntype[self.servos] * (self.servos >= 0) > 0
+        return ", ".join(np.array(self.names)[is_filtered])
+
+    def robot_under_gravity(self) -> Robot:
+        """The robot, its vertical as long as the model's gravity over that of the earth.
+
+        Raises OptionError for a model without gravity.
+        """
+        if self.gravity == 0.0:
+            raise OptionError(
+                "the model has no gravity; give it <option gravity=...>, as the arm has"
+            )
+        return replace(self.robot, up=self.robot.up * self.gravity / G)
 
     def find_feed_forward(self) -> dict[int, int]:
         """Ids of actuators that take the commanded speed of a joint, and which joint (from 0)."""

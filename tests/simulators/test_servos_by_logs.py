@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.dynamics.drives import Drive
+from minimax_cal.dynamics.laws import WORDS
 from minimax_cal.dynamics.logs.table import NOTHING, TORQUE, Run
 from tests.conftest import run
 from tests.dynamics.motions import three_joints
@@ -28,9 +29,7 @@ from experiments.driven_arms import (  # noqa: E402
 from minimax_cal.simulators.mjcf import format_tree  # noqa: E402
 from minimax_cal.simulators.motion.drives import (  # noqa: E402
     Served,
-    can_write,
     own_drives,
-    with_drives,
 )
 from minimax_cal.simulators.motion.numbers import new_model, open_model  # noqa: E402
 from minimax_cal.simulators.result import MotionGap  # noqa: E402
@@ -121,11 +120,12 @@ def test_the_fastest_run_judges_and_every_effect_has_its_worth(made):
     assert names == {(kind, f"J{j}") for kind in ("servo_gain", "command_delay") for j in (1, 2, 3)}
     for one in gap.effects:
         assert max(before / after for before, after in one.worth.values()) > 1.5
-    assert [rung.name for rung in gap.rungs][:3] == [
-        "as given", "+ gains of the drive", "+ delay of the command"]  # fmt: skip
+    steps = [f"+ {WORDS[kind]}" for kind in ("servo_gain", "command_delay")]
+    assert [rung.name for rung in gap.rungs][:3] == ["as given", *steps]
     assert MotionGap.from_dict(json.loads(json.dumps(gap.to_dict()))).to_dict() == gap.to_dict()
     assert any("delay" in text and "MJX" in text for text in gap.notices)
-    assert any(text.startswith("corrected gains of the drive") for text in gap.sentences())
+    corrected = [text for text in gap.sentences() if text.startswith("corrected ")]
+    assert len(corrected) == len(gap.effects) + len(gap.elements)
 
 
 def test_sound_drives_are_not_accused(made, tmp_path):
@@ -170,17 +170,17 @@ def test_a_torque_limit_is_found_and_written(made, tmp_path):
 
 def test_every_number_of_a_drive_is_read_back_from_the_file(made):
     opened = open_model(made.path, 3)
-    assert can_write(opened)
+    assert opened.has_correctable_servos()
     given = own_drives(opened.chain)
     assert_allclose([drive.stiffness for drive in given], KP)
     wanted = (Drive(900.0, 80.0, 0.25, 0.013, 55.0), given[1], Drive(700.0, 50.0))
     fits = tuple(SimpleNamespace(drive=drive) for drive in wanted)
     told = tuple((kind, j) for kind in ("servo_gain", "command_delay", "torque_limit")
                  for j in range(3))  # fmt: skip
-    new = with_drives(opened, Served(given, fits, told, (0.0, 0.0), np.zeros(3)))
+    new = Served(given, fits, told, (0.0, 0.0), np.zeros(3)).apply_to(opened)
     for drive, again in zip(wanted, own_drives(new.chain), strict=True):
         assert_allclose(list(vars(again).values()), list(vars(drive).values()), rtol=1e-12)
-    back = with_drives(new, Served(given, (), (), (0.0, 0.0), np.zeros(3)))
+    back = Served(given, (), (), (0.0, 0.0), np.zeros(3)).apply_to(new)
     assert own_drives(back.chain) == given
 
 
@@ -326,8 +326,8 @@ def test_a_damper_too_large_for_an_explicit_step_changes_the_integrator(made):
     given = own_drives(opened.chain)
     for damper, integrator in ((0.03 * KV[0], "mjINT_EULER"), (9.0 * KV[0], "mjINT_IMPLICITFAST")):
         fits = (SimpleNamespace(drive=replace(given[0], damper=damper)), None, None)
-        new = with_drives(opened, Served(given, fits, (("servo_gain", 0),), (0.0, 0.0),
-                                         np.zeros(3)))  # fmt: skip
+        new = Served(given, fits, (("servo_gain", 0),), (0.0, 0.0),
+                     np.zeros(3)).apply_to(opened)  # fmt: skip
         model = new.chain.model
         assert mujoco.mjtIntegrator(model.opt.integrator).name == integrator
 

@@ -146,21 +146,10 @@ def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Correct
     if whole.link >= 0:  # the masses of the one link that changed
         one = bench.candidate(whole)
         best = one if one.score < best.score + STAYS else best
-    best = without_idle(bench, best)
-    rungs = tuple(ladder(bench, best, progress))
-    names = unwritten(best.opened.chain, best.numbers.bodies, best.opened.chain.names)
-    notices = tuple(f"link of {name}: MuJoCo did not take its mass and inertia from the file; give "
-                    'the compiler inertiafromgeom="auto"' for name in names)  # fmt: skip
-    return Corrected(best.opened, rungs, tuple(worths(bench, best)), (best, bench.study),
-                     tuple(left_out(found, whole)), notices, tuple(lost(best)))  # fmt: skip
 
-
-def without_idle(bench: Bench, best: Candidate) -> Candidate:
-    """Without laws and elements that do not make held-out motion better.
-
-    Where commands were logged, the joint error under them has a say: what lowers the torque's error
-    alone may be the simulator's own, as a damper that acts within its step.
-    """
+    # Backward elimination of laws and elements that do not make held-out motion better.  Where
+    # commands were logged, the joint error under them has a say: what lowers the torque's error
+    # alone may be the simulator's own, as a damper that acts within its step.
     effects = dict.fromkeys(term.effect for term in best.asked.laws)
     fewer: list[Callable[[Asked], Asked]] = [partial(Asked.without_law, effect=e) for e in effects]
     fewer += [partial(Asked.without, element=name) for name in reversed(Element)
@@ -168,45 +157,39 @@ def without_idle(bench: Bench, best: Candidate) -> Candidate:
     fewer.append(lambda asked: asked.without(Element.ARMATURE).without(Element.MASSES))
     for less in fewer:
         bare = bench.candidate(less(best.asked))
-        idle = bare.score < best.score + STAYS
+        is_idle = bare.score < best.score + STAYS
         harms = bench.tracking(bare) < bench.tracking(best) - STAYS
-        best = bare if idle or harms else best
-    return best
+        best = bare if is_idle or harms else best
 
-
-def ladder(bench: Bench, best: Candidate, progress: Progress) -> Iterator[MotionRung]:
-    """A rung for each element, fitted with those before it."""
-    taken = set[Element]()
+    # A rung for each element, fitted with those before it; its worth is what is lost without it.
+    taken, rungs, elements = set[Element](), list[MotionRung](), list[WrittenElement]()
     for name in Element:
         if name in best.asked.elements:
             taken.add(name)
             one = bench.candidate(replace(best.asked, elements=frozenset(taken)))
             progress(f"driving the model: + {name}")
-            yield bench.judge.rung(f"+ {name}", one.opened.chain, one.numbers, one.missed)
-
-
-def worths(bench: Bench, best: Candidate) -> Iterator[WrittenElement]:
-    """What each element of the file is worth."""
+            rungs.append(bench.judge.rung(f"+ {name}", one.opened.chain, one.numbers, one.missed))
     for name in Element:
-        if name in best.asked.elements:
+        if name in taken:
             bare = bench.candidate(best.asked.without(name))
             worth = changed_joints(bare.missed.moving, best.missed.moving)
-            yield WrittenElement(name.value, name.attributes, worth)
+            elements.append(WrittenElement(name.value, name.attributes, worth))
 
-
-def lost(best: Candidate) -> Iterator[str]:
-    """What other simulators leave out of the file, for people."""
-    numbers, elements = best.numbers, best.asked.elements
-    held = {
+    # What other simulators leave out of the file.
+    numbers = best.numbers
+    is_held = {
         Element.LEVELLED: numbers.damping[:, 1:].any(),
         Element.SPRINGS: numbers.stiffness[:, 1:].any(),
-        Element.DELAY: Element.DELAY in elements,
+        Element.DELAY: Element.DELAY in taken,
     }
-    for name, is_there in held.items():
-        if is_there:
-            yield name.left_out
-    if Element.DELAY in elements and numbers.late < 0.0:
-        yield HISTORY_FIRST
+    lost = [name.left_out for name, is_there in is_held.items() if is_there]
+    if is_held[Element.DELAY] and numbers.late < 0.0:
+        lost.append(HISTORY_FIRST)
+    names = unwritten(best.opened.chain, numbers.bodies, best.opened.chain.names)
+    notices = tuple(f"link of {name}: MuJoCo did not take its mass and inertia from the file; give "
+                    'the compiler inertiafromgeom="auto"' for name in names)  # fmt: skip
+    return Corrected(best.opened, tuple(rungs), tuple(elements), (best, bench.study),
+                     tuple(left_out(found, whole)), notices, tuple(lost))  # fmt: skip
 
 
 def left_out(found: MotionDiagnosis, whole: Asked) -> Iterator[str]:

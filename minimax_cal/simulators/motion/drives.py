@@ -102,6 +102,60 @@ class Served:
         """Whether anything is another than in the model."""
         return bool(self.told) or self.share[0] != self.share[1]
 
+    def apply_to(self, opened: Opened, kinds: Sequence[str] = KINDS) -> Opened:
+        """The model with what is told of its drives, of some kinds."""
+        document = opened.given.document.copy()
+        write_drives(document, opened.chain, self.drives(kinds), self.share[1])
+        return opened.again(document)
+
+    def joint_error(self, judge: Judge, opened: Opened) -> float:
+        """Mean log joint error on the runs held out; infinite where the model is unstable."""
+        try:
+            return mean_log(judge.tracking(self.apply_to(opened).chain))
+        except RobotError:
+            return math.inf
+
+    def without_idle(self, judge: Judge, opened: Opened) -> Served:
+        """Without effects whose lack does not raise the joint error of the driven model.
+
+        opened: the model with all that logs show beside.
+        """
+        served, best = self, self.joint_error(judge, opened)
+        for one in (*reversed(self.told), ALL):
+            less = served.without(one)
+            if one[0] == SPEED_LIMIT or (one == ALL and less.share == served.share):
+                continue
+            error = less.joint_error(judge, opened)
+            if error < best + WORTH:
+                served, best = less, error
+        return served
+
+    def rate_effects(self, judge: Judge, opened: Opened) -> tuple[MotionEffect, ...]:
+        """What is told, each with the joint errors [mrad] of the model without and with it."""
+        whole, effects = judge.tracking(self.apply_to(opened).chain), []
+        shared = [ALL] if self.share[0] != self.share[1] else []
+        for kind, j in (*shared, *self.told):
+            amounts: tuple[Amount, ...] = (Amount("gravity_share", self.share[1], "1"),)
+            fit = self.fits[j]
+            if fit and j >= 0:
+                amounts = tuple(Amount(name, getattr(fit.drive, name), unit, fit.sigma[name])
+                                for name, unit in FIELDS[kind].items())  # fmt: skip
+            less = whole
+            if kind != SPEED_LIMIT:
+                less = judge.tracking(self.without((kind, j)).apply_to(opened).chain)
+            place = "all" if j < 0 else f"J{j + 1}"
+            worth = changed_joints(1e3 * less, 1e3 * whole)
+            effects.append(MotionEffect(kind, place, amounts, worth))
+        return tuple(effects)
+
+    def apply_by_steps(
+        self, effects: Sequence[MotionEffect], opened: Opened
+    ) -> Iterator[tuple[str, Opened]]:
+        """The model with the drives, a step for each kind of effect, and what it is called."""
+        for number, kind in enumerate(KINDS):
+            if kind in {effect.effect for effect in effects}:
+                yield f"+ {WORDS[kind]}", self.apply_to(opened, KINDS[: number + 1])
+
 
 def own_drives(chain: Chain) -> tuple[Drive, ...]:
     """(n) the position servos of a model."""
@@ -213,68 +267,11 @@ def body_of(chain: Chain) -> Body:
     return body
 
 
-def kept(served: Served, judge: Judge, opened: Opened) -> Served:
-    """Without effects whose lack does not raise the joint error of the driven model.
-
-    opened: the model with all that logs show beside.
-    """
-    best = joint_error(judge, opened, served)
-    for one in (*reversed(served.told), ALL):
-        less = served.without(one)
-        if one[0] == SPEED_LIMIT or (one == ALL and less.share == served.share):
-            continue
-        error = joint_error(judge, opened, less)
-        if error < best + WORTH:
-            served, best = less, error
-    return served
-
-
-def joint_error(judge: Judge, opened: Opened, served: Served) -> float:
-    """Mean log joint error on the runs held out; infinite where the model is unstable."""
-    try:
-        return mean_log(judge.tracking(with_drives(opened, served).chain))
-    except RobotError:
-        return math.inf
-
-
-def effects_of(served: Served, judge: Judge, opened: Opened) -> Iterator[MotionEffect]:
-    """What is told, each with the joint errors [mrad] of the model without and with it."""
-    whole = judge.tracking(with_drives(opened, served).chain)
-    shared = [ALL] if served.share[0] != served.share[1] else []
-    for kind, j in (*shared, *served.told):
-        amounts: tuple[Amount, ...] = (Amount("gravity_share", served.share[1], "1"),)
-        fit = served.fits[j]
-        if fit and j >= 0:
-            amounts = tuple(Amount(name, getattr(fit.drive, name), unit, fit.sigma[name])
-                            for name, unit in FIELDS[kind].items())  # fmt: skip
-        less = whole
-        if kind != SPEED_LIMIT:
-            less = judge.tracking(with_drives(opened, served.without((kind, j))).chain)
-        place = "all" if j < 0 else f"J{j + 1}"
-        yield MotionEffect(kind, place, amounts, changed_joints(1e3 * less, 1e3 * whole))
-
-
 def lost_late(effects: Sequence[MotionEffect]) -> Iterator[str]:
     """What is to be said where a file has late commands, for people."""
     if any(one.effect == DELAY for one in effects):
         yield Element.DELAY.left_out
         yield HISTORY_FIRST
-
-
-def steps_with(
-    served: Served, effects: Sequence[MotionEffect], opened: Opened
-) -> Iterator[tuple[str, Opened]]:
-    """The model with the drives, a step for each kind of effect, and what it is called."""
-    for number, kind in enumerate(KINDS):
-        if kind in {effect.effect for effect in effects}:
-            yield f"+ {WORDS[kind]}", with_drives(opened, served, KINDS[: number + 1])
-
-
-def with_drives(opened: Opened, served: Served, kinds: Sequence[str] = KINDS) -> Opened:
-    """The model with what is told of its drives, of some kinds."""
-    document = opened.given.document.copy()
-    write_drives(document, opened.chain, served.drives(kinds), served.share[1])
-    return opened.again(document)
 
 
 def write_drives(
@@ -325,20 +322,6 @@ def write_drives(
             joint.set("actuatorgravcomp", "true" if gravity_share else "false")
 
 
-def filtered_servos(chain: Chain) -> str:
-    """The joints whose servos filter their commands, in words; empty where none does."""
-    filtered = chain.model.actuator_dyntype[chain.servos] * (chain.servos >= 0)
-    return ", ".join(np.array(chain.names)[filtered > 0])
-
-
-def can_write(opened: Opened) -> bool:
-    """Whether every joint has a servo of its own that can be given other numbers."""
-    chain, tree = opened.chain, MjcfTree(opened.given.document.root)
-    tags = [{e.tag for e in tree.find_actuators(name)} for name in chain.names]
-    named = all({"position", "general"} & some for some in tags)
-    return named and not chain.model.actuator_dyntype[chain.servos].any()
-
-
 # ---- actuators and ranges ------------------------------------------------------------------------
 
 
@@ -360,31 +343,33 @@ ACTUATORS = {{
 '''
 
 
-def as_actuators(chain: Chain, served: Served | None) -> list[dict[str, Any]]:
-    """Of a model as it is written, joint by joint, in SI, limits infinite where there are none.
+def write_actuators(path: Path | str, form: str, chain: Chain, served: Served | None) -> None:
+    """Write the actuators of a model as it is written, in SI, in a format that simulators take.
 
-    served: what its logs say of speeds that no model holds.
+    form: json or isaac.  served: what its logs say of speeds that no model holds.
     """
-    dofs, step = chain.dofs, chain.step
+    dofs, step, name = chain.dofs, chain.step, chain.robot.name
     fits = served.fits if served else (None,) * len(dofs)
     held = ("dof_armature", "dof_frictionloss", "dof_damping")
-    body = np.array([getattr(chain.model, name)[dofs] for name in held]).T.tolist()
-    return [
-        {"joint": name, "stiffness": drive.stiffness, "damping": drive.damper,
+    body = np.array([getattr(chain.model, field)[dofs] for field in held]).T.tolist()
+    joints: list[dict[str, Any]] = [
+        {"joint": joint, "stiffness": drive.stiffness, "damping": drive.damper,
          "feed_forward": drive.ahead, "armature": own[0], "friction": own[1],
          "viscous_friction": own[2], "effort_limit": drive.torque,
          "velocity_limit": fit.drive.speed if fit else math.inf, "delay": drive.delay,
          "delay_steps": round(drive.delay / step)}
-        for name, drive, own, fit in zip(chain.names, own_drives(chain), body, fits, strict=True)
+        for joint, drive, own, fit in zip(chain.names, own_drives(chain), body, fits, strict=True)
     ]  # fmt: skip
+    if form == "json":
+        content = {"schema": 1, "kind": "actuators", "model": name, "timestep": step,
+                   "joints": joints}  # fmt: skip
+        write_whole(Path(path), json_text(plain(content)))
+        return
 
-
-def actuators_text(found: list[dict[str, Any]], step: float, name: str) -> dict[str, str]:
-    """The files that can be written, by their format."""
-    content = {"schema": 1, "kind": "actuators", "model": name, "timestep": step, "joints": found}
+    # Isaac Lab has a group of actuators for each delay, and no infinite limits.
     entries = ""
-    for late in sorted({one["delay_steps"] for one in found}):
-        some = [one for one in found if one["delay_steps"] == late]
+    for late in sorted({one["delay_steps"] for one in joints}):
+        some = [one for one in joints if one["delay_steps"] == late]
         fields: dict[str, Any] = {"joint_names_expr": [one["joint"] for one in some]}
         for of in ("stiffness", "damping", "armature", "friction", "viscous_friction",
                    "effort_limit", "velocity_limit"):  # fmt: skip
@@ -393,15 +378,8 @@ def actuators_text(found: list[dict[str, Any]], step: float, name: str) -> dict[
         entries += f'    "delay_{late}": DelayedPDActuatorCfg(\n'
         entries += "".join(f"        {key}={value!r},\n" for key, value in fields.items())
         entries += "    ),\n"
-    ahead = {one["joint"]: one["feed_forward"] for one in found}
-    isaac = ISAAC.format(name=name, step=step, ahead=ahead, entries=entries)
-    return {"json": json_text(plain(content)), "isaac": isaac}
-
-
-def write_actuators(path: Path | str, form: str, chain: Chain, served: Served | None) -> None:
-    """Write the actuators of a model in a format that simulators take."""
-    step, found = chain.step, as_actuators(chain, served)
-    write_whole(Path(path), actuators_text(found, step, chain.robot.name)[form])
+    ahead = {one["joint"]: one["feed_forward"] for one in joints}
+    write_whole(Path(path), ISAAC.format(name=name, step=step, ahead=ahead, entries=entries))
 
 
 # ---- ranges ------------------------------------------------------------------------------------
@@ -514,27 +492,27 @@ def by_positions(judge: Judge, opened: Opened, *, plain: bool) -> Answer:
 
     Raises OptionError without servos to correct.
     """
-    if filtered := filtered_servos(opened.chain):
+    if filtered := opened.chain.find_filtered_servos():
         raise OptionError(
             f"{opened.given.source}: the servos of {filtered} filter their commands (dyntype or "
             "timeconst): positions alone do not correct them; leave the filter out of the model, "
             "or log torques or currents"
         )
-    if judge.drives != OWN_SERVOS or not can_write(opened):
+    if judge.drives != OWN_SERVOS or not opened.has_correctable_servos():
         raise OptionError(
             f"{judge.runs[0].source}: no column of torque or current: then every run needs "
             "commands of all joints (q1_cmd_rad, ...), and the model position servos"
         )
     served, names = serve(judge, opened, plain=plain), tuple(HELD)
-    served = kept(served, judge, with_body(opened, served, names))
+    served = served.without_idle(judge, with_body(opened, served, names))
     for name in reversed(names):
         less = tuple(one for one in names if one != name)
-        bare, whole = (joint_error(judge, with_body(opened, served, some), served)
+        bare, whole = (served.joint_error(judge, with_body(opened, served, some))
                        for some in (less, names))  # fmt: skip
         names = less if bare < whole + WORTH else names
-    effects = tuple(effects_of(served, judge, with_body(opened, served, names)))
-    steps = list(steps_with(served, effects, opened))
-    driven = with_drives(opened, served)
+    effects = served.rate_effects(judge, with_body(opened, served, names))
+    steps = list(served.apply_by_steps(effects, opened))
+    driven = served.apply_to(opened)
     steps += [(f"+ {name}", with_body(driven, served, names[: number + 1]))
               for number, name in enumerate(names)]  # fmt: skip
     rungs = tuple(judge.rung(name, one.chain) for name, one in steps)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -28,7 +27,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.simulators.chain import Chain, fill_history
 from minimax_cal.simulators.drive import check_stable
-from minimax_cal.simulators.motion.numbers import Numbers, Opened, in_its_gravity
+from minimax_cal.simulators.motion.numbers import Numbers, Opened
 from minimax_cal.simulators.result import COMMANDS, MotionRung
 
 # ---- a simulated arm along a log -----------------------------------------------------------------
@@ -84,39 +83,30 @@ def follow_commands(chain: Chain, run: Run, commands: Array, source: str) -> Arr
     return stepped(chain, run, drive, source)
 
 
-def follow_torques(chain: Chain, run: Run, torque: Array, pull: Pull, source: str) -> Array:
-    """(m, n) joint values under measured torques and drives that hold the arm to the log.
-
-    torque: (m, n) at the times of the run [N m].  The drives make up for what the model gets wrong:
-    where it is right, the arm follows the log by the measured torques alone.
-    """
-    wanted, time = scipy.interpolate.CubicSpline(run.time, run.q), steps_of(run.time, chain)
-    path = wanted(time), wanted(time, 1), at_times(time, run.time, torque)
-    return held_to(chain, run, path, pull, source)
-
-
-def follow_gains(chain: Chain, run: Run, commands: Array, gains: Pull, source: str) -> Array:
-    """(m, n) joint values where proportional and derivative drives bring an arm by commands."""
-    wanted = at_times(steps_of(run.time, chain), run.time, commands)
-    return held_to(chain, run, (wanted, 0.0 * wanted, 0.0 * wanted), gains, source)
-
-
-def held_to(
+def follow_torques(
     chain: Chain, run: Run, path: tuple[Array, Array, Array], pull: Pull, source: str
 ) -> Array:
-    """(m, n) joint values under drives that hold an arm to joint values and speeds (steps, n).
+    """(m, n) joint values under torques, and drives that hold an arm to joint values and speeds.
 
-    path: these, and torque beside that of the drives [N m].
+    path: these values and speeds and torques at the steps of the model, (steps, n) each
+    [rad, rad/s, N m].  The model's own actuators are off, and it has all its weight.
     """
-    at, dofs = chain.places, chain.dofs
-    q, qd, ahead = path
+    at, dofs, model = chain.places, chain.dofs, chain.model
+    q, qd, torque = path
 
     def drive(data: Any, now: int) -> None:
         off, slow = q[now] - data.qpos[at], qd[now] - data.qvel[dofs]
-        data.qfrc_applied[dofs] = ahead[now] + pull(data.qpos[at], off, slow)
+        data.qfrc_applied[dofs] = torque[now] + pull(data.qpos[at], off, slow)
 
-    with own_drives_off(chain.model):
+    fields = ("actuator_gainprm", "actuator_biasprm", "body_gravcomp")
+    kept = {name: getattr(model, name).copy() for name in fields}
+    try:
+        for name in fields:
+            getattr(model, name)[:] = 0.0
         return stepped(chain, run, drive, source)
+    finally:
+        for name in fields:
+            getattr(model, name)[:] = kept[name]
 
 
 def by_inertia(chain: Chain) -> Pull:
@@ -132,20 +122,6 @@ def by_inertia(chain: Chain) -> Pull:
         return torque[dofs]
 
     return pull
-
-
-@contextmanager
-def own_drives_off(model: Any) -> Iterator[None]:
-    """A model without its actuators' forces, and with all its weight."""
-    fields = ("actuator_gainprm", "actuator_biasprm", "body_gravcomp")
-    kept = {name: getattr(model, name).copy() for name in fields}
-    try:
-        for name in fields:
-            getattr(model, name)[:] = 0.0
-        yield
-    finally:
-        for name in fields:
-            getattr(model, name)[:] = kept[name]
 
 
 def steps_of(time: Array, chain: Chain) -> Array:
@@ -167,12 +143,6 @@ def stepped(chain: Chain, run: Run, drive: Callable[[Any, int], None], source: s
         mj.mj_step(model, data)
     check_stable(mj, data, source)
     return at_times(run.time, time, out)
-
-
-def tracking(q: Array, run: Run) -> Array:
-    """(n,) RMS distance of joint values (m, n) from those of a run, its ends left out [rad, m]."""
-    inside = (run.time > run.time[0] + EDGE_S) & (run.time < run.time[-1] - EDGE_S)
-    return np.asarray(np.sqrt(((q - run.q)[inside] ** 2).mean(axis=0)))
 
 
 # ---- the judge -----------------------------------------------------------------------------------
@@ -219,9 +189,10 @@ class Judge:
 
         Raises CalibrationError.
         """
-        if fast:
-            runs = sorted(runs, key=speed_of)
-        robot = in_its_gravity(opened.chain)
+        if fast:  # by the RMS speed of the joints, hinges and slides alike
+            runs = sorted(runs, key=lambda run: float(
+                np.sqrt((np.gradient(run.q, run.time, axis=0) ** 2).mean())))  # fmt: skip
+        robot = opened.chain.robot_under_gravity()
         gains = known.torque_gains(robot, runs)
         learning, held = divided(known.loaded(runs), known.holdout, known.holdout_run)
         logs = prepare([*learning, *held])
@@ -254,7 +225,7 @@ class Judge:
 
     def of_model(self, opened: Opened) -> Judge:
         """The same runs and drives, for another model of the arm."""
-        return replace(self, arm=replace(self.arm, robot=in_its_gravity(opened.chain)))
+        return replace(self, arm=replace(self.arm, robot=opened.chain.robot_under_gravity()))
 
     def read(self, numbers: Numbers | None) -> tuple[Array, float]:
         """(n,) torque of the log per torque of the joint, and by how much it is late [s]."""
@@ -281,24 +252,37 @@ class Judge:
         return Scene.of(self.arm, self.held).known_torque
 
     def tracking(self, chain: Chain, numbers: Numbers | None = None) -> Array:
-        """(n,) RMS joint error under the drives over the runs that judge [rad, m]."""
-        off = [tracking(self.follow(chain, run, number, numbers), run)
-               for number, run in enumerate(self.runs)]  # fmt: skip
+        """(n,) RMS joint error under the drives over the runs that judge [rad, m].
+
+        Without the ends of each run.
+        """
+        squares = []
+        for number, run in enumerate(self.runs):
+            inside = (run.time > run.time[0] + EDGE_S) & (run.time < run.time[-1] - EDGE_S)
+            off = (self.follow(chain, run, number, numbers) - run.q)[inside]
+            squares.append(np.square(np.sqrt((off**2).mean(axis=0))))
         weights = [run.duration for run in self.runs]
-        return np.asarray(np.sqrt(np.average(np.square(off), axis=0, weights=weights)))
+        return np.asarray(np.sqrt(np.average(squares, axis=0, weights=weights)))
 
     def follow(self, chain: Chain, run: Run, number: int, numbers: Numbers | None) -> Array:
         """(m, n) where the drives bring the arm along a run that judges."""
         assert self.hold is not None
         if self.drives == OWN_SERVOS:
             return follow_commands(chain, run, command_of(run), self.source)
+        steps = steps_of(run.time, chain)
         if self.drives == GIVEN_GAINS:
-            return follow_gains(chain, run, command_of(run), self.hold, self.source)
-        gain, late = self.read(numbers)
-        rows, time = self.held.spans[number], run.time - run.time[0]
-        carried = at_times(time, self.held.since[rows], self.known[rows])
-        torque = at_times(time + late, time, run.torque - carried) * self.arm.gain / gain
-        return follow_torques(chain, run, torque, self.hold, self.source)
+            wanted = at_times(steps, run.time, command_of(run))
+            path = wanted, 0.0 * wanted, 0.0 * wanted
+        else:
+            # The drives make up for what the model gets wrong: where it is right, the arm follows
+            # the log by the measured torques alone, less those of a known payload.
+            gain, late = self.read(numbers)
+            rows, time = self.held.spans[number], run.time - run.time[0]
+            carried = at_times(time, self.held.since[rows], self.known[rows])
+            torque = at_times(time + late, time, run.torque - carried) * self.arm.gain / gain
+            spline = scipy.interpolate.CubicSpline(run.time, run.q)
+            path = spline(steps), spline(steps, 1), at_times(steps, run.time, torque)
+        return follow_torques(chain, run, path, self.hold, self.source)
 
     def rung(self, name: str, chain: Chain, numbers: Numbers | None = None,
              missed: Missed | None = None) -> MotionRung:  # fmt: skip
@@ -309,11 +293,6 @@ class Judge:
         where = self.tracking(chain, numbers) if self.drives else np.zeros(0)
         sizes = (off.whole * self.arm.gain, off.whole, off.moving, 1e3 * where)
         return MotionRung(name, *(tuple(size.tolist()) for size in sizes))
-
-
-def speed_of(run: Run) -> float:
-    """RMS speed of the joints, hinges and slides alike [rad/s, m/s]."""
-    return float(np.sqrt((np.gradient(run.q, run.time, axis=0) ** 2).mean()))
 
 
 def divided(

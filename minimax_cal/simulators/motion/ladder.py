@@ -120,7 +120,12 @@ def motion_gap(
                                                soft=found.arm.soft))  # fmt: skip
             bench = bench_of(judge, opened, found, plain=plain)
             made = by_torques(bench, found, progress)
-    nothing = judge.commanded and not improves((*first, *made.rungs))
+    nothing = False
+    if judge.commanded:  # the joint error has to fall, joint by joint and in all
+        rungs = (*first, *made.rungs)
+        start, end = (np.array(rungs[k].tracking_rms_mrad) for k in (0, -1))
+        falls = np.linalg.norm(end) < np.linalg.norm(start)
+        nothing = not (falls and mean_log(end) < mean_log(start) - STAYS)
     path = None if write is None or nothing else Path(write)
     if path is not None:
         made.opened.write(path)
@@ -149,45 +154,33 @@ def motion_gap(
 
 def by_torques(bench: Bench, found: MotionDiagnosis, progress: Progress) -> drives.Answer:
     """By torques, and by commands where they were logged."""
-    bench, served, rungs, effects = by_commands(bench, found, progress)
-    made = correct(bench, found, progress)
-    more = {"rungs": (*rungs, *made.rungs), "lost": (*made.lost, *drives.lost_late(effects))}
-    if bench.judge.drives == OWN_SERVOS and (names := drives.filtered_servos(bench.opened.chain)):
-        said = f"the servos of {names} filter their commands: gains and delay stay as they are"
-        more["notices"] = (*made.notices, said)
-    return drives.Answer(**vars(made) | more, served=served, effects=effects)
-
-
-def by_commands(
-    bench: Bench, found: MotionDiagnosis, progress: Progress
-) -> tuple[Bench, drives.Served | None, tuple[MotionRung, ...], tuple[MotionEffect, ...]]:
-    """The model with the drives that logged commands show, these, a step for each effect, and what
-    each is worth.
-    """
     judge, opened = bench.judge, bench.opened
-    if judge.drives != OWN_SERVOS or not drives.can_write(opened):
-        return bench, None, (), ()
-    progress("fitting the drives to their commands")
-    served = drives.serve(judge, opened, plain=bench.plain)
-    if not served.changes:
-        return bench, served, (), ()
-    whole = asked_of(found, bench)
-    driven = drives.with_drives(opened, served)
-    beside = bench_of(judge, driven, found, plain=bench.plain).candidate(whole).opened
-    served = drives.kept(served, judge, beside)
-    effects = tuple(drives.effects_of(served, judge, beside))
-    off = judge.torque(opened.chain)
-    rungs = tuple(judge.rung(name, one.chain, missed=off)
-                  for name, one in drives.steps_with(served, effects, opened))  # fmt: skip
-    bench = bench_of(judge, drives.with_drives(opened, served), found, plain=bench.plain)
-    return bench, served, rungs, effects
+    served: drives.Served | None = None
+    effects, rungs = tuple[MotionEffect, ...](), tuple[MotionRung, ...]()
 
+    # Drives that logged commands show, a step for each kind of effect, rated beside all elements.
+    if judge.drives == OWN_SERVOS and opened.has_correctable_servos():
+        progress("fitting the drives to their commands")
+        served = drives.serve(judge, opened, plain=bench.plain)
+    if served and served.changes:
+        driven = bench_of(judge, served.apply_to(opened), found, plain=bench.plain)
+        beside = driven.candidate(asked_of(found, bench)).opened
+        served = served.without_idle(judge, beside)
+        effects = served.rate_effects(judge, beside)
+        off = judge.torque(opened.chain)
+        rungs = tuple(judge.rung(name, one.chain, missed=off)
+                      for name, one in served.apply_by_steps(effects, opened))  # fmt: skip
+        bench = bench_of(judge, served.apply_to(opened), found, plain=bench.plain)
 
-def improves(rungs: Sequence[MotionRung]) -> bool:
-    """Whether the joint error falls from the first step to the last, joint by joint and in all."""
-    first, last = (np.array(rungs[k].tracking_rms_mrad) for k in (0, -1))
-    falls = np.linalg.norm(last) < np.linalg.norm(first)
-    return bool(falls) and mean_log(last) < mean_log(first) - STAYS
+    # Elements of the body, from torques.
+    made = correct(bench, found, progress)
+    notices, filtered = made.notices, bench.opened.chain.find_filtered_servos()
+    if judge.drives == OWN_SERVOS and filtered:
+        text = f"the servos of {filtered} filter their commands: gains and delay stay as they are"
+        notices = (*notices, text)
+    changes = {"rungs": (*rungs, *made.rungs), "notices": notices,
+               "lost": (*made.lost, *drives.lost_late(effects))}  # fmt: skip
+    return drives.Answer(**vars(made) | changes, served=served, effects=effects)
 
 
 def told_or_found(

@@ -27,7 +27,7 @@ from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.robots.document import Document
-from minimax_cal.robots.gravity import LEAST_MASS, G, masses_of, weighed
+from minimax_cal.robots.gravity import LEAST_MASS, masses_of, weighed
 from minimax_cal.robots.mjcf import Given, body_pose, mujoco, numbers, read_model
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.transforms import inverse, tail, transform
@@ -394,6 +394,13 @@ class Opened:
                 set_element(tree.section("actuator"), "position", str(servo.name), kv=damper)
         return self.again(self.given.document)
 
+    def has_correctable_servos(self) -> bool:
+        """Whether every joint has a servo of its own that can be given other numbers."""
+        chain, tree = self.chain, MjcfTree(self.given.document.root)
+        tags = [{e.tag for e in tree.find_actuators(name)} for name in chain.names]
+        is_servo = all({"position", "general"} & some for some in tags)
+        return is_servo and not chain.model.actuator_dyntype[chain.servos].any()
+
     def write(self, path: Path) -> None:
         """Write the file, and what it includes and changed beside it."""
         write_document(self.given.document, self.given.folder, path)
@@ -444,10 +451,3 @@ def calibrated(opened: Opened, fit: Fit) -> tuple[Opened, tuple[str, ...]]:
             "not in the model: encoder gains and couplings, which only position servos hold",
         )
     return opened.rebuilt(replace(opened.given, document=made.document)), notices
-
-
-def in_its_gravity(chain: Chain) -> Robot:
-    """The robot of a model, its vertical as long as the model's gravity over that of the earth."""
-    if chain.gravity == 0.0:
-        raise OptionError("the model has no gravity; give it <option gravity=...>, as the arm has")
-    return replace(chain.robot, up=chain.robot.up * chain.gravity / G)
