@@ -33,6 +33,7 @@ PLACED = 0.15  # of an error that the poses it is judged by have placed
 NOISE_MM = 0.03  # RMS of 10 um an axis, with what 9 poses leave open
 WITHIN = 1.1  # of the rung that holds only effects with an element
 KEYS = {"name", "holdout_rms_mm", "holdout_max_mm"}
+BEFORE = ["as given", "servo sag removed", "calibrated geometry"]  # names of the first rungs
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +67,8 @@ def gap(arm: Path, few_moves: None) -> SimulatorGap:
 
 def test_the_ladder_falls_to_what_the_fit_says(arm, gap):
     names = [rung.name for rung in gap.rungs]
-    assert names == ["as given", "servo sag removed", "calibrated geometry",
-                     "+ joint_compliance all"]  # fmt: skip
+    assert names[:3] == BEFORE
+    assert [name.split()[1] for name in names[3:]] == ["joint_compliance"]
     held = [rung.holdout_rms_mm for rung in gap.rungs]
     assert sorted(held, reverse=True) == held
     assert held[0] > 3.0 * held[1]  # published gains: the sag is most of it
@@ -90,10 +91,11 @@ def test_a_report_tells_that_the_simulator_met_another_arm(arm, gap):
     assert read_sources([fit, gap]).notices == ()
     here = replace(gap.provenance, data_sha256="0" * 64)
     new = replace(gap, robot=fit.robot.name, provenance=here)
-    (told,) = read_sources([fit, new]).notices
-    assert told.endswith("other measurements than the rest.")
-    (told,) = read_sources([fit, replace(new, robot="another")]).notices
-    assert f"of another, not of {fit.robot.name}: is it the same arm?" in told
+    (notice,) = read_sources([fit, new]).notices
+    assert "measurements" in notice
+    (notice,) = read_sources([fit, replace(new, robot="another")]).notices
+    assert "another" in notice
+    assert fit.robot.name in notice
 
 
 def test_the_command_and_the_report(arm, gap, tmp_path, capsys):
@@ -105,7 +107,8 @@ def test_the_command_and_the_report(arm, gap, tmp_path, capsys):
     assert run("gap", tmp_path / "arm.urdf", *ways, *more) == 0
     said = capsys.readouterr()
     found = json.loads(said.out)
-    assert "joints are set" in said.err  # a URDF has no servos
+    assert "servo" in said.err  # a URDF has none: joints are set
+    assert found["rungs"][0]["sag_mrad"] == 0.0
     assert [rung["name"] for rung in found["rungs"]][:2] == ["as given", "calibrated geometry"]
     last = found["rungs"][-1]
     assert abs(last["holdout_rms_mm"] - gap.rungs[-1].holdout_rms_mm) < AGREES
@@ -113,7 +116,7 @@ def test_the_command_and_the_report(arm, gap, tmp_path, capsys):
     assert "<svg" in (tmp_path / "gap.svg").read_text()
     page = tmp_path / "report.html"
     assert run("report", arm / "fit.json", tmp_path / "gap.json", "-o", page) == 0
-    assert "The arm in the simulator" in page.read_text()
+    assert f"{last['holdout_rms_mm']:.4f}" in page.read_text()
     assert run("report", tmp_path / "gap.json", "-o", page) == 2
 
 
@@ -124,17 +127,17 @@ def test_models_that_do_not_fit_are_refused(arm, tmp_path, capsys):
     broken.write_text("<mujoco><worldbody><body><joint type='no'/></body></worldbody></mujoco>")
     empty.write_text("<mujoco><include file='gone.xml'/></mujoco>")
     for model, said in (
-        (other, "no chain of 6 hinges"),
-        (broken, "MuJoCo refuses"),
-        (empty, "includes 'gone.xml'"),
-        (arm / "poses.csv", "is not XML"),
-        (tmp_path / "absent.xml", "cannot be read"),
+        (other, "6 hinges"),
+        (broken, "MuJoCo"),
+        (empty, "gone.xml"),
+        (arm / "poses.csv", "XML"),
+        (tmp_path / "absent.xml", "absent.xml"),
     ):
         assert run("gap", model, arm / "poses.csv", "--fit", arm / "fit.json") == 2
         assert said in capsys.readouterr().err
     mc.export("irb2600", "mjcf", other, notify=lambda notice: None)
     assert run("gap", other, arm / "poses.csv", "--fit", arm / "fit.json") == 2
-    assert "moves otherwise than the nominal robot" in capsys.readouterr().err
+    assert "nominal robot" in capsys.readouterr().err
 
 
 @pytest.mark.slow  # the quick studies run it besides
@@ -176,15 +179,15 @@ def test_an_effect_without_an_element_is_no_rung_and_what_was_fitted_beside_it_i
     written = stiffening / "corrected.xml"
     ways = {"data": stiffening / "poses.csv", "fit": stiffening / "fit.json"}
     gap = mc.simulator_gap(stiffening / "arm.xml", **ways, write=written)
-    names = [rung.name for rung in gap.rungs[2:]]
-    assert names == ["calibrated geometry", "+ joint_compliance all", "+ base_flex frame"]
+    effects = [rung.name.split()[1] for rung in gap.rungs[3:]]
+    assert effects == ["joint_compliance", "base_flex"]
     held = [rung.holdout_rms_mm for rung in gap.rungs[2:]]
     assert sorted(held, reverse=True) == held
     assert gap.commands is not None
     assert gap.commands.holdout_rms_mm < 0.7 * held[-1]
     for rung in (*gap.rungs[2:], gap.commands):
         assert abs(rung.holdout_rms_mm - rung.predicted_rms_mm) < AGREES
-    assert not any("where the fit says" in notice for notice in gap.notices)
+    assert not ladder.disagreement([*gap.rungs, gap.commands])
     # the model that is driven with the map is another file than the best one without
     commands = mc.load_commands(stiffening / "corrected.commands.json")
     fit = mc.load_fit(stiffening / "fit.json")
@@ -220,11 +223,9 @@ def test_what_makes_the_simulator_worse_is_not_written(stiffening, tmp_path, mon
         write=tmp_path / "corrected.xml",
     )  # fmt: skip
     assert gap.rungs[-1].name == "calibrated geometry"
-    assert any(
-        text.startswith("joint compliance of the whole arm: the simulated arm is worse with it")
-        for text in gap.left_out
-    )
-    assert any("not in the file: base flex" in text for text in gap.notices)
+    assert [name in text for name, text in zip(("joint compliance", "base flex"), gap.left_out,
+                                               strict=True)] == [True, True]  # fmt: skip
+    assert all(any(text in notice for notice in gap.notices) for text in gap.left_out)
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "corrected.xml"))
     assert "base_flex_x" not in [model.joint(i).name for i in range(model.njnt)]
 
@@ -232,9 +233,7 @@ def test_what_makes_the_simulator_worse_is_not_written(stiffening, tmp_path, mon
 def test_a_simulator_that_does_other_than_the_fit_says_so():
     rung = Rung("+ base_flex frame", 0.0950, 0.3, 0.0950, 0.3, 0.0, predicted_rms_mm=0.0800)
     (said,) = ladder.disagreement([rung, replace(rung, predicted_rms_mm=0.0900)])
-    assert said == (
-        "+ base flex: the simulated arm misses by 0.0950 mm where the fit says 0.0800 mm"
-    )
+    assert all(fact in said for fact in ("base flex", "0.0950 mm", "0.0800 mm"))
     assert not ladder.disagreement([replace(rung, predicted_rms_mm=float("nan"))])
 
 
@@ -331,8 +330,7 @@ def test_a_pillar_between_poses_is_nothing_that_an_arm_rests_on(turned):
     fit = mc.calibrate(fit.nominal.robot, data, "sum")
     whole = mc.simulator_gap(folder / "post.xml", data, fit=fit)
     (notice,) = [text for text in whole.notices if "touches" in text]
-    assert "at 3 poses" in notice
-    assert notice.endswith("they are left out")
+    assert "3 poses" in notice
     assert whole.holdout_poses == int(fit.held[3:].sum())
     assert whole.rungs[-1].holdout_rms_mm < NOISE_MM
 
