@@ -23,7 +23,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.gravity import tubes
 from minimax_cal.robots.mjcf import mujoco, numbers
 from minimax_cal.robots.robot import Robot
-from minimax_cal.simulators.mjcf import format_tree
+from minimax_cal.simulators.mjcf_tree import MjcfTree
 from minimax_cal.simulators.motion.numbers import new_model
 
 ARMS = ("ur10", "ur5e", "irb2600", "scara_600")
@@ -132,7 +132,7 @@ def with_motors(robot: Robot) -> bytes:
             servo.attrib.clear()
             servo.tag = "motor"
             servo.attrib.update({"name": name, "joint": name})
-    return format_tree(root)
+    return MjcfTree(root).to_bytes()
 
 
 def served(xml: bytes, stiffness: Array, damper: Array) -> bytes:

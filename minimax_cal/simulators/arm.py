@@ -15,6 +15,7 @@ import numpy as np
 import scipy
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import json_text
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.bending import BASE_FLEX, LINK_BENDING, TOOL_FLEX, bent, tilted
@@ -175,12 +176,11 @@ def moments(mass: Array, com: Array) -> Array:
 
 def per_moment(scene: Scene, kind: str, place: int) -> Array:
     """(4 n, k, 3, m) displacement of a spring of compliance 1, for each mass and first moment."""
-    verbs: dict[str, Callable[..., Array]] = {
+    verb: Callable[..., Array] = {
         "joint": partial(turned, joint=place),
         "link": partial(bent, link=place),
         "base": tilted,
-    }
-    verb = verbs[kind]
+    }[kind]
     out, n = [], scene.joints
     for mass in np.eye(n):
         centres = (np.outer(mass, axis) for axis in np.eye(4)[:, 1:])
@@ -241,6 +241,7 @@ def together(
 
 SAMPLES = 120  # poses at which laws and springs are compared
 NEGLIGIBLE = 1e-9  # [rad]
+COMMAND_MAP_ENDING = ".commands.json"  # in the place of that of the model
 LEVER = 0.1  # from the flange to what it carries [m]
 
 
@@ -295,6 +296,47 @@ class Arm:
         zeros = np.zeros(robot.joints)
         mass, com = masses or masses_of(robot, LEAST_MASS)
         return Arm(robot, mass, com, turn=zeros, gain=zeros, play=zeros)
+
+    def rest_in_play(self, data: Measurements) -> Array | None:
+        """(m, n) where joints rest in their play, by the moves that led to each pose [rad]."""
+        if not self.play.any():
+            return None
+        sides = [data.columns[f"approach{i + 1}"] for i in range(data.q.shape[1])]
+        return np.asarray(0.5 * self.play * np.stack(sides, axis=1))
+
+    def format_command_map(self, cell: Cell) -> dict[str, bytes]:
+        """The file of the command map by its ending, where there is something to map.
+
+        cell: whose effects the arm does.
+        """
+        if not self.mapped.terms:
+            return {}
+        whole = replace(cell, effects=self.mapped).whole()
+        content = {"schema": 1, "kind": "commands", "cell": whole}
+        return {COMMAND_MAP_ENDING: json_text(content).encode()}
+
+    def list_limitations(self) -> list[str]:
+        """What a file of the arm does not hold, for people."""
+        limitations = []
+        if self.mapped.terms:
+            named = ", ".join(dict.fromkeys(name_effect(*term.key) for term in self.mapped.terms))
+            limitations.append(
+                f"{named}: no element of a simulator; the file beside (*{COMMAND_MAP_ENDING}) "
+                "corrects commands, and the model counts on it: ctrl = mc.load_commands(PATH)(q)"
+            )
+        limitations += [f"not in the file: {text}" for text in self.left_out]
+        if self.remainder:
+            limitations.append(
+                "one set of masses and springs stands for the effects of the fit, to "
+                f"{1e3 * self.remainder:.2g} mm RMS"
+            )
+        if self.play.any():
+            joints = ", ".join(f"play{i + 1}" for i in np.flatnonzero(self.play))
+            limitations.append(
+                f"backlash: {joints} rest amid their play; set qpos_spring of the joint to half "
+                "the play times the sign of the last move"
+            )
+        return limitations
 
     @cached_property
     def reach(self) -> Array:
@@ -413,14 +455,6 @@ def parts_of(cell: Cell, scene: Scene, arm: Arm) -> Parts:
         if values.any():
             ELEMENTS.get(term.effect, without_element)(parts, scene, term, values)
     return parts
-
-
-def held_terms(cell: Cell) -> tuple[Term, ...]:
-    """The effects of a cell that elements hold, or a command map; those of 0 need nothing."""
-    data = still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot)
-    alone = ((term, replace(cell, effects=Fitted.of([(term, values)])))
-             for term, values in cell.effects.pairs)  # fmt: skip
-    return tuple(term for term, one in alone if not bare_parts(one, data).left_out)
 
 
 def unheld(cell: Cell, data: Measurements) -> tuple[Term, ...]:

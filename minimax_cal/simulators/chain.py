@@ -9,15 +9,24 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minimax_cal.correcting.exporters.correct import match
+from minimax_cal.correcting.exporters.correct import laid, match
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError, RobotError
 from minimax_cal.ground.files import json_of
-from minimax_cal.robots.gravity import G
-from minimax_cal.robots.mjcf import body_name, body_pose, drives, is_driven, mujoco, tree_of, way_to
+from minimax_cal.robots.gravity import G, weighed
+from minimax_cal.robots.mjcf import (
+    Given,
+    body_name,
+    body_pose,
+    drives,
+    is_driven,
+    mujoco,
+    tree_of,
+    way_to,
+)
 from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.robots.sampling import random_joints
-from minimax_cal.robots.transforms import transform
+from minimax_cal.robots.transforms import inverse, transform
 from minimax_cal.robots.urdf import UrdfRobot, both_ends, to_robot
 
 ROBOT = "minimax_cal_robot"  # the text under which a file of ours holds its robot whole
@@ -73,6 +82,12 @@ class Chain:
     def __post_init__(self) -> None:
         self.model.opt.disableflags |= int(mujoco().mjtDisableBit.mjDSBL_CONTACT)
 
+    @staticmethod
+    def find(given: Given, joint_count: int, tip: str = "") -> Chain:
+        """The arm of so many joints in a model's file.  tip: its last body.  Raises RobotError."""
+        model = given.compiled()
+        return chain_of(model, joint_count, given.source, tip, unknown=given.assumed)
+
     @property
     def bodies(self) -> tuple[int, ...]:
         """Ids of the bodies that the joints carry."""
@@ -114,16 +129,9 @@ class Chain:
     @property
     def servos(self) -> Array:
         """(n,) ids of the position actuators of its joints, -1 where there is none."""
-        return np.array([self.servo(joint) for joint in self.joints])
-
-    def servo(self, joint: int) -> int:
-        """Id of the position actuator of a joint; -1 where there is none."""
         m = self.model
-        for i in range(m.nu):
-            is_servo = m.actuator_biasprm[i, 1] < 0.0 < m.actuator_gainprm[i, 0]
-            if is_servo and drives(m, i, joint):
-                return i
-        return -1
+        ids = [i for i in range(m.nu) if m.actuator_biasprm[i, 1] < 0.0 < m.actuator_gainprm[i, 0]]
+        return np.array([next((i for i in ids if drives(m, i, j)), -1) for j in self.joints])
 
     def read_servos(self) -> ModelServos:
         """The servos with their gains, dampers and force limits, as MuJoCo has compiled them."""
@@ -154,6 +162,50 @@ class Chain:
         ours, bias = find_id(model, "TEXT", ROBOT) >= 0, model.actuator_biasprm
         bare = [i for i in range(model.nu) if ours and bias[i, 1] < 0.0 and bias[i, 2] == 0.0]
         return np.array([any(drives(model, i, j) for i in bare) for j in self.joints], dtype=bool)
+
+    @property
+    def has_assumed_masses(self) -> bool:
+        """Whether the model does not tell the masses of all links."""
+        return not bool(weighed(self.robot).all())
+
+    def find_masses(self, nominal: Robot) -> tuple[Array, Array] | None:
+        """Masses (n,) [kg], their centres (n, 3) in the links of another robot of the arm [m].
+
+        nominal: that robot.  None where the masses of the model are assumed.
+        """
+        if self.has_assumed_masses:
+            return None
+        base, _ = match(nominal, self.seen)
+        links, own = laid(nominal, base)[1:], laid(self.robot, self.base)[1:]
+        com = [
+            inverse(a)[:3, :3] @ (b[:3, :3] @ c + b[:3, 3] - a[:3, 3])
+            for a, b, c in zip(links, own, self.robot.com, strict=True)
+        ]
+        return self.robot.mass, np.array(com)
+
+    def check_force_limits(self, q: Array, source: str) -> None:
+        """Raise RobotError where gravity alone asks for more than a joint's force limit.
+
+        q: (m, n) poses that the arm is to hold [rad, m].
+        """
+        servos = self.read_servos()
+        if servos.gravity_free:
+            return
+        mj, model, data, at, dofs = self.fresh()
+        for row in q:
+            data.qpos[at] = row
+            mj.mj_forward(model, data)
+            needed = data.qfrc_bias[dofs]
+            short = (needed <= servos.limits[:, 0]) | (needed >= servos.limits[:, 1])
+            if short.any():
+                i = int(np.argmax(short))
+                unit = "N" if self.robot.prismatic[i] else "N m"
+                limit = np.abs(servos.limits[i]).min()
+                raise RobotError(
+                    f"{source}: joint {self.names[i]}: gravity asks for {abs(needed[i]):.4g} "
+                    f"{unit} at a measured pose, its force limit is {limit:.4g} {unit}; raise the "
+                    "limit (forcerange), or mend the masses"
+                )
 
     def find_filtered_servos(self) -> str:
         """The joints whose servos filter their commands, in words; empty where none does."""
@@ -208,11 +260,6 @@ class Chain:
         """(nbody, 4, 4) poses of all bodies in the world, the arm at joint values 0 [m]."""
         data = self.data_at_zero()
         return np.array([body_pose(data, body) for body in range(self.model.nbody)])
-
-    def compiled_pose(self, body: int) -> Array:
-        """(4, 4) of a body in its parent body, as the file has it [m]."""
-        turn = Rotation.from_quat(self.model.body_quat[body], scalar_first=True).as_matrix()
-        return transform(turn, np.array(self.model.body_pos[body]))
 
     def find_largest_inertias(self) -> Array:
         """(n,) about each joint, its motor's with it, all over the workspace [kg m^2]."""
@@ -313,3 +360,9 @@ def fill_history(model: Any, data: Any) -> None:
     for k, (count, _) in enumerate(getattr(model, "actuator_history", ())):
         if count:
             mujoco().mj_initCtrlHistory(model, data, k, None, np.full(count, data.ctrl[k]))
+
+
+def pose_in_parent(model: Any, body: int) -> Array:
+    """(4, 4) of a body in its parent body, as a model has it [m]."""
+    turn = Rotation.from_quat(model.body_quat[body], scalar_first=True).as_matrix()
+    return transform(turn, np.array(model.body_pos[body]))

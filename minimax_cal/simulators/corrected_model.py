@@ -23,8 +23,8 @@ from minimax_cal.robots.gravity import LEAST_MASS, G, masses_of
 from minimax_cal.robots.mjcf import Given, shifted
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import SAME, difference, head, inverse
-from minimax_cal.simulators.arm import Arm, assumed
-from minimax_cal.simulators.chain import ORIENTATION_ATTRIBUTES, ROBOT, Chain
+from minimax_cal.simulators.arm import Arm
+from minimax_cal.simulators.chain import ORIENTATION_ATTRIBUTES, ROBOT, Chain, pose_in_parent
 from minimax_cal.simulators.elements import Layout, set_link_mass, write_arm_elements
 from minimax_cal.simulators.mjcf_tree import MjcfTree, pose_attributes
 
@@ -76,7 +76,7 @@ def correct_model(
     layout = move_bodies(tree, chain, (nominal, base), calibrated)
 
     # Masses: a model keeps its own, but for a file of ours that assumes them.
-    if arm and assumed(chain.robot):
+    if arm and chain.has_assumed_masses:
         for i, body in enumerate(layout.bodies):
             set_link_mass(body, arm, i)
         for text in tree.root.iter("text"):
@@ -129,7 +129,7 @@ def move_bodies(
             parent = new[i - 1] @ inverse(old[i - 1]) @ parent
         motion = joint.motion(model.qpos0[[model.jnt_qposadr[ids[i]]]])[0]
         pose = inverse(parent) @ at @ motion @ inverse(anchor)
-        compiled = chain.compiled_pose(chain.bodies[i])
+        compiled = pose_in_parent(model, chain.bodies[i])
         if difference(compiled, pose) <= SAME * 10.0:
             continue
 
@@ -165,44 +165,3 @@ def lengthen_keyframes(given: Given, tree: ET.Element, model: Any) -> None:
                 for joint in new:
                     values.insert(int(starts[joint]), "0")
                 key.set(name, " ".join(values))
-
-
-def masses_in_links(chain: Chain, nominal: Robot) -> tuple[Array, Array] | None:
-    """Masses (n,) of the model [kg], their centres (n, 3) in the links of the fit's robot [m].
-
-    None where the model's are assumed.
-    """
-    if assumed(chain.robot):
-        return None
-    base, _ = match(nominal, chain.seen)
-    links, seen = laid(nominal, base)[1:], laid(chain.robot, chain.base)[1:]
-    com = [
-        inverse(a)[:3, :3] @ (b[:3, :3] @ c + b[:3, 3] - a[:3, 3])
-        for a, b, c in zip(links, seen, chain.robot.com, strict=True)
-    ]
-    return chain.robot.mass, np.array(com)
-
-
-def check_force_limits(chain: Chain, q: Array, source: str) -> None:
-    """Raise RobotError where gravity alone asks for more than a joint's force limit.
-
-    q: (m, n) poses that the arm is to hold [rad, m].
-    """
-    servos = chain.read_servos()
-    if servos.gravity_free:
-        return
-    mj, model, data, at, dofs = chain.fresh()
-    for row in q:
-        data.qpos[at] = row
-        mj.mj_forward(model, data)
-        needed = data.qfrc_bias[dofs]
-        short = (needed <= servos.limits[:, 0]) | (needed >= servos.limits[:, 1])
-        if short.any():
-            i = int(np.argmax(short))
-            unit = "N" if chain.robot.prismatic[i] else "N m"
-            limit = np.abs(servos.limits[i]).min()
-            raise RobotError(
-                f"{source}: joint {chain.names[i]}: gravity asks for {abs(needed[i]):.4g} {unit} at"
-                f" a measured pose, its force limit is {limit:.4g} {unit}; raise the limit "
-                "(forcerange), or mend the masses"
-            )

@@ -165,25 +165,47 @@ def visits(
 ) -> list[Visit]:
     """A run of moves, one after the other, with a model of its own: a row each of `Driven`."""
     chain = replace(chain, model=copy(chain.model))
-    (mj, model, data, at, _), sides = chain.fresh(), chain.find_plays()
-    moved = way_to(model, chain.carrier)
-    dofs, kinds = model.jnt_dofadr[list(moved)], model.jnt_type[list(moved)]
-    rest = np.where(kinds == 2, STILL_SLIDE, STILL)
-    limits, step, start = Limits.of(chain), chain.step, commands[rows[0] - 1]
-    data.qpos[at], data.ctrl[limits.servos] = start, start
+    (mj, model, data, at, dofs), plays, carrier = chain.fresh(), chain.find_plays(), chain.carrier
+    joints, servos, moved = list(chain.joints), chain.servos, list(way_to(model, carrier))
+    is_slide = model.jnt_type[moved] == mj.mjtJoint.mjJNT_SLIDE
+    rest = np.where(is_slide, STILL_SLIDE, STILL)
+
+    # Limits of actuators and joints, a little inside: rounding does not hide what is at one.
+    inside, none = 1.0 - 1e-9, np.array([-np.inf, np.inf])
+    is_limited, ends = model.actuator_forcelimited[servos, None], model.actuator_forcerange[servos]
+    low, high = (np.where(is_limited, ends, none) * inside).T
+    is_limited, ends = model.jnt_actfrclimited[joints, None], model.jnt_actfrcrange[joints]
+    low_torque, high_torque = (np.where(is_limited, ends, none) * inside).T
+
+    def steer(path: Array, every: int = 1) -> Array:
+        """(n,) at how many timesteps each joint is at a limit along commands (steps, n).
+
+        every: timesteps between two looks, and two commands.
+        """
+        starts, forces, torques = range(0, len(path), every), list[Array](), list[Array]()
+        for k in starts:
+            data.ctrl[servos] = path[k]
+            mj.mj_step(model, data, min(every, len(path) - k))
+            forces.append(data.actuator_force[servos])
+            torques.append(data.qfrc_actuator[dofs])
+        force, torque = np.array(forces), np.array(torques)
+        at_limit = (force <= low) | (force >= high) | (torque <= low_torque)
+        return np.diff([*starts, len(path)]) @ (at_limit | (torque >= high_torque))
+
+    step, start = chain.step, commands[rows[0] - 1]
+    data.qpos[at], data.ctrl[servos] = start, start
     fill_history(model, data)
     count, out = round(REST / step), list[Visit]()
-    steered(model, data, limits, np.tile(start, (count, 1)), LOOKS)
+    steer(np.tile(start, (count, 1)), LOOKS)
     for row in rows:
-        for joint, place in sides.items():
+        for joint, place in plays.items():
             model.qpos_spring[place] = play[row, joint]
         path = moves(start, commands[row], chain.robot.prismatic, step)
-        at_limit = steered(model, data, limits, path)
-        at_limit += steered(model, data, limits, np.tile(commands[row], (count, 1)), LOOKS)
+        at_limit = steer(path) + steer(np.tile(commands[row], (count, 1)), LOOKS)
         check_stable(mj, data, source)
+        speed = float((np.abs(data.qvel[model.jnt_dofadr[moved]]) / rest).max())
         share = at_limit / (len(path) + count)
-        speed = float((np.abs(data.qvel[dofs]) / rest).max())
-        out.append((body_pose(data, chain.carrier), data.qpos[at], speed, share))
+        out.append((body_pose(data, carrier), data.qpos[at], speed, share))
         start = commands[row]
         heard()
     return out
@@ -196,51 +218,6 @@ def moves(start: Array, end: Array, slides: Array, step: float) -> Array:
     count = max(1, round(max(MOVE, float(needed.max(initial=0.0))) / step))
     t = np.arange(1, count + 1)[:, None] / count
     return start + way * t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
-
-
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """Force limits of the arm's actuators, and of its joints.
-
-    servos, dofs: (n,) ids.  force, torque: (n, 2) limits, infinite where there are none.
-    """
-
-    servos: Array
-    dofs: Array
-    force: Array
-    torque: Array
-
-    @staticmethod
-    def of(chain: Chain) -> Limits:
-        """Those of a model, a little inside, so that rounding does not hide what is at one."""
-        m, joints, servos = chain.model, list(chain.joints), chain.servos
-        open_ends = np.array([-np.inf, np.inf])
-        force = np.where(m.actuator_forcelimited[servos, None], m.actuator_forcerange[servos],
-                         open_ends)  # fmt: skip
-        torque = np.where(m.jnt_actfrclimited[joints, None], m.jnt_actfrcrange[joints], open_ends)
-        inside = 1.0 - 1e-9
-        return Limits(servos, chain.dofs, force * inside, torque * inside)
-
-    def reached(self, force: Array, torque: Array) -> Array:
-        """(..., n) True where an actuator or its joint is at a limit."""
-        return ((force <= self.force[:, 0]) | (force >= self.force[:, 1])
-            | (torque <= self.torque[:, 0]) | (torque >= self.torque[:, 1]))  # fmt: skip
-
-
-def steered(model: Any, data: Any, limits: Limits, path: Array, every: int = 1) -> Array:
-    """(n,) at how many timesteps each joint is at a limit along commands (steps, n).
-
-    every: timesteps between two looks, and two commands.
-    """
-    mj, starts = mujoco(), range(0, len(path), every)
-    force, torque = list[Array](), list[Array]()
-    for k in starts:
-        data.ctrl[limits.servos] = path[k]
-        mj.mj_step(model, data, min(every, len(path) - k))
-        force.append(data.actuator_force[limits.servos])
-        torque.append(data.qfrc_actuator[limits.dofs])
-    at_limit = limits.reached(np.array(force), np.array(torque))
-    return np.diff([*starts, len(path)]) @ at_limit
 
 
 def check_stable(mj: Any, data: Any, source: str) -> None:
@@ -298,19 +275,11 @@ def measure_target_offsets(
     base: (4, 4) of the arm in the model's world [m].
     """
     commands = Commands(replace(cell, effects=arm.mapped)).follow(data)
-    points = stand(chain, data.target_names, commands, resting(arm, data))
+    points = stand(chain, data.target_names, commands, arm.rest_in_play(data))
     to = cell.base @ inverse(base)
     chosen = [cell.target_names.index(name) for name in data.target_names]
     expected = cell.seen(data)[:, chosen]
     return np.moveaxis(expected - points @ to[:3, :3].T - to[:3, 3], 1, 0)
-
-
-def resting(arm: Arm, data: Measurements) -> Array | None:
-    """(m, n) where joints rest in their play, by the moves that led to each pose [rad]."""
-    if not arm.play.any():
-        return None
-    sides = [data.columns[f"approach{i + 1}"] for i in range(data.q.shape[1])]
-    return np.asarray(0.5 * arm.play * np.stack(sides, axis=1))
 
 
 def stand(chain: Chain, names: tuple[str, ...], commands: Array, play: Array | None) -> Array:
@@ -318,8 +287,8 @@ def stand(chain: Chain, names: tuple[str, ...], commands: Array, play: Array | N
 
     commands: (m, n) [rad, m].  play: (m, n) where each joint rests in its play [rad].
     """
-    mj, model = mujoco(), copy(chain.model)
-    data, sides, servos = mj.MjData(model), chain.find_plays(), chain.servos
+    chain = replace(chain, model=copy(chain.model))
+    (mj, model, data, *_), sides, servos = chain.fresh(), chain.find_plays(), chain.servos
     joints = list(way_to(model, int(model.site(names[0]).bodyid[0])))
     at, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
     states = model.actuator_actadr[servos]

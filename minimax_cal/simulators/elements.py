@@ -140,8 +140,8 @@ def design_servos(layout: Layout, arm: Arm, *, with_springs: bool = False) -> Se
 
 def frames(robot: Robot) -> Array:
     """(n, 4, 4) frame of each joint in the base at joint values 0, z its axis [m]."""
-    frames_of_links = zip(laid(robot, np.eye(4)), robot.mdh, strict=False)
-    return np.array([at @ head(row) for at, row in frames_of_links])
+    links = laid(robot, np.eye(4))
+    return np.array([at @ head(row) for at, row in zip(links, robot.mdh, strict=False)])
 
 
 def write_arm_elements(
@@ -179,7 +179,7 @@ def write_servos(layout: Layout, arm: Arm, servos: ServoDesign) -> None:
     if given.gravity_free or share < 1.0:
         for body in layout.bodies[0].iter("body"):
             body.set("gravcomp", numbers([1.0 - share]))
-    if not (given.gravity_free or share == 1.0):
+    if share < 1.0 and not given.gravity_free:
         for joint, ends in zip(layout.joints, given.limits, strict=True):
             joint.set("actuatorgravcomp", "true")
             if np.isfinite(ends).any():
@@ -405,8 +405,5 @@ def across_themselves(matrix: Array) -> Array:
     first = vectors.sum(axis=1) / np.sqrt(3.0)
     plane = level_to(first)
     _, turned = np.linalg.eigh(plane @ half @ plane.T)
-    both = (
-        (turned[:, 0] + turned[:, 1]) / np.sqrt(2.0),
-        (turned[:, 0] - turned[:, 1]) / np.sqrt(2.0),
-    )
+    both = [(turned[:, 0] + sign * turned[:, 1]) / np.sqrt(2.0) for sign in (1.0, -1.0)]
     return np.array([first, *(way @ plane for way in both)])

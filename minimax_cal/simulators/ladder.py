@@ -35,15 +35,10 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import inverse
 from minimax_cal.robots.urdf import MODELS
 from minimax_cal.simulators.arm import ELEMENTS, Arm, arm_of, assumed, unheld, why_not
-from minimax_cal.simulators.chain import Chain, chain_of
-from minimax_cal.simulators.corrected_model import (
-    CorrectedModel,
-    check_force_limits,
-    correct_model,
-    masses_in_links,
-)
-from minimax_cal.simulators.drive import Commands, drive, placed_error, resting, touching
-from minimax_cal.simulators.mjcf import format_command_map, list_limitations, write_document
+from minimax_cal.simulators.chain import Chain
+from minimax_cal.simulators.corrected_model import CorrectedModel, correct_model
+from minimax_cal.simulators.drive import Commands, drive, placed_error, touching
+from minimax_cal.simulators.mjcf import write_document
 from minimax_cal.simulators.result import Rung, SimulatorGap
 from minimax_cal.solvers.status import Status
 
@@ -106,7 +101,7 @@ def find_causes(
 
     # A fit of the poses of the diagnosis; a fit without masses is made again with those of the
     # model: then its springs are the model's.
-    needs_masses = fit is not None and not assumed(robot) and assumed(fit.nominal.robot)
+    needs_masses = fit is not None and not chain.has_assumed_masses and assumed(fit.nominal.robot)
     if found is not None and fit is None:
         terms = carried_over(terms, robot)
         rows = replace(found.data, digest=found.provenance.data_sha256)
@@ -115,7 +110,7 @@ def find_causes(
     if needs_masses:
         progress("fit with the masses of the model")
         nominal = fit.nominal.robot
-        mass, com = masses_in_links(chain, nominal) or (nominal.mass, nominal.com)
+        mass, com = chain.find_masses(nominal) or (nominal.mass, nominal.com)
         terms = carried_over(terms, robot)
         effects = tuple(term if term.choice else term.label for term in terms)
         settings = {**vars(fit.options), "effects": effects}
@@ -125,15 +120,15 @@ def find_causes(
     geometry = fit if not fit.cell.effects.terms else again(fit, effects=())
 
     # What a simulator may have an element for, what a command map may hold, and what neither does.
-    history, turning, left_out = with_history(fit.data), list[Term](), list[str]()
+    history, left_out = with_history(fit.data), list[str]()
+    firm, turning = list[Term](), list[Term]()
     for term in terms:
         if term.effect in ELEMENTS:
-            continue
-        if term.columns(fit.cell.scene(history)).only_turns:
+            firm.append(term)
+        elif term.columns(fit.cell.scene(history)).only_turns:
             turning.append(term)
         else:
             left_out.append(f"{name_effect(*term.key)}: {why_not(EFFECTS[term.effect])}")
-    firm = tuple(term for term in terms if term.effect in ELEMENTS)
 
     # The poses that judge: those of the fit with what it held out, or others with some held out.
     is_same = bool(fit.data.poses) and fit.provenance.data_sha256 == data.digest
@@ -143,9 +138,8 @@ def find_causes(
         check_arm(fit.cell.robot, data)
         history = with_history(data)
         held = held_out(history, holdout, seed)[0]
-    floor = found.floor if found else None
-    return Causes(fit, geometry, firm, tuple(turning), tuple(left_out), history, held, floor,
-                  is_same)  # fmt: skip
+    return Causes(fit, geometry, tuple(firm), tuple(turning), tuple(left_out), history, held,
+                  found.floor if found else None, is_same)  # fmt: skip
 
 
 def with_split(data: Measurements, held: Array) -> Measurements:
@@ -236,10 +230,10 @@ def simulator_gap(
     progress("reading the model")
     rows = read_measurements(data)
     given = read_model(model)
-    chain = chain_of(given.compiled(), rows.q.shape[1], given.source, tip, unknown=given.assumed)
+    chain = Chain.find(given, rows.q.shape[1], tip)
     check_joints(chain.robot, rows)
     if (chain.servos >= 0).all():  # before anything that takes long
-        check_force_limits(chain, rows.q, given.source)
+        chain.check_force_limits(rows.q, given.source)
         drive(chain, rows.q[:FIRST_MOVES], given.source)  # some moves show whether it is stable
     causes = find_causes(chain, rows, fit, diagnosis, holdout, seed, progress)
     if not causes.held.any():
@@ -293,16 +287,16 @@ class Run:
 
     def before(self) -> list[Rung]:
         """The model as given, and without the sag of its servos."""
-        first = self.rung("as given", self.chain, self.nominal)
+        first = self.rung("as given", self.chain)
         if (self.chain.servos < 0).any():
             self.notices.append(
                 f"{self.given.source}: not every joint has a position servo: joints are set, not "
                 "driven, in the model as given"
             )
             return [replace(first, why="joints set, not driven")]
-        made = correct_model(self.given, self.chain, self.nominal.robot, None)
+        made = self.correct(None, self.nominal)
         self.notices += made.notices
-        stiff = self.rung("servo sag removed", self.compile(made.document), self.nominal)
+        stiff = self.rung("servo sag removed", self.compile(made.document))
         return [
             replace(first, why=f"servos sag by up to {first.sag_mrad:.3g} mrad"),
             replace(stiff, why="gains that hold the arm where it is commanded"),
@@ -314,7 +308,7 @@ class Run:
         Each is fitted with those before it and with nothing else: the values of a fit hold
         together, and an element with those of a fit that had more does not do what that fit says.
         """
-        fit, taken = self.causes.geometry, list[Term]()
+        fit, taken, limit = self.causes.geometry, list[Term](), 1.0 + WORSE
         rungs = [self.fitted("calibrated geometry", fit)]
         for term in self.causes.firm:
             label = name_effect(*term.key)
@@ -325,8 +319,8 @@ class Run:
                 continue
             before, rung = rungs[-1], self.fitted(term.step, more)
             if (
-                rung.train_rms_mm > (1.0 + WORSE) * before.train_rms_mm
-                or rung.holdout_rms_mm > (1.0 + WORSE) * before.holdout_rms_mm
+                rung.train_rms_mm > limit * before.train_rms_mm
+                or rung.holdout_rms_mm > limit * before.holdout_rms_mm
             ):
                 change = f"{before.holdout_rms_mm:.4f} -> {rung.holdout_rms_mm:.4f} mm"
                 self.left_out.append(f"{label}: the simulated arm is worse with it ({change})")
@@ -342,26 +336,26 @@ class Run:
         changes the rest.
         """
         arm, with_map = self.arm(fit), None
-        made = self.with_arm(arm, fit)
-        rung = self.rung(before.name, self.compile(made.document, path), fit.cell, arm, fit)
+        made = self.correct(arm, fit.cell)
+        rung = self.rung(before.name, self.compile(made.document, path), arm, fit)
         if self.mapped:
             fit = self.causes.fitted([*fit.cell.effects.terms, *self.mapped])
             arm = self.arm(fit)
         if arm.mapped.terms:
             model = None if path is None else path.with_suffix(COMMANDED)
-            chain = self.compile(self.with_arm(arm, fit).document, model)
+            chain = self.compile(self.correct(arm, fit.cell).document, model)
             if path is not None:
-                for ending, content in format_command_map(fit.cell, arm).items():
+                for ending, content in arm.format_command_map(fit.cell).items():
                     write_whole(path.with_suffix(ending), content)
                 self.notices.append(f"{model}: the model that the command map belongs to; {path} "
                                     "is the best without")  # fmt: skip
             commands = Commands(replace(fit.cell, effects=arm.mapped)).follow(self.data)
-            with_map = self.rung("with its command map", chain, fit.cell, arm, fit, commands)
+            with_map = self.rung("with its command map", chain, arm, fit, commands)
             labels = dict.fromkeys(name_effect(*term.key) for term in arm.mapped.terms)
             with_map = replace(with_map, why="commands corrected for " + ", ".join(labels))
         self.left_out += arm.left_out
         whole = replace(arm, remainder=0.0, left_out=tuple(self.left_out))
-        self.notices += (*made.notices, *list_limitations(whole))
+        self.notices += (*made.notices, *whole.list_limitations())
         return replace(rung, why=before.why), with_map
 
     def compile(self, document: Document, path: Path | None = None) -> Chain:
@@ -373,37 +367,37 @@ class Run:
 
     def arm(self, fit: Fit) -> Arm:
         """The elements of a fit, with the model's own masses unless those are assumed."""
-        own = masses_in_links(self.chain, self.nominal.robot)
-        some = fit.train.take(np.arange(0, fit.train.poses, max(1, fit.train.poses // TRAINING)))
+        own = self.chain.find_masses(self.nominal.robot)
+        train, count = fit.train, fit.train.poses
+        some = train.take(np.arange(0, count, max(1, count // TRAINING)))
         return arm_of(fit.cell, masses=own, measured=some)
 
     def fitted(self, name: str, fit: Fit) -> Rung:
         """The simulator with the arm of a fit."""
         arm = self.arm(fit)
-        return self.rung(name, self.compile(self.with_arm(arm, fit).document), fit.cell, arm, fit)
+        return self.rung(name, self.compile(self.correct(arm, fit.cell).document), arm, fit)
 
-    def with_arm(self, arm: Arm, fit: Fit) -> CorrectedModel:
-        """The model with an arm and its targets in it."""
-        names = fit.cell.target_names
+    def correct(self, arm: Arm | None, cell: Cell) -> CorrectedModel:
+        """The model with an arm and the targets of a cell in it; without an arm, without sag."""
+        names = cell.target_names if arm else ()
         return correct_model(self.given, self.chain, self.nominal.robot, arm, names)
 
     def rung(
         self,
         name: str,
         chain: Chain,
-        start: Cell,
         arm: Arm | None = None,
         fit: Fit | None = None,
         commands: Array | None = None,
     ) -> Rung:
         """Drive a model to every pose and judge where it comes to rest.
 
-        start: base and targets to begin with.  arm, fit: that the model is to do, if any.
+        arm, fit: that the model is to do, if any.
         commands: (m, n) where they are other than the joint values of the poses.
         """
         q = self.data.q
         commands = q if commands is None else commands
-        play = None if arm is None else resting(arm, self.data)
+        play = None if arm is None else arm.rest_in_play(self.data)
         count = len(q)
 
         def report(done: int) -> None:
@@ -421,6 +415,7 @@ class Run:
             )
 
         # Base and targets from the training poses, begun where the cell has them.
+        start = fit.cell if fit else self.nominal
         end = inverse(driven.poses[0]) @ start.robot.pose(q[0])
         spots = start.target_positions @ end[:3, :3].T + end[:3, 3]
         error = placed_error(driven.poses, self.data, judge & ~self.held, (start.base, spots))

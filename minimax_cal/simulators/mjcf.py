@@ -20,26 +20,20 @@ import numpy as np
 from minimax_cal.correcting.exporters.job import Export, Job, origins
 from minimax_cal.correcting.exporters.urdf import assumptions
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import json_text, write_whole
-from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.effects.table import Term
-from minimax_cal.modelling.effects.words import name_effect
+from minimax_cal.ground.files import write_whole
+from minimax_cal.modelling.cell import Cell, still
+from minimax_cal.modelling.effects.table import Fitted, Term
 from minimax_cal.robots.document import Document, Writing
 from minimax_cal.robots.gravity import G
 from minimax_cal.robots.mjcf import find_assets, mujoco, read_model
 from minimax_cal.robots.transforms import tail
-from minimax_cal.simulators.arm import Arm, arm_of, held_terms, sample
-from minimax_cal.simulators.chain import ROBOT, ModelServos, chain_of
-from minimax_cal.simulators.corrected_model import (
-    check_force_limits,
-    correct_model,
-    masses_in_links,
-)
+from minimax_cal.simulators.arm import Arm, arm_of, bare_parts, sample
+from minimax_cal.simulators.chain import ROBOT, Chain, ModelServos, chain_of
+from minimax_cal.simulators.corrected_model import correct_model
 from minimax_cal.simulators.drive import measure_target_offsets
 from minimax_cal.simulators.elements import Layout, set_link_mass, write_arm_elements
 from minimax_cal.simulators.mjcf_tree import MjcfTree, add_element, pose_attributes
 
-COMMAND_MAP_ENDING = ".commands.json"
 ROD_RADIUS = 0.02  # of the links that are drawn [m]
 NEW_TIMESTEP = 0.002  # of a new file [s]
 
@@ -53,7 +47,7 @@ def write(job: Job) -> Export:
     if not job.model:
         cell = job.cell or Cell(job.robot, np.eye(4), (), np.zeros((0, 3)))
         arm, base = arm_of(cell, job.q), np.eye(4)
-        content = format_tree(build_new_tree(arm, cell.target_names))
+        content = build_new_tree(arm, cell.target_names).to_bytes()
         beside, chain = dict[str, bytes](), None
         notices: tuple[str, ...] = (assumptions(job.robot),)
         if find_spec("mujoco") and cell.target_names:
@@ -65,62 +59,25 @@ def write(job: Job) -> Export:
                 f"{job.source}: mjcf= is corrected by a calibration: give one, not a robot"
             )
         cell, given = job.cell, read_model(job.model)
-        chain = chain_of(
-            given.compiled(), job.robot.joints, given.source, job.tip, unknown=given.assumed
-        )
-        arm = arm_of(cell, job.q, masses_in_links(chain, job.nominal))
+        chain = Chain.find(given, job.robot.joints, job.tip)
+        arm = arm_of(cell, job.q, chain.find_masses(job.nominal))
         q = sample(job.robot) if job.q is None else job.q
-        check_force_limits(chain, q, given.source)
+        chain.check_force_limits(q, given.source)
         made = correct_model(given, chain, job.nominal, arm, cell.target_names)
         chain = chain.in_model(given.compiled(made.document.root))  # before assets are renamed
         content, beside = format_document(made.document, given.folder, job.path)
         base, notices = made.base, made.notices
     offsets = None if chain is None else partial(measure_target_offsets, chain, cell, arm, base)
-    beside = {**beside, **format_command_map(cell, arm)}
-    return Export(content, (*notices, *list_limitations(arm)), beside, offsets)
+    beside |= arm.format_command_map(cell)
+    return Export(content, (*notices, *arm.list_limitations()), beside, offsets)
 
 
 def carries(cell: Cell) -> tuple[Term, ...]:
-    """The effects that a simulator has an element for, or that turn joints alone."""
-    return held_terms(cell)
-
-
-def list_limitations(arm: Arm) -> list[str]:
-    """What the file does not hold, for people."""
-    limitations = []
-    if arm.mapped.terms:
-        named = ", ".join(dict.fromkeys(name_effect(*term.key) for term in arm.mapped.terms))
-        limitations.append(
-            f"{named}: no element of a simulator; the file beside (*{COMMAND_MAP_ENDING}) corrects "
-            "commands, and the model counts on it: ctrl = mc.load_commands(PATH)(q)"
-        )
-    limitations += [f"not in the file: {text}" for text in arm.left_out]
-    if arm.remainder:
-        limitations.append(
-            "one set of masses and springs stands for the effects of the fit, to "
-            f"{1e3 * arm.remainder:.2g} mm RMS"
-        )
-    if arm.play.any():
-        joints = ", ".join(f"play{i + 1}" for i in np.flatnonzero(arm.play))
-        limitations.append(
-            f"backlash: {joints} rest amid their play; set qpos_spring of the joint to half the "
-            "play times the sign of the last move"
-        )
-    return limitations
-
-
-def format_command_map(cell: Cell, arm: Arm) -> dict[str, bytes]:
-    """The file of the command map by its ending, where there is something to map."""
-    if not arm.mapped.terms:
-        return {}
-    content = {"schema": 1, "kind": "commands", "cell": replace(cell, effects=arm.mapped).whole()}
-    return {COMMAND_MAP_ENDING: json_text(content).encode()}
-
-
-def format_tree(tree: ET.Element) -> bytes:
-    """The text of a new file."""
-    ET.indent(tree)
-    return bytes(ET.tostring(tree, encoding="utf-8", xml_declaration=True)) + b"\n"
+    """The effects of a cell that elements hold, or a command map; those of 0 need nothing."""
+    data = still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot)
+    alone = ((term, replace(cell, effects=Fitted.of([(term, values)])))
+             for term, values in cell.effects.pairs)  # fmt: skip
+    return tuple(term for term, one in alone if not bare_parts(one, data).left_out)
 
 
 def format_document(
@@ -136,7 +93,7 @@ def format_document(
     if is_elsewhere and path is not None and any(e.get("file") for e in document.root.iter()):
         find_assets(document.root, Path(os.path.relpath(here, path.resolve().parent)))
     if not document.pieces:
-        return format_tree(document.root), {}
+        return MjcfTree(document.root).to_bytes(), {}
     how = Writing(is_elsewhere, path.stem if path else "")
     return document.raw(how), how.beside
 
@@ -151,7 +108,7 @@ def write_document(document: Document, source: Path, path: Path) -> None:
 
 def build_new_tree(
     arm: Arm, target_names: Sequence[str], *, with_springs: bool = False
-) -> ET.Element:
+) -> MjcfTree:
     """A new file of an arm: bodies link1 ... linkn, masses, servos, springs, and rods to see.
 
     with_springs: as in `write_arm_elements`.
@@ -190,8 +147,9 @@ def build_new_tree(
     add_element(root, "actuator")
     axes = np.array([[0.0, 0.0, 1.0]]) * robot.sign[:, None]
     names = tuple(f"joint{i + 1}" for i in range(n))
-    layout = Layout(MjcfTree(root), names, tuple(bodies), tuple(joints),
+    tree = MjcfTree(root)
+    layout = Layout(tree, names, tuple(bodies), tuple(joints),
                     np.broadcast_to(np.eye(4), (n, 4, 4)), np.zeros((n, 3)), axes,
                     ModelServos.none(n), np.zeros(n), NEW_TIMESTEP)  # fmt: skip
     write_arm_elements(layout, arm, target_names, with_springs=with_springs)
-    return root
+    return tree

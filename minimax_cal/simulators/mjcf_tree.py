@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
 from minimax_cal.robots.mjcf import mujoco, numbers
-from minimax_cal.robots.transforms import transform
-from minimax_cal.simulators.chain import ORIENTATION_ATTRIBUTES, Chain
+from minimax_cal.simulators.chain import ORIENTATION_ATTRIBUTES, Chain, pose_in_parent
 
 
 def format_attributes(attributes: Mapping[str, object]) -> dict[str, str]:
@@ -49,6 +48,11 @@ class MjcfTree:
     """The elements of an MJCF.  root: <mujoco>."""
 
     root: ET.Element
+
+    def to_bytes(self) -> bytes:
+        """The text of a file, indented."""
+        ET.indent(self.root)
+        return bytes(ET.tostring(self.root, encoding="utf-8", xml_declaration=True)) + b"\n"
 
     def section(self, tag: str) -> ET.Element:
         """The first section of a tag, added where there is none."""
@@ -108,9 +112,7 @@ class MjcfTree:
         pose = " ".join(f'{k}="{said[k]}"' for k in ("pos", *ORIENTATION_ATTRIBUTES) if k in said)
         units = " ".join(f'{k}="{compiler[k]}"' for k in ("angle", "eulerseq") if k in compiler)
         text = f"<mujoco><compiler {units}/><worldbody><body {pose}/></worldbody></mujoco>"
-        model = mujoco().MjModel.from_xml_string(text)
-        turn = Rotation.from_quat(model.body_quat[1], scalar_first=True).as_matrix()
-        return transform(turn, np.array(model.body_pos[1]))
+        return pose_in_parent(mujoco().MjModel.from_xml_string(text), 1)
 
     @property
     def uses_degrees(self) -> bool:

@@ -69,7 +69,7 @@ def sites(model: Any, chain: Chain, q: np.ndarray, names: tuple[str, ...]) -> np
         mujoco.mj_resetData(model, data)
         for i, joint in enumerate(ids):
             data.qpos[model.jnt_qposadr[joint]] = row[i]
-            data.ctrl[moved.servo(joint)] = row[i]
+            data.ctrl[moved.servos[i]] = row[i]
         while data.time < 8.0:
             mujoco.mj_step(model, data, 100)
             if np.abs(data.qvel).max() < 1e-7:
@@ -170,7 +170,7 @@ def test_published_gains_sag(given):
     assert not rested.moving.any()
     # the servo is a spring: each joint stands off by its torque over its gain
     torque = still_torque(chain, rested.q)
-    gains = np.array([chain.model.actuator_gainprm[chain.servo(j), 0] for j in chain.joints])
+    gains = np.array(chain.model.actuator_gainprm[chain.servos, 0])
     assert_allclose(rested.q - q, torque / gains, rtol=0, atol=2e-5)  # its slowest pole is at 5/s
 
 

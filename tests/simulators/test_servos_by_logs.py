@@ -26,7 +26,7 @@ from experiments.driven_arms import (  # noqa: E402
     served,
     with_motors,
 )
-from minimax_cal.simulators.mjcf import format_tree  # noqa: E402
+from minimax_cal.simulators.mjcf_tree import MjcfTree  # noqa: E402
 from minimax_cal.simulators.motion.drives import (  # noqa: E402
     Served,
     own_drives,
@@ -347,7 +347,7 @@ def test_a_new_model_of_a_robot_file_gets_the_drives_of_the_log(made, tmp_path):
 def test_a_file_of_ours_whose_joints_hold_the_dampers_of_its_servos(tmp_path, scale):
     """The file itself made the log, sound or with other gains: its torques lack the dampers."""
     path, out = tmp_path / "arm.xml", tmp_path / "out.xml"
-    path.write_bytes(format_tree(new_model(three_joints()).root))
+    path.write_bytes(MjcfTree(new_model(three_joints()).root).to_bytes())
     arm = DrivenArm(three_joints(), path.read_bytes(), LACKS, 3, STEP)
     real = mujoco.MjModel.from_xml_path(str(path))
     real.opt.timestep = STEP

@@ -11,7 +11,7 @@ import numpy as np
 
 from minimax_cal.dynamics.diagnose import MATTERS
 from minimax_cal.dynamics.laws import LAWS, Element, Term
-from minimax_cal.dynamics.result import MotionDiagnosis, MotionEffect, changed_joints
+from minimax_cal.dynamics.result import MotionDiagnosis, changed_joints
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress
 from minimax_cal.robots.mjcf import is_driven
@@ -162,32 +162,30 @@ def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Correct
         best = bare if is_idle or harms else best
 
     # A rung for each element, fitted with those before it; its worth is what is lost without it.
-    taken, rungs, elements = set[Element](), list[MotionRung](), list[WrittenElement]()
-    for name in Element:
-        if name in best.asked.elements:
-            taken.add(name)
-            one = bench.candidate(replace(best.asked, elements=frozenset(taken)))
-            progress(f"driving the model: + {name}")
-            rungs.append(bench.judge.rung(f"+ {name}", one.opened.chain, one.numbers, one.missed))
-    for name in Element:
-        if name in taken:
-            bare = bench.candidate(best.asked.without(name))
-            worth = changed_joints(bare.missed.moving, best.missed.moving)
-            elements.append(WrittenElement(name.value, name.attributes, worth))
+    names = [name for name in Element if name in best.asked.elements]
+    rungs, elements = list[MotionRung](), list[WrittenElement]()
+    for number, name in enumerate(names, start=1):
+        one = bench.candidate(replace(best.asked, elements=frozenset(names[:number])))
+        progress(f"driving the model: + {name}")
+        rungs.append(bench.judge.rung(f"+ {name}", one.opened.chain, one.numbers, one.missed))
+    for name in names:
+        bare = bench.candidate(best.asked.without(name))
+        worth = changed_joints(bare.missed.moving, best.missed.moving)
+        elements.append(WrittenElement(name.value, name.attributes, worth))
 
     # What other simulators leave out of the file.
     numbers = best.numbers
     is_held = {
         Element.LEVELLED: numbers.damping[:, 1:].any(),
         Element.SPRINGS: numbers.stiffness[:, 1:].any(),
-        Element.DELAY: Element.DELAY in taken,
+        Element.DELAY: Element.DELAY in names,
     }
     lost = [name.left_out for name, is_there in is_held.items() if is_there]
     if is_held[Element.DELAY] and numbers.late < 0.0:
         lost.append(HISTORY_FIRST)
-    names = unwritten(best.opened.chain, numbers.bodies, best.opened.chain.names)
-    notices = tuple(f"link of {name}: MuJoCo did not take its mass and inertia from the file; give "
-                    'the compiler inertiafromgeom="auto"' for name in names)  # fmt: skip
+    links = unwritten(best.opened.chain, numbers.bodies)
+    notices = tuple(f"link of {link}: MuJoCo did not take its mass and inertia from the file; give "
+                    'the compiler inertiafromgeom="auto"' for link in links)  # fmt: skip
     return Corrected(best.opened, tuple(rungs), tuple(elements), (best, bench.study),
                      tuple(left_out(found, whole)), notices, tuple(lost))  # fmt: skip
 
@@ -195,8 +193,9 @@ def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Correct
 def left_out(found: MotionDiagnosis, whole: Asked) -> Iterator[str]:
     """What the file does not hold, and what that costs.  whole: all that it may hold."""
     for one in found.effects:
-        law = LAWS.get(one.effect)
-        if law is None or is_body(one):
+        law = LAWS.get(one.effect)  # the model holds a link whose mass is not as given
+        is_link = any(p.name == "mass" for p in one.parameters) and math.isnan(one.frequency)
+        if law is None or is_link:
             continue
         held = bool(law.held)
         if Element.GAIN in law.held:
@@ -209,8 +208,3 @@ def left_out(found: MotionDiagnosis, whole: Asked) -> Iterator[str]:
             small = f"{without:.3g}" == f"{with_it:.3g}"
             yield f"{one.words}: {law.why}" + ("" if small else f" (costs {cost})")
     yield from (one.sentence(found.unit) for one in found.unexplained if one.share > MATTERS)
-
-
-def is_body(one: MotionEffect) -> bool:
-    """Whether an effect is a link whose mass is not as given, which the model holds."""
-    return any(p.name == "mass" for p in one.parameters) and math.isnan(one.frequency)

@@ -217,15 +217,6 @@ def kept_numbers(study: Study, asked: Asked) -> Numbers:
     )
 
 
-def standing(study: Study, asked: Asked) -> Array:
-    """(M, n) torque of what the model has and is not fitted [N m]."""
-    own, motion = kept_numbers(study, asked), study.scene.logs.motion
-    out = own.friction * study.scene.sense + own.armature * motion.qdd
-    out += np.einsum("mjp,jp->mj", speeds(motion.qd), own.damping)
-    x = motion.q - own.rest
-    return np.asarray(sum((own.stiffness[:, p] * x ** (p + 1) for p in range(POWERS)), out))
-
-
 def solved(
     study: Study,
     scene: Scene,
@@ -241,9 +232,16 @@ def solved(
         len(logs.since), len(columns)))  # fmt: skip
     matrix = np.zeros((len(kept), len(columns)))
     for k, column in enumerate(columns):
-        own = white.kept[column.joint]
-        matrix[kept == column.joint, k] = white.white_joint(column.joint, rows[own, k])
-    fixed = logs.filtered(standing(study, asked) / scene.divisor)
+        some = rows[white.kept[column.joint], k]
+        matrix[kept == column.joint, k] = white.white_joint(column.joint, some)
+
+    # Torque of what the model has and is not fitted [N m].
+    own, motion = kept_numbers(study, asked), study.scene.logs.motion
+    fixed = own.friction * study.scene.sense + own.armature * motion.qdd
+    fixed += np.einsum("mjp,jp->mj", speeds(motion.qd), own.damping)
+    x = motion.q - own.rest
+    fixed = sum((own.stiffness[:, p] * x ** (p + 1) for p in range(POWERS)), fixed)
+    fixed = logs.filtered(fixed / scene.divisor)
     right = error - white.white(fixed.T[white.kept])
     triangle = np.asarray(np.linalg.qr(np.hstack([study.links, matrix, right[:, None]]), mode="r"))
     split = study.links.shape[1]
@@ -257,7 +255,7 @@ def joint_fit(
 ) -> tuple[Array, Array]:
     """Bodies (n, 4, 4) and linear numbers (k,) that explain condensed rows best."""
     links, linear, right = rows
-    n, k = study.bodies.count, len(columns)
+    n, k = len(study.bodies.drawn), len(columns)
     free = np.zeros((n, PER_LINK), dtype=bool)
     if Element.MASSES in asked.elements:
         free[:] = np.arange(n)[:, None] == asked.link if asked.link >= 0 else True
@@ -307,8 +305,9 @@ def least_within(
         slope = jacobian(x)
         pull, gram = slope.T @ left, slope.T @ slope
         for _ in range(STEPS):
-            held = (x <= least) & (pull > 0.0)
-            new = x + damped_step(gram, pull, damping, ~held)
+            free = (x > least) | ~(pull > 0.0)  # the others are held at their bounds
+            new = x.copy()
+            new[free] -= solve_scaled(gram[np.ix_(free, free)], pull[free], damping)
             new = np.maximum(new, least)
             with np.errstate(over="ignore", invalid="ignore"):  # too far a step is refused
                 after = residual(new)
@@ -322,13 +321,6 @@ def least_within(
         if gained <= CLOSE * (left @ left):
             break
     return x
-
-
-def damped_step(gram: Array, pull: Array, damping: float, free: Array) -> Array:
-    """(p,) step of the free ones; 0 of the others."""
-    out = np.zeros(len(pull))
-    out[free] = -solve_scaled(gram[np.ix_(free, free)], pull[free], damping)
-    return out
 
 
 def numbers_of(
@@ -379,20 +371,15 @@ def spring_of(torque: Array) -> tuple[Array, float]:
 
 
 def with_numbers(study: Study, scene: Scene, numbers: Numbers) -> Scene:
-    """The scene with the load and the friction of some numbers, friction as MuJoCo has it."""
-    links = study.bodies.links(numbers.bodies)
-    out = scene.with_body(of_all(links), scene.friction)
-    vars(out)["sense"] = sense_of(study, out, numbers)
-    return out
-
-
-def sense_of(study: Study, scene: Scene, numbers: Numbers) -> Array:
-    """(M, n) share of its largest that MuJoCo's friction has at every sample.
+    """The scene with the load and the friction of some numbers, friction as MuJoCo has it.
 
     Friction is a soft constraint there: force = D (qdd + b qd) within its largest
     [MuJoCo, Computation: constraint solver].
     """
-    motion = scene.logs.motion
+    scene = scene.with_body(of_all(study.bodies.links(numbers.bodies)), scene.friction)
+    motion, chain, model = scene.logs.motion, study.chain, copy(study.chain.model)
+
+    # The largest friction (M, n) at every sample: of the joint, and of laws that no element holds.
     least = LEAST_FRICTION * np.abs(scene.logs.torque).max(axis=0) * scene.divisor
     whole = np.maximum(numbers.friction, least + 1e-12) + np.zeros_like(motion.q)
     sliding = scene.with_body(scene.rigid, scene.friction)
@@ -401,29 +388,22 @@ def sense_of(study: Study, scene: Scene, numbers: Numbers) -> Array:
         if term.law.dry and len(value):
             amount = (term.columns(sliding) @ value) * scene.divisor[term.joint]
             whole[:, term.joint] = np.maximum(whole[:, term.joint] + amount, least[term.joint])
-    stiffness, rate = softness(study.chain, numbers)
-    return np.asarray(np.clip(stiffness * (motion.qdd + rate * motion.qd) / whole, -1.0, 1.0))
 
-
-def softness(chain: Chain, numbers: Numbers) -> tuple[Array, Array]:
-    """(n,) D [kg m^2] and b [1/s] of the friction of each joint, as a model has it."""
-    model = chain.model
-    dofs = chain.dofs
-    reference, impedance = model.dof_solref[dofs], model.dof_solimp[dofs]
-    start, end = np.clip(impedance[:, :2].T, *IMPEDANCES)
-    time = np.maximum(reference[:, 0], 2.0 * chain.step)
-    rate = np.where(reference[:, 0] > 0.0, 2.0 / (end * time), -reference[:, 1] / end)
-    return start / (1.0 - start) / weights(chain, numbers), rate
-
-
-def weights(chain: Chain, numbers: Numbers) -> Array:
-    """(n,) inverse inertia of each joint at rest in a model with other masses [1/(kg m^2)]."""
-    mj, model = mujoco(), copy(chain.model)
+    # D [kg m^2] from the inverse inertia of each joint at rest, with these masses; b [1/s].
     dofs = chain.dofs
     for body, pseudo in zip(chain.bodies, numbers.bodies, strict=True):
         values = inertial(pseudo)
         model.body_mass[body], model.body_ipos[body] = values["mass"][0], values["pos"]
         model.body_iquat[body], model.body_inertia[body] = values["quat"], values["diaginertia"]
     model.dof_armature[dofs] = numbers.armature
+    mj = mujoco()
     mj.mj_setConst(model, mj.MjData(model))
-    return np.asarray(np.maximum(model.dof_invweight0[dofs], 1e-15))
+    weights = np.asarray(np.maximum(model.dof_invweight0[dofs], 1e-15))
+    reference, impedance = model.dof_solref[dofs], model.dof_solimp[dofs]
+    start, end = np.clip(impedance[:, :2].T, *IMPEDANCES)
+    time = np.maximum(reference[:, 0], 2.0 * chain.step)
+    rate = np.where(reference[:, 0] > 0.0, 2.0 / (end * time), -reference[:, 1] / end)
+    stiffness = start / (1.0 - start) / weights
+    sense = np.clip(stiffness * (motion.qdd + rate * motion.qd) / whole, -1.0, 1.0)
+    vars(scene)["sense"] = np.asarray(sense)
+    return scene

@@ -112,7 +112,7 @@ def follow_torques(
 def by_inertia(chain: Chain) -> Pull:
     """Drives whose gains follow the inertia of an arm: critically damped."""
     mj, model, data, at, dofs = chain.fresh()
-    wanted, torque = np.zeros(model.nv), np.zeros(model.nv)
+    wanted, torque = np.zeros((2, model.nv))
 
     def pull(q: Array, off: Array, slow: Array) -> Array:
         data.qpos[at] = q
@@ -313,14 +313,11 @@ def divided(
                 f"{run.source}: {run.duration:.1f} s are too short to learn and to judge; log more"
             )
         early = run.time < cut
-        return [part_of(run, early, "")], [part_of(run, ~early, " (its end)")]
+        parts = {run.name: run.at(early), f"{run.name} (its end)": run.at(~early)}
+        start, end = (replace(part, name=name, time=part.time - part.time[0])
+                      for name, part in parts.items())  # fmt: skip
+        return [start], [end]
     if not wanted:
         count = min(len(runs) - 1, max(1, round(share * len(runs))))
         wanted = tuple(run.name for run in runs[-count:])
     return [r for r in runs if r.name not in wanted], [r for r in runs if r.name in wanted]
-
-
-def part_of(run: Run, rows: Array, words: str) -> Run:
-    """Some rows of a run.  rows: (m,) mask."""
-    part = run.at(rows)
-    return replace(part, name=run.name + words, time=part.time - part.time[0])

@@ -19,7 +19,6 @@ from minimax_cal.ground.files import check_writable
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.ground.threads import one_thread
-from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.mjcf import mujoco
 from minimax_cal.robots.urdf import MODELS
 from minimax_cal.simulators.motion import drives
@@ -93,7 +92,14 @@ def motion_gap(
     >>> print(mc.motion_gap("arm.xml", ["run1.csv", "run2.csv"], write="corrected.xml").summary())
     """
     began = time.perf_counter()
-    check_request(write, actuators, randomize)
+    if write is not None:
+        check_writable(write, MODELS)
+    mujoco()
+    if actuators and actuators[0] not in ("isaac", "json"):
+        raise OptionError(f"actuators={actuators[0]!r}: give isaac or json, and a file")
+    for file in (actuators and actuators[1], randomize):
+        if file is not None:
+            check_writable(file)
     progress("reading the model and the logs")
     runs = read_logs(model, logs)
     opened = open_model(model, runs[0].joints if runs else 0, tip)
@@ -212,25 +218,9 @@ def told_or_found(
     return found
 
 
-def check_request(
-    write: Path | str | None,
-    actuators: tuple[str, Path | str] | None,
-    ranges: Path | str | None,
-) -> None:
-    """Raise CalibrationError for what cannot be written, and where there is no MuJoCo."""
-    if write is not None:
-        check_writable(write, MODELS)
-    mujoco()
-    if actuators and actuators[0] not in ("isaac", "json"):
-        raise OptionError(f"actuators={actuators[0]!r}: give isaac or json, and a file")
-    for path in (actuators and actuators[1], ranges):
-        if path is not None:
-            check_writable(path)
-
-
 def bench_of(judge: Judge, opened: Opened, found: MotionDiagnosis, *, plain: bool) -> Bench:
     """Where corrections of a model are fitted and judged.  plain: as of `Bench`."""
-    assumed = opened.given.assumed or not weighed(opened.chain.robot).all()
+    assumed = opened.given.assumed or opened.chain.has_assumed_masses
     study = Study.of(opened.chain, judge.arm, judge.learning, found.models[-1].terms,
                      opened.chain.find_largest_inertias(),
                      PRIOR_ASSUMED if assumed else PRIOR)  # fmt: skip

@@ -33,13 +33,8 @@ from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.transforms import inverse, tail, transform
 from minimax_cal.robots.urdf import MODELS, is_urdf
 from minimax_cal.simulators.arm import Arm, arm_of
-from minimax_cal.simulators.chain import (
-    ORIENTATION_ATTRIBUTES,
-    Chain,
-    chain_along,
-    chain_of,
-)
-from minimax_cal.simulators.corrected_model import correct_model, masses_in_links
+from minimax_cal.simulators.chain import ORIENTATION_ATTRIBUTES, Chain, chain_along
+from minimax_cal.simulators.corrected_model import correct_model
 from minimax_cal.simulators.elements import MIN_DAMPER_TIMESTEPS, set_servo_gains
 from minimax_cal.simulators.mjcf import build_new_tree, write_document
 from minimax_cal.simulators.mjcf_tree import MjcfTree, format_attributes, set_element
@@ -117,17 +112,18 @@ class Bodies:
         holder, bodies = chain.find_carrying_joints(), chain.bodies
         drawn, beside, to_link = [], [], []
         for i, body in enumerate(bodies):
+            own, others = np.zeros((2, 4, 4))
+            for k in np.flatnonzero(holder == i):
+                turn = data.ximat[k].reshape(3, 3)
+                about = turn @ np.diag(model.body_inertia[k]) @ turn.T
+                part = own if k == body else others
+                part += of_body(float(model.body_mass[k]), data.xipos[k], about)
             here = body_pose(data, body)
-            others = [int(k) for k in np.flatnonzero(holder == i) if k != body]
-            drawn.append(physical(inside(model, data, [body], here)))
-            beside.append(inside(model, data, others, here))
+            back = inverse(here)
+            drawn.append(physical(back @ own @ back.T))
+            beside.append(back @ others @ back.T)
             to_link.append(inverse(links[i]) @ here)
         return Bodies(np.array(drawn), np.array(beside), np.array(to_link))
-
-    @property
-    def count(self) -> int:
-        """Number of joints."""
-        return len(self.drawn)
 
     def links(self, own: Array) -> Array:
         """(n, 10) parameters of the links in the robot's frames, of bodies (n, 4, 4)."""
@@ -149,17 +145,6 @@ class Bodies:
         right = np.moveaxis(whole[:, :, COLUMNS], 1, 2)
         change = left[..., :, None] * right[..., None, :]
         return parameters_of(change + np.swapaxes(change, -1, -2))
-
-
-def inside(model: Any, data: Any, bodies: Sequence[int], frame: Array) -> Array:
-    """(4, 4) of some bodies of a model together, in a frame of the world (4, 4)."""
-    out = np.zeros((4, 4))
-    for body in bodies:
-        turn = data.ximat[body].reshape(3, 3)
-        about = turn @ np.diag(model.body_inertia[body]) @ turn.T
-        out += of_body(float(model.body_mass[body]), data.xipos[body], about)
-    back = inverse(frame)
-    return back @ out @ back.T
 
 
 def upper(coordinates: Array) -> Array:
@@ -250,6 +235,10 @@ def has_powers(model: Any) -> bool:
 SAME = 1e-12  # relative change of a number that is none
 STOPS = 4e-6  # friction moves the tool of a new file, at each joint, by no more [m]
 HISTORY_MARGIN = 2  # samples of a delayed signal beyond those of the delay
+JOINT_ATTRIBUTES = {  # by their fields of `Numbers`
+    "armature": "armature", "friction": "frictionloss", "damping": "damping",
+    "stiffness": "stiffness",
+}  # fmt: skip
 MIN_DELAY_TIMESTEPS = 0.5  # a shorter delay is none
 
 
@@ -264,13 +253,8 @@ def write_numbers(document: Document, chain: Chain, given: Numbers, found: Numbe
         # Masses and joints; the coefficients of a polynomial without zeros at their end.
         if not is_same(found.bodies[i], given.bodies[i]):
             set_inertia(parents[joint], found.bodies[i])
-        pairs = {
-            "armature": (found.armature[[i]], given.armature[[i]]),
-            "frictionloss": (found.friction[[i]], given.friction[[i]]),
-            "damping": (found.damping[i], given.damping[i]),
-            "stiffness": (found.stiffness[i], given.stiffness[i]),
-        }
-        for attribute, pair in pairs.items():
+        for field, attribute in JOINT_ATTRIBUTES.items():
+            pair = (np.atleast_1d(getattr(one, field)[i]) for one in (found, given))
             new, old = (v[: 1 + np.flatnonzero(v).max(initial=0)] for v in pair)
             if new.shape != old.shape or not is_same(new, old):
                 joint.set(attribute, numbers(new))
@@ -331,30 +315,28 @@ def stiffen(root: ET.Element, chain: Chain, found: Numbers) -> None:
             set_servo_gains(servo, needed[i], max(damper, MIN_DAMPER_TIMESTEPS * step * needed[i]))
 
 
-def new_model(robot: Robot) -> Document:
-    """A new file of a robot: its masses as drawn, position servos that hold it."""
-    root = build_new_tree(Arm.rigid(robot), ())
-    weigh_drawn(root, robot)
-    return Document(root)
+def new_model(robot: Robot, arm: Arm | None = None, target_names: Sequence[str] = ()) -> Document:
+    """A new file of a robot: its masses as drawn, position servos that hold it.
 
-
-def weigh_drawn(root: ET.Element, robot: Robot) -> None:
-    """Give the links of a new file the inertias of a robot, where it tells them."""
-    bodies = {str(body.get("name")): body for body in root.iter("body")}
+    arm: what bends in it, by springs of its own; nothing unless given.
+    """
+    tree = build_new_tree(arm or Arm.rigid(robot), target_names, with_springs=arm is not None)
+    bodies = {str(body.get("name")): body for body in tree.root.iter("body")}
     drawn = inertial_parameters(robot)
     for i in np.flatnonzero(weighed(robot)):
         place = tail(robot.mdh[i])  # of the link's frame in that of its joint, the body's
         moved = place @ pseudo_inertia(drawn[i]) @ place.T
         if drawn[i, 0] > LEAST_MASS and np.linalg.eigvalsh(moved)[0] > 0.0:
             set_inertia(bodies[f"link{i + 1}"], moved)
+    return Document(tree.root)
 
 
-def unwritten(chain: Chain, wanted: Array, names: Sequence[str]) -> list[str]:
+def unwritten(chain: Chain, wanted: Array) -> list[str]:
     """Links whose masses MuJoCo did not take from the file.  wanted: (n, 4, 4)."""
     got = Bodies.of(chain).drawn
     off = np.abs(parameters_of(got) - parameters_of(wanted)).max(axis=1)
     size = np.abs(parameters_of(wanted)).max(axis=1)
-    return [names[int(i)] for i in np.flatnonzero(off > 1e-6 * size)]
+    return [chain.names[int(i)] for i in np.flatnonzero(off > 1e-6 * size)]
 
 
 # ---- a model to be corrected ---------------------------------------------------------------------
@@ -406,28 +388,22 @@ class Opened:
         write_document(self.given.document, self.given.folder, path)
 
 
-def is_mjcf(model: Path | str) -> bool:
-    """Whether a model is a simulator's own."""
-    path = Path(model)
-    return path.suffix.lower() in MODELS and not is_urdf(path)
-
-
 def open_model(model: Path | str, joints: int, tip: str = "", *, freed: bool = True) -> Opened:
     """The arm of so many joints in a model's file; of a robot file or URDF a new model.
 
     freed: whether servos get the dampers that joints hold for them.  Raises CalibrationError.
     """
     mujoco()
-    if is_mjcf(model):
+    if Path(model).suffix.lower() in MODELS and not is_urdf(Path(model)):
         given = read_model(model)
-        chain = chain_of(given.compiled(), joints, given.source, tip, unknown=given.assumed)
+        chain = Chain.find(given, joints, tip)
         opened = Opened(given, chain, new=False)
         return opened.with_free_joints() if freed else opened
     robot = load_robot(model)
     if robot.joints != joints:
         raise OptionError(f"{model}: has {robot.joints} joints, the logs have {joints}")
     given = Given(str(model), new_model(robot), Path())
-    chain = chain_of(given.compiled(), joints, given.source)
+    chain = Chain.find(given, joints)
     opened = Opened(given, chain, new=True)
     return opened.with_free_joints() if freed else opened
 
@@ -437,12 +413,11 @@ def calibrated(opened: Opened, fit: Fit) -> tuple[Opened, tuple[str, ...]]:
     names = fit.cell.target_names
     if opened.new:
         arm = arm_of(fit.cell, fit.train.q, masses_of(fit.cell.robot, LEAST_MASS))
-        document = Document(build_new_tree(arm, names, with_springs=True))
-        weigh_drawn(document.root, fit.cell.robot)
+        document = new_model(fit.cell.robot, arm, names)
         given = replace(opened.given, document=document)
         return opened.rebuilt(given).with_free_joints(), ()
     nominal = fit.nominal.robot
-    arm = arm_of(fit.cell, fit.train.q, masses_in_links(opened.chain, nominal))
+    arm = arm_of(fit.cell, fit.train.q, opened.chain.find_masses(nominal))
     driven = bool((opened.chain.servos >= 0).any())
     made = correct_model(opened.given, opened.chain, nominal, arm, names, with_servos=driven)
     notices = made.notices
