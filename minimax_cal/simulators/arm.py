@@ -176,11 +176,12 @@ def moments(mass: Array, com: Array) -> Array:
 
 def per_moment(scene: Scene, kind: str, place: int) -> Array:
     """(4 n, k, 3, m) displacement of a spring of compliance 1, for each mass and first moment."""
-    verb: Callable[..., Array] = {
+    verbs: dict[str, Callable[..., Array]] = {
         "joint": partial(turned, joint=place),
         "link": partial(bent, link=place),
         "base": tilted,
-    }[kind]
+    }
+    verb = verbs[kind]
     out, n = [], scene.joints
     for mass in np.eye(n):
         centres = (np.outer(mass, axis) for axis in np.eye(4)[:, 1:])
@@ -311,8 +312,8 @@ class Arm:
         """
         if not self.mapped.terms:
             return {}
-        whole = replace(cell, effects=self.mapped).whole()
-        content = {"schema": 1, "kind": "commands", "cell": whole}
+        content = {"schema": 1, "kind": "commands",
+                   "cell": replace(cell, effects=self.mapped).whole()}  # fmt: skip
         return {COMMAND_MAP_ENDING: json_text(content).encode()}
 
     def list_limitations(self) -> list[str]:
@@ -402,10 +403,8 @@ def arm_of(
         change, after = found.firm, state.step(found.change)
         arm = with_tool(parts.arm, found.sag, found.drawn)
         mount = inverse(state.base) @ after.base @ arm.mount
-        parts.arm = replace(
-            arm, robot=arm.robot.with_mdh(after.mdh), spots=after.target_positions, mount=mount,
-            **found.held,
-        )  # fmt: skip
+        parts.arm = replace(arm, robot=arm.robot.with_mdh(after.mdh), mount=mount,
+                            spots=after.target_positions, **found.held)  # fmt: skip
     for term, values in parts.firm:
         FIRM[term.effect](parts, scene, term, values + change[: len(values)])
         change = change[len(values) :]

@@ -190,7 +190,7 @@ def visits(
             torques.append(data.qfrc_actuator[dofs])
         force, torque = np.array(forces), np.array(torques)
         at_limit = (force <= low) | (force >= high) | (torque <= low_torque)
-        return np.diff([*starts, len(path)]) @ (at_limit | (torque >= high_torque))
+        return np.asarray(np.diff([*starts, len(path)]) @ (at_limit | (torque >= high_torque)))
 
     step, start = chain.step, commands[rows[0] - 1]
     data.qpos[at], data.ctrl[servos] = start, start

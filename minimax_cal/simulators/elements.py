@@ -250,7 +250,7 @@ def add_spring(
     new = ET.Element("joint", format_attributes({
         "name": name, "type": kind, "pos": at, "axis": axis, "stiffness": [stiffness],
         "springref": "0", "ref": "0", "limited": "false", "damping": [damping],
-        "frictionloss": "0", "armature": [SPRING_INERTIA * inertia],
+        "frictionloss": "0", "armature": [SPRING_INERTIA * inertia]
     }))  # fmt: skip
     if feels_all_gravity:
         ends = [-MAX_SPRING_ACTUATION, MAX_SPRING_ACTUATION]
@@ -280,7 +280,7 @@ def write_springs(layout: Layout, arm: Arm, servos: ServoDesign, load_share: flo
         sag = load_share * (servos.gravity_torque[i] * arm.reach[i]) / MAX_STIFF_SAG
         hinge = add_spring(
             bodies[i], f"play{i + 1}", "hinge", layout.anchors[i], layout.axes[i],
-            max(sag, inertia[i] / SPRING_TIME**2), inertia[i], feels_all_gravity=False,
+            max(sag, inertia[i] / SPRING_TIME**2), inertia[i], feels_all_gravity=False
         )  # fmt: skip
         ends = np.array([-1.01, 1.01]) * (0.5 * abs(arm.play[i]))  # the spring ends inside
         hinge.set("limited", "true")

@@ -101,22 +101,21 @@ def find_causes(
 
     # A fit of the poses of the diagnosis; a fit without masses is made again with those of the
     # model: then its springs are the model's.
-    needs_masses = fit is not None and not chain.has_assumed_masses and assumed(fit.nominal.robot)
-    if found is not None and fit is None:
+    if fit is None:
+        assert found is not None
         terms = carried_over(terms, robot)
         rows = replace(found.data, digest=found.provenance.data_sha256)
-        fit = calibrate(robot, with_split(rows, found.held), objective="sum")
-    assert fit is not None
-    if needs_masses:
+        new: Fit = calibrate(robot, with_split(rows, found.held), objective="sum")
+        fit = new
+    elif not chain.has_assumed_masses and assumed(fit.nominal.robot):
         progress("fit with the masses of the model")
         nominal = fit.nominal.robot
         mass, com = chain.find_masses(nominal) or (nominal.mass, nominal.com)
         terms = carried_over(terms, robot)
-        effects = tuple(term if term.choice else term.label for term in terms)
-        settings = {**vars(fit.options), "effects": effects}
-        rows = with_split(fit.data, fit.held)
-        fit = calibrate(replace(nominal, mass=mass, com=com), rows, **settings)
-        terms = fit.cell.effects.terms
+        effects = {"effects": tuple(term if term.choice else term.label for term in terms)}
+        new = calibrate(replace(nominal, mass=mass, com=com), with_split(fit.data, fit.held),
+                        **vars(fit.options) | effects)  # fmt: skip
+        fit, terms = new, new.cell.effects.terms
     geometry = fit if not fit.cell.effects.terms else again(fit, effects=())
 
     # What a simulator may have an element for, what a command map may hold, and what neither does.
@@ -144,8 +143,7 @@ def find_causes(
 
 def with_split(data: Measurements, held: Array) -> Measurements:
     """The measurements with a split column.  held: (m,) True where held out."""
-    column = np.where(held, "holdout", "train")
-    return replace(data, columns={**data.columns, "split": column})
+    return replace(data, columns={**data.columns, "split": np.where(held, "holdout", "train")})
 
 
 def carried_over(terms: Sequence[Term], robot: Robot) -> tuple[Term, ...]:
@@ -427,7 +425,7 @@ class Run:
         return Rung(
             name, held.rms_mm, held.max_mm, train.rms_mm, train.max_mm,
             1e3 * off.max(initial=0.0), predicted,
-            moving_poses=int(driven.moving.sum()), at_limit=driven.limited.max(),
+            moving_poses=int(driven.moving.sum()), at_limit=driven.limited.max()
         )  # fmt: skip
 
     def tell(self, what: str, data: Measurements, rows: Array, judge: Array) -> None:

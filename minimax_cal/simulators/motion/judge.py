@@ -112,7 +112,7 @@ def follow_torques(
 def by_inertia(chain: Chain) -> Pull:
     """Drives whose gains follow the inertia of an arm: critically damped."""
     mj, model, data, at, dofs = chain.fresh()
-    wanted, torque = np.zeros((2, model.nv))
+    wanted, torque = np.zeros(model.nv), np.zeros(model.nv)
 
     def pull(q: Array, off: Array, slow: Array) -> Array:
         data.qpos[at] = q
