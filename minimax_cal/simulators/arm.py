@@ -393,10 +393,10 @@ def arm_of(
         plain = replace(cell, effects=NOTHING)
         state = plain.state
         model = model_of(robot, replace(scene.data, y=plain.predict(scene.data.q)))
-        geometry = np.moveaxis(model.jacobian(state), 1, 2)
+        geometry = np.moveaxis(model.jacobian(state), 0, 2)
         left = np.zeros(scene.points.shape)
         if measured is not None:
-            left = np.moveaxis(cell.error(measured) @ cell.base[:3, :3], 1, 2)
+            left = np.moveaxis(cell.error(measured) @ cell.base[:3, :3], 0, 2)
         laws, firm = Fitted.of((*parts.soft, *parts.sagging)), [term for term, _ in parts.firm]
         begun = (parts.arm.mass, parts.arm.com)
         found = springs_of(scene, laws, left, geometry, firm, begun, fixed=bool(masses))

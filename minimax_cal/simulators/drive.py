@@ -269,7 +269,7 @@ SMALL = 1e-7  # to find slopes of forces [rad, m]
 def measure_target_offsets(
     chain: Chain, cell: Cell, arm: Arm, base: Array, data: Measurements
 ) -> Array:
-    """(k, m, 3) from where the targets of a written model stand to where the cell says [m].
+    """(m, k, 3) from where the targets of a written model stand to where the cell says [m].
 
     As the instrument sees it; the command map of the arm corrects the commands.
     base: (4, 4) of the arm in the model's world [m].
@@ -279,7 +279,7 @@ def measure_target_offsets(
     to = cell.base @ inverse(base)
     chosen = [cell.target_names.index(name) for name in data.target_names]
     expected = cell.seen(data)[:, chosen]
-    return np.moveaxis(expected - points @ to[:3, :3].T - to[:3, 3], 1, 0)
+    return np.asarray(expected - points @ to[:3, :3].T - to[:3, 3])
 
 
 def stand(chain: Chain, names: tuple[str, ...], commands: Array, play: Array | None) -> Array:

@@ -417,11 +417,11 @@ class Run:
         end = inverse(driven.poses[0]) @ start.robot.pose(q[0])
         spots = start.target_positions @ end[:3, :3].T + end[:3, 3]
         error = placed_error(driven.poses, self.data, judge & ~self.held, (start.base, spots))
-        held, train = (accuracy(error[:, judge & rows]) for rows in (self.held, ~self.held))
+        held, train = (accuracy(error[judge & rows]) for rows in (self.held, ~self.held))
         off = np.abs(driven.q - commands)[judge][:, ~chain.robot.prismatic]
         predicted = np.nan
         if fit is not None and self.causes.same:
-            predicted = accuracy(fit.cell.error(self.data)[:, judge & self.held]).rms_mm
+            predicted = accuracy(fit.cell.error(self.data)[judge & self.held]).rms_mm
         return Rung(
             name, held.rms_mm, held.max_mm, train.rms_mm, train.max_mm,
             1e3 * off.max(initial=0.0), predicted,
