@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.diagnosing.causes import with_jumps
+from minimax_cal.diagnosing.causes import add_session_jumps
 from minimax_cal.diagnosing.study import SUM, studied
-from minimax_cal.evidence.stability import resemblances
+from minimax_cal.evidence.library import Library
+from minimax_cal.evidence.noise import restricted
 from minimax_cal.fitting.options import silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.linear_algebra import project_out
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements, read_measurements
@@ -38,5 +40,25 @@ def resemblance(
     moved = np.einsum("ab,mka->kbm", study.fit.state.rotation, displacement[rows])
     clock = np.unique(study.scene.column("clock"))  # a jump may be at any moment
     study = replace(study, moments=clock[EARLIEST : len(clock) - EARLIEST])
-    lib = with_jumps(arm_library(study.scene, study.rows), study)
+    lib = add_session_jumps(arm_library(study.scene, study.rows), study)
     return resemblances(lib, study.rows.of(moved[None]))
+
+
+def resemblances(lib: Library, column: Array) -> dict[tuple[str, str], float]:
+    """rho^2 of every candidate with rows (N, 1) that something adds to the error: the best variant.
+
+    Projected on what geometry cannot imitate and weighed by the noise that the data show with it.
+    """
+    noise = restricted(lib.rows, column)
+    root = np.sqrt(noise.weights(lib.rows))[:, None]
+    basis = np.linalg.qr(lib.rows.basis * root)[0]
+    field = project_out(column * root, basis)[:, 0]
+    whole = project_out(lib.columns * root, basis)
+    out: dict[tuple[str, str], float] = {}
+    for c in lib.candidates:
+        part = whole[:, c.main]
+        scale = np.maximum(np.linalg.norm(part, axis=0), 1e-300)
+        found = np.linalg.lstsq(part / scale, field, rcond=1e-6)[0]
+        share = 1.0 - float(((field - part / scale @ found) ** 2).sum() / (field @ field))
+        out[c.key] = max(out.get(c.key, 0.0), share)
+    return out

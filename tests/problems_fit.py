@@ -1,5 +1,6 @@
 """Fits that several tests start from."""
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -84,3 +85,8 @@ def check_products(
     assert_allclose(lower @ lower.T, geometry @ geometry.T, rtol=ROUNDING, atol=1e-9)
     shared = geometry @ every[np.concatenate([[0], 1 + index])].T
     assert_allclose(lower @ found.part[i], shared, rtol=ROUNDING, atol=ROUNDING * size.max())
+
+
+def numbers(text: str) -> list[float]:
+    """Numbers in a sentence, whatever its words are."""
+    return [float(number) for number in re.findall(r"\d+(?:\.\d+)?", text)]

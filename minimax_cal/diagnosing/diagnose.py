@@ -12,50 +12,29 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from minimax_cal.diagnosing.causes import (
-    Causes,
-    beside_curves,
-    beside_maps,
-    causes_of,
-    fault_findings,
-    left_beside,
-    merged,
-    whole,
-)
-from minimax_cal.diagnosing.error_maps import error_maps
-from minimax_cal.diagnosing.established import often
+from minimax_cal.diagnosing.causes import Causes, remaining_beside_terms, search_causes
+from minimax_cal.diagnosing.clean_data import CleanData, clean_measurements
+from minimax_cal.diagnosing.error_budget import fit_error_budget
+from minimax_cal.diagnosing.findings import describe_faults
 from minimax_cal.diagnosing.folds import beyond_of
 from minimax_cal.diagnosing.foot import asked_foot, foot_notices, foot_tells
-from minimax_cal.diagnosing.gap import (
-    FAULTS,
-    Judges,
-    Ladder,
-    climbed,
-    closed,
-    of_lines,
-    valued,
-    with_shares,
-)
-from minimax_cal.diagnosing.joint import Joint
+from minimax_cal.diagnosing.gap import FAULTS, Judges, Ladder, closed, valued, with_shares
 from minimax_cal.diagnosing.result import Diagnosis, Finding, Step
-from minimax_cal.diagnosing.scatter import are_wrong, unpulled, wrong_rows
-from minimax_cal.diagnosing.set_aside import judged_with, sized, with_targets
+from minimax_cal.diagnosing.set_aside import judged_with
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.diagnosing.trial import session_notices
 from minimax_cal.diagnosing.verdict import ABOVE_NOISE, down_to, explanation, known_noise
 from minimax_cal.diagnosing.what_remains import remaining_of
 from minimax_cal.diagnosing.where import where
 from minimax_cal.fitting.beyond import Beyond
-from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
 from minimax_cal.fitting.crossed import MIN_HELD_POSES
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.floor import DISTANCES, Floor, floor_of, noise_at_most, with_instrument
 from minimax_cal.fitting.judged import doubts
-from minimax_cal.fitting.jump_sizes import fit_jump_sizes
 from minimax_cal.fitting.options import Options, Progress, silent
 from minimax_cal.fitting.outcome import FileEvidence, missed_rows
 from minimax_cal.fitting.several.options import READ, RelativeOptions, check_no_others, with_others
-from minimax_cal.fitting.solve import Solved, fit_cell
+from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.fitting.suspects import contradictions
 from minimax_cal.ground.arrays import Array
@@ -68,16 +47,11 @@ from minimax_cal.instruments.file import Given, InstrumentData, taken
 from minimax_cal.instruments.images import Images
 from minimax_cal.instruments.tracker import Points
 from minimax_cal.measuring import checks
-from minimax_cal.measuring.faults import find_faults, in_lines, mended, standing_out
-from minimax_cal.measuring.faults.fault import Fault
-from minimax_cal.measuring.faults.nests import RESEAT
-from minimax_cal.measuring.faults.sessions import session_jumps
 from minimax_cal.measuring.grouping import clusters, held_out, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import EFFECTS
-from minimax_cal.modelling.effects.time import SESSION_JUMP, TARGET_SHIFT
+from minimax_cal.modelling.effects.time import SESSION_JUMP
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.robots.robot import Robot, RobotSource, load_robot
 
@@ -88,7 +62,6 @@ FAULTY, CAUSES, BUDGET = "faults of the data", "testing causes", "error budget"
 PARTS, REMAINING = "regions held out", "remaining error"
 STEPS = (FAULTY, CAUSES, BUDGET, PARTS, REMAINING)
 NOT_ASKED = Beyond(reason="not asked for")
-ROBUST = replace(SUM, trim=0.3)  # a fit that up to so many wrong points do not pull
 sought = grouped("What is sought")
 
 
@@ -224,78 +197,85 @@ def diagnose(
             f"{given.source}: no pose is held out; a diagnosis needs some that no fit has seen: "
             "measure more poses, or hold out more (holdout)"
         )
-    notices = (*notices, *few_judges(raw.take(held)), *unplaced(raw, ~held))
-    raw = stationed(robot, raw, ~held)
-    with one_thread():
-        asked = Asked(robot, raw, held, options, jobs, cluster)
-        return examined(asked, notices, progress, began)
-
-
-def few_judges(held: Measurements) -> Iterator[str]:
-    """That few poses judge.  held: those held out."""
-    if len(np.unique(clusters(held))) < MIN_HELD_POSES:
-        yield (
-            f"only {held.poses} poses are held out: what is said of new poses rests on these; "
+    judges = raw.take(held)
+    if len(np.unique(clusters(judges))) < MIN_HELD_POSES:
+        few = (
+            f"only {judges.poses} poses are held out: what is said of new poses rests on these; "
             "calibrate with the effects found judges every pose by a fit without it"
         )
+        notices = (*notices, few)
+    notices = (*notices, *unplaced(raw, ~held))
+    raw = stationed(robot, raw, ~held)
+    with one_thread():
+        return examine(robot, raw, held, options, notices, progress, began, (jobs, cluster))
 
 
-@dataclass(frozen=True, eq=False)
-class Asked:
-    """What is to be diagnosed.  held: (m,) of the poses as given, True for those no fit may see."""
+def examine(
+    robot: Robot,
+    given: Measurements,
+    held: Array,
+    options: DiagnosisOptions,
+    notices: tuple[str, ...],
+    progress: Progress,
+    began: float,
+    workers: tuple[int, str],
+) -> Diagnosis:
+    """The diagnosis of checked measurements.
 
-    robot: Robot
-    data: Measurements
-    held: Array
-    options: DiagnosisOptions
-    jobs: int = 1
-    cluster: str = ""
-
-    def train(self, data: Measurements) -> Measurements:
-        """Of some of the rows those that fits may see."""
-        return data.take(~np.isin(data.line, self.data.line[self.held]))
-
-
-def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: float) -> Diagnosis:
-    """The diagnosis of checked measurements.  began: when the work did [s]."""
-    robot, options = asked.robot, asked.options
-    step_of = partial(options.step_of, progress)
-    clean = cleaned(asked, step_of(FAULTY))
-    train = asked.train(clean.data)
-    judges = judges_of(asked, clean, train)
+    held: (m,) True for poses that no fit may see.  began: when the work did [s].  workers:
+    processes, and the address of a Dask scheduler.
+    """
+    step_of, held_lines = partial(options.step_of, progress), given.line[held]
+    clean = clean_measurements(robot, given, held_lines, step_of(FAULTY))
+    train = clean.data.take(~np.isin(clean.data.line, held_lines))
+    judges = Judges.of(given.take(held), clean.measured, clean.data, train, options.holdout_by)
     fit = clean.fit or fit_cell(robot, train, SUM, progress)
-    study = replace(studied(robot, train, fit), moments=clean.moments)
-    workers = asked.jobs, asked.cluster
-    study, causes = causes_of(study, clean.faults, options.exclude, step_of(CAUSES), *workers)
-    causes, spoken, ladder = in_rungs(study, causes, step_of(BUDGET))
+    study = replace(studied(robot, train, fit), moments=clean.jump_times)
+
+    # Causes, their budget, and how well these extrapolate: where worse than geometry, none of them
+    # is recommended.
+    study, causes = search_causes(study, clean.faults, options.exclude, step_of(CAUSES), *workers)
+    causes, spoken, ladder = fit_error_budget(study, causes, step_of(BUDGET))
     beyond = NOT_ASKED if options.quick else beyond_of(study, causes, judges, step_of(PARTS))
     refused = math.nan
-    if beyond.typical_mm > beyond.geometric_typical_mm:  # what does not extrapolate
-        causes, spoken = (not_extending(one) for one in (causes, spoken))
+    if beyond.typical_mm > beyond.geometric_typical_mm:
+        causes, spoken = (
+            replace(one, effects=tuple(replace(f, extends=not f.established) for f in one.effects))
+            for one in (causes, spoken)
+        )
         ladder, refused = replace(ladder, sure=0), beyond.typical_mm
         beyond = beyond_of(study, causes, judges, silent)
     kept = ladder.confirmed
-    causes = replace(causes, left=left_beside(study, causes, kept.last.terms))
+    causes = replace(causes, left=remaining_beside_terms(study, causes, kept.last.terms))
+
+    # Steps on held-out poses, and the noise beneath the last one that is recommended.
     last, late = judges.marked(kept.fits[0].cell, kept.last.cell)
-    steps = steps_of(asked, study, last, spoken, ladder)
-    tell_steps(steps, progress)
+    spoilt = None
+    if any(f.effect in FAULTS for f in causes.faults):
+        spoilt = given.take(~np.isin(given.line, held_lines))
+    steps = judge_steps(study, last, spoken, ladder, spoilt)
+    for one in steps:
+        progress(name_rung(name_step(one.name), one.holdout.rms_mm))
     count = len(steps) - len(ladder.taken) + ladder.sure
     step = steps[count - 1]
     judge = step.trusted if step.trusted.poses else step.train
-    whole = floor_beneath(robot, clean.data, kept.last)
+    error = kept.last.cell.error(clean.data)
+    most = noise_at_most(error, kept.last.poses.left_free)
+    whole = floor_of(clean.data, error, robot.repeatability, most)
     floor = whole.beneath(judge.rms_mm)  # noise is part of what is left
     share, interval = closed(kept, last, floor, options.seed)
     effects = [*valued(spoken.effects, kept), *valued(spoken.effects, ladder)[ladder.sure :]]
     foot = tuple(foot_tells(kept.last, clean.data))
     effects = [*asked_foot(effects, foot)]
-    findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.least)
+    findings = with_shares([*describe_faults(causes.faults), *effects], steps, floor.least)
+
+    # The verdict, by all that is known of the noise.
     step_of(REMAINING)
     known = known_noise(kept.last, whole, clean.data, robot.repeatability)
-    wrong = against(robot, floor, step)
-    gone, counted = judged_with(asked.data, clean.data, clean.left, judges.held, kept.last.cell)
+    wrong = explain_contradiction(robot, floor, step)
+    gone, counted = judged_with(given, clean.data, clean.left_out, judges.held, kept.last.cell)
     told = explanation(findings, causes, known, study.fit.status, failed=bool(wrong))
     left = () if told["verdict"] == "not_repeatable" else causes.left  # it scatters, that is all
-    error = kept.last.cell.error(clean.data)
     most = floor.value if told["structure_in"] == ABOVE_NOISE else math.inf
     rest, complete = remaining_of(left, judge.rms_mm, clean.data, error, most)
     more = ladder.last.cell if len(steps) > count else None
@@ -312,14 +292,14 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         noise=float(np.sqrt(study.uneven * causes.choice.noise.variance)),  # of a mean coordinate
         where=where(study).to_dict(),
         notices=(
-            *asked.data.notices,
+            *given.notices,
             *notices,
             *notices_of(study, clean, kept, late, effects),
             *foot_notices(foot),
             *doubts(study.robot, study.fit, study.nominal.error(study.data)),
             *filter(None, [wrong]),
         ),
-        provenance=Provenance.of(robot, asked.data, vars(options)),
+        provenance=Provenance.of(robot, given, vars(options)),
         seconds=time.perf_counter() - began,
         data=study.geometric.placed(clean.data),
         held=~np.isin(clean.data.line, train.line),
@@ -336,7 +316,11 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
 
 
 def notices_of(
-    study: Study, clean: Clean, ladder: Ladder, late: tuple[str, ...], effects: Sequence[Finding]
+    study: Study,
+    clean: CleanData,
+    ladder: Ladder,
+    late: tuple[str, ...],
+    effects: Sequence[Finding],
 ) -> Iterator[str]:
     """What the reader should know.
 
@@ -344,200 +328,41 @@ def notices_of(
     """
     yield from clean.remarks
     if not any(one.term.effect == SESSION_JUMP.name for one in effects):  # its size is the fit's
-        yield from clean.jumps
+        yield from clean.jump_texts
     yield from filter(None, [study.scene.unused_torques])
     if late:
         yield f"outliers that no effect found explains: {name_first(late)}"
-    every = ladder.last.cell.placed(clean.given)
+    every = ladder.last.cell.placed(clean.measured)
     yield from contradictions(every, ladder.last.cell.error(every))
     yield from session_notices(study, effects)
     yield from study.fit.notices
 
 
-def in_rungs(study: Study, causes: Causes, progress: Progress) -> tuple[Causes, Causes, Ladder]:
-    """The causes, those found often enough to be spoken of, and the ladder, with maps of joints."""
-    spoken, ladder = with_maps(study, causes, progress)
-    if ladder.maps:
-        progress("causes beside the error maps")
-        other, wider = with_maps(study, beside_curves(study, causes, ladder.maps), progress)
-        if wider.maps and no_worse(wider, ladder):
-            spoken, ladder = other, wider
-    return spoken if spoken.maps.terms else causes, spoken, ladder
-
-
-def no_worse(one: Ladder, other: Ladder) -> bool:
-    """Whether groups left out of the last fit are met no worse than by another's."""
-    parts = one.last.spared(other.last.spared(other.parts))
-    return one.last.cross_validated(parts) <= other.last.cross_validated(parts)
-
-
-def with_maps(study: Study, causes: Causes, progress: Progress) -> tuple[Causes, Ladder]:
-    """The causes found often enough to be spoken of, and the ladder.
-
-    With the error maps, and fine waves, that joints have besides.
-    """
-    found = often(causes.effects)
-    chosen = [term for finding in found for term in finding.terms]
-    causes = replace(causes, effects=tuple(whole(f, chosen, study.scene) for f in found))
-    ladder = laddered(study, causes)
-    progress("error maps of joints")
-    maps = error_maps(ladder.last, causes.exclude)
-    if not maps.terms:
-        return causes, ladder
-    effects = merged(maps.findings([causes.effects[i] for i in ladder.taken], study.scene))
-    causes = beside_maps(study, replace(causes, effects=tuple(effects), maps=maps), maps.terms)
-    ladder = laddered(study, causes)
-    texts = {term.text for term in ladder.last.terms}
-    held = [term for term in maps.terms if term.text in texts]
-    return (causes if len(held) == len(maps.terms) else beside_maps(study, causes, held)), ladder
-
-
-def laddered(study: Study, causes: Causes) -> Ladder:
-    """The ladder of all causes, those that are confirmed first."""
-    effects, sure = causes.effects, [found.established for found in causes.effects]
-    return climbed(study, [found.terms for found in effects], sure, guessed=causes.guessed)
-
-
-def not_extending(causes: Causes) -> Causes:
-    """The causes, none of them recommended: poses beyond those measured are met worse by them."""
-    effects = (replace(f, extends=not f.established) for f in causes.effects)
-    return replace(causes, effects=tuple(effects))
-
-
-def floor_beneath(robot: Robot, data: Measurements, last: Joint) -> Floor:
-    """What noise alone would leave beneath the last rung."""
-    error = last.cell.error(data)
-    most = noise_at_most(error, last.poses.left_free)
-    return floor_of(data, error, robot.repeatability, most)
-
-
-def steps_of(
-    asked: Asked, study: Study, judges: Judges, causes: Causes, ladder: Ladder
+def judge_steps(
+    study: Study, judges: Judges, causes: Causes, ladder: Ladder, spoilt: Measurements | None
 ) -> list[Step]:
-    """The rungs, each judged: faults of the data first, by what they do to a fit."""
+    """The steps of the budget, each judged: faults of the data first, by what they do to a fit.
+
+    spoilt: training poses as measured, where they hold faults that were mended.
+    """
+    robot, geometric = study.robot, "geometric"
     steps = [judges.step("nominal", study.nominal)]
-    spoilt = dict.fromkeys(f.effect for f in causes.faults if f.effect in FAULTS)
-    first = ladder.fits[0].cell
     if spoilt:
-        train = asked.train(asked.data)
-        fit = fit_cell(asked.robot, train, SUM, silent)
-        whole = replace(judges, train=train)
+        fit, whole = fit_cell(robot, spoilt, SUM, silent), replace(judges, train=spoilt)
         steps = [
-            whole.step("nominal", fit.nominal_cell(asked.robot, train)),
-            whole.step("geometric", fit.cell(asked.robot, train)),
+            whole.step("nominal", fit.nominal_cell(robot, spoilt)),
+            whole.step("geometric", fit.cell(robot, spoilt)),
         ]
-    steps.append(judges.step(f"without {' and '.join(spoilt)}" if spoilt else "geometric", first))
-    for number, wider in zip(ladder.taken, ladder.fits[1:], strict=True):
-        term = causes.effects[number].term
-        steps.append(judges.step(term.step, wider.cell))
-    return steps
+        faults = dict.fromkeys(f.effect for f in causes.faults if f.effect in FAULTS)
+        geometric = f"without {' and '.join(faults)}"
+    names = (geometric, *(causes.effects[number].term.step for number in ladder.taken))
+    cells = zip(names, ladder.fits, strict=True)
+    return [*steps, *(judges.step(name, fit.cell) for name, fit in cells)]
 
 
-def tell_steps(steps: Sequence[Step], progress: Progress) -> None:
-    """Each step of the budget with its held-out error."""
-    for step in steps:
-        progress(name_rung(name_step(step.name), step.holdout.rms_mm))
-
-
-def judges_of(asked: Asked, clean: Clean, train: Measurements) -> Judges:
-    """Who judges: every held-out point as measured, those that stand out marked."""
-    held = asked.data.take(asked.held)
-    right = dict(zip(clean.given.line, clean.given.y, strict=True))
-    held = held.with_y(np.array([right.get(line, held.y[i]) for i, line in enumerate(held.line)]))
-    sound = of_lines(held.line, clean.data.line, clean.data.seen)
-    return Judges(train, held, held.seen & ~sound, asked.options.holdout_by)
-
-
-def against(robot: Robot, floor: Floor, last: Step) -> str:
+def explain_contradiction(robot: Robot, floor: Floor, last: Step) -> str:
     """Why the last rung contradicts the data; empty where it does not."""
     certain = floor.certain and floor.source != DISTANCES  # which do not hold what the arm does
     known = (floor.value, floor.source) if certain else None
     scores = {"training": (last.train, last.train), "held-out": (last.holdout, last.trusted)}
     return missed_rows(robot, FileEvidence(scores, floor=known))
-
-
-# ---- data faults -------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Clean:
-    """Measurements with rows and points put right or left out.
-
-    given: as measured, but for points that stood in each other's rows.  left: points that no fit
-    counts, by lines of the file.  faults: their rows as lines
-    of the file.  remarks: on them, for people.  fit: the geometric fit of the training poses, where
-    it is that of the clean data.  moments: as `Study` has them.  jumps: what is said of these,
-    where no effect says it.
-    """
-
-    data: Measurements
-    given: Measurements
-    left: tuple[Fault, ...]
-    faults: tuple[Fault, ...]
-    remarks: tuple[str, ...]
-    fit: Solved | None
-    moments: Array
-    jumps: tuple[str, ...]
-
-
-def cleaned(asked: Asked, progress: Progress) -> Clean:
-    """The data without the faults that can be mended."""
-    robot = asked.robot
-    data, exchanged = in_order(robot, asked.data)
-    found = find_faults(data)
-    sound = mended(data, found)
-    check_plausible(robot, sound)
-    progress("geometry")
-
-    def fitted(some: Measurements, options: Options = SUM) -> Cell:
-        return fit_cell(robot, asked.train(some), options, silent).cell(robot, some)
-
-    found = with_targets(found, data, fitted)
-    sound = mended(data, found)
-    fit = fit_cell(robot, asked.train(sound), SUM, progress)
-    cell = fit.cell(robot, sound)
-    found = tuple(sized(fault, cell, data) for fault in found)
-    error = cell.error(sound)
-    more = standing_out(cell.placed(sound), error)
-
-    def robust() -> Array:
-        return fitted(sound, ROBUST).error(sound)
-
-    shifted = any(fault.effect == TARGET_SHIFT.name for fault in found)
-    many = () if more or shifted else unpulled(error, robust, sound)
-    wrong = wrong_rows(data, cell.error(data))
-    points = (*in_lines(data, found, "outliers"), *in_lines(sound, more, "outliers"))
-    faults = (
-        *exchanged,
-        *in_lines(data, found, "swapped_rows", RESEAT),
-        *(one for one in points if are_wrong(one, wrong, data.line)),
-        *in_lines(sound, many, "outliers"),
-    )
-    more = (*more, *many)
-    sound = mended(sound, more)
-    sound = sound.take(np.asarray(sound.seen.any(axis=1)))
-    placed, held = cell.placed(sound), np.isin(sound.line, asked.data.line[asked.held])
-
-    def fit_sizes(rows: Array) -> Array:
-        return fit_jump_sizes(robot, placed, ~held, SUM, rows)
-
-    jumped = session_jumps(placed, cell.error(sound), fit_sizes)
-    told = (*found, *more)
-    remarks = tuple(fault.text for fault in told if fault.effect != TARGET_SHIFT.name)
-    rows = np.concatenate([NO_ROWS, *(fault.rows for fault in jumped)])
-    moments = sound.columns["clock"][rows]
-    left = tuple(in_lines(data, (*found, *more), "outliers", RESEAT))
-    return Clean(
-        sound, data, left, faults, remarks, None if more else fit, moments,
-        tuple(fault.text for fault in jumped),
-    )  # fmt: skip
-
-
-def in_order(robot: Robot, data: Measurements) -> tuple[Measurements, tuple[Fault, ...]]:
-    """The data with points that stand in each other's rows put back, and the fault if any did."""
-    rows, source = misplaced(robot, data)
-    if not len(rows):
-        return data, ()
-    text = f"{data.source}: rows hold each other's points: {data.list_rows(rows)}"
-    fault = Fault("swapped_rows", "all", text, data.line[rows])
-    return put_right(data, rows, source), (fault,)

@@ -32,7 +32,7 @@ from minimax_cal.evidence.limits import GAIN_LEVEL, NEARLY, NEEDLESS, ONE_WAVE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.gears import GEAR_RIPPLE, sweeping
 from minimax_cal.modelling.effects.maps import FINEST, JOINT_ERROR_MAP, range_of, sines
-from minimax_cal.modelling.effects.scene import BESIDE, Effect, Scene, joint_of
+from minimax_cal.modelling.effects.scene import BESIDE, Scene, joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.periodogram import Line, elsewhere, expected
 
@@ -176,7 +176,13 @@ def chosen(fit: Joint, left: Left, beside: Sequence[Block]) -> list[Found]:
     while waiting:
         tried = [at.with_block(block) for block in waiting]
         for number in np.argsort([one.square for one in tried]).tolist():
-            plain = at.with_block(slow(left, waiting[number].place))
+            # Laws of the joint's own angle that have a name: its gain, and slow waves.
+            joint = joint_of(waiting[number].place)
+            q = left.q[:, joint]
+            laws = np.stack([q, *(f(k * q) for k in (1, 2, 3) for f in (np.cos, np.sin))], axis=1)
+            columns = left.arm[:, :, joint, None] * laws[:, None]
+            slow = Block(f"J{joint + 1}", columns, np.full((1, laws.shape[1]), USUAL))
+            plain = at.with_block(slow)
             each = [gain_chance(base, tried[number], left.group) for base in (at, plain)]
             chance = tries * max(each)
             if chance < GAIN_LEVEL:
@@ -186,15 +192,6 @@ def chosen(fit: Joint, left: Left, beside: Sequence[Block]) -> list[Found]:
         else:
             return out
     return out
-
-
-def slow(left: Left, place: str) -> Block:
-    """The laws of a joint's own angle that have a name: its gain, and slow waves."""
-    joint = joint_of(place)
-    q = left.q[:, joint]
-    laws = np.stack([q, *(f(k * q) for k in (1, 2, 3) for f in (np.cos, np.sin))], axis=1)
-    columns = left.arm[:, :, joint, None] * laws[:, None]
-    return Block(place, columns, np.full((1, laws.shape[1]), USUAL))
 
 
 def term_of(fit: Joint, block: Block, at: Beside, variance: float, *, wave: bool) -> Term:
@@ -235,7 +232,11 @@ def replaced(
     """Named laws of the same angles as maps, without which groups left out are met as well."""
     blocks = [found.block for found in (*lines, *maps)]
     places = {found.block.place for found in maps}
-    own = [t for t in fit.terms if t.place in places and is_series(EFFECTS[t.effect])]
+    own = []  # a wave, or a gain: a part of any curve of its joint's angle
+    for term in fit.terms:
+        law = EFFECTS[term.effect]
+        if term.place in places and law.of_angle and (law.lines or law.linear):
+            own.append(term)
     least = squared(left, usual, blocks)
     bare = begun(without(fit, left, own).take(usual)).square
     gone: tuple[Term, ...] = ()
@@ -244,11 +245,6 @@ def replaced(
         if squared(without(fit, left, fewer), usual, blocks) - least < NEEDLESS * (bare - least):
             gone = fewer
     return gone
-
-
-def is_series(effect: Effect) -> bool:
-    """Whether a law is a part of any curve of its joint's angle: a wave, or a gain."""
-    return effect.of_angle and (effect.lines or effect.linear)
 
 
 def squared(left: Left, usual: Array, blocks: Sequence[Block]) -> float:

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from minimax_cal.diagnosing.causes import Causes, effects_of
-from minimax_cal.diagnosing.established import is_named
-from minimax_cal.diagnosing.gap import Judges, Ladder, climbed
+from minimax_cal.diagnosing.causes import Causes
+from minimax_cal.diagnosing.established import covers_key
+from minimax_cal.diagnosing.findings import group_terms
+from minimax_cal.diagnosing.gap import Judges, Ladder, fit_ladder
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence.selection import select, tuned_again
 from minimax_cal.fitting.beyond import Beyond, Errors, not_claimed, without
@@ -33,11 +34,11 @@ def fold_of(study: Study, causes: Causes, rows: Array, state: State) -> Ladder:
     """
     small = studied(study.robot, study.data.take(rows), replace(study.fit, state=state))
     if not causes.confirmed:
-        return climbed(small, [], [])
+        return fit_ladder(small, [], [])
     choice = tuned_again(select(causes.choice.part(study.rows.at(rows))))
-    named = causes.maps.beside(effects_of(choice))
-    sure = [any(is_named(one, terms[0].key) for one in causes.confirmed) for terms in named]
-    return climbed(small, named, sure, guessed=causes.guessed).confirmed
+    named = causes.maps.beside(group_terms(choice))
+    sure = [any(covers_key(one, terms[0].key) for one in causes.confirmed) for terms in named]
+    return fit_ladder(small, named, sure, guessed=causes.guessed).confirmed
 
 
 def fold_errors(

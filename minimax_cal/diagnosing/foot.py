@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,23 +11,15 @@ from minimax_cal.diagnosing.joint import Joint
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.evidence.limits import DISAGREE
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.linear_algebra import jackknife_variance
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import moved, station
-from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.words import name_effect
 
 BLOCKS = 10  # of the visits, left out in turn: what the law misses goes on for a while
 LEAST = 30  # poses at which a reflector was measured
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """How far the middle of the foot's reflectors moved, as a law has it.  (3,) base axes [m]."""
-
-    value: Array
-    sigma: Array
 
 
 def reflectors(data: Measurements) -> Array:
@@ -46,32 +38,6 @@ def reflectors(data: Measurements) -> Array:
     if data.frames:
         points = moved(points, np.stack(list(data.frames.values()))[station(data)])
     return points[:, np.isfinite(points[..., 0]).sum(axis=0) >= LEAST]
-
-
-def seen_foot(cell: Cell, data: Measurements) -> Scene | None:
-    """The scene of a cell with the foot's reflectors in the place of the targets; None without."""
-    scene = cell.scene(data)
-    points = reflectors(cell.placed(data))
-    if not points.shape[1]:
-        return None
-    points = (points - scene.origin) @ scene.rotation
-    return replace(scene, points=np.moveaxis(points, 0, 2))
-
-
-def measured(scene: Scene, term: Term) -> Motion:
-    """What the reflectors themselves say of a law: its d parameters fitted to them alone.
-
-    Each stands where it stands: constants are free.  sigma: by blocks of visits left out.
-    """
-    columns = term.columns(replace(scene, points=np.nan_to_num(scene.points))).shift
-    clock = scene.column("clock")
-    block = np.minimum((np.argsort(np.argsort(clock)) * BLOCKS) // len(clock), BLOCKS - 1)
-    whole = fitted(scene.points, columns, np.ones(len(clock), dtype=bool))
-    spared = np.array([fitted(scene.points, columns, block != b) for b in range(BLOCKS)])
-    middle = motion(scene, term)
-    values = spared @ middle.T
-    sigma = np.sqrt((BLOCKS - 1) / BLOCKS * ((values - values.mean(axis=0)) ** 2).sum(axis=0))
-    return Motion(middle @ whole, sigma)
 
 
 def fitted(points: Array, columns: Array, rows: Array) -> Array:
@@ -97,24 +63,34 @@ def motion(scene: Scene, term: Term) -> Array:
 
 def foot_tells(fit: Joint, data: Measurements) -> Iterator[tuple[Term, str, str]]:
     """Laws of a fit that move the foot, how far its reflectors say, and where they contradict."""
-    scene, at = seen_foot(fit.cell, data), fit.model.names.geometric
+    points, scene = reflectors(fit.cell.placed(data)), fit.cell.scene(data)
+    if not points.shape[1]:
+        return
+    # The reflectors in the place of the targets, in base axes.
+    points = np.moveaxis((points - scene.origin) @ scene.rotation, 0, 2)
+    scene, clock = replace(scene, points=points), scene.column("clock")
+    block = np.minimum((np.argsort(np.argsort(clock)) * BLOCKS) // len(clock), BLOCKS - 1)
+    at = fit.model.names.geometric
     for term in fit.terms:
         count = len(term.columns(fit.study.scene).names)
         own, at = slice(at, at + count), at + count
-        if scene is None or EFFECTS[term.effect].moves != "frame" or term.frees_frames:
+        if EFFECTS[term.effect].moves != "frame" or term.frees_frames:
             continue
-        across, told = motion(scene, term), measured(scene, term)
+        # The law fitted to the reflectors alone; its sigma by blocks of visits left out in turn.
+        across = motion(scene, term)
+        columns = term.columns(replace(scene, points=np.nan_to_num(points))).shift
+        told = across @ fitted(points, columns, block >= 0)
+        parts = np.array([fitted(points, columns, block != b) for b in range(BLOCKS)])
+        told_sigma = np.sqrt(jackknife_variance(parts @ across.T))
         value = across @ fit.cell.effects.values[fit.terms.index(term)]
         spread = across @ np.nan_to_num(fit.uncertainty.covariance[own, own]) @ across.T
         own_sigma = np.sqrt(np.diag(spread))
-        sigma = np.hypot(own_sigma, told.sigma)
-        wrong = np.abs(value - told.value) > DISAGREE * sigma
+        sigma = np.hypot(own_sigma, told_sigma)
+        wrong = np.abs(value - told) > DISAGREE * sigma
         shown = ", ".join(
             f"{axis} {1e6 * b:+.0f} +- {1e6 * s:.0f} um, by the fit "
             f"{1e6 * a:+.0f} +- {1e6 * u:.0f} um"
-            for axis, a, u, b, s in zip(
-                "xyz", value, own_sigma, told.value, told.sigma, strict=True
-            )
+            for axis, a, u, b, s in zip("xyz", value, own_sigma, told, told_sigma, strict=True)
         )
         yield term, shown, ", ".join(np.array(list("xyz"))[wrong])
 

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import overload
+from typing import Any
 
 import numpy as np
 
 from minimax_cal.diagnosing.joint import Joint, joint
 from minimax_cal.diagnosing.result import TOLD_AS, Finding, Step, as_motion
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.diagnosing.trial import Predicting, Trial, Trials
+from minimax_cal.diagnosing.trial import Trial, Trials
 from minimax_cal.evidence.limits import END, FOLDS, HELPS, MINOR, SAYS_NOTHING, SEEN_BEFORE
 from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.beyond import without
 from minimax_cal.fitting.floor import Floor
 from minimax_cal.fitting.stations import steps_of
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.linear_algebra import jackknife_variance, project_out
 from minimax_cal.measuring.faults import mended, standing_out
 from minimax_cal.measuring.faults.nests import RESEAT
 from minimax_cal.measuring.grouping import clusters
@@ -26,7 +27,6 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.maps import curve_of
 from minimax_cal.modelling.effects.scene import Scene, joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Term
-from minimax_cal.modelling.parameters import State
 
 RESAMPLES = 1000
 FEWEST = 100  # of them that show a gap
@@ -52,11 +52,7 @@ class Fits(Sequence[Joint]):
     def __len__(self) -> int:
         return 1 + len(self.steps)
 
-    @overload
-    def __getitem__(self, at: int) -> Joint: ...
-    @overload
-    def __getitem__(self, at: slice) -> Sequence[Joint]: ...
-    def __getitem__(self, at: int | slice) -> Joint | Sequence[Joint]:
+    def __getitem__(self, at: Any) -> Any:
         if isinstance(at, slice):
             start, stop, step = at.indices(len(self))
             if (start, step) == (0, 1) and stop:
@@ -106,7 +102,7 @@ def folds(data: Measurements, count: int) -> Array:
     return np.asarray(order[group] % count)
 
 
-def climbed(
+def fit_ladder(
     study: Study, effects: Sequence[Sequence[Term]], sure: Sequence[bool], *, guessed: bool = False
 ) -> Ladder:
     """The ladder of a study's effects, in their order; with maps of joints the largest first.
@@ -129,8 +125,11 @@ def climbed(
     def helps(wide: Trial, number: int) -> bool:
         both = wide.spared(spared)
         better = wide.cross_validated(both) < (1.0 - HELPS) * last.cross_validated(both)
+        if not (better and wide.no_worse(last)):
+            return False
         ends = ends_of(study.scene, effects[number][0]) if guessed else []
-        return better and wide.no_worse(last) and not is_worse(last, wide, ends)
+        both = wide.spared(last.spared(ends))
+        return wide.cross_validated(both) <= last.cross_validated(both)
 
     for first in (True, False):
         waiting = [number for number in order if sure[number] == first]
@@ -164,14 +163,8 @@ def by_size(trials: Trials, study: Study, effects: Sequence[Sequence[Term]]) -> 
             value = values[at : at + len(fields)]
             at += len(fields)
             whole[number] += rows.of(np.tensordot(value, fields, 1)[None])[:, 0]
-    clear = whole - (whole @ rows.basis) @ rows.basis.T
-    return [int(number) for number in np.argsort(-(clear**2).sum(axis=1), kind="stable")]
-
-
-def is_worse(before: Predicting, wide: Predicting, parts: Sequence[Array]) -> bool:
-    """Whether parts that are left out are predicted worse with an effect more."""
-    both = wide.spared(before.spared(parts))
-    return wide.cross_validated(both) > before.cross_validated(both)
+    clear = project_out(whole.T, rows.basis)
+    return [int(number) for number in np.argsort(-(clear**2).sum(axis=0), kind="stable")]
 
 
 def ends_of(scene: Scene, term: Term) -> list[Array]:
@@ -199,26 +192,16 @@ def valued(findings: Sequence[Finding], ladder: Ladder) -> list[Finding]:
     for finding in [findings[number] for number in ladder.taken]:
         own = slice(at, at + len(finding.values))
         at = own.stop
-        values, sure = last.state.effects[own].tolist(), sigma[own].tolist()
-        motion = motions(ladder.last.study.scene, finding)
-        new = replace(finding, values=tuple(values), sigmas=tuple(sure), motion=motion)
-        covers = slice(geometric + own.start, geometric + own.stop)
-        out.append(replace(new, curve=drawn(new, last, covers)))
+        values, sure = last.state.effects[own], sigma[own].tolist()
+        motion, term, curve = motions(last.study.scene, finding), finding.term, finding.curve
+        if EFFECTS[term.effect].is_map:
+            sign = float(last.study.robot.sign[joint_of(term.place)])
+            covers = slice(geometric + own.start, geometric + own.stop)
+            covariance = last.uncertainty.covariance[covers, covers]
+            curve = curve_of(term.choice, sign, values, covariance)
+        new = replace(finding, values=tuple(values.tolist()), sigmas=tuple(sure), motion=motion)
+        out.append(replace(new, curve=curve))
     return out
-
-
-def drawn(finding: Finding, fit: Joint, own: slice) -> Array:
-    """(3, g) the curve of an error map, as `curve_of`; (3, 0) of another effect.
-
-    own: of its parameters among those of the fit.
-    """
-    term = finding.term
-    if not (term.effect in EFFECTS and EFFECTS[term.effect].is_map):
-        return np.zeros((3, 0))
-    sign = float(fit.study.robot.sign[joint_of(term.place)])
-    return curve_of(
-        term.choice, sign, np.array(finding.values), fit.uncertainty.covariance[own, own]
-    )
 
 
 def motions(scene: Scene, finding: Finding) -> tuple[float, ...]:
@@ -255,6 +238,24 @@ class Judges:
     held: Measurements
     far: Array
     by: str | None = None
+
+    @staticmethod
+    def of(
+        held: Measurements,
+        measured: Measurements,
+        clean: Measurements,
+        train: Measurements,
+        by: str | None,
+    ) -> Judges:
+        """Every held-out point as measured, those that stand out marked.
+
+        measured: points that stood in each other's rows put back.  clean: without faults.
+        """
+        right = dict(zip(measured.line, measured.y, strict=True))
+        y = [right.get(line, held.y[i]) for i, line in enumerate(held.line)]
+        held = held.with_y(np.array(y))
+        sound = of_lines(held.line, clean.line, clean.seen)
+        return Judges(train, held, held.seen & ~sound, by)
 
     @property
     def whole(self) -> Measurements:
@@ -338,11 +339,11 @@ def closed(ladder: Ladder, judges: Judges, floor: Floor, seed: int) -> tuple[flo
     """Share of the gap that a ladder closes on held-out poses, and its 95 % interval."""
     before, after = (judges.errors(fit.cell) for fit in (ladder.fits[0], ladder.last))
     variance, rng = spared(ladder, judges, floor), np.random.default_rng(seed)
-    return told(*closed_share(before, after, clusters(judges.held), floor, variance, rng))
+    return clip_share(*closed_share(before, after, clusters(judges.held), floor, variance, rng))
 
 
-def told(share: float, ends: Ends) -> tuple[float, Ends]:
-    """The same between 0 and 1, without an interval that says nothing."""
+def clip_share(share: float, ends: Ends) -> tuple[float, Ends]:
+    """A share and its interval between 0 and 1; NaN for an interval that says nothing."""
     low, high = np.clip(ends, 0.0, 1.0).tolist()
     if not high - low < SAYS_NOTHING:
         low = high = float("nan")
@@ -395,21 +396,16 @@ def share_of(pair: Sequence[Array], floor: Array) -> Array:
 
 def spared(ladder: Ladder, judges: Judges, floor: Floor) -> float:
     """Variance of the share closed that the choice of training poses brings: a jackknife."""
-    part = folds(judges.train, SPARED)
+    part, frames = folds(judges.train, SPARED), steps_of(judges.train.frames)
     masks = [part == number for number in range(SPARED)]
-    shares = []
-    frames = steps_of(judges.train.frames)
-    fits = [
-        without(fit.estimator, fit.state, masks, frames) for fit in (ladder.fits[0], ladder.last)
-    ]
-    for states in zip(*fits, strict=True):
-        if states[0] is None or states[1] is None:
-            continue
+    fits, known = (ladder.fits[0], ladder.last), np.zeros(0)
+    for states in zip(*(without(f.estimator, f.state, masks, frames) for f in fits), strict=True):
         pair = [
             sums(judges.errors(fit.with_state(state))).sum(axis=1)
-            for fit, state in zip((ladder.fits[0], ladder.last), states, strict=True)
-            if isinstance(state, State)
+            for fit, state in zip(fits, states, strict=True)
+            if state is not None
         ]
-        shares.append(float(share_of(pair, np.array([floor.least]))[0]))
-    known = np.array([share for share in shares if np.isfinite(share)])
-    return float((len(known) - 1) * np.var(known)) if len(known) > 2 else 0.0
+        if len(pair) == len(fits):
+            known = np.append(known, share_of(pair, np.array([floor.least])))
+    known = known[np.isfinite(known)]
+    return float(jackknife_variance(known)) if len(known) > 2 else 0.0

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from scipy.special import chdtri
 
-from minimax_cal.diagnosing.causes import Causes, sought_again, whole
-from minimax_cal.diagnosing.established import often
+from minimax_cal.diagnosing.causes import Causes, judge_causes
+from minimax_cal.diagnosing.established import select_frequent
+from minimax_cal.diagnosing.findings import with_complete_law
 from minimax_cal.diagnosing.gap import motions as motions_of
 from minimax_cal.diagnosing.instruments_result import RelativeDiagnosis, RelativeStep
 from minimax_cal.diagnosing.result import Finding
@@ -106,41 +107,36 @@ def diagnosed(
             "a diagnosis needs held-out rows in every file: measure more, or hold out more "
             "(holdout)"
         )
-    return examined(asked, tuple(exclude), progress, began)
-
-
-@one_thread()
-def examined(
-    asked: Asked, exclude: tuple[str, ...], progress: Progress, began: float
-) -> RelativeDiagnosis:
-    """The diagnosis of checked measurements.  began: when the work did [s]."""
-    fit = asked.fit(progress)
-    progress("testing causes")
-    scene, causes = causes_of(asked, fit, exclude)
-    progress("error budget")
-    ladder = budget_of(asked, fit, often(causes.effects))
-    effects = with_shares(scene, ladder)
-    last = ladder.calibrations[-1]
-    known, file, unit = known_noise(scene, ladder.fits[-1])
-    failed = last.status is Status.FAILED or ladder.calibrations[0].status is Status.FAILED
-    steps = [RelativeStep.of("nominal", ladder.calibrations[0], nominal=True)]
-    names = ["geometric", *(found.term.step for found in ladder.findings)]
-    steps += [RelativeStep.of(n, c) for n, c in zip(names, ladder.calibrations, strict=True)]
-    return RelativeDiagnosis(
-        **explanation(effects, causes, known, last.status, failed=failed),
-        calibration=last,
-        steps=tuple(steps),
-        floor_file=file,
-        floor=(known.remaining, known.highest),
-        floor_unit=unit,
-        seconds=time.perf_counter() - began,
-    )
+    with one_thread():
+        fit = asked.fit(progress)
+        progress("testing causes")
+        scene, causes = search_causes(asked, fit, tuple(exclude))
+        progress("error budget")
+        ladder = budget_of(asked, fit, select_frequent(causes.effects))
+        effects = with_shares(scene, ladder)
+        last = ladder.calibrations[-1]
+        known, file, unit = known_noise(scene, ladder.fits[-1])
+        failed = last.status is Status.FAILED or ladder.calibrations[0].status is Status.FAILED
+        steps = [RelativeStep.of("nominal", ladder.calibrations[0], nominal=True)]
+        names = ["geometric", *(found.term.step for found in ladder.findings)]
+        steps += [RelativeStep.of(n, c) for n, c in zip(names, ladder.calibrations, strict=True)]
+        return RelativeDiagnosis(
+            **explanation(effects, causes, known, last.status, failed=failed),
+            calibration=last,
+            steps=tuple(steps),
+            floor_file=file,
+            floor=(known.remaining, known.highest),
+            floor_unit=unit,
+            seconds=time.perf_counter() - began,
+        )
 
 
 # ---- the search --------------------------------------------------------------------------------
 
 
-def causes_of(asked: Asked, fit: InstrumentFit, exclude: tuple[str, ...]) -> tuple[Scene, Causes]:
+def search_causes(
+    asked: Asked, fit: InstrumentFit, exclude: tuple[str, ...]
+) -> tuple[Scene, Causes]:
     """What explains the errors that geometry leaves.
 
     The instruments are weighed once more by the noises beside the effects: what geometry leaves of
@@ -160,7 +156,7 @@ def causes_of(asked: Asked, fit: InstrumentFit, exclude: tuple[str, ...]) -> tup
     if choice.noise.variance >= rows.exact**2:
         left = left_over(scene, rows, choice.doubted, motions(choice))
     untestable = (*choice.library.untestable, *lacking.items())
-    return scene, sought_again(
+    return scene, judge_causes(
         scene, Causes((), left_out, choice, (), left, untestable), rows.group
     )
 
@@ -201,7 +197,7 @@ def budget_of(asked: Asked, fit: InstrumentFit, effects: Sequence[Finding]) -> B
     """The steps of the error budget.  effects: found often enough, the weightiest first."""
     chosen = [term for found in effects for term in found.terms]
     scene = scene_of_all(asked.robot, fit)
-    waiting = [whole(found, chosen, scene) for found in effects]
+    waiting = [with_complete_law(found, chosen, scene) for found in effects]
     every = [term for found in waiting for term in found.terms]
     began = time.perf_counter()
     full = asked.beside(every).fit(silent) if waiting else fit

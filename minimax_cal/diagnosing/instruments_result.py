@@ -176,19 +176,13 @@ class RelativeDiagnosis(Explained, Result):
         with reading(source, "diagnosis"):
             own = content["diagnosis"]
             told, floor = stored(cls, own), own["floor"]
+            end, scale = ("", 1.0) if "unit" in floor else ("_mm", 1e-3)
+            low, high = (scale * number(floor[f"{k}{end}"]) for k in ("remaining", "noise_floor"))
             each = enumerate(own["effects"])
             return cls(
                 **told,
                 calibration=calibration,
                 effects=tuple(Finding.told(one, f"effects[{i}]", terms) for i, one in each),
-                **floor_from(floor),
+                floor=(low, high),
+                floor_unit=str(floor.get("unit", METRE)),
             )
-
-
-def floor_from(told: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a diagnosis from its floor in a file, in mm or in the unit that it names."""
-    if "unit" in told:
-        ends = number(told["remaining"]), number(told["noise_floor"])
-        return {"floor": ends, "floor_unit": str(told["unit"])}
-    ends = 1e-3 * number(told["remaining_mm"]), 1e-3 * number(told["noise_floor_mm"])
-    return {"floor": ends, "floor_unit": METRE}

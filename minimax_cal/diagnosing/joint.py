@@ -104,8 +104,7 @@ def joint(study: Study, terms: Sequence[Term]) -> Joint:
         pull = poses.score.sum(axis=0) + poses.prior * poses.off
         pull[len(pull) - len(weight) :] -= weight * state.effects
         normal_matrix = poses.normal_matrix + np.diag(prior)
-        room = np.full((len(pull), 2), np.inf)
-        room[:, 0] = -np.inf
+        room = np.tile([-np.inf, np.inf], (len(pull), 1))
         room[len(room) - len(allowed) :] = allowed - state.effects[:, None]
         step = bounded(normal_matrix, pull, *room.T)
         gain = float(2.0 * step @ pull - step @ normal_matrix @ step)
@@ -115,12 +114,7 @@ def joint(study: Study, terms: Sequence[Term]) -> Joint:
             break
     state = replace(state, effects=settled(state.effects, allowed))
     model, state = extended(base, robot, data, state, terms) if terms else (base, state)
-    model = believing(model, weight)
+    prior = model.prior.weight.copy()
+    prior[len(prior) - len(weight) :] += weight
+    model = replace(model, prior=replace(model.prior, weight=prior))
     return Joint(study, terms, state, model, at_bounds(state.effects, allowed))
-
-
-def believing(model: Model, weight: Array) -> Model:
-    """The model with priors (e,) of its effects beside those that it has."""
-    whole = model.prior.weight.copy()
-    whole[len(whole) - len(weight) :] += weight
-    return replace(model, prior=replace(model.prior, weight=whole))

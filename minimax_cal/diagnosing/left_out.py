@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 import scipy
@@ -71,16 +72,9 @@ class Left:
     def take(self, rows: Array) -> Left:
         """Some of the poses.  rows: mask (m,)."""
         parts = self.parts[:, rows]
-        return Left(
-            y=self.y[rows],
-            columns=self.columns[rows],
-            arm=self.arm[rows],
-            root=self.root[rows],
-            prior=self.prior,
-            q=self.q[rows],
-            group=self.group[rows],
-            parts=parts[parts.any(axis=1)],
-        )
+        names = ("y", "columns", "arm", "root", "q", "group")
+        some: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}
+        return replace(self, **some, parts=parts[parts.any(axis=1)])
 
     @property
     def groups(self) -> int:

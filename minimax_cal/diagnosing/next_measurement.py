@@ -17,6 +17,7 @@ import numpy as np
 from minimax_cal.evidence.limits import COVERED, ENOUGH, HELPFUL, NO_POWER
 from minimax_cal.evidence.noise import Noise, identified
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.linear_algebra import column_scales, schur_complement
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term, fields_of, of_sessions
@@ -32,6 +33,7 @@ GOLDEN = 0.6180339887498949
 STEP = 0.1  # move by which a pose is approached from its other side [rad, m]
 LOAD = 0.03  # payload that is proposed, as a share of the arm's mass
 FOOT = 0.2  # radius of the reflectors on the foot, as a share of the reach
+FITTED_RIDGE = 1e-13  # of a unit column that is fitted: what no pose shows stays finite
 SAME = 1e-6  # relative change of a field below which a proposal does not concern an effect
 
 
@@ -169,18 +171,25 @@ class Site:
 def plan(scene: Scene, weight: Array, rng: np.random.Generator) -> Plan:
     """The existing poses, and after them those that are proposed."""
     m, n = scene.poses, scene.joints
-    outer = np.argsort(-aside(scene), kind="stable")[: max(AGAIN)]
+    tip, up = scene.points.mean(axis=0), scene.robot.up
+    reach = np.linalg.norm(tip - up[:, None] * (up @ tip), axis=0)  # from the vertical at the base
+    outer = np.argsort(-reach, kind="stable")[: max(AGAIN)]
     first = np.argsort(scene.column("clock"), kind="stable")[: max(AGAIN)]
     old = with_columns(scene.data, scene)
     like = rng.integers(0, m, max(MORE))  # which targets are seen, and what is not told below
     some = [old, more(scene, old.take(like), rng)]
     fresh = 1.0 + (np.arange(len(outer)) + 0.5) * GOLDEN % 1.0  # all over another session
     again = then(old.take(outer), clock=fresh)
-    sides = {f"approach{j + 1}": flipped(again.columns[f"approach{j + 1}"]) for j in range(n)}
+    last = {name: again.columns[name] for name in (f"approach{j + 1}" for j in range(n))}
+    sides = {name: np.where(side == 0.0, 1.0, -side) for name, side in last.items()}
     moves = {f"move{j + 1}": STEP * sides[f"approach{j + 1}"] for j in range(n)}
     heavier = again.columns["payload"] + payload(scene)
     hung = then(again, payload=heavier, **hanging(scene, outer, payload(scene)))
-    late = then(old.take(first), clock=1.0 + (np.arange(len(first)) + 1.0) / m, **warm(old))
+    read = old.columns.get("temperature", np.zeros(0))
+    warm: dict[str, Array] = {}
+    if np.isfinite(read).any():  # as high as it was
+        warm = {"temperature": np.full(len(first), np.nanmax(read))}
+    late = then(old.take(first), clock=1.0 + (np.arange(len(first)) + 1.0) / m, **warm)
     some += [late, again, hung, then(again, **sides, **moves)]
     parts = [weight[:, rows] for rows in (np.arange(m), like, first, outer, outer, outer)]
     starts = np.cumsum([0, *(part.poses for part in some)])
@@ -190,12 +199,6 @@ def plan(scene: Scene, weight: Array, rng: np.random.Generator) -> Plan:
         for kind, start, part in zip(kinds, starts[:-1], some, strict=True)
     }
     return Plan(old.followed_by(*some[1:]), np.concatenate(parts, axis=1), at)
-
-
-def aside(scene: Scene) -> Array:
-    """(m,) how far out the arm reaches from the vertical through its base [m]."""
-    tip, up = scene.points.mean(axis=0), scene.robot.up
-    return np.asarray(np.linalg.norm(tip - up[:, None] * (up @ tip), axis=0))
 
 
 def with_columns(data: Measurements, scene: Scene) -> Measurements:
@@ -210,19 +213,6 @@ def with_columns(data: Measurements, scene: Scene) -> Measurements:
 def then(data: Measurements, **columns: Array) -> Measurements:
     """The same rows with other columns."""
     return replace(data, columns={**data.columns, **columns})
-
-
-def flipped(side: Array) -> Array:
-    """The other direction of a last move."""
-    return np.where(side == 0.0, 1.0, -side)
-
-
-def warm(data: Measurements) -> dict[str, Array]:
-    """The temperature as high as it was, where it was read."""
-    read = data.columns.get("temperature", np.zeros(0))
-    if not np.isfinite(read).any():
-        return {}
-    return {"temperature": np.full(min(max(AGAIN), data.poses), np.nanmax(read))}
 
 
 def payload(scene: Scene) -> float:
@@ -364,35 +354,6 @@ def beside(site: Site, known: Sequence[tuple[Term, Array]]) -> list[Fields]:
     return out
 
 
-def stacked(parts: Sequence[Fields], poses: int) -> Fields:
-    """Columns side by side; effects that do not move the foot leave it still."""
-    still = [p.foot if p.foot.shape[-1] else np.zeros((*p.foot.shape[:-1], poses)) for p in parts]
-    return Fields(
-        np.concatenate([p.points for p in parts]),
-        np.concatenate(still),
-        np.concatenate([p.ridge for p in parts]),
-    )
-
-
-def left(gram: Array, fitted: int) -> Array:
-    """A Gram matrix with its first columns projected out."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    gram = gram * scale * scale[:, None]
-    first, across = gram[:fitted, :fitted], gram[:fitted, fitted:]
-    rest = gram[fitted:, fitted:] - across.T @ np.linalg.solve(
-        first + 1e-13 * np.eye(fitted), across
-    )
-    return np.asarray(rest / scale[fitted:] / scale[fitted:, None])
-
-
-def power_of(gram: Array) -> float:
-    """lambda (1 - rho^2) of the first column, the others being its rival's."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(gram)[1:], 1e-300))
-    inverse = np.linalg.pinv(gram[1:, 1:] * scale * scale[:, None], 1e-9, hermitian=True)
-    across = gram[0, 1:] * scale
-    return float(max(gram[0, 0] - across @ inverse @ across, 0.0))
-
-
 def powers(site: Site, pair: Pair) -> dict[tuple[str, int], float]:
     """Power to tell the two apart: now (`old`), and with each proposal that concerns them."""
     mine, _, _ = fields(site, pair.one)
@@ -401,7 +362,15 @@ def powers(site: Site, pair: Pair) -> dict[tuple[str, int], float]:
     rival = list(fields(site, pair.other)[:2])
     fitted = beside(site, pair.known)
     count = sum(len(part.ridge) for part in fitted)
-    everything = stacked([*fitted, found, *rival], site.plan.at["foot"][1])
+    columns, poses = [*fitted, found, *rival], site.plan.at["foot"][1]
+    everything = Fields(
+        np.concatenate([part.points for part in columns]),
+        np.concatenate([
+            part.foot if part.foot.shape[-1] else np.zeros((*part.foot.shape[:-1], poses))
+            for part in columns  # that do not move the foot leave it still
+        ]),
+        np.concatenate([part.ridge for part in columns]),
+    )  # fmt: skip
     p = site.geometry.shape[1]
     rows = np.concatenate([site.geometry, site.turned.of(everything.points)], axis=1)
     rows *= site.root[:, None]
@@ -428,7 +397,13 @@ def powers(site: Site, pair: Pair) -> dict[tuple[str, int], float]:
             span = site.spans[key]
             half = np.concatenate([span.T @ gram[:p], gram[p:]])
             whole = np.concatenate([half[:, :p] @ span, half[:, p:]], axis=1)
-            out[key] = power_of(left(whole, span.shape[1] + count))
+            # What remains of the effect's motion once the rival has imitated it.
+            left = schur_complement(whole, span.shape[1] + count, FITTED_RIDGE)
+            scale = 1.0 / column_scales(left[1:, 1:])
+            unit = left[1:, 1:] * scale * scale[:, None]
+            inverse = np.linalg.pinv(unit, 1e-9, hermitian=True)
+            across = left[0, 1:] * scale
+            out[key] = float(max(left[0, 0] - across @ inverse @ across, 0.0))
     return out
 
 
@@ -479,7 +454,17 @@ def words(site: Site, kind: str, count: int) -> str:
     """A proposal as one would say it to a technician."""
     scene = site.scene
     if kind == "more":
-        return f"measure {count} more poses {spread(scene)}"
+        # Over the joints by which further poses reach farther than those at hand.
+        lower, upper = bounds(scene)
+        narrow = np.ptp(scene.data.q, axis=0) < COVERED * (upper - lower)
+        names = [str(j + 1) for j in np.flatnonzero(narrow)]
+        where = f"over the whole range of joint{'s' if len(names) > 1 else ''} "
+        where += " and ".join([*filter(None, [", ".join(names[:-1])]), *names[-1:]])
+        if not names:
+            where = "all over the workspace"
+        elif len(names) == scene.joints:
+            where = "over the whole range of all joints"
+        return f"measure {count} more poses {where}"
     if kind == "load":
         extra = " more" if scene.column("payload").any() else ""
         return (
@@ -493,16 +478,3 @@ def words(site: Site, kind: str, count: int) -> str:
         "foot": "put three reflectors on the robot's foot, far apart, and measure them at the "
         f"{count} poses that reach out farthest",
     }[kind]
-
-
-def spread(scene: Scene) -> str:
-    """Over which joints further poses reach farther than those at hand."""
-    lower, upper = bounds(scene)
-    narrow = np.ptp(scene.data.q, axis=0) < COVERED * (upper - lower)
-    names = [str(j + 1) for j in np.flatnonzero(narrow)]
-    if not names:
-        return "all over the workspace"
-    if len(names) == scene.joints:
-        return "over the whole range of all joints"
-    listed = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-    return f"over the whole range of joint{'s' if len(names) > 1 else ''} {listed}"

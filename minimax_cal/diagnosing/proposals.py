@@ -47,11 +47,8 @@ def proposal(found: Explained, floor_known: bool) -> Proposal | None:
     if found.verdict == "not_repeatable":
         return AGAIN
     settled = separating([one for one in found.by_rung if one.established])
-    return settled or (of_unknown(found) if found.verdict == "unknown" else None)
-
-
-def of_unknown(found: Explained) -> Proposal:
-    """What would tell more of an error that nothing explains."""
+    if settled or found.verdict != "unknown":
+        return settled
     driver = found.structure_in.partition(FOLLOWING)[2]
     asked = (one for one in ASKING if any(word in driver for word in one[0]))
     _, kind, text = next(asked, MORE)

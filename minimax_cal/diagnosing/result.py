@@ -222,7 +222,13 @@ class Finding(Record):
         Where masses are not told, by the largest motion that it makes: mrad, or mm.
         """
         if self.curve.size:
-            return of_curve(self.curve)
+            _, turn, sure = self.curve
+            most = int(np.argmax(np.abs(turn)))
+            ends = {"RMS": (rms(turn), rms(sure)), "largest": (abs(turn[most]), sure[most])}
+            return [
+                {"name": name, "value": float(value), "sigma": finite(float(sigma)), "unit": "rad"}
+                for name, (value, sigma) in ends.items()
+            ]
         scale = [in_files(unit)[0] for unit in self.units]
         units = tuple(in_files(unit)[1] for unit in self.units)
         if self.motion:
@@ -269,17 +275,6 @@ class Finding(Record):
             sigmas=tuple(p.sigma for p in every),
             curve=array([curve.get(key, []) for key in CURVE], f"{at}.curve"),
         )
-
-
-def of_curve(curve: Array) -> list[dict[str, Any]]:
-    """An error map in two numbers, for JSON.  curve: as `Finding.curve`."""
-    _, turn, sigma = curve
-    most = int(np.argmax(np.abs(turn)))
-    told = {"RMS": (rms(turn), rms(sigma)), "largest": (abs(turn[most]), sigma[most])}
-    return [
-        {"name": name, "value": float(value), "sigma": finite(float(sure)), "unit": "rad"}
-        for name, (value, sure) in told.items()
-    ]
 
 
 class Dependence(NamedTuple):

@@ -153,7 +153,7 @@ class WholePoses:
 # ---- tails ---------------------------------------------------------------------------------------
 
 
-def wrong_rows(data: Measurements, error: Array) -> Array:
+def find_rows_beyond_tails(data: Measurements, error: Array) -> Array:
     """(m,) True where a point is farther off than the tails of all others allow.
 
     Judged by the errors of a fit, and by the distances between targets, each against Student's t
@@ -161,14 +161,16 @@ def wrong_rows(data: Measurements, error: Array) -> Array:
     wrong for being far off.  error: (m, k, 3) of all points [m].
     """
     out = np.zeros(data.poses, dtype=bool)
-    spread, far = judged(np.linalg.norm(error, axis=-1), 3)
+    spread, far = fit_tails(np.linalg.norm(error, axis=-1), 3)
     if spread.dof <= HEAVY:
         return out
     off = np.abs(between(data).off.T)
-    return np.asarray(far | judged(off, 1)[1] if off.size else far)
+    return np.asarray(far | fit_tails(off, 1)[1] if off.size else far)
 
 
-def unpulled(error: Array, again: Callable[[], Array], data: Measurements) -> tuple[Fault, ...]:
+def find_points_of_pulled_fit(
+    error: Array, again: Callable[[], Array], data: Measurements
+) -> tuple[Fault, ...]:
     """Points that are wrong where so many are that they pull the fit.
 
     error: (m, k, 3) of a plain fit [m].  again: that of one which wrong points do not pull, asked
@@ -179,24 +181,15 @@ def unpulled(error: Array, again: Callable[[], Array], data: Measurements) -> tu
     if not np.nanmax(size, initial=0.0) > MAX_GAUSSIAN * np.nanmedian(size):
         return ()
     robust = again()
-    spread, far = judged(np.linalg.norm(robust, axis=-1), 3)
-    return far_off(data, robust, far) if spread.dof > HEAVY and scattered(data, far) else ()
+    spread, far = fit_tails(np.linalg.norm(robust, axis=-1), 3)
+    runs = int((np.diff(far[visits(data)].astype(int), prepend=0) == 1).sum())
+    is_scattered = 2 * runs > int(far.sum())  # most are single ones among the visits
+    return far_off(data, robust, far) if spread.dof > HEAVY and is_scattered else ()
 
 
-def scattered(data: Measurements, far: Array) -> bool:
-    """Whether poses (m,) are single ones among the visits: most that follow each other moved."""
-    begins = np.diff(far[visits(data)].astype(int), prepend=0) == 1
-    return 2 * int(begins.sum()) > int(far.sum())
-
-
-def judged(size: Array, directions: int) -> tuple[Spread, Array]:
+def fit_tails(size: Array, directions: int) -> tuple[Spread, Array]:
     """How sizes (m, s) scatter, and (m,) True where one stands out.  NaN is unknown."""
     seen = np.isfinite(size)
     scores = Scores(np.where(seen, size, 0.0) ** 2, directions * seen)
     spread = spread_of(scores, float(directions * seen.sum()))
     return spread, np.asarray(spread.far(scores).any(axis=1))
-
-
-def are_wrong(fault: Fault, rows: Array, line: Array) -> bool:
-    """Whether rows of a fault, as lines of the file, are among those that are wrong."""
-    return bool(np.isin(fault.rows, line[rows]).any())

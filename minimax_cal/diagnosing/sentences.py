@@ -7,11 +7,9 @@ from collections.abc import Sequence
 
 from minimax_cal.diagnosing.result import (
     Alternative,
-    Dependence,
     Diagnosis,
     Explained,
     Finding,
-    Remaining,
 )
 from minimax_cal.diagnosing.verdict import ABOVE_NOISE, ONLY_MINOR
 from minimax_cal.evidence.limits import HALF, STRUCTURE
@@ -78,32 +76,27 @@ def explained(found: Explained) -> tuple[str, ...]:
 
 def causes_first(found: Explained) -> tuple[str, ...]:
     """What comes first: the causes, or that the most is unexplained."""
-    causes = (listed(title_of(found), found.main, found.shares_of), subsampled(found.main))
-    return (opening(found), *causes) if is_partial(found) else (*causes, opening(found))
+    verdict, main, partial = found.verdict, found.main, is_partial(found)
+    ambiguous = verdict == "one_of" and bool(main and main[0].alternatives)
+    title = OPENINGS["one_of" if ambiguous else "named"]
+    if verdict == "none":
+        title = "Minor cause"
+    elif verdict == "unknown" and partial:
+        title = "Partial cause"
+    title += "s" if len(main) > 1 else ""
+
+    opening = OPENINGS[verdict]
+    if verdict in ("named", "one_of") and main:
+        opening = ""  # the causes say it all
+    elif verdict == "none" and main:
+        opening = ONLY_SMALL
+    elif verdict == "unknown":
+        opening = f"{opening}: {unexplained(found)}"
+    causes = (listed(title, main, found.shares_of), subsampled(main))
+    return (opening, *causes) if partial else (*causes, opening)
 
 
 # ---- the sentences -----------------------------------------------------------------------------
-
-
-def opening(found: Explained) -> str:
-    """What comes before the causes; empty where these say it all."""
-    if found.verdict in ("named", "one_of") and found.main:
-        return ""
-    if found.verdict == "none" and found.main:
-        return ONLY_SMALL
-    text = OPENINGS[found.verdict]
-    return f"{text}: {unexplained(found)}" if found.verdict == "unknown" else text
-
-
-def title_of(found: Explained) -> str:
-    """Main cause, ambiguous cause, a minor one, or a partial one where most is unexplained."""
-    many = "s" if len(found.main) > 1 else ""
-    if found.verdict == "none":
-        return f"Minor cause{many}"
-    if found.verdict == "unknown" and is_partial(found):
-        return f"Partial cause{many}"
-    ambiguous = found.verdict == "one_of" and bool(found.main and found.main[0].alternatives)
-    return f"{OPENINGS['one_of' if ambiguous else 'named']}{many}"
 
 
 def is_partial(found: Explained) -> bool:
@@ -132,7 +125,19 @@ def listed(title: str, findings: Sequence[Finding], of: str) -> str:
     kinds: dict[str, list[Finding]] = {}
     for finding in findings:
         kinds.setdefault(finding.term.effect, []).append(finding)
-    parts = [cause_of(same, first=i == 0) for i, same in enumerate(kinds.values())]
+    parts = []
+    for i, same in enumerate(kinds.values()):
+        # Where, of the first kind also what it is, its alternatives, its share.
+        text = f"{named_together(same)}{'' if i else f' ({same[0].cause})'}"
+        amounts = dict(zip(same[0].names, same[0].values, strict=True))
+        part = amounts.get("explained", math.nan)  # of joints that were read back
+        if math.isfinite(part) and not math.isfinite(same[0].before):
+            text += f", with {100.0 * part:.0f} % of the remaining error along the last moves"
+        which = {id(f): f" (for {f.at.removeprefix('at ')})" * (len(same) > 1) for f in same}
+        others = sorted({f"{a.name}{which[id(f)]}" for f in same for a in f.alternatives})
+        text += f", or {' or '.join(others)}" if others else ""
+        shares = [f"{100.0 * f.share:.0f} %" for f in same if f.share > 0.0]
+        parts.append(", ".join([text, " and ".join(shares)]) if shares else text)
     share = f" of the squared error {of}" if any("%" in part for part in parts) else ""
     return f"{title}: {'; '.join(parts)}{share}." if parts else ""
 
@@ -149,22 +154,6 @@ def subsampled(findings: Sequence[Finding]) -> str:
     if loose and loose != list(findings):
         sure = f"confirmed, but {names_of(loose, ' and ')} is not distinguished from others"
     return f"{each} again in {least}{100.0 * often:.0f} % of the subsamples of the poses: {sure}."
-
-
-def cause_of(same: Sequence[Finding], *, first: bool) -> str:
-    """One kind of cause: where, of the first one also what it is, its alternatives, its share."""
-    why = f" ({same[0].cause})" if first else ""
-    others = sorted({f"{a.name}{at_which(f, same)}" for f in same for a in f.alternatives})
-    text = f"{named_together(same)}{why}{lines_of(same[0])}"
-    if others:
-        text += f", or {' or '.join(others)}"
-    shares = [f"{100.0 * f.share:.0f} %" for f in same if f.share > 0.0]
-    return ", ".join([text, " and ".join(shares)]) if shares else text
-
-
-def at_which(finding: Finding, same: Sequence[Finding]) -> str:
-    """To which of several places an alternative belongs."""
-    return f" (for {finding.at.removeprefix('at ')})" if len(same) > 1 else ""
 
 
 def names_of(found: Sequence[Named], between: str = "; ") -> str:
@@ -210,14 +199,6 @@ def together(places: Sequence[str]) -> str:
     return ", ".join(places)
 
 
-def lines_of(finding: Finding) -> str:
-    """Of joints that were read back: how much of the remaining error it explains."""
-    share = dict(zip(finding.names, finding.values, strict=True)).get("explained", math.nan)
-    if math.isfinite(finding.before) or not math.isfinite(share):
-        return ""
-    return f", with {100.0 * share:.0f} % of the remaining error along the last moves"
-
-
 def shrunk(found: Diagnosis) -> str:
     """How far the error falls on held-out poses."""
     nominal, geometric, last = (found.ladder[i].holdout for i in (0, 1, -1))
@@ -227,7 +208,12 @@ def shrunk(found: Diagnosis) -> str:
     )
     if len(found.ladder) < 3:
         return f"{text}."
-    far = f"largest {last.max_mm:.3f} mm{without_far(found)}"
+    sound = found.ladder[-1].trusted
+    count = sum(last.counts) - sum(sound.counts)
+    far = f"largest {last.max_mm:.3f} mm"
+    if count and sum(sound.counts):
+        points = "1 outlier" if count == 1 else f"{count} outliers"
+        far += f"; {sound.rms_mm:.3f} mm without {points}"
     name = found.ladder[-1].name
     what = "all confirmed effects" if name.startswith("+ ") else name_step(name)
     text += f", {what} {last.rms_mm:.3f} mm ({far})"
@@ -244,38 +230,23 @@ def closed_words(found: Diagnosis) -> str:
     return f"{share} of the squared error {found.shares_of} is explained{ends}"
 
 
-def without_far(found: Diagnosis) -> str:
-    """What the whole model does without held-out outliers; empty where there are none."""
-    every, sound = found.ladder[-1].holdout, found.ladder[-1].trusted
-    count = sum(every.counts) - sum(sound.counts)
-    points = "1 outlier" if count == 1 else f"{count} outliers"
-    return f"; {sound.rms_mm:.3f} mm without {points}" if count and sum(sound.counts) else ""
-
-
 def remaining(found: Diagnosis) -> str:
     """The remaining error: what is noise, what depends on something, and what nothing explains."""
-    if found.remaining is None:
+    left = found.remaining
+    if left is None:
         return ""
-    rms = found.ladder[-1].trusted.rms_mm
-    return f"Remaining error {rms:.3f} mm RMS: {', '.join(parts_of(found, found.remaining))}."
-
-
-def parts_of(found: Diagnosis, left: Remaining) -> list[str]:
-    """What remains, part by part."""
     own = "measurement noise" if left.noise_from == REPEATS else "the instrument's noise"
     noise = f"{left.noise_mm:.3f} mm is {own} ({left.noise_from})"
     parts = [noise if math.isfinite(left.noise_mm) else "its noise is not known"]
-    parts += [dependence(one) for one in left.depends[:1]] or ["no dependence was found"]
+    parts += [
+        f"{one.rms_mm:.3f} mm is {name_structure(one.name)} (p {name_chance(one.p)})"
+        for one in left.depends[:1]
+    ] or ["no dependence was found"]
     within = found.floor_known and found.meets_floor  # the noise is no surer than that
     if left.unexplained_mm >= NOTHING_MM and not within:
         what = "is unexplained" if found.floor_known else "may be the arm's repeatability"
         parts.append(f"{left.unexplained_mm:.3f} mm {what}")
-    return parts
-
-
-def dependence(one: Dependence) -> str:
-    """How much of an error depends on what."""
-    return f"{one.rms_mm:.3f} mm is {name_structure(one.name)} (p {name_chance(one.p)})"
+    return f"Remaining error {found.ladder[-1].trusted.rms_mm:.3f} mm RMS: {', '.join(parts)}."
 
 
 def away(found: Diagnosis) -> str:

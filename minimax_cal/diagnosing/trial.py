@@ -27,6 +27,7 @@ from minimax_cal.fitting.between_sessions import amounts, change_of, frame_chang
 from minimax_cal.fitting.beyond import are_needed, step_without
 from minimax_cal.fitting.uncertainty import Estimator, Linearised, Poses, quantile
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.linear_algebra import scale_symmetric
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term, at_bounds, bounds
 from minimax_cal.modelling.effects.words import name_effect
@@ -64,7 +65,7 @@ def weights_of(poses: Linearised, values: Array, parts: Sequence[slice]) -> Arra
     across = solve_normal(gram[:p, :p], gram[:p, p:])
     left = gram[p:, p:] - gram[p:, :p] @ across  # what geometry leaves of the effects
     size = np.sqrt(np.diag(gram)[p:])  # how far a unit moves all points
-    left = left / np.outer(size, size)
+    left = scale_symmetric(left, size)
     told = (pull[p:] - across.T @ pull[:p]) / size + left @ (values * size)
     square = float((poses.error**2).sum())
     least = square - float(pull @ solve_normal(gram, pull[:, None])[:, 0])
@@ -103,8 +104,8 @@ class Predicting(ABC):
         return {}
 
     @cached_property
-    def lefts(self) -> dict[bytes, Array]:
-        """Of folds that were asked for, what `left_at` found."""
+    def squares(self) -> dict[bytes, float]:
+        """Of folds that were left out, the sum of squares there."""
         return {}
 
     def spared(self, folds: Sequence[Array]) -> list[Array]:
@@ -120,15 +121,14 @@ class Predicting(ABC):
         """Sum of squares at folds left out in turn [m^2], linear; infinite where one is needed."""
         if len(self.spared(folds)) < len(folds):
             return float("inf")
-        return sum((float((self.left_at(fold) ** 2).sum()) for fold in folds), 0.0)
-
-    def left_at(self, fold: Array) -> Array:
-        """(f, r) errors at the poses of a fold, mask (m,), by a fit without them, linear."""
-        mark = fold.tobytes()
-        if mark not in self.lefts:
-            step = step_without(self.poses, fold)
-            self.lefts[mark] = self.poses.error[fold] - self.poses.jacobian[fold] @ step
-        return self.lefts[mark]
+        total = 0.0
+        for fold in folds:
+            mark = fold.tobytes()
+            if mark not in self.squares:
+                left = self.poses.jacobian[fold] @ step_without(self.poses, fold)
+                self.squares[mark] = float(((self.poses.error[fold] - left) ** 2).sum())
+            total += self.squares[mark]
+        return total
 
 
 class Trials:

@@ -15,7 +15,11 @@ import numpy as np
 from scipy.special import chdtri
 
 from minimax_cal.diagnosing.causes import Causes
-from minimax_cal.diagnosing.established import asked, loose_among, mostly_loose
+from minimax_cal.diagnosing.established import (
+    find_unconfirmed,
+    has_frequencies,
+    is_mostly_unconfirmed,
+)
 from minimax_cal.diagnosing.joint import Joint
 from minimax_cal.diagnosing.left_out import joint_units
 from minimax_cal.diagnosing.result import WORSE_OUTSIDE, Finding, Untestable
@@ -23,7 +27,6 @@ from minimax_cal.diagnosing.what_remains import loudest
 from minimax_cal.evidence.limits import HALF, MAX_JOINT_JITTER, MAX_OVER_NOISE
 from minimax_cal.fitting.accuracy import rms_interval
 from minimax_cal.fitting.floor import REPEATS, Floor, least_scatter, of_coordinate
-from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.points import noise_between
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
@@ -80,52 +83,38 @@ def known_noise(last: Joint, floor: Floor, data: Measurements, repeatability: fl
 
     data: without faults.  repeatability: of the arm by its data sheet, NaN unknown [m].
     """
-    sound = usual_scatter(last)
-    told = math.isfinite(repeatability)
-    arm = max(sound, 1e3 * repeatability) if told else sound
-    repeats, between = floor.source == REPEATS, noise_between(data)
-    instrument = of_coordinate(between[0]) if between else math.nan
-    highest = math.hypot(floor.high, 0.0 if repeats or told else sound)
-    return Known(
-        highest=highest if floor.certain else math.nan,
-        remaining=remaining_mm(last),
-        visits=least_visits(data, last.cell.error(data)) if repeats else math.nan,
-        expected=math.hypot(instrument, arm),
-    )
-
-
-def usual_scatter(last: Joint) -> float:
-    """RMS distance by which sound joints miss their place at these poses, at most [mm]."""
+    # RMS distance by which sound joints miss their place at these poses, at most.
     scene = last.study.scene
     arm = scene.jacobian * joint_units(scene)[:, None, None, None]
-    return 1e3 * MAX_JOINT_JITTER * float(np.sqrt((arm**2).sum(axis=(0, 2)).mean()))
+    sound = 1e3 * MAX_JOINT_JITTER * float(np.sqrt((arm**2).sum(axis=(0, 2)).mean()))
+    known = math.isfinite(repeatability)
+    expected = max(sound, 1e3 * repeatability) if known else sound
 
+    # Scatter of repeated poses by the mean of the squares, which sees two peaks where a median does
+    # not; a pose counts as one number, for what joints do moves all of its points.
+    repeats, between = floor.source == REPEATS, noise_between(data)
+    again = least_scatter(data, last.cell.error(data)) if repeats else None
+    visits = math.nan
+    if again:
+        square, group = again
+        free = float(len(np.unique(group)))
+        visits = 1e3 * math.sqrt(float(square.mean()) * free / float(chdtri(free, 0.025)))
 
-def least_visits(data: Measurements, error: Array) -> float:
-    """Lower 97.5 % limit of the RMS distance by which visits to one pose differ [mm].
+    # Error on the poses of the fit, over their degrees of freedom: elsewhere errors of the
+    # parameters count, which no noise tells.
+    own, free = last.study.data, last.poses.left_free
+    low = rms_interval(last.cell.error(own), clusters(own), rng=np.random.default_rng(0)).low
+    count = 3.0 * float(np.count_nonzero(own.seen))
+    remaining = 1e3 * float(np.nan_to_num(low)) * math.sqrt(count / free) if free >= 1.0 else 0.0
 
-    By the mean of the squares, which sees a scatter of two peaks where a median does not; a pose
-    counts as one number, for what joints do moves all of its points.  error: (m, k, 3) [m].
-    """
-    again = least_scatter(data, error)
-    if again is None:
-        return math.nan
-    square, group = again
-    free = float(len(np.unique(group)))
-    return 1e3 * math.sqrt(float(square.mean()) * free / float(chdtri(free, 0.025)))
-
-
-def remaining_mm(last: Joint) -> float:
-    """Lower 95 % limit of the RMS distance that the last step leaves [mm].
-
-    On the poses of the fit, over their degrees of freedom: elsewhere errors of the parameters
-    count, which no noise tells.
-    """
-    data = last.study.data
-    low = rms_interval(last.cell.error(data), clusters(data), rng=np.random.default_rng(0)).low
-    count = 3.0 * float(np.count_nonzero(data.seen))
-    free = last.poses.left_free
-    return 1e3 * float(np.nan_to_num(low)) * math.sqrt(count / free) if free >= 1.0 else 0.0
+    instrument = of_coordinate(between[0]) if between else math.nan
+    highest = math.hypot(floor.high, 0.0 if repeats or known else sound)
+    return Known(
+        highest=highest if floor.certain else math.nan,
+        remaining=remaining,
+        visits=visits,
+        expected=math.hypot(instrument, expected),
+    )
 
 
 def answered(
@@ -154,8 +143,6 @@ UNSURE = "the causes found change with the choice of poses"
 UNASKED = "too few poses to confirm the causes found"
 UNHELPFUL = "the causes found do not improve held-out poses"
 
-Structure = tuple[str, float]
-
 
 def explanation(
     findings: Sequence[Finding], causes: Causes, known: Known, status: Status, *, failed: bool
@@ -165,7 +152,23 @@ def explanation(
     findings: as the ladder took them, with the faults.  known: noise.  status: of the geometric
     fit.  failed: whether the last fit contradicts the data.
     """
-    verdict, (where, p) = judged(findings, causes)
+    # By the evidence: what is confirmed, and whether anything significant remains.
+    remains = loudest(causes.left)
+    loud = remains or causes.left[0]
+    where, p = loud.name, loud.p
+    sure = [found for found in findings if found.established]
+    named = [found for found in sure if np.isfinite(found.size)]  # no fault of the data
+    if remains:
+        verdict = "unknown"
+    elif is_mostly_unconfirmed(causes.effects, named):
+        verdict = "unknown"
+        where = why_loose(causes.effects, find_unconfirmed(causes.effects, named))
+    elif not sure:
+        verdict = "none"
+    else:
+        verdict = "one_of" if any(found.alternatives for found in sure) else "named"
+
+    # By all that is known of the noise besides.
     verdict, where = answered(verdict, where, findings, known)
     return {
         "status": Status.FAILED if failed else status,
@@ -179,28 +182,9 @@ def explanation(
     }
 
 
-def judged(findings: Sequence[Finding], causes: Causes) -> tuple[str, Structure]:
-    """The verdict by the evidence; what remains loudest, and its chance.
-
-    findings: as the ladder took them, with the faults.
-    """
-    loud = loudest(causes.left) or causes.left[0]
-    structure = (loud.name, loud.p)
-    sure = [found for found in findings if found.established]
-    if loudest(causes.left):
-        return "unknown", structure
-    named = [found for found in sure if np.isfinite(found.size)]  # no fault of the data
-    unsure = why_loose(causes.effects, loose_among(causes.effects, named))
-    if mostly_loose(causes.effects, named):
-        return "unknown", (unsure, structure[1])
-    if not sure:
-        return "none", structure
-    return ("one_of" if any(found.alternatives for found in sure) else "named"), structure
-
-
 def why_loose(effects: Sequence[Finding], loose: Sequence[Finding]) -> str:
     """What is wrong with the names that do not hold."""
-    if not asked(effects):
+    if not has_frequencies(effects):
         return UNASKED
     if any(not found.extends for found in loose):
         return WORSE_OUTSIDE

@@ -122,7 +122,9 @@ def where(study: Study) -> Where:
     """Where the errors of a study's geometric fit lie."""
     data, base = study.data, study.geometric.base
     error = study.model.error(study.fit.state)
-    point, sight = (data.y - base[:3, 3]) @ base[:3, :3], in_sight(study)
+    point = (data.y - base[:3, 3]) @ base[:3, :3]
+    seen = data.y - stood(data)[:, None]  # from the instrument
+    sight = seen / np.linalg.norm(seen, axis=-1, keepdims=True) @ base[:3, :3]
     given, between = instrument_noise(data), noise_between(data)
     noise = between[0] if between and not math.isfinite(given) else given
     turn = joint_equivalent(error, study.scene.jacobian, noise)
@@ -148,13 +150,6 @@ def where(study: Study) -> Where:
         temperature=loudest(every, lambda one: one.driver == "temperature"),
         noise=noise,
     )
-
-
-def in_sight(study: Study) -> Array:
-    """(m, k, 3) unit vectors from the instrument to the targets, in base axes."""
-    seen = study.data.y - stood(study.data)[:, None]
-    away = np.linalg.norm(seen, axis=-1, keepdims=True)
-    return np.asarray(seen / away @ study.geometric.base[:3, :3])
 
 
 def loudest(every: Asked, chosen: Callable[[Component], bool]) -> Follows | None:

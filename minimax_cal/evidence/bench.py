@@ -13,8 +13,9 @@ from scipy.special import fdtrc
 from minimax_cal.evidence.library import Aside, Candidate, Kind, Library, kinds
 from minimax_cal.evidence.limits import CREDIBLE, LINES
 from minimax_cal.evidence.noise import Noise, inflation, triangles
-from minimax_cal.evidence.products import At, Products, regularised, within
+from minimax_cal.evidence.products import Products, regularised, within
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.linear_algebra import column_scales, scale_symmetric
 from minimax_cal.solvers.bounded import bounded
 
 ROUNDING = 1e-15  # share of a square that is no more than rounding
@@ -140,17 +141,12 @@ class Bench:
         """The bench for the library's lines."""
         return self.beside(self.library.lines or self.library.aside(()))
 
-    def line(self, c: Candidate) -> Candidate | None:
-        """The line that was stored as a candidate later."""
-        lines = self.library.lines.candidates if self.library.lines else ()
-        return next((one for one in lines if one.text == c.text), None)
-
     def added(self, c: Candidate) -> Added:
         """A candidate beside what was chosen, at its best ratio."""
-        line = self.line(c)
-        if line is None:
-            return self.compared(Kind.of([c]))[0]
-        return replace(self.lines.compared(Kind.of([line]))[0], candidate=c)
+        for line in self.library.lines.candidates if self.library.lines else ():
+            if line.text == c.text:  # it was stored as a candidate later
+                return replace(self.lines.compared(Kind.of([line]))[0], candidate=c)
+        return self.compared(Kind.of([c]))[0]
 
     def ranked(self, among: Sequence[Candidate]) -> list[Added]:
         """Candidates that are worth it by evidence, and the best of each kind."""
@@ -168,7 +164,13 @@ class Bench:
         up = np.maximum(self.base - cost[at, each], 0.0)
         value = value[at, each]
         sigma = np.sqrt(np.maximum(inverse[at, each] * variance[:, None], 0.0))
-        worth = up - volume[at, each] - occam(kind, up) - prior_penalty(kind, value, sigma)
+        # Evidence: the gain less what so many free parameters must gain (Occam), what values far
+        # beyond the usual cost, and what a sign that is physically impossible gains.
+        d, usual = kind.free, ((value / kind.typical[:, None]) ** 2).sum(axis=1)
+        occam = d * (1.0 + np.log(np.maximum(up / d, 1.0))) + 2.0 * np.log(kind.tries)
+        wrong = kind.positive & (value[:, 0] < 0.0)
+        sign = wrong * (value[:, 0] / np.maximum(sigma[:, 0], 1e-300)) ** 2
+        worth = up - volume[at, each] - occam - (usual + sign)
         shown = np.union1d(np.flatnonzero(worth > 0.0), [np.argmax(worth)])
         return [
             Added(
@@ -206,14 +208,13 @@ class Bench:
 
     def improbable(self, one: Added, level: float) -> bool:
         """Whether a gain is less probable than a level, by all rows and by groups of them."""
-        return self.p_value(one) < level and self.p_value(one, self.wide(one)) < level
-
-    def wide(self, one: Added) -> float:
-        """By how much rows are noisier along a candidate than all together."""
+        if self.p_value(one) >= level:
+            return False
         at = int(np.argmax(self.settings.ratios == one.ratio))
         motion = one.value @ self.library.fields(one.candidate)[: len(one.value)]
         own, rest = self.fixed.white(motion[None], at)[0], self.fixed.left(at)
-        return inflation(own, rest, self.library.rows.group, self.dof)
+        wide = inflation(own, rest, self.library.rows.group, self.dof)
+        return self.p_value(one, wide) < level
 
     def likeness(self, one: Added, other: Candidate) -> tuple[float, float]:
         """lambda of an effect found, and rho^2: the share of its motion that another imitates."""
@@ -225,7 +226,7 @@ class Bench:
         across = one.value @ both[:d, d:]
         own = np.diag(both)[d:]  # zero where geometry imitates a column
         scale = np.sqrt(np.maximum(own, 1e-12 * own.max(initial=0.0) + 1e-300))
-        inverse = np.linalg.pinv(both[d:, d:] / np.outer(scale, scale), 1e-9, hermitian=True)
+        inverse = np.linalg.pinv(scale_symmetric(both[d:, d:], scale), 1e-9, hermitian=True)
         shared = float((across / scale) @ inverse @ (across / scale))
         return size / one.variance, min(shared / max(size, 1e-300), 1.0)
 
@@ -313,19 +314,6 @@ class Fixed:
         return part, pull - (part @ self.before[..., None])[..., 0]
 
 
-def occam(kind: Kind, gain: Array) -> Array:
-    """What d free parameters must gain to be worth it (c,): d (1 + log of the gain of each)."""
-    d = kind.free
-    return np.asarray(d * (1.0 + np.log(np.maximum(gain / d, 1.0))) + 2.0 * np.log(kind.tries))
-
-
-def prior_penalty(kind: Kind, value: Array, sigma: Array) -> Array:
-    """What values far beyond the usual cost (c,), and signs that no body has."""
-    cost = ((value / kind.typical[:, None]) ** 2).sum(axis=1)
-    wrong = kind.positive & (value[:, 0] < 0.0)
-    return np.asarray(cost + wrong * (value[:, 0] / np.maximum(sigma[:, 0], 1e-300)) ** 2)
-
-
 def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ()) -> Bench:
     """The place to compare further candidates beside those chosen.
 
@@ -337,7 +325,12 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
     ratios = products.ratios_below(noise)
     index = np.concatenate([main, loose])
     at = products.at(ratios, index)
-    factor = triangles(beside_priors(at, index, ridge * noise.variance))
+    # Products of the chosen and of their doubts, which come last, with the doubts' priors.
+    each = range(len(index))
+    gram = at.lines[:, :, index].copy()
+    gram[:, each, each] = regularised(gram[:, each, each], at.whole[:, index])
+    gram[:, each, each] += np.pad(ridge * noise.variance, (len(main), 0))
+    factor = triangles(gram)
     both = np.concatenate([at.pull[..., None], at.lines], axis=2)
     part = np.stack([
         solve_triangular(lower, lines, lower=True, check_finite=False).T
@@ -357,36 +350,19 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
         logs=spread + at.logs + 2.0 * np.log(size).sum(axis=1),
         own=at.among,
     )
+    r = at.factor.shape[1]  # of geometry, whose triangles stand above those of the chosen
+    whole = np.zeros((len(ratios), r + len(index), r + len(index)))
+    whole[:, :r, :r], whole[:, r:, r:] = at.factor, factor
+    whole[:, r:, :r] = np.swapaxes(at.part[:, :, 1:], 1, 2)
     held = Fixed(
         products,
         index,
-        stacked(at.factor, at.part[:, :, 1:], factor),
+        whole,
         products.kept / (1.0 + np.outer(ratios, rows.variance_ratio)),
         np.concatenate([at.part[:, :, 0], before], axis=1),
         rows.error,
     )
     return Bench(lib, tuple(chosen), noise, settings, held, dof, float(lib.laws))
-
-
-def beside_priors(at: At, index: Array, ridge: Array) -> Array:
-    """(s, q, q) products among columns, those of the doubts, which come last, with their priors.
-
-    index: (q,) columns.  ridge: (r,) that is added for each doubt.
-    """
-    each = range(len(index))
-    gram = at.lines[:, :, index].copy()
-    gram[:, each, each] = regularised(gram[:, each, each], at.whole[:, index])
-    gram[:, each, each] += np.pad(ridge, (len(index) - len(ridge), 0))
-    return gram
-
-
-def stacked(first: Array, part: Array, second: Array) -> Array:
-    """Lower triangles of two sets of columns, (s, r, r) and (s, q, q), and (s, r, q) between."""
-    r = first.shape[1]
-    whole = np.zeros((len(first), r + second.shape[1], r + second.shape[1]))
-    whole[:, :r, :r], whole[:, r:, r:] = first, second
-    whole[:, r:, :r] = np.swapaxes(part, 1, 2)
-    return whole
 
 
 def normal_equations(
@@ -401,8 +377,8 @@ def normal_equations(
     (whole,), _ = lib.products.gram(np.array([noise.ratio]), index)
     gram, pull = whole[:-1, :-1], whole[:-1, -1]
     gram = gram + np.diag(np.pad(ridge * noise.variance, (len(main), 0)))
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    return gram / np.outer(scale, scale), pull / scale, scale
+    scale = column_scales(gram)
+    return scale_symmetric(gram, scale), pull / scale, scale
 
 
 def against_signs(lib: Library, fits: Sequence[Added], noise: Noise) -> float:

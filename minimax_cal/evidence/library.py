@@ -292,10 +292,8 @@ class Stack:
     def add(self, term: Any, tries: float = 1.0) -> Candidate | None:
         """One candidate; None if it adds nothing to any row."""
         found = self.dictionary.spec(term)
-        return None if found is None else self.candidate(found, tries)
-
-    def candidate(self, found: Spec, tries: float) -> Candidate:
-        """A law whose columns are stored here."""
+        if found is None:
+            return None
         columns = np.concatenate([found.columns, found.doubts], axis=1)
         main, doubt = np.split(self.place(columns), [found.columns.shape[1]])
         return Candidate(

@@ -21,6 +21,7 @@ import numpy as np
 
 from minimax_cal.evidence.limits import LEAST_NOISE_DOF
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.linear_algebra import column_scales, project_out, scale_symmetric
 
 RATIOS = np.concatenate([[0.0], np.logspace(-3, 5, 9)])  # among which the likeliest is sought
 ZERO = -300  # the decade of the ratio 0
@@ -54,11 +55,8 @@ def interpolation(x: Array, count: int) -> Array:
     return np.asarray(part / part.sum(axis=1, keepdims=True))
 
 
-@cache
-def finely() -> tuple[Array, Array]:
-    """Points (f,) from 0 to 1, and how values there follow from those at a few (f, g)."""
-    x = np.linspace(0.0, 1.0, FINE)
-    return x, interpolation(x, FEW)
+FINE_POINTS: Array = np.linspace(0.0, 1.0, FINE)
+FINE_WEIGHTS = interpolation(FINE_POINTS, FEW)  # (f, g) how values there follow from those at a few
 
 
 def find_ratio(cost: Callable[[Array], Array]) -> float:
@@ -66,22 +64,16 @@ def find_ratio(cost: Callable[[Array], Array]) -> float:
     best = int(np.argmin(cost(RATIOS)))
     if not best:
         return 0.0
-    ends = RATIOS[[max(best - 1, 1), min(best + 1, len(RATIOS) - 1)]]
-    low, high = np.log10(ends)
-    x, between = finely()
-    values = between @ cost(10.0 ** (low + (high - low) * points(FEW)))
-    at = int(np.argmin(values))
-    step = vertex(values, at) / (FINE - 1)
-    return float(10.0 ** (low + (high - low) * (x[at] + step)))
-
-
-def vertex(values: Array, at: int) -> float:
-    """Where beside its least point, in steps, the parabola through it and its neighbours is."""
-    if at in (0, len(values) - 1):
-        return 0.0
-    before, here, after = values[at - 1 : at + 2]
-    bend = before - 2.0 * here + after
-    return float(0.5 * (before - after) / bend) if bend > 0.0 else 0.0
+    # Between the neighbours the cost is a polynomial in the logarithm of the ratio; beside its
+    # least value on a fine grid the vertex of the parabola through that and its neighbours.
+    low, high = np.log10(RATIOS[[max(best - 1, 1), min(best + 1, len(RATIOS) - 1)]])
+    values = FINE_WEIGHTS @ cost(10.0 ** (low + (high - low) * points(FEW)))
+    at, step = int(np.argmin(values)), 0.0
+    if 0 < at < FINE - 1:
+        before, here, after = values[at - 1 : at + 2]
+        bend = before - 2.0 * here + after
+        step = float(0.5 * (before - after) / bend) if bend > 0.0 else 0.0
+    return float(10.0 ** (low + (high - low) * (FINE_POINTS[at] + step / (FINE - 1))))
 
 
 # ---- ratios --------------------------------------------------------------------------------------
@@ -122,10 +114,10 @@ class Problem:
         columns: of factors whose priors weigh as one row of unit error; a direction that is
         determined by no more than that is left.
         """
-        rest = columns - self.basis @ (self.basis.T @ columns)
+        rest = project_out(columns, self.basis)
         span, size, _ = np.linalg.svd(rest, full_matrices=False)
         span = span[:, size > 1.0]
-        error = self.error - span @ (span.T @ self.error)
+        error = project_out(self.error, span)
         return replace(self, error=error, basis=np.concatenate([self.basis, span], axis=1))
 
 
@@ -140,7 +132,7 @@ def identified(gram: Array) -> Array:
     """(p, r) combinations of parameters that turn a Gram matrix (p, p) into 1."""
     norm = np.sqrt(np.diag(gram))
     used = norm > 0.0
-    whole = told_apart(gram[np.ix_(used, used)] / np.outer(norm[used], norm[used]))
+    whole = told_apart(scale_symmetric(gram[np.ix_(used, used)], norm[used]))
     out = np.zeros((len(gram), whole.shape[1]))
     out[used] = whole / norm[used][:, None]
     return out
@@ -236,7 +228,7 @@ def costs(gram: Array, ratios: Array, varied: Array, dof: int) -> tuple[Array, A
 
 def triangles(gram: Array) -> Array:
     """(s, f, f) lower triangles whose squares are matrices (s, f, f), as near as those allow."""
-    scale = np.sqrt(np.maximum(np.einsum("sff->sf", gram), 1e-300))[..., None]
+    scale = column_scales(gram)[..., None]
     unit = gram / scale / np.swapaxes(scale, 1, 2)
     try:
         return np.asarray(scale * np.linalg.cholesky(unit))

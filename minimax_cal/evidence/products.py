@@ -337,7 +337,6 @@ class Products:
         self.kept = np.ones(len(columns.rows.error), dtype=bool) if kept is None else kept
         self.count = int(np.count_nonzero(self.kept & columns.rows.measured))
         self.formed: dict[int | None, Beside] = {}
-        self.summed: dict[int | None, Sums] = {}
         self.noises: dict[bytes, Noise] = {}
         self.last: tuple[bytes, Array] = (b"", np.empty(0))
 
@@ -355,16 +354,11 @@ class Products:
         """(d, N) candidates' columns less what geometry imitates."""
         return np.asarray(self.columns.clear[self.columns.fixed + index])
 
-    def sums(self, number: int | None) -> Sums:
-        """Products at the nodes of a decade of ratios; None: at RATIOS."""
-        if number not in self.summed:
-            self.summed[number] = Sums(self.columns, RATIOS if number is None else nodes(number))
-        return self.summed[number]
-
     def beside(self, number: int | None) -> Beside:
         """What the geometry leaves of the products of a decade; None: at RATIOS."""
         if number not in self.formed:
-            self.formed[number] = Beside(self.sums(number))
+            ratios = RATIOS if number is None else nodes(number)
+            self.formed[number] = Beside(Sums(self.columns, ratios))
         return self.formed[number]
 
     def views(self, ratios: Array) -> list[View]:
@@ -395,17 +389,9 @@ class Products:
 
     def noise(self, index: Array) -> Noise:
         """The noise beside some of the candidates' columns, by restricted maximum likelihood."""
-        mark = index.tobytes()
-        if mark not in self.noises:
-            self.noises[mark] = self.estimated(index)
-        return self.noises[mark]
-
-    def estimated(self, index: Array) -> Noise:
-        """The noise, computed."""
-        rows, dof = self.columns.rows, self.dof(index)
-        if dof < LEAST_NOISE_DOF:
-            error = rows.error[self.kept]
-            return Noise(0.0, float(error @ error) / max(self.count, 1) + 1e-18, 0.0)
+        mark, rows, dof = index.tobytes(), self.columns.rows, self.dof(index)
+        if mark in self.noises:
+            return self.noises[mark]
         varied = rows.variance_ratio[self.kept]
 
         def cost(ratios: Array) -> tuple[Array, Array]:
@@ -413,8 +399,14 @@ class Products:
             value, squares = costs(gram, ratios, varied, dof)
             return value + logs, squares
 
-        ratio = self.find_ratio(lambda ratios: cost(ratios)[0])
-        return noise_of(ratio, float(cost(np.array([ratio]))[1][0]) / dof, rows)
+        if dof < LEAST_NOISE_DOF:
+            error = rows.error[self.kept]
+            noise = Noise(0.0, float(error @ error) / max(self.count, 1) + 1e-18, 0.0)
+        else:
+            ratio = self.find_ratio(lambda ratios: cost(ratios)[0])
+            noise = noise_of(ratio, float(cost(np.array([ratio]))[1][0]) / dof, rows)
+        self.noises[mark] = noise
+        return noise
 
     def find_ratio(self, cost: Callable[[Array], Array]) -> float:
         """The ratio of least cost."""

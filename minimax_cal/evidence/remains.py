@@ -18,6 +18,7 @@ import numpy as np
 from minimax_cal.evidence.limits import AUDIBLE, SCATTERS
 from minimax_cal.evidence.noise import Noise, Problem
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.linear_algebra import project_out
 
 TOGETHER = 30  # visits to one pose in a block, whose cost grows with their cube
 
@@ -182,14 +183,14 @@ class Rest:
 
     def beside(self, drawn: Array) -> Array:
         """(N, 1 + b) the rows, and drawn ones (N, b) without what was fitted."""
-        out = np.concatenate([self.rows[:, None], drawn], axis=1)
-        out[:, 1:] -= self.basis @ (self.basis.T @ drawn)
-        return out
+        return np.concatenate([self.rows[:, None], project_out(drawn, self.basis)], axis=1)
 
     def felt(self, motion: Array, rows: Array) -> Array:
         """(d, m, b) products at each visit of motions (N, d) with rows (N, b)."""
         shape = len(self.group), self.width, -1
-        moved = scaled(self, motion).reshape(shape)
+        weighted = motion * self.root[:, None]  # and of one size each, without those fitted
+        size = np.linalg.norm(weighted, axis=0)
+        moved = (weighted[:, size > 0.0] / size[size > 0.0]).reshape(shape)
         return np.asarray(np.einsum("mwd,mwb->dmb", moved, rows.reshape(shape), optimize=True))
 
 
@@ -199,8 +200,7 @@ def rest_of(rows: Problem, noise: Noise, known: Array, turn: Array) -> Rest:
     columns = np.concatenate([rows.basis, known], axis=1) * root[:, None]
     norm = np.linalg.norm(columns, axis=0)
     basis = np.linalg.qr(columns[:, norm > 0] / norm[norm > 0])[0]
-    rest = rows.error * root
-    rest = rest - basis @ (basis.T @ rest)
+    rest = project_out(rows.error * root, basis)
     dof = rows.count - basis.shape[1]
     return Rest(rest, basis, root, dof, rows.group[:: turn.shape[1]], turn)
 
@@ -231,11 +231,27 @@ class Asked:
         return tuple(self.told(i) for i in order[:most])
 
     def told(self, number: int) -> Remains:
-        """What is known of a component."""
+        """What is known of a component: with its share of the rest's square beyond chance.
+
+        With z features of variance v the score |z'r|^2 is that by chance plus v |z'z|^2 (MINQUE);
+        by chance, of rows of variance s, it has the mean s tr z'z and the variance 2 s^2 |z'z|^2.
+        """
         one = self.components[number]
-        share = share_of(self.rest, one, self.drawn)
-        score, p = float(self.score[number]), float(self.p[number])
-        return Remains(one.place, one.driver, score, p, share, one.functions)
+        felt, feature = self.rest.felt(one.motion, self.drawn), one.feature
+        if not isinstance(feature, Fading) and len(feature) > 1:
+            ways = [score_of(way[None], felt[..., :1])[0] for way in feature]
+            feature = feature[[int(np.argmax(ways))]]
+        found, *chance = score_of(feature, felt).tolist()
+        mean, spread = float(np.mean(chance)), float(np.var(chance))
+        share = 2.0 * (found - mean) * mean / max(spread * self.rest.dof, 1e-300)
+        return Remains(
+            one.place,
+            one.driver,
+            float(self.score[number]),
+            float(self.p[number]),
+            float(max(share, 0.0)),
+            one.functions,
+        )
 
 
 def asked(rest: Rest, components: Sequence[Component]) -> Asked:
@@ -249,25 +265,15 @@ def asked(rest: Rest, components: Sequence[Component]) -> Asked:
     drawn[:, 1:] *= np.sqrt(rest.total / max(rest.dof, 1))
     if not moving:
         return Asked(rest, (), np.zeros(0), np.zeros(0), (), drawn)
-    score, chance = largest(scores_of(rest, moving, drawn))
+    score, chance = largest(rest, moving, drawn)
     order = np.argsort(-score).tolist()
     loud = sorted([i for i in order if chance[i] < AUDIBLE][:ASKED] or order[:1])
     signs = np.repeat(rng.choice((-1.0, 1.0), (len(rest.group), DRAWS)), rest.width, axis=0)
     flipped = rest.beside(signs * rest.even()[:, None])
-    _, by_signs = largest(scores_of(rest, [moving[i] for i in loud], flipped))
+    _, by_signs = largest(rest, [moving[i] for i in loud], flipped)
     p = chance.copy()
     p[loud] = np.where(by_signs > SCATTERS, 1.0, chance[loud])
     return Asked(rest, moving, score, p, loud, drawn)
-
-
-def scores_of(rest: Rest, components: Sequence[Component], drawn: Array) -> Array:
-    """(c, b) squared products of components with rows (N, b), the first those that are left."""
-    out: list[Array] = []
-    for _, same in groupby(components, key=lambda one: id(one.motion)):
-        several = list(same)
-        felt = rest.felt(several[0].motion, drawn)
-        out += [score_of(one.feature, felt) for one in several]
-    return np.array(out)
 
 
 def score_of(feature: Array | Fading, felt: Array) -> Array:
@@ -280,45 +286,22 @@ def score_of(feature: Array | Fading, felt: Array) -> Array:
     return np.asarray(told.reshape(len(felt), ways, count, -1).sum(axis=(0, 2)).max(axis=0))
 
 
-def largest(scores: Array) -> tuple[Array, Array]:
+def largest(rest: Rest, components: Sequence[Component], drawn: Array) -> tuple[Array, Array]:
     """(c,) scores as of a standard normal variable, and chance that the largest of all is so large.
 
-    scores: (c, 1 + DRAWS), the first of the rows, the others by chance.
+    drawn: (N, 1 + DRAWS), the rows, and rows by chance.
     """
-    score = standardised(scores)
-    most = np.sort(score[:, 1:].max(axis=0))
-    return score[:, 0], 1.0 - np.searchsorted(most, score[:, 0]) / (DRAWS + 1.0)
-
-
-def standardised(scores: Array) -> Array:
-    """(c, 1 + DRAWS) scores, each row as of a standard normal variable if by chance.
-
-    By the cube root of Wilson and Hilferty [1931], the degrees of freedom by the moments.
-    """
+    # Squared products with the rows, of all components of one motion together.
+    found: list[Array] = []
+    for _, same in groupby(components, key=lambda one: id(one.motion)):
+        several = list(same)
+        felt = rest.felt(several[0].motion, drawn)
+        found += [score_of(one.feature, felt) for one in several]
+    scores = np.array(found)
+    # Cube root of Wilson and Hilferty [1931], the degrees of freedom by the moments.
     mean, spread = scores[:, 1:].mean(axis=1)[:, None], scores[:, 1:].var(axis=1)[:, None]
     unit = 2.0 / 9.0 * spread / np.maximum(2.0 * mean**2, 1e-300)  # 2 / 9 of one over the freedom
     root = np.cbrt(scores / np.maximum(mean, 1e-300))
-    return np.asarray((root - 1.0 + unit) / np.sqrt(np.maximum(unit, 1e-300)))
-
-
-def scaled(rest: Rest, motion: Array) -> Array:
-    """(N, e) weighted motions of one size each, without those that were fitted."""
-    weighed = motion * rest.root[:, None]
-    size = np.linalg.norm(weighed, axis=0)
-    return np.asarray(weighed[:, size > 0.0] / size[size > 0.0])
-
-
-def share_of(rest: Rest, one: Component, drawn: Array) -> float:
-    """Share of the rest's square that a component has, by its score beyond chance.
-
-    With z features of variance v the score |z'r|^2 is that by chance plus v |z'z|^2 (MINQUE); by
-    chance, of rows of variance s, it has the mean s tr z'z and the variance 2 s^2 |z'z|^2.
-    drawn: (N, 1 + b) the rows, and rows by chance.
-    """
-    felt = rest.felt(one.motion, drawn)
-    feature = one.feature
-    if not isinstance(feature, Fading) and len(feature) > 1:
-        feature = feature[[int(np.argmax([score_of(w[None], felt[..., :1])[0] for w in feature]))]]
-    score, *chance = score_of(feature, felt).tolist()
-    mean, spread = float(np.mean(chance)), float(np.var(chance))
-    return float(max(2.0 * (score - mean) * mean / max(spread * rest.dof, 1e-300), 0.0))
+    score = (root - 1.0 + unit) / np.sqrt(np.maximum(unit, 1e-300))
+    most = np.sort(score[:, 1:].max(axis=0))
+    return score[:, 0], 1.0 - np.searchsorted(most, score[:, 0]) / (DRAWS + 1.0)

@@ -123,37 +123,7 @@ def select(
     tuned, and replacement waits for the end.  level: chance of a false name on data without an
     effect.  first: what was chosen with other weights.
     """
-    lib, fits = begun(lib, first)
-    noise = noise_beside(lib, fits)
-    if noise.variance < lib.rows.exact**2 or lib.products.dof(NOTHING) < LEAST_DOF:
-        return Choice(lib, (), noise)
-    if fits:  # weighed otherwise now
-        lib, fits = refined(lib, fits, level, last=True)
-        noise = noise_beside(lib, fits)
-    for _ in range(MOST):
-        if not lib.is_part:
-            known = lib.columns[:, columns_of([one.candidate for one in fits])[0]]
-            heard = [one.candidate.term for one in fits if one.candidate.is_line]
-            found = lib.dictionary.lines(noise, known, heard)
-            lines = lib.aside(found) if found else None
-            lib = replace(lib, candidates=plain(lib), lines=lines)
-        table = bench(lib, [one.candidate for one in fits], fits)
-        if table.dof < LEAST_DOF:
-            break
-        lib, best = addition(lib, table, fits, level)
-        if not best:
-            break
-        fits = [*fits, *best]
-        if not lib.is_part and (len(fits) <= REFINED or len(fits) % SELDOM == 0):
-            lib, fits = refined(lib, fits, level)
-        noise = noise_beside(lib, fits)
-    if len(fits) > REFINED or lib.is_part:
-        lib, fits = refined(lib, fits, level)
-    return Choice(lib, tuple(fits), noise_beside(lib, fits))
-
-
-def begun(lib: Library, first: Sequence[Added]) -> tuple[Library, list[Added]]:
-    """The library and the effects chosen of another, in their order, with their values."""
+    # Start from the effects selected with other weights, if any.
     fits: list[Added] = []
     known = {c.text: c for c in lib.candidates}
     for one in first:
@@ -164,12 +134,34 @@ def begun(lib: Library, first: Sequence[Added]) -> tuple[Library, list[Added]]:
         if c.text not in known:
             lib = replace(lib, candidates=(*lib.candidates, mine))
         fits.append(replace(one, candidate=mine))
-    return lib, fits
+    noise = noise_beside(lib, fits)
+    if noise.variance < lib.rows.exact**2 or lib.products.dof(NOTHING) < LEAST_DOF:
+        return Choice(lib, (), noise)
+    if fits:
+        lib, fits = refine_effects(lib, fits, level, last=True)
+        noise = noise_beside(lib, fits)
 
-
-def plain(lib: Library) -> tuple[Candidate, ...]:
-    """The candidates without lines that were found: those of an earlier round."""
-    return tuple(c for c in lib.candidates if not c.is_line)
+    # Forward steps: lines sought again in what remains, the best addition, replacement, the noise.
+    for _ in range(MOST):
+        if not lib.is_part:
+            fitted = lib.columns[:, columns_of([one.candidate for one in fits])[0]]
+            heard = [one.candidate.term for one in fits if one.candidate.is_line]
+            found = lib.dictionary.lines(noise, fitted, heard)
+            no_lines = tuple(c for c in lib.candidates if not c.is_line)  # of an earlier step
+            lib = replace(lib, candidates=no_lines, lines=lib.aside(found) if found else None)
+        table = bench(lib, [one.candidate for one in fits], fits)
+        if table.dof < LEAST_DOF:
+            break
+        lib, best = find_best_addition(lib, table, fits, level)
+        if not best:
+            break
+        fits = [*fits, *best]
+        if not lib.is_part and (len(fits) <= REFINED or len(fits) % SELDOM == 0):
+            lib, fits = refine_effects(lib, fits, level)
+        noise = noise_beside(lib, fits)
+    if len(fits) > REFINED or lib.is_part:
+        lib, fits = refine_effects(lib, fits, level)
+    return Choice(lib, tuple(fits), noise_beside(lib, fits))
 
 
 def noise_beside(lib: Library, fits: Sequence[Added]) -> Noise:
@@ -183,34 +175,45 @@ def without(fits: Sequence[Added], number: int) -> tuple[list[Candidate], list[A
     return [one.candidate for one in others], others
 
 
-def repeated(c: Candidate, chosen: Sequence[Candidate]) -> bool:
+def is_taken(c: Candidate, chosen: Sequence[Candidate]) -> bool:
     """Whether an effect is at a place already; lines of one cause may be several."""
     same = [other for other in chosen if other.key == c.key]
     return any(not c.repeats or other.text == c.text for other in same)
 
 
-def addition(
+def find_best_addition(
     lib: Library, table: Bench, fits: Sequence[Added], level: float
 ) -> tuple[Library, list[Added]]:
-    """The candidate that adds most evidence and passes the gate; none if none does.
+    """The candidate that adds most evidence and is significant; none if none is.
 
-    The best few are tuned before they are compared.  fits: the effects that were chosen.
+    fits: the effects that were chosen.
     """
     best: Added | None = None
     least = against_signs(lib, fits, table.noise)
     seen: set[tuple[str, str]] = set()
     room = table.dof - LEAST_NOISE_DOF  # parameters that rows can still tell
     for one in table.everyone:
+        # In the order of evidence; with tuning an inferior one may still overtake the best.
         if one.evidence <= 0.0 or len(one.candidate.main) > room:
             continue
-        if best and one.evidence < best.evidence - may_gain(lib, best):
+        reach = max(NEAR, NEAR_SHARE * best.gain) if best and not lib.is_part else 0.0
+        if best and one.evidence < best.evidence - reach:
             break
-        if one.candidate.key in seen or repeated(one.candidate, table.chosen):
+        if one.candidate.key in seen or is_taken(one.candidate, table.chosen):
             continue
         if table.improbable(one, level):
+            # Tuned, on all rows; the library takes the tuned candidate in place of the first.
             seen.add(one.candidate.key)
-            lib, better = adopted(lib, shaped(table, one), one.candidate)
-            better = signed(lib, fits, better, least, table)
+            better = one if lib.is_part else tuned(table, one)
+            if better.candidate is not one.candidate:
+                new = lib.with_terms([(better.candidate.term, one.candidate.tries)])[0]
+                kept = tuple(new if c is one.candidate else c for c in lib.candidates)
+                lib, better = replace(lib, candidates=kept), replace(better, candidate=new)
+            # Less what it owes to signs that are physically impossible, its own or others'.
+            if lib.lines is None or not lib.lines.holds(better.candidate):
+                owed = max(against_signs(lib, [*fits, better], table.noise) - least, 0.0)
+                gain = max(better.gain - owed, 0.0)
+                better = replace(better, gain=gain, evidence=better.evidence - owed)
             if better.evidence > 0.0 and table.p_value(better) < level:
                 best = better if not best or better.evidence > best.evidence else best
         if len(seen) == CONTENDERS:
@@ -221,31 +224,10 @@ def addition(
     return lib, [replace(best, candidate=stored)]
 
 
-def may_gain(lib: Library, best: Added) -> float:
-    """Evidence that a candidate tuned may win upon the best one; of a part nothing is tuned."""
-    return 0.0 if lib.is_part else max(NEAR, NEAR_SHARE * best.gain)
-
-
-def signed(lib: Library, fits: Sequence[Added], one: Added, least: float, table: Bench) -> Added:
-    """A candidate, its gain less what it owes to signs that no body has, its own or others'.
-
-    least: what the effects chosen before owe to them.
-    """
-    if lib.lines is not None and lib.lines.holds(one.candidate):
-        return one
-    owed = max(against_signs(lib, [*fits, one], table.noise) - least, 0.0)
-    return replace(one, gain=max(one.gain - owed, 0.0), evidence=one.evidence - owed)
-
-
-def shaped(table: Bench, best: Added) -> Added:
-    """A candidate tuned; of a part of the rows as it is."""
-    return best if table.library.is_part else tuned(table, best)
-
-
 def tuned(table: Bench, best: Added) -> Added:
     """A candidate with what its law has chosen (a moment, a time constant) searched more finely.
 
-    The candidate returned belongs to no library yet: `adopted` gives it a place.
+    The candidate returned belongs to no library yet.
     """
     for _ in range(TUNINGS):
         near = table.library.dictionary.finer(best.candidate.term)
@@ -269,16 +251,7 @@ def tuned_again(choice: Choice) -> Choice:
     return replace(choice, found=tuple(found))
 
 
-def adopted(lib: Library, one: Added, instead: Candidate) -> tuple[Library, Added]:
-    """The library with a tuned candidate in the place of the one it came from."""
-    if one.candidate is instead:
-        return lib, one
-    found = lib.with_terms([(one.candidate.term, instead.tries)])[0]
-    kept = tuple(found if c is instead else c for c in lib.candidates)
-    return replace(lib, candidates=kept), replace(one, candidate=found)
-
-
-def refined(
+def refine_effects(
     lib: Library, fits: list[Added], level: float, *, last: bool = False
 ) -> tuple[Library, list[Added]]:
     """Replace each effect by any that does better, and drop what is no longer needed.
@@ -294,12 +267,12 @@ def refined(
             chosen, others = without(fits, number)
             table = bench(lib, chosen, others)
             own = table.added(fits[number].candidate)
-            top = next((o for o in table.everyone if not repeated(o.candidate, chosen)), own)
+            top = next((o for o in table.everyone if not is_taken(o.candidate, chosen)), own)
             if top.candidate is not own.candidate and top.evidence > own.evidence + TIE:
                 lib, stored = lib.stored(top.candidate)
                 fits[number], changed = replace(top, candidate=stored), True
             elif table.p_value(own) > level:
-                return refined(lib, others, level, last=last)
+                return refine_effects(lib, others, level, last=last)
             else:
                 fits[number] = own
         if not changed:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from minimax_cal.evidence.bench import Added, Bench
-from minimax_cal.evidence.library import Key, Library
+from minimax_cal.evidence.library import Key
 from minimax_cal.evidence.limits import (
     BAND,
     ENOUGH,
@@ -25,7 +25,6 @@ from minimax_cal.evidence.limits import (
     REPEATED_LEVEL,
     ROUNDS,
 )
-from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.selection import NOTHING, Choice, select
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.parallel import share
@@ -124,26 +123,4 @@ def alternatives(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
         if power < ENOUGH or (close and table.p_beside(one, other.candidate) >= LEVEL):
             seen.add(other.candidate.key)
             out.append((other, rho2, power))
-    return out
-
-
-def resemblances(lib: Library, column: Array) -> dict[tuple[str, str], float]:
-    """rho^2 of every candidate with rows (N, 1) that something adds to the error: the best variant.
-
-    Projected on what geometry cannot imitate and weighed by the noise that the data show with it.
-    """
-    noise = restricted(lib.rows, column)
-    root = np.sqrt(noise.weights(lib.rows))[:, None]
-    basis = np.linalg.qr(lib.rows.basis * root)[0]
-    field = column * root
-    field = (field - basis @ (basis.T @ field))[:, 0]
-    whole = lib.columns * root
-    whole = whole - basis @ (basis.T @ whole)
-    out: dict[tuple[str, str], float] = {}
-    for c in lib.candidates:
-        part = whole[:, c.main]
-        scale = np.maximum(np.linalg.norm(part, axis=0), 1e-300)
-        found = np.linalg.lstsq(part / scale, field, rcond=1e-6)[0]
-        share = 1.0 - float(((field - part / scale @ found) ** 2).sum() / (field @ field))
-        out[c.key] = max(out.get(c.key, 0.0), share)
     return out

@@ -10,11 +10,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.diagnosing import diagnose, gap
-from minimax_cal.diagnosing.causes import Causes, beside_curves, causes_of
-from minimax_cal.diagnosing.diagnose import in_rungs, no_worse, with_maps
+from minimax_cal.diagnosing import error_budget, gap
+from minimax_cal.diagnosing.causes import Causes, search_beside_maps, search_causes
+from minimax_cal.diagnosing.error_budget import fit_error_budget, predicts_no_worse
 from minimax_cal.diagnosing.error_maps import error_maps, strongest_wave
-from minimax_cal.diagnosing.gap import climbed
+from minimax_cal.diagnosing.gap import fit_ladder
 from minimax_cal.diagnosing.joint import Joint, joint
 from minimax_cal.diagnosing.left_out import Beside, Block, Left, begun
 from minimax_cal.diagnosing.study import SUM, Study, studied
@@ -25,6 +25,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.maps import sines, spread
 from minimax_cal.modelling.effects.table import EFFECTS, Term, terms
+from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 from minimax_cal.robots.robot import Robot
 
@@ -126,7 +127,7 @@ def test_a_diagnosis_tells_the_curve_and_a_fit_compensates_it(robot: Robot, tmp_
     fit = mc.calibrate(robot, data, objective="sum", effects=tmp_path / "diagnosis.json")
     assert fit.accuracy["holdout"].rms_mm < 0.5 * told.ladder[1].holdout.rms_mm
     rows = fit.effect_table().rows
-    assert [row[0] for row in rows] == ["joint error map at joint 2, RMS"]
+    assert [row[0].partition(",")[0] for row in rows] == [name_effect("joint_error_map", "J2")]
     fit.save(tmp_path / "fit.json")
     loaded = mc.load_fit(tmp_path / "fit.json")
     assert_allclose(loaded.predict(q), fit.predict(q), atol=1e-12)
@@ -149,14 +150,14 @@ def test_what_stood_in_for_curves_is_named_no_more() -> None:
 def bumpy(robot: Robot) -> tuple[Study, Causes]:
     """An arm with a curve in joint 2, and what is found of it without maps."""
     study = geometric(robot, rigid(robot, 220, 2, 6), {1: bumps}).study
-    return study, causes_of(study, (), (), silent)[1]
+    return study, search_causes(study, (), (), silent)[1]
 
 
 def test_what_curves_may_be_is_no_geometry_of_names(bumpy: tuple[Study, Causes]) -> None:
     """Beside maps is projected out what the data tell of them; what their priors hold is not."""
     study, bare = bumpy
     (term,) = error_maps(joint(study, ())).terms
-    beside = beside_curves(study, bare, (term,))
+    beside = search_beside_maps(study, bare, (term,))
     rows, wide = study.rows, beside.choice.library.rows
     assert_allclose(wide.basis.T @ wide.basis, np.eye(wide.basis.shape[1]), atol=1e-9)
     assert_allclose(wide.basis.T @ wide.error, 0.0, atol=1e-12)
@@ -173,12 +174,10 @@ def test_what_was_found_first_stays_where_the_new_model_is_worse(
     bumpy: tuple[Study, Causes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study, bare = bumpy
-    first, _ = with_maps(study, bare, silent)
-    monkeypatch.setattr(diagnose, "no_worse", lambda one, other: False)
-    causes, spoken, ladder = in_rungs(study, bare, silent)
-    assert causes is spoken
-    assert [f.term.text for f in spoken.effects] == [f.term.text for f in first.effects]
-    assert spoken.choice is bare.choice  # and with it its noise
+    monkeypatch.setattr(error_budget, "predicts_no_worse", lambda one, other: False)
+    causes, tried, ladder = fit_error_budget(study, bare, silent)
+    assert causes is tried
+    assert tried.choice is bare.choice  # and with it its noise
     assert ladder.maps
 
 
@@ -191,7 +190,8 @@ def test_a_law_and_a_curve_much_smaller_are_both_told() -> None:
     first, second = (f.term.label for f in told.effects[:2])
     assert (first, second) == ("joint_compliance:all", "joint_error_map:J3")
     steps = [step.name for step in told.ladder[2:]]
-    assert steps[:2] == ["+ joint_compliance all", "+ joint_error_map J3"]
+    terms = Term("joint_compliance", "all"), Term("joint_error_map", "J3")
+    assert steps[:2] == [term.step for term in terms]
     rms = [step.holdout.rms_mm for step in told.ladder]
     assert rms[3] < 0.75 * rms[2] < 0.3 * rms[1]
 
@@ -207,15 +207,15 @@ def test_a_ladder_keeps_a_map_whatever_its_place_among_the_effects(
     law = Term("joint_compliance", "all", plain)
     (curve,) = terms(study.scene, ["joint_error_map:J3:size=0.0001"])
     effects = [[(law,), (curve,)][number] for number in order]
-    ladder = climbed(study, effects, [True] * len(effects))
+    ladder = fit_ladder(study, effects, [True] * len(effects))
     assert [effects[number] for number in ladder.taken] == [(law,), (curve,)]
     assert ladder.maps == (curve,)
-    bare = climbed(study, [(law,)], [True])
-    assert no_worse(ladder, bare)
-    assert not no_worse(bare, ladder)
+    bare = fit_ladder(study, [(law,)], [True])
+    assert predicts_no_worse(ladder, bare)
+    assert not predicts_no_worse(bare, ladder)
     monkeypatch.setattr(gap, "by_size", lambda trials, study, effects: list(range(len(effects))))
     # the curve by itself is refused, and tried again
-    assert climbed(study, effects, [True] * len(effects)).taken == ladder.taken
+    assert fit_ladder(study, effects, [True] * len(effects)).taken == ladder.taken
 
 
 # ---- left out ------------------------------------------------------------------------------------

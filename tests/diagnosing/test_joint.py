@@ -11,8 +11,8 @@ from scipy.stats import multivariate_normal
 
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
-from minimax_cal.diagnosing.causes import entire, whole
-from minimax_cal.diagnosing.gap import climbed, folds
+from minimax_cal.diagnosing.findings import complete_law, with_complete_law
+from minimax_cal.diagnosing.gap import fit_ladder, folds
 from minimax_cal.diagnosing.joint import joint
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import SUM, Study, studied
@@ -112,7 +112,7 @@ def test_no_effect_moves_a_point_by_more_than_a_fiftieth_of_the_reach(play: Stud
 def test_an_effect_that_is_not_there_is_no_rung(play: Study) -> None:
     """Backlash at joint 2 is there; ripple of a joint that has none is not."""
     idle = [(Term("gear_ripple", "J6", {"turns": turns}),) for turns in (31.0, 47.0, 83.0, 117.0)]
-    ladder = climbed(play, [(PLAY,), *idle], [True] * (1 + len(idle)))
+    ladder = fit_ladder(play, [(PLAY,), *idle], [True] * (1 + len(idle)))
     assert ladder.taken[0] == 0
     assert len(ladder.taken) <= 3  # each helps groups of poses by accident about as often as not
     errors = [fit.cross_validated([folds(play.data, 5) == i for i in range(5)])
@@ -150,24 +150,26 @@ def test_a_gear_is_fitted_in_all_its_orders(seed: int) -> None:
     twice = (Term("gear_error", "J2", {"turns": 2.0}),)
     bare, part, full = (
         accuracy(joint(study, terms).cell.error(away)).rms_mm
-        for terms in ((), twice, entire(twice, twice))
+        for terms in ((), twice, complete_law(twice, twice))
     )
     assert full < 0.9 * min(bare, part)
     found = Finding(twice, ("cos", "sin"), ("rad",) * 2, (1.0,) * 2, (1.0,) * 2, 9.0, 0.0)
-    told = whole(found, twice, study.scene)
+    told = with_complete_law(found, twice, study.scene)
     assert [term.text for term in told.terms] == ["gear_error:J2:orders=2.0"]
     assert told.names == ("cos 1/turn", "sin 1/turn", "cos 2/turn", "sin 2/turn")
     assert len(told.values) == len(told.sigmas) == len(told.units) == 4
     assert told.shown == twice
     every = Term("gear_error", "all", {"turns": 1.0, "joints": mask_of(range(6))})
-    kept = whole(found, (*twice, every), study.scene)  # once a turn is known of all joints
+    kept = with_complete_law(
+        found, (*twice, every), study.scene
+    )  # once a turn is known of all joints
     assert [term.text for term in kept.terms] == ["gear_error:J2:turns=2.0"]
     third = (Term("gear_error", "J2", {"turns": 3.0}),)
-    told = whole(replace(found, terms=third), (*third, every), study.scene)
+    told = with_complete_law(replace(found, terms=third), (*third, every), study.scene)
     assert [term.choice for term in told.terms] == [{"turns": 2.0}, {"turns": 3.0}]
     assert told.names == ("cos 2/turn", "sin 2/turn", "cos 3/turn", "sin 3/turn")
     elsewhere = Term("gear_error", "all", {"turns": 1.0, "joints": mask_of([3, 4])})
-    assert [t.choice for t in entire(twice, (*twice, elsewhere))] == [{"orders": 2.0}]
+    assert [t.choice for t in complete_law(twice, (*twice, elsewhere))] == [{"orders": 2.0}]
 
 
 @pytest.mark.parametrize(("targets", "jitter"), [(1, 0.0), (3, 6e-5)])

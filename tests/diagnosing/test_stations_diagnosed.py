@@ -1,5 +1,6 @@
 """Diagnoses of several stations, of a station that moved, and what the foot says of it."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -139,7 +140,8 @@ def test_reflectors_that_move_confirm_a_drift(term: Term) -> None:
     (notice,) = foot_notices(told)
     found = Finding((term,), (), (), (), (), again=1.0)
     assert [one.evidence for one in asked_foot([found], told)] == ["confirmed, 1.00"]
-    assert "they agree with it" in notice
+    assert not any(odd for _, _, odd in told)
+    assert told[0][1] in notice
     assert "x +" in notice
 
 
@@ -147,7 +149,8 @@ def test_reflectors_that_move_confirm_a_drift(term: Term) -> None:
 def test_reflectors_that_stand_contradict_it(term: Term) -> None:
     told = [*foot_tells(*drifting(False, term))]
     (notice,) = foot_notices(told)
-    assert "they contradict it in x" in notice
+    assert [odd for _, _, odd in told] == ["x"]
+    assert told[0][1] in notice
     other = Finding((Term("backlash", "J1"),), (), (), (), (), again=1.0)
     found = [*asked_foot([replace(other, terms=(term,)), other], told)]
     assert found[0].evidence.startswith("confirmed, 1.00, contradicted in x")
@@ -196,7 +199,7 @@ def test_a_fault_of_the_data_is_no_effect_to_fit() -> None:
     _, data, found = reseat_of(3)
     fit = mc.calibrate("irb120", data, objective="sum", effects=found)
     assert fit.cell.effects.terms == ()
-    assert any("smr2 was re-seated" in notice for notice in fit.notices)
+    assert any("smr2" in notice for notice in fit.notices)
 
 
 @pytest.mark.parametrize("targets", [1, 3])
@@ -232,4 +235,5 @@ def test_what_no_fit_counts_is_listed_and_counted() -> None:
     again = mc.Diagnosis.from_dict(content)
     assert again.set_aside == found.set_aside
     assert again.to_dict()["accuracy"] == content["accuracy"]
-    assert "set aside (1 by the user, 30 by the program); with them RMS" in found.headline()
+    counts = [int(n) for n in re.findall(r"(\d+) by the", found.headline())]
+    assert counts == [1, 30]

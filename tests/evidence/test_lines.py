@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 
 from experiments.gap_cases import Cause
 from experiments.machines import Asked, make
-from minimax_cal.diagnosing.causes import chosen
+from minimax_cal.diagnosing.causes import select_effects
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.evidence.bench import bench
 from minimax_cal.evidence.limits import LINES
@@ -106,7 +106,7 @@ def test_a_line_is_expected_where_another_gear_has_the_like(place, turns, heard,
 
 def test_the_level_is_shared_once():
     """Chances of all that is looked at, each at its own gate, add up to the level."""
-    choice = chosen(opened("irb120"), ())
+    choice = select_effects(opened("irb120"), ())
     table = bench(choice.library, ())
     laws = [c for c in choice.library.candidates if not c.is_line]
     lines = {c.tries: c for c in choice.library.lines.candidates}
@@ -116,7 +116,7 @@ def test_the_level_is_shared_once():
 
 def test_an_expected_line_has_the_level_to_itself():
     loud = Cause("gear_ripple", "J2", 2000.0, 1)
-    choice = chosen(opened("irb120", loud, seed=5, told=False), ())
+    choice = select_effects(opened("irb120", loud, seed=5, told=False), ())
     (line,) = choice.chosen
     turns = line.term.choice["turns"]
     lib = choice.library
@@ -134,7 +134,7 @@ def test_an_expected_line_has_the_level_to_itself():
 @pytest.mark.parametrize(("told", "named"), [(True, True), (False, False)])
 def test_a_faint_line_is_found_where_its_gear_is_known(told, named):
     made = opened("irb120", Cause("gear_ripple", "J1", 20.0, 1), seed=5, told=told)
-    choice = chosen(made, ())
+    choice = select_effects(made, ())
     assert (("gear_ripple", "J1") in {c.key for c in choice.chosen}) == named
 
 
@@ -148,12 +148,12 @@ def test_a_faint_line_is_found_where_its_gear_is_known(told, named):
 )
 def test_one_law_of_another_course_is_one_name(law, place, key):
     """Motors and casting that warm up apart, a lag that ends, two orders of one gear."""
-    choice = chosen(opened("rail", Cause(law, place, 3000.0), seed=4, poses=100), ())
+    choice = select_effects(opened("rail", Cause(law, place, 3000.0), seed=4, poses=100), ())
     assert {c.key for c in choice.chosen} == {key}
 
 
 def test_what_other_weights_chose_is_dropped_where_not_needed_and_alone_compared_anew():
-    choice = chosen(opened("irb120", Cause("backlash", "J2", 500.0)), ())
+    choice = select_effects(opened("irb120", Cause("backlash", "J2", 500.0)), ())
     lib = choice.library
     for key, beside in ((("gear_error", "J4"), choice.found), (("settling", "J2"), ())):
         idle = bench(lib, ()).added(next(c for c in lib.candidates if c.key == key))
@@ -199,7 +199,7 @@ def test_a_line_has_a_ratio_or_another_line_for_company(ratio, own, others, turn
 @pytest.mark.parametrize("strong", [20.0, 2000.0])
 def test_a_faint_line_is_found_where_another_joint_has_the_like(strong):
     faint, loud = Cause("gear_ripple", "J1", 24.0, 1), Cause("gear_ripple", "J2", strong, 1)
-    choice = chosen(opened("irb120", faint, loud, seed=5, told=False), ())
+    choice = select_effects(opened("irb120", faint, loud, seed=5, told=False), ())
     found = {c.key for c in choice.chosen}
     assert (("gear_ripple", "J1") in found) == (strong > 100.0)
 
@@ -211,7 +211,7 @@ def test_lines_that_are_not_there_are_rarely_found_beside_one(seeds):
     strange = 0
     for seed in seeds:
         arm = ("irb120", "ur5e", "scara_600")[seed % 3]
-        choice = chosen(opened(arm, loud, seed=200 + seed, told=False), ())
+        choice = select_effects(opened(arm, loud, seed=200 + seed, told=False), ())
         keys = {c.key for c in choice.chosen}
         assert ("gear_ripple", "J2") in keys
         strange += len(keys) > 1

@@ -14,7 +14,7 @@ from scipy.optimize import lsq_linear
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
 from experiments.resemblance import resemblance
-from minimax_cal.diagnosing.causes import chosen
+from minimax_cal.diagnosing.causes import select_effects
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.bench import against_signs, bench, columns_of, credible
@@ -61,14 +61,14 @@ def study_of(robot: mc.Robot, data: mc.Measurements) -> Study:
 )
 def test_a_plain_effect_is_named_and_sized(law, place):
     """lambda = 1000: effect and place exactly, and the noise is found beside it."""
-    choice = chosen(opened(Cause(law, place, 1000.0), seed=11), ())
+    choice = select_effects(opened(Cause(law, place, 1000.0), seed=11), ())
     assert [c.key for c in choice.chosen] == [(law, place)]
     assert 12e-6 < np.sqrt(choice.noise.variance) < 25e-6
 
 
 def test_a_joint_that_stiffens_is_told_as_its_compliance():
     """By a machine whose law is not ours: tau / (1 + 2 |tau| / most)."""
-    choice = chosen(opened(Cause("joint_compliance/hardening", "J3", 5000.0), seed=11), ())
+    choice = select_effects(opened(Cause("joint_compliance/hardening", "J3", 5000.0), seed=11), ())
     (one,) = choice.chosen
     assert one.key == ("joint_compliance", "J3")
     assert one.term.choice["within"] > 0.0
@@ -84,7 +84,7 @@ def test_masses_in_doubt_excuse_what_little_they_explain():
     off = replace(robot, mass=mass * [1.0, 1.15, 0.9, 1.2, 1.0, 0.85])
     told = study_of(off, with_history(made.data))
     for exclude, excused in (((), True), (("joint_compliance",), False)):
-        choice = chosen(told, exclude)
+        choice = select_effects(told, exclude)
         main, loose, _ = columns_of(choice.chosen, choice.found)
         assert len(loose)
         assert credible(choice.library, choice.found, choice.noise) == excused
@@ -93,20 +93,20 @@ def test_masses_in_doubt_excuse_what_little_they_explain():
 
 def test_no_name_without_an_effect():
     for seed in range(5):
-        choice = chosen(opened(seed=100 + seed), ())
+        choice = select_effects(opened(seed=100 + seed), ())
         assert choice.chosen == ()
 
 
 def test_two_effects_are_both_named():
     made = opened(Cause("backlash", "J1", 300.0), Cause("gear_error", "J3", 300.0), seed=4)
-    choice = chosen(made, ())
+    choice = select_effects(made, ())
     assert {c.key for c in choice.chosen} == {("backlash", "J1"), ("gear_error", "J3")}
 
 
 def test_rivals_hold_the_truth_where_it_cannot_be_told():
     """A tilting base looks like a yielding second joint: whatever is named, both are in the set."""
     for seed in (1, 2):
-        choice = chosen(opened(Cause("base_flex", "frame", 60.0), seed=seed), ())
+        choice = select_effects(opened(Cause("base_flex", "frame", 60.0), seed=seed), ())
         table, named = choice.beside_others(0)
         found = alternatives(table, named)
         names = {named.candidate.key, *(other.candidate.key for other, _, _ in found)}
@@ -147,7 +147,7 @@ def test_a_cause_and_what_resembles_it_stay_rivals():
 def test_lambda_is_the_one_that_was_asked_for():
     """The generator's detectability and the diagnosis' agree to 35 %, masses being 15 % off."""
     made = opened(Cause("joint_compliance", "J3", 400.0), seed=6)
-    choice = chosen(made, ())
+    choice = select_effects(made, ())
     table, one = choice.beside_others(0)
     size, rho2 = table.likeness(one, one.candidate)
     assert abs(size / 400.0 - 1.0) < 0.35
@@ -191,7 +191,7 @@ SOFT = np.array([0.0, 1e-6, 1.5e-6, 1e-5, 1.5e-5, 4e-5])
 
 def test_the_weight_of_an_untold_tool_is_found_beside_the_axis():
     made = yielding(opened(seed=3, poses=200), np.array([0.06, -0.08, 0.1]), SOFT)
-    choice = chosen(made, ())
+    choice = select_effects(made, ())
     (one,) = choice.chosen
     assert one.key == ("joint_compliance", "all")
     assert "tool" in one.term.choice
@@ -205,7 +205,7 @@ def test_the_weight_of_an_untold_tool_is_found_beside_the_axis():
 
 def test_a_tool_on_the_axis_needs_no_levers():
     made = yielding(opened(seed=3, poses=200), np.array([0.0, 0.0, 0.1]), SOFT)
-    choice = chosen(made, ())
+    choice = select_effects(made, ())
     assert [c.key for c in choice.chosen] == [("joint_compliance", "all")]
     assert "tool" not in choice.chosen[0].term.choice
 
