@@ -13,6 +13,7 @@ import numpy as np
 from minimax_cal.dynamics.logs import read_runs
 from minimax_cal.dynamics.logs.table import CURRENT, NOTHING, TORQUE, Run
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, link_parameters, regressor
+from minimax_cal.dynamics.rows import Logs
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import grouped, number, numbers
@@ -88,6 +89,13 @@ class MotionKnown:
             )
         return [run if run.payload is not None else replace(run, payload=mass) for run in runs]
 
+    def split_folds(self, logs: Logs) -> Array:
+        """(R,) fold in which each row is left out, negative for never.  Raises OptionError."""
+        held_out_runs = named_runs(logs, self.holdout_run)
+        if not (held_out_runs or 0.0 < self.holdout < 1.0):
+            raise OptionError(f"holdout={self.holdout:g} must lie between 0 and 1")
+        return logs.split_folds(self.holdout, held_out_runs)
+
     @property
     def load(self) -> Array:
         """(10,) inertial parameters of what the flange carries, per kilogram."""
@@ -132,6 +140,17 @@ class MotionKnown:
                 f"{1.0 / LARGEST:g} and {LARGEST:g}"
             )
         return np.array(np.broadcast_to(values, robot.joints))
+
+
+def named_runs(logs: Logs, given: str | Sequence[str] | None) -> tuple[str, ...]:
+    """The runs that judge.  Raises OptionError."""
+    wanted = (given,) if isinstance(given, str) else tuple(given or ())
+    for name in wanted:
+        if name not in logs.names:
+            raise OptionError(f"holdout_run: no run {name!r}; choose {', '.join(logs.names)}")
+    if wanted and len(set(wanted)) == len(logs.names):
+        raise OptionError("holdout_run: leaves no run to learn from; name fewer")
+    return wanted
 
 
 def joint_names(robot: Robot | str | Path) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -21,6 +22,7 @@ from minimax_cal.dynamics.rows import CUTOFF_HZ, Scene, sense_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Table
+from minimax_cal.measuring.faults.fault import Amount
 
 Choice = Mapping[str, float]
 FINER = (0.75, 0.87, 1.15, 1.33)  # times a tuned number, in a finer search
@@ -148,6 +150,19 @@ class Law:
         if self.reads != {"v"}:
             return []
         return [one * sense if self.dry else one for one in self.per_unit({"v": v, **choice})]
+
+    def amounts(
+        self, value: Array, sigma: Array, log_unit: str, tuned: Choice = MappingProxyType({})
+    ) -> tuple[Amount, ...]:
+        """Its parameters (d,) in the unit of the log, and its tuned numbers."""
+        units = {"t": log_unit, "": "1"}
+        fitted = [
+            Amount(name, float(v), units.get(unit, unit.replace("t", log_unit, 1)), float(s))
+            for name, unit, v, s in zip(self.names, self.units, value, sigma, strict=False)
+        ]
+        shape = [Amount(name, v, self.tuned[name].unit if name in self.tuned else "1")
+                 for name, v in tuned.items()]  # fmt: skip
+        return (*fitted, *shape)
 
     def tried(self, scene: Scene, j: int) -> list[Choice]:
         """Tuned numbers to begin with."""

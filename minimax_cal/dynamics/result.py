@@ -69,6 +69,12 @@ class MotionEffect:
         return max(self.worth.items(), key=lambda item: item[1][0] ** 2 - item[1][1] ** 2)
 
     @property
+    def relative_gain(self) -> float:
+        """Fall of the squared RMS at the joint at which it closes most, over the square before."""
+        before, after = self.best[1]
+        return (before**2 - after**2) / max(before**2, 1e-300)
+
+    @property
     def words(self) -> str:
         """For people, as `joint flexibility at J2`; of a payload with the runs that carry it."""
         runs = ", ".join(p.name for p in self.parameters[PER_LINK:] if self.effect == "payload")

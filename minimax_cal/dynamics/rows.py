@@ -46,6 +46,9 @@ GAP_S = 0.1  # longer steps of time are gaps
 EDGE_S = 0.4  # at the ends and about gaps, where the filter has little to look at
 AR_ORDER = 4  # of the noise of a joint: rows that went before and matter
 QUARTERS = 4  # groups of a trajectory, which err together
+NEVER_OUT = -1  # number of the fold of rows that are always fitted
+MIN_DURATION = 25.0  # of trajectories: in less, laws stand in for each other
+MIN_PEAK_SPEED = 0.25  # that some joint must reach [rad/s, m/s]: slower, most laws are invisible
 SAMPLED = ("torque", "since", "payload", "temperature", "gap")  # of Logs, beside the motion
 LEAST_NOISE = 1e-9  # of the largest torque: the noise of computed rows
 
@@ -245,6 +248,35 @@ class Logs:
             for since, torque in ((self.since[run], self.torque[run]) for run in self.spans)
         ]
         return replace(self, torque=np.concatenate(moved))
+
+    def split_folds(self, share: float, held_out_runs: Sequence[str] = ()) -> Array:
+        """(R,) fold of every row: runs named are one; else whole runs in turn, about a share each.
+
+        A single run is left out by quarters.
+        """
+        count = len(self.names)
+        if held_out_runs:
+            fold = [0 if name in held_out_runs else NEVER_OUT for name in self.names]
+            return np.array(fold)[self.run]
+        if count == 1:
+            return self.quarter
+        parts = min(count, max(2, round(1.0 / share)))
+        return (np.arange(count) % parts)[self.run]
+
+    def describe_lacks(self) -> tuple[str, ...]:
+        """Why the motion is too little to name a cause."""
+        peak, out = float(np.abs(self.motion.qd).max()), []
+        if self.seconds < MIN_DURATION:
+            out.append(
+                f"{self.seconds:.0f} s of trajectories; record {MIN_DURATION:.0f} s or more, "
+                "better several of different kinds"
+            )
+        if peak < MIN_PEAK_SPEED:
+            out.append(
+                f"no joint is faster than {peak:.2g} rad/s; record a run that reaches "
+                f"{MIN_PEAK_SPEED:g} rad/s or more"
+            )
+        return tuple(out)
 
     def only(self, runs: Sequence[int]) -> Logs:
         """The logs of some runs."""

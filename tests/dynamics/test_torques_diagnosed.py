@@ -16,7 +16,8 @@ import minimax_cal as mc
 from experiments.motion_cases import MUJOCO, RATIO, Case, make
 from minimax_cal.cli import torques
 from minimax_cal.dynamics.laws import Term
-from minimax_cal.dynamics.model import Columns, weighing
+from minimax_cal.dynamics.masses import select_weighed_payloads
+from minimax_cal.dynamics.model import Columns
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
 from minimax_cal.dynamics.rows import ROW_HZ, Arm, Scene, prepare
 from minimax_cal.ground.arrays import Array
@@ -164,7 +165,7 @@ def test_what_has_no_weight_is_no_payload(mass: float) -> None:
     logs = prepare(simulated(carried=(0.0, mass, 0.0), seed=3))
     arm = Arm.of(ARM, np.ones(3), ARM.ratio, np.zeros(10), logs)
     columns, term = Columns(Scene.of(arm, logs)), Term("payload", "L3", {"run1": 1.0})
-    assert weighing(columns, [], [term]) == ([term] if mass else [])
+    assert select_weighed_payloads(columns, [], [term]) == ([term] if mass else [])
 
 
 def test_runs_that_differ_by_an_inertia_carry_no_payload() -> None:

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from minimax_cal.dynamics.diagnose import named_runs
 from minimax_cal.dynamics.drives import command_of
-from minimax_cal.dynamics.given import MotionKnown
+from minimax_cal.dynamics.given import MotionKnown, named_runs
 from minimax_cal.dynamics.logs.table import NOTHING, Run
 from minimax_cal.dynamics.rows import (
     EDGE_S,
