@@ -18,6 +18,7 @@ from minimax_cal.dynamics.result import worth_by_joint
 from minimax_cal.dynamics.rows import Arm
 from minimax_cal.evidence.noise import inflation, orthonormal
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.linear_algebra import project_out
 
 MAX_CONTRADICTION_P = 1e-4  # p-value below which rows contradict a body that is not refitted
 MAX_LIKELIHOOD_LOSS = 12.0  # of log likelihood, twice: links that explain as much
@@ -153,8 +154,7 @@ def find_payloads(columns: Columns, terms: Sequence[Term]) -> list[Term]:
     link = np.moveaxis(logs.filtered(columns.scene.regressor[:, :, -PER_LINK:]), 1, 0)
     link = white.white(link[kept])
     link /= np.maximum(np.linalg.norm(link, axis=0), 1e-300)
-    error = white.white(columns.error[kept])
-    error = error - basis @ (basis.T @ error)
+    error = project_out(basis, white.white(columns.error[kept]))
     each = [(link[run == r], basis[run == r]) for r in range(count)]
     shared = np.concatenate([own.T @ rows for rows, own in each], axis=1)
     gram = block_diag(*(rows.T @ rows for rows, _ in each)) - shared.T @ shared
@@ -163,7 +163,7 @@ def find_payloads(columns: Columns, terms: Sequence[Term]) -> list[Term]:
     def residuals_of(value: Array) -> Array:
         """(N,) of last links (10 r,) of the runs."""
         moved = (link * value.reshape(count, -1)[run]).sum(axis=1)
-        return np.asarray(error - moved + basis @ (basis.T @ moved))
+        return np.asarray(error - project_out(basis, moved))
 
     # Agglomeration: the two loads that differ least are joined [Wald test of their difference].
     label = np.arange(count)  # which load a run has

@@ -17,6 +17,7 @@ from minimax_cal.dynamics.rows import Arm, Scene, Whitening, sense_of, whitening
 from minimax_cal.evidence.library import Spec
 from minimax_cal.evidence.noise import Noise, Problem, orthonormal
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.linear_algebra import project_out
 
 RIDGE = 1e-10  # of the squares of a column: keeps a fit of columns alike from running away
 SOFTER = np.geomspace(0.005, 0.1, 9)  # of a joint's largest speed
@@ -114,13 +115,13 @@ class Columns:
                 continue
             beside[:, self.rigid.shape[2] + 2 * j] = 0.0  # the Coulomb friction of this joint
             basis = orthonormal(beside)
-            left = self.error[j, rows] - basis @ (basis.T @ self.error[j, rows])
+            left = project_out(basis, self.error[j, rows])
             as_it_is = np.array([arm.soft[j]])
             rough = arm.fastest[j] * SOFTER
             remaining, speeds = [], [as_it_is, rough]
             for number in range(3):  # as it is, softer, and finer about the best of these
                 sense = logs.filtered(sense_of(qd, speeds[number]))[rows]
-                sense = sense - basis @ (basis.T @ sense)
+                sense = project_out(basis, sense)
                 size = np.maximum((sense**2).sum(axis=0), 1e-300)
                 remaining.append(float(left @ left) - (left @ sense) ** 2 / size)
                 if number == 1:

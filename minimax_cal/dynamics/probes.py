@@ -7,7 +7,7 @@ remembers, or that was taken for more than it is, does not make it small.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from minimax_cal.dynamics.model import Normal
 from minimax_cal.dynamics.rows import CUTOFF_HZ, FILTER_ORDER, SAMPLE_HZ, Scene
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.linear_algebra import project_out
 
 LEVEL = 0.02  # chance that noise alone is called structure, of all probes at all joints, at most:
 # what noise foretells of rows left out is below 0 on average
@@ -87,9 +88,9 @@ class Moments:
         return [f for one in columns for f in (one, one * self.sense[:, self.joint])]
 
     @property
-    def others(self) -> Iterator[int]:
+    def others(self) -> list[int]:
         """The other joints."""
-        return (k for k in range(self.q.shape[1]) if k != self.joint)
+        return [k for k in range(self.q.shape[1]) if k != self.joint]
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +193,7 @@ def by_acceleration(m: Moments) -> list[Array]:
 
 def by_others(m: Moments) -> list[Array]:
     """Where the other joints are, alone and two together, how they move and what they transmit."""
-    others = list(m.others)
+    others = m.others
     alone = [
         f
         for k in others
@@ -268,12 +269,14 @@ def unexplained(normal: Normal, value: Array) -> list[Unexplained]:
         if np.count_nonzero(mine) < 10 * BUMPS:
             continue
         basis = orthonormal(normal.raw[j, kept][:, value != 0.0])
-        left = less(basis, plain[mine])
+        left = project_out(basis, plain[mine])
         noise = float(np.sqrt(np.mean(plain[mine] ** 2)))
         moments = Moments.of(scene, j, scene.logs.picked[kept], past)
         group = np.unique(normal.group[mine], return_inverse=True)[1]
         for name, columns in DRIVERS.items():
-            fold = blocks(moments) if name == TIME else group
+            fold = group
+            if name == TIME:  # stretches: what follows time is not foretold far from where it was
+                fold = (scene.logs.since[moments.at] / BLOCK_S).astype(int) % TIME_FOLDS
             raw = np.stack(columns(moments), axis=1)
             share, p = foretold(beside(basis, raw), left, fold, group)
             p = min(1.0, p * len(DRIVERS) * scene.logs.joints)
@@ -283,21 +286,9 @@ def unexplained(normal: Normal, value: Array) -> list[Unexplained]:
     return sorted(out, key=lambda one: -one.share)
 
 
-def blocks(m: Moments) -> Array:
-    """(k,) folds of rows, each of short stretches of every run: what follows time is not foretold
-    far from where it was seen.
-    """
-    return (m.scene.logs.since[m.at] / BLOCK_S).astype(int) % TIME_FOLDS
-
-
-def less(basis: Array, rows: Array) -> Array:
-    """Rows (k, ...) less what the model imitates.  basis: (k, r) orthonormal."""
-    return np.asarray(rows - basis @ (basis.T @ rows))
-
-
 def beside(basis: Array, columns: Array) -> Array:
     """Columns (k, d) less what the model imitates, of unit size a row."""
-    field = less(basis, columns)
+    field = project_out(basis, columns)
     size = np.sqrt(np.mean(field**2, axis=0))
     least = RANK * np.sqrt(np.mean(columns**2, axis=0)) + 1e-300
     return np.asarray(field / np.maximum(size, least))
@@ -324,11 +315,7 @@ def foretold(field: Array, left: Array, fold: Array, group: Array) -> tuple[floa
         share = 1.0 - float(after.sum()) / max(float(before.sum()), 1e-300)
         if share > found[0]:
             gain = (before - after) / np.maximum(np.maximum(before, after), 1e-300)
-            found = share, student(gain)
+            count = len(gain)
+            unsure = float(gain.std(ddof=1)) / np.sqrt(count) if count > 1 else np.inf
+            found = share, float(stdtr(count - 1, -float(gain.mean()) / max(unsure, 1e-12)))
     return found
-
-
-def student(gain: Array) -> float:
-    """p-value of gains (g,) whose mean is above 0."""
-    unsure = float(gain.std(ddof=1)) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
-    return float(stdtr(len(gain) - 1, -float(gain.mean()) / max(unsure, 1e-12)))
