@@ -316,7 +316,7 @@ def build_effects(
         minor = is_minor(worth, usual)
         effects.insert(0, MotionEffect("delay", "all", (whole,), worth, minor=minor))
     if change is not None:
-        last, law = len(change.before) - 1, LAWS["payload"]
+        last, law = logs.joints - 1, LAWS["payload"]
         names = {k: ("payload" if k == last else "link_inertia", f"L{k + 1}")
                  for k in range(last + 1)}  # fmt: skip
         effects.insert(0, MotionEffect(

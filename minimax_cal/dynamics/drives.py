@@ -206,8 +206,7 @@ class Followed:
             torque = run.torque[:, j] * self.gain[j] if self.measured else torque
             stretch = stretch_of(number, time)
             out.append(np.array([torque, asked + carried, qd, time, 0 * time + number, stretch]))
-        torque, asked, qd, since, of, stretch = np.concatenate(out, axis=1)
-        return Samples(torque, asked, qd, since, of, stretch)
+        return Samples(*np.concatenate(out, axis=1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,6 @@ from minimax_cal.dynamics.regressor import PER_LINK
 from minimax_cal.dynamics.rows import CUTOFF_HZ, Scene, sense_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.faults.fault import Amount
 
 Choice = Mapping[str, float]
@@ -229,11 +228,6 @@ def coupled_drive(scene: Scene, j: int, choice: Choice) -> Array:
     return out
 
 
-def by_sign(scene: Scene, j: int) -> list[Choice]:
-    """With the joint before it, or against it."""
-    return [{"sign": 1.0}, {"sign": -1.0}]
-
-
 def has_neighbour(scene: Scene, j: int) -> str:
     """Whether a joint and the one before it turn, and their torques have one unit."""
     if not j or scene.arm.robot.prismatic[[j - 1, j]].any():
@@ -333,8 +327,8 @@ EVERY = (
         nonnegative=True, held=(Element.ARMATURE,)),
     # its rotor is no law: of parallel joints it is what a rotor of one joint and the links are
     Law("coupled_drive", "drive that turns by two joints", (), ("Coulomb", "viscous"),
-        ("t", "t s/rad"), coupled_drive, choices=by_sign, needs=has_neighbour, nonnegative=True,
-        tuned={"sign": Tuned()}, why="give `coupling` in the robot file"),
+        ("t", "t s/rad"), coupled_drive, needs=has_neighbour, nonnegative=True,
+        tuned={"sign": Tuned((1.0, -1.0))}, why="give `coupling` in the robot file"),
     Law("drive_gain", "drive gain", ("load",), needs=has_gains, separate=KNOWN_LOAD,
         held=(Element.GAIN,), **SHARE,
         why="scales what is logged, and no motor of the model holds it: give drive_gain="),
@@ -401,15 +395,6 @@ def register_law(law: Law) -> Law:
         raise OptionError(f"law {law.name}: give a name and a unit for each of its parameters")
     LAWS[law.name], WORDS[law.name] = law, law.words
     return law
-
-
-def laws_table() -> Table:
-    """The laws for people: what each adds to a joint's torque, and where a simulator has it."""
-    rows = []
-    for law in LAWS.values():
-        form = ", ".join(law.torque).replace("np.", "") or None
-        rows.append((law.name, law.words, form, ", ".join(law.held) or None))
-    return Table.made("Laws", rows, "name | law | torque per unit | held by")
 
 
 @dataclass(frozen=True)

@@ -45,13 +45,6 @@ class Columns:
             self.stored[term.text] = joints, np.moveaxis(rows, 1, 0) if whole else rows[None]
         return self.stored[term.text]
 
-    def at_all(self, term: Term) -> Array:
-        """(n, R, d) of all joints."""
-        joints, rows = self.rows_of(term)
-        out = np.zeros((self.scene.logs.joints, *rows.shape[1:]))
-        out[joints] = rows
-        return out
-
     @cached_property
     def rigid(self) -> Array:
         """(n, R, p) of the rigid body; of each joint for itself where they share no parameters."""
@@ -72,15 +65,13 @@ class Columns:
 
     def design(self, terms: Sequence[Term] = ()) -> Array:
         """(n, R, p) rigid body, usual friction and some laws: the columns of every fit."""
-        every = (self.at_all(term) for term in terms)
-        return np.concatenate([self.rigid, self.usual, *every], axis=2)
-
-    def places(self, terms: Sequence[Term] = ()) -> dict[str, slice]:
-        """Which of these columns belong to what."""
-        size = {RIGID: self.rigid.shape[2], FRICTION: self.usual.shape[2]}
-        size |= {term.text: self.rows_of(term)[1].shape[2] for term in terms}
-        ends = np.cumsum([0, *size.values()]).tolist()
-        return dict(zip(size, map(slice, ends[:-1], ends[1:]), strict=True))
+        parts = [self.rigid, self.usual]
+        for term in terms:
+            joints, rows = self.rows_of(term)
+            part = np.zeros((self.scene.logs.joints, *rows.shape[1:]))
+            part[joints] = rows
+            parts.append(part)
+        return np.concatenate(parts, axis=2)
 
     @cached_property
     def error(self) -> Array:
@@ -145,25 +136,22 @@ def block_rows(each: Array) -> Array:
     return out.reshape(n, count, n * d)
 
 
-def solve_ridged(gram: Array, pull: Array, ridge: float = RIDGE) -> Array:
-    """(p,) least squares by products (p, p) with a unit diagonal and (p,)."""
-    return np.linalg.solve(gram + ridge * np.eye(len(gram)), pull)
-
-
 def solve_scaled(gram: Array, pull: Array, ridge: float = RIDGE) -> Array:
     """(p,) least squares by products (p, p) and (p,); columns alike share what they explain.
 
     ridge: of the products with a unit diagonal.
     """
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    return np.asarray(solve_ridged(gram / np.outer(scale, scale), pull / scale, ridge) / scale)
+    unit = gram / np.outer(scale, scale) + ridge * np.eye(len(gram))
+    return np.asarray(np.linalg.solve(unit, pull / scale) / scale)
 
 
 def least_squares(columns: Array, error: Array) -> Array:
     """(p,) values of columns (N, p), those alike sharing what they explain."""
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     unit = columns / scale
-    return np.asarray(solve_ridged(unit.T @ unit, unit.T @ error) / scale)
+    gram = unit.T @ unit + RIDGE * np.eye(unit.shape[1])
+    return np.asarray(np.linalg.solve(gram, unit.T @ error) / scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,15 +186,15 @@ class TorqueLaws:
             out[self.white.joint == j] = self.white.white_joint(int(j), part[self.white.kept[j]])
         if not np.any(out):
             return None
-        law, d = term.law, out.shape[1]
+        law, count = term.law, len(out)
         return Spec(
             term=term,
             text=term.text,
             key=term.key,
             columns=out,
-            doubts=np.zeros((len(out), 0)),
+            doubts=np.zeros((count, 0)),
             owner=np.zeros(0, dtype=int),
-            nonnegative=np.full(d, law.nonnegative),
+            nonnegative=np.full(out.shape[1], law.nonnegative),
             typical=law.typical * (self.size[term.joint] if law.of_torque else 1.0),
             tuned=len(term.tuned),
             repeats=law.repeats,
@@ -310,9 +298,13 @@ class Normal:
     def of(columns: Columns, white: Whitening, terms: Sequence[Term]) -> Normal:
         """Of all rows that are fitted."""
         raw, kept = columns.design(terms), white.kept
-        group = white.rows(columns.scene.logs.quarter)
+        sizes = {RIGID: columns.rigid.shape[2], FRICTION: columns.usual.shape[2]}
+        sizes |= {term.text: columns.rows_of(term)[1].shape[2] for term in terms}
+        ends = np.cumsum([0, *sizes.values()]).tolist()
+        place = dict(zip(sizes, map(slice, ends[:-1], ends[1:]), strict=True))
         return Normal(columns, white, tuple(terms), raw, white.white(raw[kept]),
-                      white.white(columns.error[kept]), columns.places(terms), group)  # fmt: skip
+                      white.white(columns.error[kept]), place,
+                      white.rows(columns.scene.logs.quarter))  # fmt: skip
 
     @staticmethod
     def fit_whitened(columns: Columns, terms: Sequence[Term]) -> Normal:

@@ -83,9 +83,19 @@ class Moments:
         return Moments(scene, joint, at, past, motion.q, motion.qd, motion.qdd, scene.sense[at],
                        load[at] / size)  # fmt: skip
 
+    @property
+    def own_sense(self) -> Array:
+        """(k,) of the joint."""
+        return self.sense[:, self.joint]
+
+    @property
+    def own_speed(self) -> Array:
+        """(k,) of the joint."""
+        return self.qd[:, self.joint]
+
     def both_ways(self, columns: list[Array]) -> list[Array]:
         """Columns alone and with the direction."""
-        return [f for one in columns for f in (one, one * self.sense[:, self.joint])]
+        return [f for one in columns for f in (one, one * self.own_sense)]
 
     @property
     def others(self) -> list[int]:
@@ -147,13 +157,13 @@ def by_angle(m: Moments) -> list[Array]:
     q = m.q[:, m.joint]
     if m.scene.arm.robot.prismatic[m.joint]:
         return m.both_ways(bumps(q))
-    slow = np.arange(1.0, WAVES + 1.0)
-    return [*waves(q, slow), *(f * m.sense[:, m.joint] for f in waves(q, slow[:2]))]
+    slow = waves(q, np.arange(1.0, WAVES + 1.0))
+    return [*slow, *(wave * m.own_sense for wave in slow[:4])]
 
 
 def by_fine_angle(m: Moments) -> list[Array]:
     """Waves of the angle as gears and motors have them, less what the filter takes."""
-    q, qd = m.q[:, m.joint], m.qd[:, m.joint]
+    q, qd = m.q[:, m.joint], m.own_speed
     far = max(float(np.ptp(q)), 1e-12)
     first = WAVES + 1.0 if not m.scene.arm.robot.prismatic[m.joint] else np.pi / far
     counts = first + np.arange(STEPS) * max(np.pi / far, (FINEST - first) / STEPS)
@@ -166,19 +176,20 @@ def by_fine_angle(m: Moments) -> list[Array]:
 
 def by_speed(m: Moments) -> list[Array]:
     """The joint's speed, the same both ways."""
-    return [b * m.sense[:, m.joint] for b in bumps(np.abs(m.qd[:, m.joint]))]
+    return [b * m.own_sense for b in bumps(np.abs(m.own_speed))]
 
 
 def by_direction(m: Moments) -> list[Array]:
     """The joint's speed, otherwise one way than the other."""
-    return bumps(np.abs(m.qd[:, m.joint]))
+    return bumps(np.abs(m.own_speed))
 
 
 def by_load(m: Moments) -> list[Array]:
     """The torque that the joint transmits, alone, with the direction and with the speed."""
-    size, sense, v = m.load[:, m.joint], m.sense[:, m.joint], m.qd[:, m.joint]
-    return [size, np.abs(size), size**2, size**3, np.abs(size) * sense, size**2 * sense,
-            np.abs(size) * v, size**2 * v, size * sense]  # fmt: skip
+    load, sense, v = m.load[:, m.joint], m.own_sense, m.own_speed
+    size, square = np.abs(load), load**2
+    return [load, size, square, load**3, size * sense, square * sense, size * v, square * v,
+            load * sense]  # fmt: skip
 
 
 def by_acceleration(m: Moments) -> list[Array]:
@@ -187,7 +198,7 @@ def by_acceleration(m: Moments) -> list[Array]:
     qdd = m.qdd[:, j]
     first = logs.start[logs.run_of(m.at)]
     earlier = [logs.motion.qdd[np.maximum(m.at - int(s * SAMPLE_HZ), first), j] for s in BEFORE_S]
-    return [qdd, np.abs(qdd), np.abs(qdd) * m.sense[:, j],
+    return [qdd, np.abs(qdd), np.abs(qdd) * m.own_sense,
             logs.slope(logs.motion.qdd[:, j])[m.at], *earlier]  # fmt: skip
 
 
@@ -207,7 +218,7 @@ def by_others(m: Moments) -> list[Array]:
 
 def by_friction_of_others(m: Moments) -> list[Array]:
     """Friction and damping of this joint by what the other joints do."""
-    sense, v = m.sense[:, m.joint], m.qd[:, m.joint]
+    sense, v = m.own_sense, m.own_speed
     out = []
     for k in m.others:
         cos, sin = np.cos(m.q[:, k]), np.sin(m.q[:, k])
@@ -236,7 +247,7 @@ def by_memory(m: Moments) -> list[Array]:
     way = whole[m.at] / max(float(whole.max()), 1e-12)
     faded = [np.exp(-way / length) for length in (0.02, 0.06, 0.2, 0.6)]
     recent = [*m.past.recent[m.at, j].T]
-    by_way = [f for b in faded for f in (b * m.sense[:, j], b * m.qd[:, j])]
+    by_way = [f for b in faded for f in (b * m.own_sense, b * m.own_speed)]
     return [*by_way, *m.both_ways(recent), *m.past.lagged[m.at, j].T]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.dynamics.logs.table import Log
+from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.optional import optional
 from minimax_cal.reading.formats import SI
@@ -64,11 +65,11 @@ def log_of(path: Path, topic: str, messages: Sequence[tuple[int, Any]]) -> Log:
         raise DataError(f"{path}: {topic} holds no positions; record /joint_states with them")
     stamped = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for _, m in same]
     received = [1e-9 * (t - same[0][0]) for t, _ in same]
-    time = np.array(stamped if any(stamped) else received) - (stamped[0] if any(stamped) else 0.0)
-    rows = {kind: [np.asarray(getattr(m, member), dtype=float) for _, m in same]
-            for kind, member in MEMBERS.items()}  # fmt: skip
-    held = {kind: np.array(each) for kind, each in rows.items()
-            if all(len(row) == len(names) for row in each)}  # fmt: skip
+    time, held = np.array(stamped if any(stamped) else received), dict[str, Array]()
+    for kind, member in MEMBERS.items():
+        rows = [np.asarray(getattr(m, member), dtype=float) for _, m in same]
+        if all(len(row) == len(names) for row in rows):
+            held[kind] = np.array(rows)
     other = len(messages) - len(same)
     said = (
         f"{path}: {other} messages of {topic} have other joints than {', '.join(names)}: left out"
@@ -77,7 +78,7 @@ def log_of(path: Path, topic: str, messages: Sequence[tuple[int, Any]]) -> Log:
         source=str(path),
         title="ROS bag",
         line=np.arange(1, len(same) + 1),
-        values={"t": time, **held},
+        values={"t": time - time[0], **held},
         headers={kind: tuple(f"{MEMBERS[kind]} of {n}" for n in names) for kind in held},
         units={kind: (SI[kind],) * len(names) for kind in held},
         joints=names,
