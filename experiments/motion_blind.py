@@ -34,7 +34,7 @@ from experiments.sweep import Study, study_options
 from minimax_cal.dynamics.diagnose import family
 from minimax_cal.dynamics.given import MotionKnown
 from minimax_cal.dynamics.laws import USUAL, terms_of
-from minimax_cal.dynamics.model import Columns, TorqueLaws
+from minimax_cal.dynamics.model import Body, Columns, TorqueLaws
 from minimax_cal.dynamics.regressor import PER_LINK
 from minimax_cal.dynamics.result import MotionEffect
 from minimax_cal.dynamics.rows import Arm, Logs, Scene, Whitening, prepare, whitening
@@ -162,7 +162,7 @@ def oracle(made: Made, truth: tuple[Name, ...]) -> tuple[float, float]:
     ones = np.ones(made.robot.joints)
     arm = Arm.of(made.robot, ones, RATIO * ones, MotionKnown(made.payload).load, logs)
     scene = Scene.of(arm, logs)
-    columns = Columns(Columns(scene).fit_first_body().in_scene(scene))
+    columns = Body.fit_with_friction(scene).build_columns(scene)
     kept = logs.fitted.T
     white = whitening(logs, of_runs(made, made.noise).y.T[kept])
     signal = white.white(of_runs(made, made.signal).y.T[kept])

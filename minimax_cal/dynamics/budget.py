@@ -17,7 +17,6 @@ from minimax_cal.dynamics.model import (
     FRICTION,
     RIGID,
     Body,
-    Columns,
     Normal,
     TorqueModel,
     held_friction,
@@ -362,7 +361,7 @@ def evaluate_motion(
     if not arm.known.any():
         prepared = replace(prepared, payload=np.full_like(prepared.payload, np.nan))
     scene = Scene.of(arm, prepared)
-    columns = cache(lambda context: Columns(context.in_scene(scene)))
+    columns = cache(lambda context: context.build_columns(scene))
     steps = []
     for model in found.models:
         logged = prepared.earlier(model.delay) if model.delay else prepared

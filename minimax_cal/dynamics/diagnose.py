@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from minimax_cal.dynamics.budget import CrossValidation
-from minimax_cal.dynamics.given import LEAST_SCALE, MOST_SCALE, MotionKnown, runs_of
+from minimax_cal.dynamics.given import LEAST_SCALE, MOST_SCALE, MotionKnown
 from minimax_cal.dynamics.laws import ANGLE, CURVE, LAWS, USUAL, Term, terms_of
 from minimax_cal.dynamics.logs.table import Run
 from minimax_cal.dynamics.masses import LinkChange, compare_with_given_masses, find_payloads
@@ -31,7 +31,7 @@ from minimax_cal.dynamics.result import (
     NotTestable,
     Verdict,
 )
-from minimax_cal.dynamics.rows import Arm, Logs, Scene, prepare
+from minimax_cal.dynamics.rows import Arm, Logs, Scene
 from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import LEVEL, MINOR
 from minimax_cal.evidence.selection import Choice, select
@@ -42,8 +42,10 @@ from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.ground.threads import one_thread
 from minimax_cal.measuring.faults.fault import Amount
 from minimax_cal.robots.gravity import weighed
-from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.robot import Robot
 
+MIN_DURATION = 25.0  # of trajectories: in less, laws stand in for each other
+MIN_PEAK_SPEED = 0.25  # that some joint must reach [rad/s, m/s]: slower, most laws are invisible
 MATTERS = 0.28  # of the remaining error's square at a joint, 15 % of its RMS: more has no name
 SELECTION_FOLD = 0.2  # about this share of the trajectories is left out in turn to judge a law
 HALVINGS = 2  # of the groups, in whose halves names are sought again
@@ -91,18 +93,13 @@ def diagnose_motion(
     >>> print(mc.diagnose_motion("arm.urdf", ["run1.csv", "run2.csv"]).summary())
     """
     began = time.perf_counter()
-    arm_of = load_robot(robot)
     check_left_out(exclude, LAWS)
     progress("reading logs")
-    runs = runs_of(robot, arm_of, logs)
-    prepared = prepare(known.loaded(runs))
-    arm = Arm.of(arm_of, known.gains(arm_of, runs), known.ratios(arm_of), known.load, prepared)
-    run_fold = known.split_folds(prepared)
+    inputs = known.read_inputs(robot, logs)
     with one_thread():
-        found = diagnose_torques(arm, prepared, run_fold, exclude, progress)
-    notices = dict.fromkeys(text for run in runs for text in run.notices)
+        found = diagnose_torques(inputs.arm, inputs.logs, inputs.run_fold, exclude, progress)
     seconds = time.perf_counter() - began
-    return replace(found, notices=(*notices, *found.notices), seconds=seconds)
+    return replace(found, notices=(*inputs.notices, *found.notices), seconds=seconds)
 
 
 def diagnose_torques(
@@ -115,7 +112,6 @@ def diagnose_torques(
     """
     rows = run_fold < 0 if (run_fold < 0).any() else run_fold >= 0
     learning, logged_torque = np.unique(logs.run[rows]).tolist(), logs.y
-    too_little = logs.only(learning).describe_lacks()
 
     # Forward selection of laws by evidence; again with whatever changes the rows or all columns.
     progress("searching for causes")
@@ -145,7 +141,7 @@ def diagnose_torques(
     # Generalised least squares of all runs, and without each fold.
     columns = search.columns
     if len(learning) < len(logs.names):
-        columns = Columns(search.context.in_scene(Scene.of(arm, logs)))
+        columns = search.context.build_columns(Scene.of(arm, logs))
     normal = Normal.fit_whitened(columns, search.terms)
     undelayed = columns.error + (logged_torque - logs.y).T
     validation = CrossValidation.of(normal, undelayed, run_fold)
@@ -159,6 +155,7 @@ def diagnose_torques(
         masses = replace(masses, change=None)
 
     effects = build_effects(search, validation, repeats, delay, masses.change)
+    too_little = search.describe_lacking_motion()
     return MotionDiagnosis(
         arm=arm, unit=logs.unit, verdict=find_verdict(effects, left, too_little), effects=effects,
         budget=validation.build_budget(delay.value), unexplained=left,
@@ -197,6 +194,21 @@ class LawSearch:
         """With some of its laws."""
         found = tuple(one for one in self.choice.found if one.candidate.term in terms)
         return replace(self, choice=replace(self.choice, found=found))
+
+    def describe_lacking_motion(self) -> tuple[str, ...]:
+        """Why the motion is too little to name a cause."""
+        peak, out = float(np.abs(self.logs.motion.qd).max()), []
+        if self.logs.seconds < MIN_DURATION:
+            out.append(
+                f"{self.logs.seconds:.0f} s of trajectories; record {MIN_DURATION:.0f} s or more, "
+                "better several of different kinds"
+            )
+        if peak < MIN_PEAK_SPEED:
+            out.append(
+                f"no joint is faster than {peak:.2g} rad/s; record a run that reaches "
+                f"{MIN_PEAK_SPEED:g} rad/s or more"
+            )
+        return tuple(out)
 
     def list_untestable(self) -> tuple[NotTestable, ...]:
         """What the logs cannot show, each effect and need once."""
@@ -243,8 +255,8 @@ class LawSearch:
 def search_laws(arm: Arm, logs: Logs, exclude: Sequence[str]) -> LawSearch:
     """The laws that the fitted rows of some logs call for."""
     scene = Scene.of(arm, logs)
-    context = Columns(scene).fit_first_body()
-    columns = Columns(context.in_scene(scene))
+    context = Body.fit_with_friction(scene)
+    columns = context.build_columns(scene)
     every, lacking = terms_of(columns.scene, exclude)
     terms = [term for term in every if term.effect != "payload"]
     if len(terms) < len(every):

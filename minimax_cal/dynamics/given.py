@@ -13,12 +13,12 @@ import numpy as np
 from minimax_cal.dynamics.logs import read_runs
 from minimax_cal.dynamics.logs.table import CURRENT, NOTHING, TORQUE, Run
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, link_parameters, regressor
-from minimax_cal.dynamics.rows import Logs
+from minimax_cal.dynamics.rows import Arm, Logs, prepare
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import grouped, number, numbers
 from minimax_cal.robots.gravity import weighed
-from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.urdf import has_links, load_urdf
 
 HEAVIEST, FARTHEST = 1e4, 10.0  # payload of the largest arms, several times over [kg, m]
@@ -36,6 +36,20 @@ def carried(text: str) -> Payload:
     if not number(mass) > 0.0 or len(parts) != 3 or not all(map(math.isfinite, parts)):
         raise OptionError(f"payload={text!r}: give KG@x,y,z in kg and m, as 2@0,0,0.05")
     return number(mass), (parts[0], parts[1], parts[2])
+
+
+@dataclass(frozen=True, eq=False)
+class MotionInputs:
+    """What a motion diagnosis begins with.
+
+    run_fold: (R,) in which a row of the logs is left out, negative for rows that are always fitted.
+    notices: of the files.
+    """
+
+    arm: Arm
+    logs: Logs
+    run_fold: Array
+    notices: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -77,6 +91,21 @@ class MotionKnown:
         many=tuple,
     )
 
+    def read_inputs(
+        self, robot: Robot | str | Path, logs: Sequence[Run | str | Path] | str | Path
+    ) -> MotionInputs:
+        """Arm, rows and folds of a diagnosis.  Raises CalibrationError."""
+        arm_of = load_robot(robot)
+        runs = runs_of(robot, arm_of, logs)
+        rows = prepare(self.loaded(runs))
+        arm = Arm.of(arm_of, self.gains(arm_of, runs), self.ratios(arm_of), self.load, rows)
+        held_out_runs = named_runs(rows, self.holdout_run)
+        if not (held_out_runs or 0.0 < self.holdout < 1.0):
+            raise OptionError(f"holdout={self.holdout:g} must lie between 0 and 1")
+        notices = dict.fromkeys(text for run in runs for text in run.notices)
+        run_fold = rows.split_folds(self.holdout, held_out_runs)
+        return MotionInputs(arm, rows, run_fold, tuple(notices))
+
     def loaded(self, runs: Sequence[Run]) -> list[Run]:
         """The runs with the mass at the flange, where they say none.  Raises OptionError."""
         if self.payload is None:
@@ -88,13 +117,6 @@ class MotionKnown:
                 f"{FARTHEST:g} m of the flange"
             )
         return [run if run.payload is not None else replace(run, payload=mass) for run in runs]
-
-    def split_folds(self, logs: Logs) -> Array:
-        """(R,) fold in which each row is left out, negative for never.  Raises OptionError."""
-        held_out_runs = named_runs(logs, self.holdout_run)
-        if not (held_out_runs or 0.0 < self.holdout < 1.0):
-            raise OptionError(f"holdout={self.holdout:g} must lie between 0 and 1")
-        return logs.split_folds(self.holdout, held_out_runs)
 
     @property
     def load(self) -> Array:

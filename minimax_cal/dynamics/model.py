@@ -79,12 +79,6 @@ class Columns:
         known = self.scene.logs.filtered(self.scene.known_torque)
         return (self.scene.logs.y - known).T
 
-    def fit_first_body(self) -> Body:
-        """Rigid body and usual friction by plain least squares on the rows that are fitted."""
-        kept = self.scene.logs.fitted.T
-        value = least_squares(self.design()[kept], self.error[kept])
-        return Body.of(self.scene.arm, *np.split(value, [self.rigid.shape[2]]))
-
     def of_each(self, terms: Sequence[Term]) -> Array:
         """(n, R, p) rigid body, usual friction, a variant of every law, and all that runs carry."""
         first = {t.text if t.effect == "payload" else t.key: t for t in reversed(terms)}
@@ -233,6 +227,17 @@ class Body:
         each = rigid.reshape(-1, arm.base.shape[1])
         near = arm.drawn + (each - arm.base.T @ arm.drawn) @ arm.base.T
         return Body(near, usual.reshape(-1, 2))
+
+    @staticmethod
+    def fit_with_friction(scene: Scene) -> Body:
+        """Rigid body and usual friction by plain least squares on the rows that are fitted."""
+        columns, kept = Columns(scene), scene.logs.fitted.T
+        value = least_squares(columns.design()[kept], columns.error[kept])
+        return Body.of(scene.arm, *np.split(value, [columns.rigid.shape[2]]))
+
+    def build_columns(self, scene: Scene) -> Columns:
+        """Columns of a scene with this load and friction."""
+        return Columns(self.in_scene(scene))
 
     def in_scene(self, scene: Scene) -> Scene:
         """A scene with this load and friction."""

@@ -47,8 +47,6 @@ EDGE_S = 0.4  # at the ends and about gaps, where the filter has little to look 
 AR_ORDER = 4  # of the noise of a joint: rows that went before and matter
 QUARTERS = 4  # groups of a trajectory, which err together
 NEVER_OUT = -1  # number of the fold of rows that are always fitted
-MIN_DURATION = 25.0  # of trajectories: in less, laws stand in for each other
-MIN_PEAK_SPEED = 0.25  # that some joint must reach [rad/s, m/s]: slower, most laws are invisible
 SAMPLED = ("torque", "since", "payload", "temperature", "gap")  # of Logs, beside the motion
 LEAST_NOISE = 1e-9  # of the largest torque: the noise of computed rows
 
@@ -257,21 +255,6 @@ class Logs:
             return self.quarter
         parts = min(count, max(2, round(1.0 / share)))
         return (np.arange(count) % parts)[self.run]
-
-    def describe_lacks(self) -> tuple[str, ...]:
-        """Why the motion is too little to name a cause."""
-        peak, out = float(np.abs(self.motion.qd).max()), []
-        if self.seconds < MIN_DURATION:
-            out.append(
-                f"{self.seconds:.0f} s of trajectories; record {MIN_DURATION:.0f} s or more, "
-                "better several of different kinds"
-            )
-        if peak < MIN_PEAK_SPEED:
-            out.append(
-                f"no joint is faster than {peak:.2g} rad/s; record a run that reaches "
-                f"{MIN_PEAK_SPEED:g} rad/s or more"
-            )
-        return tuple(out)
 
     def only(self, runs: Sequence[int]) -> Logs:
         """The logs of some runs."""

@@ -347,6 +347,16 @@ def test_a_log_without_time_asks_for_it(tmp_path: Path) -> None:
         read_runs(path)
 
 
+def test_values_that_are_never_in_one_row_are_refused(tmp_path: Path) -> None:
+    columns = house(motion())
+    for name in columns:
+        if name != "t_s":
+            odd = name.startswith("tau")
+            columns[name] = [v if i % 2 == odd else "" for i, v in enumerate(columns[name])]
+    with pytest.raises(mc.DataError, match="of every joint; log them together"):
+        read_runs(write(tmp_path / "x.csv", columns))
+
+
 def test_torn_lines_and_few(tmp_path: Path) -> None:
     lines = write(tmp_path / "x.csv", house(motion())).read_text().splitlines()
     lines[100], lines[200] = lines[100][:30], lines[200].replace(",", ",0.1-", 1)
