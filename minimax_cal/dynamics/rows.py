@@ -326,9 +326,8 @@ class Whitening:
 
     def white(self, rows: Array) -> Array:
         """Rows (N, ...) of all joints with a noise of unit variance and no memory."""
-        joints = range(len(self.kept))
-        parts = [self.white_joint(j, rows[self.joint == j]) for j in joints]
-        return np.concatenate(parts)
+        return np.concatenate([self.white_joint(j, rows[self.joint == j])
+                               for j in range(len(self.kept))])  # fmt: skip
 
     def white_joint(self, joint: int, rows: Array) -> Array:
         """The same of one joint's rows (k, ...)."""

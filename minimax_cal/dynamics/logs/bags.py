@@ -34,24 +34,22 @@ def read_bag(path: Path) -> list[Log]:
     try:
         types = typesys.get_typestore(typesys.Stores.LATEST)
         with rosbags.AnyReader([path], default_typestore=types) as reader:
-            topics = {c.topic: c for c in reader.connections if c.msgtype == STATE}
-            messages = [
-                (c.topic, stamp, reader.deserialize(raw, STATE))
-                for c, stamp, raw in (reader.messages(list(topics.values())) if topics else ())
-            ]
+            found = [c for c in reader.connections if c.msgtype == STATE]
+            messages: dict[str, list[tuple[int, Any]]] = {c.topic: [] for c in found}
+            for c, stamp, raw in reader.messages(found) if found else ():
+                messages[c.topic].append((stamp, reader.deserialize(raw, STATE)))
     except Exception as error:  # of a broken file the parser of another package raises anything
         why = str(error).partition("\n")[0] or type(error).__name__
         raise DataError(f"{path}: cannot be read as a bag ({why})") from error
-    by_topic = {topic: [(t, m) for at, t, m in messages if at == topic] for topic in topics}
-    logs = {topic: log_of(path, topic, found) for topic, found in by_topic.items() if found}
-    with_effort = [log for log in logs.values() if "tau" in log.values]
+    logs = {topic: log_of(path, topic, some) for topic, some in messages.items() if some}
+    with_effort = {topic: log for topic, log in logs.items() if "tau" in log.values}
     if not with_effort:
         held = "no JointState" if not logs else f"no effort in {', '.join(logs)}"
         raise DataError(f"{path}: holds {held}; record /joint_states with effort")
     if len(with_effort) > 1:
-        names = " and ".join(topic for topic, log in logs.items() if "tau" in log.values)
+        names = " and ".join(with_effort)
         raise DataError(f"{path}: holds efforts in {names}; record one of them")
-    return with_effort
+    return list(with_effort.values())
 
 
 def log_of(path: Path, topic: str, messages: Sequence[tuple[int, Any]]) -> Log:

@@ -272,21 +272,19 @@ def is_unclipped(draft: Draft) -> Draft:
     for j, torque in enumerate(draft.torque.T):
         start = np.flatnonzero(np.append(True, np.diff(torque) != 0.0))
         length = np.diff(np.append(start, len(torque)))
-        value = torque[start]
-        high = np.abs(value) >= 0.999 * np.abs(torque).max()
+        high = np.abs(torque[start]) >= 0.999 * np.abs(torque).max()
         limit = max(least, 2 * int(length[~high].max(initial=0)))
-        flat = [
-            (a, a + n)
+        flat = {
+            a: n
             for a, n in zip(start[high], length[high], strict=True)
             if n >= limit and np.ptp(draft.q[a : a + n], axis=0).max() > 0.1 * MOVES
-        ]
+        }
         if flat:
-            count = sum(end - first for first, end in flat)
-            at = f"{torque[flat[0][0]]:.4g} {'N m' if draft.kind == 'tau' else 'A'}"
+            rows = np.array(list(flat))
+            at = f"{torque[rows[0]]:.4g} {'N m' if draft.kind == 'tau' else 'A'}"
             draft = draft.saying(
-                f"column {draft.column(draft.kind, j)} is cut off at {at} in {count} rows "
-                f"({draft.lines(np.array([first for first, _ in flat]))}): a limit of the drive; "
-                "move more slowly there"
+                f"column {draft.column(draft.kind, j)} is cut off at {at} in {sum(flat.values())} "
+                f"rows ({draft.lines(rows)}): a limit of the drive; move more slowly there"
             )
     return draft
 

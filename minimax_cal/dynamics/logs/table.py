@@ -126,16 +126,11 @@ class Log:
         def some(columns: tuple[str, ...]) -> tuple[str, ...]:
             return tuple(columns[i] for i in at) if len(columns) == n else columns
 
-        return replace(
-            self,
-            values={
-                kind: value[:, at] if value.ndim == 2 and value.shape[1] == n else value
-                for kind, value in self.values.items()
-            },
-            headers={kind: some(names) for kind, names in self.headers.items()},
-            units={kind: some(names) for kind, names in self.units.items()},
-            joints=some(self.joints),
-        )
+        values = {kind: value[:, at] if value.shape[1:] == (n,) else value
+                  for kind, value in self.values.items()}  # fmt: skip
+        headers = {kind: some(names) for kind, names in self.headers.items()}
+        units = {kind: some(names) for kind, names in self.units.items()}
+        return replace(self, values=values, headers=headers, units=units, joints=some(self.joints))
 
 
 def log_sheet(path: Path, lines: int | None = None) -> Sheet:
