@@ -13,7 +13,7 @@ import numpy as np
 from minimax_cal.dynamics.logs import read_runs
 from minimax_cal.dynamics.logs.table import CURRENT, NOTHING, TORQUE, Run
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, link_parameters, regressor
-from minimax_cal.dynamics.rows import Arm, Logs, prepare
+from minimax_cal.dynamics.rows import Arm, Logs, named_runs, prepare
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import grouped, number, numbers
@@ -162,17 +162,6 @@ class MotionKnown:
                 f"{1.0 / LARGEST:g} and {LARGEST:g}"
             )
         return np.array(np.broadcast_to(values, robot.joints))
-
-
-def named_runs(logs: Logs, given: str | Sequence[str] | None) -> tuple[str, ...]:
-    """The runs that judge.  Raises OptionError."""
-    wanted = (given,) if isinstance(given, str) else tuple(given or ())
-    for name in wanted:
-        if name not in logs.names:
-            raise OptionError(f"holdout_run: no run {name!r}; choose {', '.join(logs.names)}")
-    if wanted and len(set(wanted)) == len(logs.names):
-        raise OptionError("holdout_run: leaves no run to learn from; name fewer")
-    return wanted
 
 
 def read_logs(

@@ -29,6 +29,7 @@ from minimax_cal.dynamics.regressor import (
     regressor,
 )
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.facts import APART
 from minimax_cal.robots.robot import Robot
 
@@ -300,6 +301,17 @@ def prepare(runs: Sequence[Run]) -> Logs:
     start = np.cumsum([0, *(len(one.since) for one in each)])
     names = tuple(run.name for run in runs)
     return replace(each[0], names=names, motion=Motion(*motion), start=start, **rows)
+
+
+def named_runs(logs: Logs, given: str | Sequence[str] | None) -> tuple[str, ...]:
+    """The runs that judge.  Raises OptionError."""
+    wanted = (given,) if isinstance(given, str) else tuple(given or ())
+    for name in wanted:
+        if name not in logs.names:
+            raise OptionError(f"holdout_run: no run {name!r}; choose {', '.join(logs.names)}")
+    if wanted and len(set(wanted)) == len(logs.names):
+        raise OptionError("holdout_run: leaves no run to learn from; name fewer")
+    return wanted
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from minimax_cal.dynamics.drives import command_of
-from minimax_cal.dynamics.given import MotionKnown, named_runs
+from minimax_cal.dynamics.given import MotionKnown
 from minimax_cal.dynamics.logs.table import NOTHING, Run
 from minimax_cal.dynamics.rows import (
     EDGE_S,
@@ -20,6 +20,7 @@ from minimax_cal.dynamics.rows import (
     Logs,
     Scene,
     at_times,
+    named_runs,
     prepare,
     rms_by_joint,
 )
