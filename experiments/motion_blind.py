@@ -34,7 +34,7 @@ from experiments.sweep import Study, study_options
 from minimax_cal.dynamics.diagnose import family
 from minimax_cal.dynamics.given import MotionKnown
 from minimax_cal.dynamics.laws import USUAL, terms_of
-from minimax_cal.dynamics.model import Columns, dictionary_of, first_body
+from minimax_cal.dynamics.model import Body, Columns, TorqueLaws
 from minimax_cal.dynamics.regressor import PER_LINK
 from minimax_cal.dynamics.result import MotionEffect
 from minimax_cal.dynamics.rows import Arm, Logs, Scene, Whitening, prepare, whitening
@@ -162,7 +162,7 @@ def oracle(made: Made, truth: tuple[Name, ...]) -> tuple[float, float]:
     ones = np.ones(made.robot.joints)
     arm = Arm.of(made.robot, ones, RATIO * ones, MotionKnown(made.payload).load, logs)
     scene = Scene.of(arm, logs)
-    columns = Columns(first_body(Columns(scene)).in_scene(scene))
+    columns = Body.fit_with_friction(scene).build_columns(scene)
     kept = logs.fitted.T
     white = whitening(logs, of_runs(made, made.noise).y.T[kept])
     signal = white.white(of_runs(made, made.signal).y.T[kept])
@@ -180,7 +180,7 @@ def of_runs(made: Made, torques: Sequence[Array]) -> Logs:
 
 def by_laws(columns: Columns, white: Whitening, truth: Name) -> tuple[Array, list[Array]]:
     """What is always fitted, and the span of every law but the true one."""
-    laws = dictionary_of(columns, white)
+    laws = TorqueLaws.of(columns, white)
     basis, spans = laws.problem.basis, []
     for term in terms_of(columns.scene, ())[0]:
         spec = laws.spec(term) if term.key != truth else None

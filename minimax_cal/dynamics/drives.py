@@ -17,7 +17,7 @@ from typing import Any, cast
 import numpy as np
 import scipy
 
-from minimax_cal.dynamics.logs.table import NOTHING, Run
+from minimax_cal.dynamics.logs.table import NOTHING, Run, rows_of
 from minimax_cal.dynamics.regressor import Motion
 from minimax_cal.dynamics.rows import (
     SLOWEST,
@@ -100,12 +100,6 @@ class DriveFit:
         """(R,) torque of some rows that it does not explain."""
         return rows.rest(self.drive, self.apart)
 
-    def told(self, name: str, given: Drive) -> bool:
-        """Whether something that was fitted beside is there for sure."""
-        at = 2 if name == AHEAD else len(FITTED) + list(self.beside).index(name)
-        off = self.drive.ahead - given.ahead if name == AHEAD else self.beside[name]
-        return abs(off) > STANDS * float(np.sqrt(covariance_of(self.change)[at, at]))
-
 
 def stretch_of(run: Array | int, since: Array) -> Array:
     """(R,) numbers of the stretches of rows: of which run, and when in it [s]."""
@@ -185,9 +179,17 @@ class Followed:
 
     def clear(self, j: int, torque: float, speed: float) -> Rows:
         """The rows of a joint that no larger torque and speed is near."""
-        every, seen = self.joint(j), self.samples(j, Drive(0.0, 0.0))
+        rows, seen = self.joint(j), self.samples(j, Drive(0.0, 0.0))
         beyond = (np.abs(seen.torque) > torque) | (np.abs(seen.qd) > speed)
-        return every.at(seen.away(every, beyond))
+        is_clear = np.ones(len(rows.q), dtype=bool)
+        for number in np.unique(rows.run):
+            mine, here = rows.run == number, seen.run == number
+            count = np.concatenate([[0], np.cumsum(beyond[here])])
+            before, after = (count[np.searchsorted(seen.since[here], rows.since[mine] + side)]
+                             for side in (-UNFITTED_S, UNFITTED_S))  # fmt: skip
+            is_clear[mine] = before == after
+        names = ("torque", "q", "qd", "qdd", "sense", "since", "run", "stretch")
+        return replace(rows, **rows_of(rows, names, is_clear))
 
     def samples(self, j: int, drive: Drive) -> Samples:
         """Every row of the logs as logged, at a joint: torque, and what a drive would ask for."""
@@ -204,8 +206,7 @@ class Followed:
             torque = run.torque[:, j] * self.gain[j] if self.measured else torque
             stretch = stretch_of(number, time)
             out.append(np.array([torque, asked + carried, qd, time, 0 * time + number, stretch]))
-        torque, asked, qd, since, of, stretch = np.concatenate(out, axis=1)
-        return Samples(torque, asked, qd, since, of, stretch)
+        return Samples(*np.concatenate(out, axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,17 +225,6 @@ class Samples:
         """Standard deviation of torque that the drive does not explain, whatever the limits."""
         return 1.4826 * float(np.median(np.abs(self.torque - self.asked)))
 
-    def away(self, rows: Rows, at_limit: Array) -> Array:
-        """(R,) True for rows that no sample at a limit is near.  at_limit: (m,)."""
-        out = np.ones(len(rows.q), dtype=bool)
-        for number in np.unique(rows.run):
-            mine, here = rows.run == number, self.run == number
-            time = self.since[here]
-            count = np.concatenate([[0], np.cumsum(at_limit[here])])
-            ends = [np.searchsorted(time, rows.since[mine] + side * UNFITTED_S) for side in (-1, 1)]
-            out[mine] = count[ends[1]] == count[ends[0]]
-        return out
-
 
 @dataclass(frozen=True, eq=False)
 class Rows:
@@ -252,11 +242,6 @@ class Rows:
     run: Array
     stretch: Array
     curves: tuple[Any, ...]
-
-    def at(self, rows: Array) -> Rows:
-        """Some rows.  rows: (R,) mask."""
-        names = ("torque", "q", "qd", "qdd", "sense", "since", "run", "stretch")
-        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def command(self, late: float, order: int = 0) -> Array:
         """(R,) the command or its derivative, so late [s]."""
@@ -310,23 +295,8 @@ def solve(rows: Rows, given: Drive, beside: Sequence[str]) -> DriveFit:
         own[:, 2] = (change[:, ahead] - share * change[:, 1]) / value[1]
     drive = replace(given, stiffness=float(value[0]), damper=float(value[1]), ahead=share,
                     delay=late)  # fmt: skip
-    named = dict(zip(beside, value[2:].tolist(), strict=True))
-    change = np.hstack([own, change[:, 2:-1]])
-    return DriveFit(drive, change, np.unique(rows.stretch), named)
-
-
-def solve_plainly(rows: Rows, held: Rows, given: Drive, always: Sequence[str]) -> DriveFit:
-    """The same with no more beside than is there for sure, and predicts rows held out.
-
-    always: what is fitted in any case.
-    """
-    beside = [AHEAD, INERTIA, FRICTION]
-    found = solve(rows, given, beside)
-    for name in reversed([one for one in beside if one not in always]):
-        less = solve(rows, given, [one for one in found.beside if one != name])
-        if not (found.told(name, given) and predicts(held, found.rest(held), less.rest(held))):
-            found = less
-    return found
+    return DriveFit(drive, np.hstack([own, change[:, 2:-1]]), np.unique(rows.stretch),
+                    dict(zip(beside, value[2:].tolist(), strict=True)))  # fmt: skip
 
 
 def covariance_of(change: Array) -> Array:
@@ -366,8 +336,19 @@ def fit_drive(learnt: Followed, judged: Followed, j: int, given: Drive) -> Drive
     for _ in range(2):  # clear of what may be a limit, then of what is one
         if len(np.unique(rows.stretch)) < 2 * LEAST_BLOCKS or np.abs(rows.qd).max() < SLOWEST:
             return None
+        # No more beside the drive than is there for sure, and predicts rows held out.
         held = judged.clear(j, torque, speed)
-        found = solve_plainly(rows, held, given, learnt.beside)
+        found = solve(rows, given, [AHEAD, INERTIA, FRICTION])
+        for name in (FRICTION, INERTIA, AHEAD):
+            if name in learnt.beside:
+                continue
+            at, off = 2, found.drive.ahead - given.ahead
+            if name != AHEAD:
+                at, off = len(FITTED) + list(found.beside).index(name), found.beside[name]
+            sure = abs(off) > STANDS * float(np.sqrt(covariance_of(found.change)[at, at]))
+            less = solve(rows, given, [one for one in found.beside if one != name])
+            if not (sure and predicts(held, found.rest(held), less.rest(held))):
+                found = less
         seen = learnt.samples(j, found.drive)
         torque, slack = torque_limit(seen) if learnt.measured else NO_LIMIT
         speed, off = speed_limit(seen, torque) if learnt.measured else NO_LIMIT
@@ -409,13 +390,13 @@ def speed_limit(seen: Samples, torque: float) -> tuple[float, float]:
     """A speed near which torque falls below what the drive asks for, and its deviation."""
     asked = np.clip(seen.asked, -torque, torque)
     slack = STANDS * seen.noise + (BEYOND - 1.0) * float(np.abs(seen.torque).max())
-    falls = np.sign(seen.qd) * (asked - seen.torque) > slack
-    fast = np.abs(seen.qd) > LIMIT * np.abs(seen.qd).max()
-    if not stands(falls & fast, seen.stretch):
+    size = np.abs(seen.qd)
+    at_limit = np.sign(seen.qd) * (asked - seen.torque) > slack
+    at_limit &= size > LIMIT * size.max()
+    if not stands(at_limit, seen.stretch):
         return NO_LIMIT
-    found = np.abs(seen.qd[falls & fast])
-    count = len(np.unique(seen.stretch[falls & fast]))
-    return float(np.median(found)), float(np.std(found)) / math.sqrt(count)
+    count = len(np.unique(seen.stretch[at_limit]))
+    return float(np.median(size[at_limit])), float(np.std(size[at_limit])) / math.sqrt(count)
 
 
 def stands(rows: Array, stretch: Array) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,11 +13,12 @@ import numpy as np
 from minimax_cal.dynamics.logs import read_runs
 from minimax_cal.dynamics.logs.table import CURRENT, NOTHING, TORQUE, Run
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, link_parameters, regressor
+from minimax_cal.dynamics.rows import Arm, Logs, named_runs, prepare
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import grouped, number, numbers
 from minimax_cal.robots.gravity import weighed
-from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.urdf import has_links, load_urdf
 
 HEAVIEST, FARTHEST = 1e4, 10.0  # payload of the largest arms, several times over [kg, m]
@@ -35,6 +36,20 @@ def carried(text: str) -> Payload:
     if not number(mass) > 0.0 or len(parts) != 3 or not all(map(math.isfinite, parts)):
         raise OptionError(f"payload={text!r}: give KG@x,y,z in kg and m, as 2@0,0,0.05")
     return number(mass), (parts[0], parts[1], parts[2])
+
+
+@dataclass(frozen=True, eq=False)
+class MotionInputs:
+    """What a motion diagnosis begins with.
+
+    run_fold: (R,) in which a row of the logs is left out, negative for rows that are always fitted.
+    notices: of the files.
+    """
+
+    arm: Arm
+    logs: Logs
+    run_fold: Array
+    notices: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -75,6 +90,21 @@ class MotionKnown:
         metavar="NAME",
         many=tuple,
     )
+
+    def read_inputs(
+        self, robot: Robot | str | Path, logs: Sequence[Run | str | Path] | str | Path
+    ) -> MotionInputs:
+        """Arm, rows and folds of a diagnosis.  Raises CalibrationError."""
+        arm_of = load_robot(robot)
+        runs = runs_of(robot, arm_of, logs)
+        rows = prepare(self.loaded(runs))
+        arm = Arm.of(arm_of, self.gains(arm_of, runs), self.ratios(arm_of), self.load, rows)
+        held_out_runs = named_runs(rows, self.holdout_run)
+        if not (held_out_runs or 0.0 < self.holdout < 1.0):
+            raise OptionError(f"holdout={self.holdout:g} must lie between 0 and 1")
+        notices = dict.fromkeys(text for run in runs for text in run.notices)
+        run_fold = rows.split_folds(self.holdout, held_out_runs)
+        return MotionInputs(arm, rows, run_fold, tuple(notices))
 
     def loaded(self, runs: Sequence[Run]) -> list[Run]:
         """The runs with the mass at the flange, where they say none.  Raises OptionError."""
@@ -134,13 +164,6 @@ class MotionKnown:
         return np.array(np.broadcast_to(values, robot.joints))
 
 
-def joint_names(robot: Robot | str | Path) -> tuple[str, ...]:
-    """Names of the joints, of a URDF or MJCF."""
-    if isinstance(robot, Robot) or not has_links(robot):
-        return ()
-    return tuple(joint.name for joint in load_urdf(robot).chain if joint.moves)
-
-
 def read_logs(
     given: Robot | str | Path, logs: Sequence[Run | str | Path] | str | Path
 ) -> tuple[Run, ...]:
@@ -148,7 +171,12 @@ def read_logs(
     listed = [logs] if isinstance(logs, str | Path) else list(logs)
     paths = [one for one in listed if not isinstance(one, Run)]
     runs = [one for one in listed if isinstance(one, Run)]
-    return (*runs, *(read_runs(paths, joint_names(given)) if paths else ()))
+    if not paths:
+        return tuple(runs)
+    names: tuple[str, ...] = ()
+    if not isinstance(given, Robot) and has_links(given):  # a URDF or MJCF
+        names = tuple(joint.name for joint in load_urdf(given).chain if joint.moves)
+    return (*runs, *read_runs(paths, names))
 
 
 def runs_of(
@@ -200,62 +228,52 @@ SLACK = 0.01  # of the range of a joint: how far outside its limits it may be
 
 def against_robot(robot: Robot, run: Run) -> Run:
     """A run of the robot's joints, with notices of what does not fit it."""
-    return replace(run, notices=(*run.notices, *outside(robot, run), *odd_torque(robot, run)))
+    source, notices = run.source, list(run.notices)
 
-
-def outside(robot: Robot, run: Run) -> Iterator[str]:
-    """Notices of joints outside their limits."""
+    # Joints outside their limits.
     slack = SLACK * (robot.upper - robot.lower)
     slack = np.where(np.isfinite(slack), slack, 0.0)
     off = (run.q < robot.lower - slack) | (run.q > robot.upper + slack)
-    for j in np.flatnonzero(off.any(axis=0)):
+    for j in np.flatnonzero(off.any(axis=0)).tolist():
         low, high = run.q[:, j].min(), run.q[:, j].max()
         unit, scale = ("mm", 1e3) if robot.prismatic[j] else ("deg", 180.0 / np.pi)
-        yield (
-            f"{run.source}: joint {j + 1} moves from {scale * low:.4g} to {scale * high:.4g} "
+        notices.append(
+            f"{source}: joint {j + 1} moves from {scale * low:.4g} to {scale * high:.4g} "
             f"{unit}, outside the limits of {robot.name}; check its unit and zero"
         )
 
-
-def odd_torque(robot: Robot, run: Run) -> Iterator[str]:
-    """A notice where torques are not those that hold the arm's masses: order, sign, size."""
+    # Torques that are not those that hold the arm's masses: order, sign, size.
     if run.unit == NOTHING or not weighed(robot).all():
-        return
+        return replace(run, notices=tuple(notices))
     rows = np.unique(np.linspace(0, len(run.time) - 1, COMPARED).astype(int))
-    weight = gravity(robot, run.q[rows])
+    weight, torque = gravity(robot, run.q[rows]), run.torque[rows]
     span = np.where(robot.prismatic, 0.0, np.ptp(weight, axis=0))
     j = int(np.argmax(span))
     if span[j] < HEAVY:
-        return
-    alike = np.nan_to_num(np.corrcoef(weight[:, j], run.torque[rows].T)[0, 1:])
+        return replace(run, notices=tuple(notices))
+    alike = np.nan_to_num(np.corrcoef(weight[:, j], torque.T)[0, 1:])
     other = int(np.argmax(np.abs(alike)))
     if abs(alike[other]) > FOLLOWS and other != j:
-        yield (
-            f"{run.source}: the torque of joint {other + 1} follows gravity at joint {j + 1} "
+        notices.append(
+            f"{source}: the torque of joint {other + 1} follows gravity at joint {j + 1} "
             f"(correlation {alike[other]:.2f}, that of joint {j + 1} {alike[j]:.2f}); check the "
             "order of the joints"
         )
     elif alike[j] < -FOLLOWS:
-        yield (
-            f"{run.source}: the torque of joint {j + 1} has the sign of gravity, not of what holds "
+        notices.append(
+            f"{source}: the torque of joint {j + 1} has the sign of gravity, not of what holds "
             "it; check its sign"
         )
     elif run.unit == TORQUE:
         speed = np.gradient(run.q[:, j], run.time)[rows]
-        yield from odd_size(robot, run, j, weight[:, j], run.torque[rows, j], speed)
-
-
-def odd_size(
-    robot: Robot, run: Run, j: int, weight: Array, torque: Array, speed: Array
-) -> Iterator[str]:
-    """A notice where a joint's torque is another multiple of gravity's.  Arrays: (m,)."""
-    columns = np.column_stack([weight, np.sign(speed), speed, np.ones(len(speed))])
-    scale = float(np.linalg.lstsq(columns, torque, rcond=None)[0][0])
-    if not LEAST_SCALE < scale < MOST_SCALE:
-        yield (
-            f"{run.source}: the torque of joint {j + 1} is {scale:.3g} times what holds the masses "
-            f"of {robot.name}; a current? then name the columns i1_A, i2_A, ..."
-        )
+        columns = np.column_stack([weight[:, j], np.sign(speed), speed, np.ones(len(speed))])
+        scale = float(np.linalg.lstsq(columns, torque[:, j], rcond=None)[0][0])
+        if not LEAST_SCALE < scale < MOST_SCALE:
+            notices.append(
+                f"{source}: the torque of joint {j + 1} is {scale:.3g} times what holds the masses "
+                f"of {robot.name}; a current? then name the columns i1_A, i2_A, ..."
+            )
+    return replace(run, notices=tuple(notices))
 
 
 def gravity(robot: Robot, q: Array) -> Array:

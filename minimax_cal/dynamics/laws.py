@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -20,7 +21,7 @@ from minimax_cal.dynamics.regressor import PER_LINK
 from minimax_cal.dynamics.rows import CUTOFF_HZ, Scene, sense_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.tables import Table
+from minimax_cal.measuring.faults.fault import Amount
 
 Choice = Mapping[str, float]
 FINER = (0.75, 0.87, 1.15, 1.33)  # times a tuned number, in a finer search
@@ -149,6 +150,19 @@ class Law:
             return []
         return [one * sense if self.dry else one for one in self.per_unit({"v": v, **choice})]
 
+    def amounts(
+        self, value: Array, sigma: Array, log_unit: str, tuned: Choice = MappingProxyType({})
+    ) -> tuple[Amount, ...]:
+        """Its parameters (d,) in the unit of the log, and its tuned numbers."""
+        units = {"t": log_unit, "": "1"}
+        fitted = [
+            Amount(name, float(v), units.get(unit, unit.replace("t", log_unit, 1)), float(s))
+            for name, unit, v, s in zip(self.names, self.units, value, sigma, strict=False)
+        ]
+        shape = [Amount(name, v, self.tuned[name].unit if name in self.tuned else "1")
+                 for name, v in tuned.items()]  # fmt: skip
+        return (*fitted, *shape)
+
     def tried(self, scene: Scene, j: int) -> list[Choice]:
         """Tuned numbers to begin with."""
         if self.choices is not None:
@@ -212,11 +226,6 @@ def coupled_drive(scene: Scene, j: int, choice: Choice) -> Array:
     out = np.zeros((*scene.load.shape, 2))
     out[:, j], out[:, j - 1] = at_motor, sign * at_motor
     return out
-
-
-def by_sign(scene: Scene, j: int) -> list[Choice]:
-    """With the joint before it, or against it."""
-    return [{"sign": 1.0}, {"sign": -1.0}]
 
 
 def has_neighbour(scene: Scene, j: int) -> str:
@@ -318,8 +327,8 @@ EVERY = (
         nonnegative=True, held=(Element.ARMATURE,)),
     # its rotor is no law: of parallel joints it is what a rotor of one joint and the links are
     Law("coupled_drive", "drive that turns by two joints", (), ("Coulomb", "viscous"),
-        ("t", "t s/rad"), coupled_drive, choices=by_sign, needs=has_neighbour, nonnegative=True,
-        tuned={"sign": Tuned()}, why="give `coupling` in the robot file"),
+        ("t", "t s/rad"), coupled_drive, needs=has_neighbour, nonnegative=True,
+        tuned={"sign": Tuned((1.0, -1.0))}, why="give `coupling` in the robot file"),
     Law("drive_gain", "drive gain", ("load",), needs=has_gains, separate=KNOWN_LOAD,
         held=(Element.GAIN,), **SHARE,
         why="scales what is logged, and no motor of the model holds it: give drive_gain="),
@@ -386,15 +395,6 @@ def register_law(law: Law) -> Law:
         raise OptionError(f"law {law.name}: give a name and a unit for each of its parameters")
     LAWS[law.name], WORDS[law.name] = law, law.words
     return law
-
-
-def laws_table() -> Table:
-    """The laws for people: what each adds to a joint's torque, and where a simulator has it."""
-    rows = []
-    for law in LAWS.values():
-        form = ", ".join(law.torque).replace("np.", "") or None
-        rows.append((law.name, law.words, form, ", ".join(law.held) or None))
-    return Table.made("Laws", rows, "name | law | torque per unit | held by")
 
 
 @dataclass(frozen=True)

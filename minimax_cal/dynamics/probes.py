@@ -7,7 +7,7 @@ remembers, or that was taken for more than it is, does not make it small.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from minimax_cal.dynamics.model import Normal
 from minimax_cal.dynamics.rows import CUTOFF_HZ, FILTER_ORDER, SAMPLE_HZ, Scene
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.linear_algebra import project_out
 
 LEVEL = 0.02  # chance that noise alone is called structure, of all probes at all joints, at most:
 # what noise foretells of rows left out is below 0 on average
@@ -82,14 +83,24 @@ class Moments:
         return Moments(scene, joint, at, past, motion.q, motion.qd, motion.qdd, scene.sense[at],
                        load[at] / size)  # fmt: skip
 
-    def both_ways(self, columns: list[Array]) -> list[Array]:
-        """Columns alone and with the direction."""
-        return [f for one in columns for f in (one, one * self.sense[:, self.joint])]
+    @property
+    def own_sense(self) -> Array:
+        """(k,) of the joint."""
+        return self.sense[:, self.joint]
 
     @property
-    def others(self) -> Iterator[int]:
+    def own_speed(self) -> Array:
+        """(k,) of the joint."""
+        return self.qd[:, self.joint]
+
+    def both_ways(self, columns: list[Array]) -> list[Array]:
+        """Columns alone and with the direction."""
+        return [f for one in columns for f in (one, one * self.own_sense)]
+
+    @property
+    def others(self) -> list[int]:
         """The other joints."""
-        return (k for k in range(self.q.shape[1]) if k != self.joint)
+        return [k for k in range(self.q.shape[1]) if k != self.joint]
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,13 +157,13 @@ def by_angle(m: Moments) -> list[Array]:
     q = m.q[:, m.joint]
     if m.scene.arm.robot.prismatic[m.joint]:
         return m.both_ways(bumps(q))
-    slow = np.arange(1.0, WAVES + 1.0)
-    return [*waves(q, slow), *(f * m.sense[:, m.joint] for f in waves(q, slow[:2]))]
+    slow = waves(q, np.arange(1.0, WAVES + 1.0))
+    return [*slow, *(wave * m.own_sense for wave in slow[:4])]
 
 
 def by_fine_angle(m: Moments) -> list[Array]:
     """Waves of the angle as gears and motors have them, less what the filter takes."""
-    q, qd = m.q[:, m.joint], m.qd[:, m.joint]
+    q, qd = m.q[:, m.joint], m.own_speed
     far = max(float(np.ptp(q)), 1e-12)
     first = WAVES + 1.0 if not m.scene.arm.robot.prismatic[m.joint] else np.pi / far
     counts = first + np.arange(STEPS) * max(np.pi / far, (FINEST - first) / STEPS)
@@ -165,19 +176,20 @@ def by_fine_angle(m: Moments) -> list[Array]:
 
 def by_speed(m: Moments) -> list[Array]:
     """The joint's speed, the same both ways."""
-    return [b * m.sense[:, m.joint] for b in bumps(np.abs(m.qd[:, m.joint]))]
+    return [b * m.own_sense for b in bumps(np.abs(m.own_speed))]
 
 
 def by_direction(m: Moments) -> list[Array]:
     """The joint's speed, otherwise one way than the other."""
-    return bumps(np.abs(m.qd[:, m.joint]))
+    return bumps(np.abs(m.own_speed))
 
 
 def by_load(m: Moments) -> list[Array]:
     """The torque that the joint transmits, alone, with the direction and with the speed."""
-    size, sense, v = m.load[:, m.joint], m.sense[:, m.joint], m.qd[:, m.joint]
-    return [size, np.abs(size), size**2, size**3, np.abs(size) * sense, size**2 * sense,
-            np.abs(size) * v, size**2 * v, size * sense]  # fmt: skip
+    load, sense, v = m.load[:, m.joint], m.own_sense, m.own_speed
+    size, square = np.abs(load), load**2
+    return [load, size, square, load**3, size * sense, square * sense, size * v, square * v,
+            load * sense]  # fmt: skip
 
 
 def by_acceleration(m: Moments) -> list[Array]:
@@ -186,13 +198,13 @@ def by_acceleration(m: Moments) -> list[Array]:
     qdd = m.qdd[:, j]
     first = logs.start[logs.run_of(m.at)]
     earlier = [logs.motion.qdd[np.maximum(m.at - int(s * SAMPLE_HZ), first), j] for s in BEFORE_S]
-    return [qdd, np.abs(qdd), np.abs(qdd) * m.sense[:, j],
+    return [qdd, np.abs(qdd), np.abs(qdd) * m.own_sense,
             logs.slope(logs.motion.qdd[:, j])[m.at], *earlier]  # fmt: skip
 
 
 def by_others(m: Moments) -> list[Array]:
     """Where the other joints are, alone and two together, how they move and what they transmit."""
-    others = list(m.others)
+    others = m.others
     alone = [
         f
         for k in others
@@ -206,7 +218,7 @@ def by_others(m: Moments) -> list[Array]:
 
 def by_friction_of_others(m: Moments) -> list[Array]:
     """Friction and damping of this joint by what the other joints do."""
-    sense, v = m.sense[:, m.joint], m.qd[:, m.joint]
+    sense, v = m.own_sense, m.own_speed
     out = []
     for k in m.others:
         cos, sin = np.cos(m.q[:, k]), np.sin(m.q[:, k])
@@ -235,7 +247,7 @@ def by_memory(m: Moments) -> list[Array]:
     way = whole[m.at] / max(float(whole.max()), 1e-12)
     faded = [np.exp(-way / length) for length in (0.02, 0.06, 0.2, 0.6)]
     recent = [*m.past.recent[m.at, j].T]
-    by_way = [f for b in faded for f in (b * m.sense[:, j], b * m.qd[:, j])]
+    by_way = [f for b in faded for f in (b * m.own_sense, b * m.own_speed)]
     return [*by_way, *m.both_ways(recent), *m.past.lagged[m.at, j].T]
 
 
@@ -268,12 +280,14 @@ def unexplained(normal: Normal, value: Array) -> list[Unexplained]:
         if np.count_nonzero(mine) < 10 * BUMPS:
             continue
         basis = orthonormal(normal.raw[j, kept][:, value != 0.0])
-        left = less(basis, plain[mine])
+        left = project_out(plain[mine], basis)
         noise = float(np.sqrt(np.mean(plain[mine] ** 2)))
         moments = Moments.of(scene, j, scene.logs.picked[kept], past)
         group = np.unique(normal.group[mine], return_inverse=True)[1]
         for name, columns in DRIVERS.items():
-            fold = blocks(moments) if name == TIME else group
+            fold = group
+            if name == TIME:  # stretches: what follows time is not foretold far from where it was
+                fold = (scene.logs.since[moments.at] / BLOCK_S).astype(int) % TIME_FOLDS
             raw = np.stack(columns(moments), axis=1)
             share, p = foretold(beside(basis, raw), left, fold, group)
             p = min(1.0, p * len(DRIVERS) * scene.logs.joints)
@@ -283,21 +297,9 @@ def unexplained(normal: Normal, value: Array) -> list[Unexplained]:
     return sorted(out, key=lambda one: -one.share)
 
 
-def blocks(m: Moments) -> Array:
-    """(k,) folds of rows, each of short stretches of every run: what follows time is not foretold
-    far from where it was seen.
-    """
-    return (m.scene.logs.since[m.at] / BLOCK_S).astype(int) % TIME_FOLDS
-
-
-def less(basis: Array, rows: Array) -> Array:
-    """Rows (k, ...) less what the model imitates.  basis: (k, r) orthonormal."""
-    return np.asarray(rows - basis @ (basis.T @ rows))
-
-
 def beside(basis: Array, columns: Array) -> Array:
     """Columns (k, d) less what the model imitates, of unit size a row."""
-    field = less(basis, columns)
+    field = project_out(columns, basis)
     size = np.sqrt(np.mean(field**2, axis=0))
     least = RANK * np.sqrt(np.mean(columns**2, axis=0)) + 1e-300
     return np.asarray(field / np.maximum(size, least))
@@ -324,11 +326,7 @@ def foretold(field: Array, left: Array, fold: Array, group: Array) -> tuple[floa
         share = 1.0 - float(after.sum()) / max(float(before.sum()), 1e-300)
         if share > found[0]:
             gain = (before - after) / np.maximum(np.maximum(before, after), 1e-300)
-            found = share, student(gain)
+            count = len(gain)
+            unsure = float(gain.std(ddof=1)) / np.sqrt(count) if count > 1 else np.inf
+            found = share, float(stdtr(count - 1, -float(gain.mean()) / max(unsure, 1e-12)))
     return found
-
-
-def student(gain: Array) -> float:
-    """p-value of gains (g,) whose mean is above 0."""
-    unsure = float(gain.std(ddof=1)) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
-    return float(stdtr(len(gain) - 1, -float(gain.mean()) / max(unsure, 1e-12)))

@@ -69,6 +69,12 @@ class MotionEffect:
         return max(self.worth.items(), key=lambda item: item[1][0] ** 2 - item[1][1] ** 2)
 
     @property
+    def relative_gain(self) -> float:
+        """Fall of the squared RMS at the joint at which it closes most, over the square before."""
+        before, after = self.best[1]
+        return (before**2 - after**2) / max(before**2, 1e-300)
+
+    @property
     def words(self) -> str:
         """For people, as `joint flexibility at J2`; of a payload with the runs that carry it."""
         runs = ", ".join(p.name for p in self.parameters[PER_LINK:] if self.effect == "payload")
@@ -162,7 +168,11 @@ class MotionDiagnosis(Result):
             return f"Too little motion to name a cause: {self.too_little[0]}."
         said = SENTENCES[self.verdict]
         if self.main:
-            said += f": {grouped(self.main)}"
+            places: dict[str, set[str]] = {}
+            for one in sorted(self.main, key=lambda one: one.effect in USUAL):  # those come last
+                places.setdefault(WORDS[one.effect], set()).add(one.place)
+            named = (f"{words} at {', '.join(sorted(some))}" for words, some in places.items())
+            said += f": {'; '.join(named)}"
         if self.unexplained and self.verdict in ("named", "unknown"):
             said += f". {self.unexplained[0].sentence(self.unit)}"
         return f"{said}."
@@ -214,16 +224,6 @@ class MotionDiagnosis(Result):
         return {"arm": arm}
 
 
-def grouped(effects: tuple[MotionEffect, ...]) -> str:
-    """Effects in words, each once with all its places."""
-    places: dict[str, list[str]] = {}
-    for one in effects:
-        places.setdefault(WORDS[one.effect], []).append(one.place)
-    usual = [WORDS[name] for name in USUAL]
-    order = sorted(places, key=lambda words: words in usual)  # what a toolbox has comes last
-    return "; ".join(f"{words} at {', '.join(sorted(set(places[words])))}" for words in order)
-
-
 def table_by_joint(title: str, what: str, records: Sequence[object], of: str) -> Table:
     """A number of each joint, a row a record.  what: their names are; of: the attribute."""
     joints = range(len(getattr(records[0], of)))
@@ -244,28 +244,29 @@ def changed_joints(without: Array, with_it: Array) -> dict[str, tuple[float, flo
 
 def check_parts(found: MotionDiagnosis) -> None:
     """Raise ValueError for parts that are not of one arm, and for effects that do not exist."""
-    n, arm, run = found.arm.robot.joints, found.arm, found.held_run
-    bodies = [body for model in found.models for body in (model.body, model.context)]
+    arm, run, n = found.arm, found.held_run, found.arm.robot.joints
     sizes: list[tuple[Any, tuple[int, ...]]] = [
         *((row, (n,)) for row in (arm.ratio, arm.soft, arm.fastest, found.curves)),
         *((row, (n,)) for s in found.budget for row in (s.holdout_rms, s.holdout_rms_moving)),
         (arm.gain, (n if arm.shared else 0,)), (arm.known, (PER_LINK,)),
         *((part, (n, len(run.time))) for part in (run.measured, run.predicted)),
         *((p, (len(c.speed),)) for c in found.curves for p in (c.speed, c.torque, c.sigma)),
-        *((model.held, (n, len(YIELD))) for model in found.models),
-        *((body.usual, (n, 2)) for body in bodies),
-        *((body.rigid, (1 if len(body.rigid) == 1 else n, PER_LINK * n)) for body in bodies),
     ]  # fmt: skip
+    for model in found.models:
+        sizes.append((model.held, (n, len(YIELD))))
+        for body in (model.body, model.context):
+            joints = 1 if len(body.rigid) == 1 else n
+            sizes += [(body.usual, (n, 2)), (body.rigid, (joints, PER_LINK * n))]
     late = [model.delay for model in found.models]
     if any(np.shape(part) != size for part, size in sizes) or not np.isfinite(late).all():
         raise ValueError(f"its numbers are not of one arm of {n} joints and one run")
     if not all(one.worth for one in found.effects):
         raise ValueError("effects: one has no worth")
-    named = [one.effect for one in found.effects]
-    named += [other.effect for one in found.effects for other in one.alternatives]
-    named += [one.effect for one in found.not_testable]
-    if unknown := [name for name in named if name not in WORDS]:
-        raise ValueError(f"no effect {unknown[0]!r:.40}")
+    names = [one.effect for one in found.effects] + [one.effect for one in found.not_testable]
+    names += [other.effect for one in found.effects for other in one.alternatives]
+    for name in names:
+        if name not in WORDS:
+            raise ValueError(f"no effect {name!r:.40}")
 
 
 def load_motion(path: MotionDiagnosis | Path | str) -> MotionDiagnosis:

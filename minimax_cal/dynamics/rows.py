@@ -29,6 +29,7 @@ from minimax_cal.dynamics.regressor import (
     regressor,
 )
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.facts import APART
 from minimax_cal.robots.robot import Robot
 
@@ -46,6 +47,7 @@ GAP_S = 0.1  # longer steps of time are gaps
 EDGE_S = 0.4  # at the ends and about gaps, where the filter has little to look at
 AR_ORDER = 4  # of the noise of a joint: rows that went before and matter
 QUARTERS = 4  # groups of a trajectory, which err together
+NEVER_OUT = -1  # number of the fold of rows that are always fitted
 SAMPLED = ("torque", "since", "payload", "temperature", "gap")  # of Logs, beside the motion
 LEAST_NOISE = 1e-9  # of the largest torque: the noise of computed rows
 
@@ -101,21 +103,16 @@ def at_times(to: Array, time: Array, values: Array) -> Array:
     return np.stack([np.interp(to, time, column) for column in values.T], axis=1)
 
 
-@lru_cache(maxsize=4)
-def taps(rate: float) -> Array:
-    """(2 k + 1,) what the filter takes of the samples about one, as far as that can be seen."""
-    wide = int(4.0 * rate)
-    one = np.zeros(2 * wide + 1)
-    one[wide] = 1.0
-    found = smooth(one, rate)
-    seen = np.flatnonzero(np.abs(found) > LEAST_TAP * found[wide])
-    return found[seen[0] : seen[-1] + 1]
-
-
 @lru_cache(maxsize=32)
 def run_operator(samples: int) -> csr_array:
     """(rows, samples) the filter of one run, from samples to rows, as `smooth` treats its ends."""
-    weight = taps(SAMPLE_HZ)
+    # What the filter takes of the samples about one, as far as that can be seen.
+    wide = int(4.0 * SAMPLE_HZ)
+    impulse = np.zeros(2 * wide + 1)
+    impulse[wide] = 1.0
+    weight = smooth(impulse, SAMPLE_HZ)
+    seen = np.flatnonzero(np.abs(weight) > LEAST_TAP * weight[wide])
+    weight = weight[seen[0] : seen[-1] + 1]
     reach = len(weight) // 2
     rows = np.arange(0, samples, int(SAMPLE_HZ / ROW_HZ))
     at = rows[:, None] + np.arange(-reach, reach + 1)
@@ -225,9 +222,8 @@ class Logs:
     @cached_property
     def operator(self) -> csr_array:
         """(R, M) the filter, from samples to rows."""
-        long = np.diff(self.start)
-        parts = [run_operator(int(m)) for m in long]
-        return csr_array(block_diag(parts, format="csr"))
+        parts = map(run_operator, np.diff(self.start).tolist())
+        return csr_array(block_diag(list(parts), format="csr"))
 
     def filtered(self, columns: Array) -> Array:
         """Rows (R, ...) of columns (M, ...), filtered."""
@@ -240,44 +236,48 @@ class Logs:
 
     def earlier(self, late: float) -> Logs:
         """The logs with torques that were logged so much after the motion [s] put back in time."""
-        moved = [
-            scipy.interpolate.CubicSpline(since, torque)(np.clip(since + late, since[0], since[-1]))
-            for since, torque in ((self.since[run], self.torque[run]) for run in self.spans)
-        ]
+        moved = []
+        for run in self.spans:
+            since = self.since[run]
+            spline = scipy.interpolate.CubicSpline(since, self.torque[run])
+            moved.append(spline(np.clip(since + late, since[0], since[-1])))
         return replace(self, torque=np.concatenate(moved))
+
+    def split_folds(self, share: float, held_out_runs: Sequence[str] = ()) -> Array:
+        """(R,) fold of every row: runs named are one; else whole runs in turn, about a share each.
+
+        A single run is left out by quarters.
+        """
+        count = len(self.names)
+        if held_out_runs:
+            fold = [0 if name in held_out_runs else NEVER_OUT for name in self.names]
+            return np.array(fold)[self.run]
+        if count == 1:
+            return self.quarter
+        parts = min(count, max(2, round(1.0 / share)))
+        return (np.arange(count) % parts)[self.run]
 
     def only(self, runs: Sequence[int]) -> Logs:
         """The logs of some runs."""
         keep = np.concatenate([np.arange(len(self.since))[self.spans[r]] for r in runs])
-        long = np.diff(self.start)[list(runs)]
-        return replace(
-            self,
-            names=tuple(self.names[r] for r in runs),
-            motion=self.motion.at(keep),
-            start=np.concatenate([[0], np.cumsum(long)]),
-            **rows_of(self, SAMPLED, keep),
-        )
-
-
-def even_grid(run: Run) -> tuple[Array, float]:
-    """Even times (m,) [s] of a run, at a whole multiple of SAMPLE_HZ, and the rate [Hz]."""
-    rate = 1.0 / float(np.median(np.diff(run.time)))
-    rate = SAMPLE_HZ * max(1, round(rate / SAMPLE_HZ))
-    return np.arange(run.time[0], run.time[-1], 1.0 / rate), rate
+        start = np.cumsum([0, *np.diff(self.start)[list(runs)]])
+        names, motion = tuple(self.names[r] for r in runs), self.motion.at(keep)
+        rows = rows_of(self, SAMPLED, keep)
+        return replace(self, names=names, motion=motion, start=start, **rows)
 
 
 def prepare_run(run: Run) -> Logs:
     """One trajectory on the even grid."""
-    time, rate = even_grid(run)
-    every = int(rate / SAMPLE_HZ)
+    every = max(1, round(1.0 / float(np.median(np.diff(run.time))) / SAMPLE_HZ))
+    rate = SAMPLE_HZ * every
+    time = np.arange(run.time[0], run.time[-1], 1.0 / rate)
 
-    def even(values: Array) -> Array:
-        return scipy.interpolate.CubicSpline(run.time, values)(time)
+    def resampled(values: Array) -> Array:
+        return smooth(scipy.interpolate.CubicSpline(run.time, values)(time), rate)
 
-    q = smooth(even(run.q), rate)
-    qd = slope(q, rate) if run.qd is None else smooth(even(run.qd), rate)
-    qdd = slope(qd, rate) if run.qdd is None else smooth(even(run.qdd), rate)
-    torque = smooth(even(run.torque), rate)
+    q, torque = resampled(run.q), resampled(run.torque)
+    qd = slope(q, rate) if run.qd is None else resampled(run.qd)
+    qdd = slope(qd, rate) if run.qdd is None else resampled(run.qdd)
     motion = Motion(q, qd, qdd).at(slice(None, None, every))
     m, n = motion.q.shape
     temperature = np.full((m, n), np.nan)
@@ -288,33 +288,30 @@ def prepare_run(run: Run) -> Logs:
     begin, end = ([first, *run.time[wide + side], last] for side in (0, 1))
     since = time[::every, None]
     near = (since > np.array(begin) - EDGE_S) & (since < np.array(end) + EDGE_S)
-    return Logs(
-        (run.name,),
-        motion,
-        torque[::every],
-        time[::every] - run.time[0],
-        np.full(m, np.nan if run.payload is None else run.payload),
-        temperature,
-        np.array([0, m]),
-        np.asarray(near.any(axis=1)),
-        run.unit,
-    )
+    payload = np.full(m, np.nan if run.payload is None else run.payload)
+    return Logs((run.name,), motion, torque[::every], time[::every] - run.time[0], payload,
+                temperature, np.array([0, m]), np.asarray(near.any(axis=1)), run.unit)  # fmt: skip
 
 
 def prepare(runs: Sequence[Run]) -> Logs:
     """All trajectories on the even grid, one after another."""
     each = [prepare_run(run) for run in runs]
-
-    q, qd, qdd = (np.concatenate([getattr(one.motion, k) for one in each])
-                  for k in ("q", "qd", "qdd"))  # fmt: skip
+    motion = (np.concatenate([getattr(one.motion, k) for one in each]) for k in ("q", "qd", "qdd"))
     rows: dict[str, Any] = {k: np.concatenate([getattr(o, k) for o in each]) for k in SAMPLED}
-    return replace(
-        each[0],
-        names=tuple(one.names[0] for one in each),
-        motion=Motion(q, qd, qdd),
-        start=np.concatenate([[0], np.cumsum([len(one.since) for one in each])]),
-        **rows,
-    )
+    start = np.cumsum([0, *(len(one.since) for one in each)])
+    names = tuple(run.name for run in runs)
+    return replace(each[0], names=names, motion=Motion(*motion), start=start, **rows)
+
+
+def named_runs(logs: Logs, given: str | Sequence[str] | None) -> tuple[str, ...]:
+    """The runs that judge.  Raises OptionError."""
+    wanted = (given,) if isinstance(given, str) else tuple(given or ())
+    for name in wanted:
+        if name not in logs.names:
+            raise OptionError(f"holdout_run: no run {name!r}; choose {', '.join(logs.names)}")
+    if wanted and len(set(wanted)) == len(logs.names):
+        raise OptionError("holdout_run: leaves no run to learn from; name fewer")
+    return wanted
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,9 +338,8 @@ class Whitening:
 
     def white(self, rows: Array) -> Array:
         """Rows (N, ...) of all joints with a noise of unit variance and no memory."""
-        joints = range(len(self.kept))
-        parts = [self.white_joint(j, rows[self.joint == j]) for j in joints]
-        return np.concatenate(parts)
+        return np.concatenate([self.white_joint(j, rows[self.joint == j])
+                               for j in range(len(self.kept))])  # fmt: skip
 
     def white_joint(self, joint: int, rows: Array) -> Array:
         """The same of one joint's rows (k, ...)."""
@@ -357,8 +353,7 @@ class Whitening:
 
 def rms_by_joint(missed: Array, rows: Array | None = None) -> Array:
     """(n,) RMS of what is missed (R, n), of all rows or of some of each joint (R, n)."""
-    if rows is None:
-        return np.asarray(np.sqrt((missed**2).mean(axis=0)))
+    rows = np.ones_like(missed) if rows is None else rows
     count = np.maximum(rows.sum(axis=0), 1)
     return np.asarray(np.sqrt((missed**2 * rows).sum(axis=0) / count))
 
@@ -368,15 +363,6 @@ def standard_errors(values: Array) -> float:
     return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-300))
 
 
-def in_order(kept: Array, run: Array) -> Array:
-    """(N,) fitted rows of the same joint and run just before, at most AR_ORDER."""
-    out = np.zeros(kept.shape, dtype=int)
-    for i in range(THIN, kept.shape[1]):
-        before = i - THIN
-        out[:, i] = np.where(kept[:, before] & (run[i] == run[before]), out[:, before] + 1, 0)
-    return np.minimum(out, AR_ORDER)[kept]
-
-
 def whitening(logs: Logs, rest: Array) -> Whitening:
     """From what a fit leaves of the rows.  rest: (N,), joint by joint.
 
@@ -384,13 +370,16 @@ def whitening(logs: Logs, rest: Array) -> Whitening:
     a row after a gap has fewer before it.
     """
     kept = logs.fitted.T
-    place = in_order(kept, logs.run)
-    joint = np.nonzero(kept)[0]
-    size = np.abs(logs.y).max(axis=0)
-    weights = np.zeros((logs.joints, AR_ORDER + 1, AR_ORDER + 1))
-    for j in range(logs.joints):
-        weights[j] = predictors(rest[joint == j], place[joint == j], LEAST_NOISE * size[j])
-    return Whitening(kept, place, weights)
+    before = np.zeros(kept.shape, dtype=int)  # fitted rows of the same joint and run just before
+    for i in range(THIN, kept.shape[1]):
+        last = i - THIN
+        follows = kept[:, last] & (logs.run[i] == logs.run[last])
+        before[:, i] = np.where(follows, before[:, last] + 1, 0)
+    place = np.minimum(before, AR_ORDER)[kept]
+    joint, least = np.nonzero(kept)[0], LEAST_NOISE * np.abs(logs.y).max(axis=0)
+    weights = [predictors(rest[joint == j], place[joint == j], least[j])
+               for j in range(logs.joints)]  # fmt: skip
+    return Whitening(kept, place, np.array(weights))
 
 
 def predictors(rest: Array, place: Array, least: float) -> Array:
@@ -562,24 +551,20 @@ class Scene:
             out[run] = np.abs(q - np.take_along_axis(q, last, axis=0))
         return out
 
-    def along(self, motion: Motion) -> Array:
-        """(M, n) torque of the body along another motion, by recursion."""
-        return inverse_dynamics(self.arm.robot, motion, self.rigid[0].reshape(-1, PER_LINK))
-
     @cached_property
-    def as_moved(self) -> Array:
-        """(M, n) torque of the body by the same recursion as where the motion is shifted."""
-        return self.along(self.logs.motion)
+    def recursive_load(self) -> Array:
+        """(M, n) torque of the body by the recursion that `shifted` takes [N m, N]."""
+        links = self.rigid[0].reshape(-1, PER_LINK)
+        return inverse_dynamics(self.arm.robot, self.logs.motion, links)
 
     def shifted(self, by: Array) -> Array:
         """(M, n) torque of the body per unit of a shift `by` (M, n) of the motion [rad, m]."""
-        one = self.logs.motion
-        step = 1e-6 / max(float(np.abs(by).max()), 1e-300)
-        rate = self.logs.slope(by)
-        moved = Motion(
-            one.q + step * by, one.qd + step * rate, one.qdd + step * self.logs.slope(rate)
-        )
-        return (self.along(moved) - self.as_moved) / step / self.divisor
+        motion, links = self.logs.motion, self.rigid[0].reshape(-1, PER_LINK)
+        step, rate = 1e-6 / max(float(np.abs(by).max()), 1e-300), self.logs.slope(by)
+        moved = Motion(motion.q + step * by, motion.qd + step * rate,
+                       motion.qdd + step * self.logs.slope(rate))  # fmt: skip
+        torque = inverse_dynamics(self.arm.robot, moved, links)
+        return (torque - self.recursive_load) / step / self.divisor
 
     def with_body(self, rigid: Array, friction: Array) -> Scene:
         """The scene with another body and friction, its regressor kept."""

@@ -52,7 +52,8 @@ def test_a_bag_is_a_run(tmp_path: Path, plugin: str, ending: str) -> None:
     path = next(path.glob(ending)) if ending else path
     assert are_logs([path])
     (run,) = read_runs(path, ("turn", "lift"))
-    assert run.notices == (f"{path}: joints gripper are not the robot's: left out",)
+    (notice,) = run.notices
+    assert "gripper" in notice
     assert_allclose(run.time, t, atol=1e-6)
     assert_allclose(run.q, q[:, [1, 0]], atol=1e-12)
     assert_allclose(run.torque, tau[:, [1, 0]], atol=1e-12)

@@ -6,11 +6,12 @@ from dynamics.motions import simulated, three_joints
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.dynamics.probes import Past, beside, foretold, less
+from minimax_cal.dynamics.probes import Past, beside, foretold
 from minimax_cal.dynamics.regressor import Motion
 from minimax_cal.dynamics.rows import Arm, Scene, prepare, sense_of
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.linear_algebra import project_out
 
 GROUP = np.repeat(np.arange(12), 60)
 
@@ -52,7 +53,7 @@ def test_what_the_model_imitates_is_no_probe() -> None:
     assert_allclose(np.mean(field**2, axis=0), 1.0)
     imitated = beside(basis, basis @ rng.normal(size=(6, 2)))
     assert np.abs(imitated).max() < 1e-8
-    assert_allclose(less(basis, basis), 0.0, atol=1e-12)
+    assert_allclose(project_out(basis, basis), 0.0, atol=1e-12)
 
 
 def test_a_spring_with_play_stays_within_it() -> None:

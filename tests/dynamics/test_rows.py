@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from dynamics.motions import fourier, run_of
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from minimax_cal.dynamics.rows import (
@@ -13,6 +13,7 @@ from minimax_cal.dynamics.rows import (
     CUTOFF_HZ,
     EDGE_S,
     FILTER_ORDER,
+    NEVER_OUT,
     ROW_HZ,
     prepare,
     slope,
@@ -90,6 +91,16 @@ def test_runs_stand_one_after_another() -> None:
         assert_allclose(found, alone.y, rtol=0, atol=1e-12)
     assert (mine.moving == alone.moving).all()
     assert mine.names == ("run4",)
+
+
+def test_folds_are_whole_runs_and_quarters_of_a_single_one() -> None:
+    logs = prepare([log(seed)[0] for seed in (3, 4, 5)])
+    assert_array_equal(logs.split_folds(0.5), logs.run % 2)
+    assert_array_equal(logs.split_folds(0.2), logs.run)
+    named = logs.split_folds(0.2, [logs.names[1]])
+    assert_array_equal(named, np.where(logs.run == 1, 0, NEVER_OUT))
+    alone = logs.only([2])
+    assert_array_equal(alone.split_folds(0.2), alone.quarter)
 
 
 def remembering(rng: np.random.Generator, count: int) -> Array:

@@ -52,23 +52,23 @@ class LogFiles:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        keys = ("name", "source", "format", "rows", "duration_s", "step_s", "payload_kg", "columns")
-        rows = ((run.name, run.source, title, len(run.time), run.duration, run.step, run.payload,
-                 columns) for run, title, columns in zip(self.runs, self.titles, self.columns,
-                                                         strict=True))  # fmt: skip
-        told, first = [dict(zip(keys, row, strict=True)) for row in rows], self.runs[0]
-        return {"joints": first.joints, "unit": first.unit, "runs": told, "notices": self.notices}
+        rows = [
+            {"name": run.name, "source": run.source, "format": title, "rows": len(run.time),
+             "duration_s": run.duration, "step_s": run.step, "payload_kg": run.payload,
+             "columns": columns}
+            for run, title, columns in zip(self.runs, self.titles, self.columns, strict=True)
+        ]  # fmt: skip
+        first = self.runs[0]
+        return {"joints": first.joints, "unit": first.unit, "runs": rows, "notices": self.notices}
 
     def table(self) -> Table:
         """A row a run."""
-        told, first = self.to_dict()["runs"], self.runs[0]
-        rows = (
-            (run["name"], run["format"], run["rows"], run["duration_s"], 1.0 / run["step_s"],
-             run["columns"][0], first.unit)
-            for run in told
-        )  # fmt: skip
-        total, count = sum(run.duration for run in self.runs), len(told)
-        title = f"{count} run{'s' * (count > 1)}, {total:.1f} s, {first.joints} joints"
+        rows = ((run.name, title, len(run.time), run.duration, 1.0 / run.step, columns[0], run.unit)
+                for run, title, columns in zip(self.runs, self.titles, self.columns,
+                                               strict=True))  # fmt: skip
+        total, count = sum(run.duration for run in self.runs), len(self.runs)
+        joints = self.runs[0].joints
+        title = f"{count} run{'s' * (count > 1)}, {total:.1f} s, {joints} joints"
         columns = "run | format | rows | s | rows a second | first joint | torque in"
         return Table.made(title, rows, columns)
 
@@ -129,13 +129,20 @@ def import_logs(
         name = path.stem if [p.stem for p in files].count(path.stem) == 1 else str(path)
         for log in read_bag(path) if is_bag(path) else [read_table(path, given)]:
             drafts += map(checked, join_short_runs(drafts_of(in_order(log, joints), name)))
-    same_arm(drafts)
+    first = drafts[0]
+    for draft in drafts:
+        source, other = draft.log.source, first.log.source
+        if draft.q.shape[1] != first.q.shape[1] or (draft.log.sliding != first.log.sliding).any():
+            raise DataError(f"{source}: has other joints than {other}; give logs of one arm")
+        if draft.kind != first.kind:
+            what = "torques" if draft.kind == "tau" else "currents"
+            raise DataError(f"{source}: holds {what}, unlike {other}; log the same of all runs")
     check_repeats([draft for draft in drafts if draft.measured])
     return LogFiles(
         runs=tuple(draft.run() for draft in drafts),
         titles=tuple(draft.log.title for draft in drafts),
         columns=tuple((*d.log.headers["q"], *d.log.headers[d.kind]) for d in drafts),
-        sliding=drafts[0].log.sliding,
+        sliding=first.log.sliding,
     )
 
 
@@ -178,33 +185,15 @@ def order_by_names(names: Sequence[str], joints: Sequence[str]) -> list[int] | N
     return found if len(set(found)) == len(joints) else None
 
 
-def same_arm(drafts: Sequence[Draft]) -> None:
-    """Raise DataError where files have other joints than the first."""
-    first = drafts[0]
-    for draft in drafts:
-        if draft.q.shape[1] != first.q.shape[1] or (draft.log.sliding != first.log.sliding).any():
-            raise DataError(
-                f"{draft.log.source}: has other joints than {first.log.source}; give logs of one "
-                "arm"
-            )
-        if draft.kind != first.kind:
-            raise DataError(
-                f"{draft.log.source}: holds {'torques' if draft.kind == 'tau' else 'currents'}, "
-                f"unlike {first.log.source}; log the same of all runs"
-            )
-
-
 def are_logs(paths: Sequence[Path | str]) -> bool:
-    """Whether all files are logs of a motion, as their columns say."""
-    return all(is_bag(Path(path)) or looks_like_log(Path(path)) for path in paths)
-
-
-def looks_like_log(path: Path) -> bool:
-    """Whether the header of a text file, or its lack, is that of a log."""
-    try:
-        return is_log(log_sheet(path, LOOKED_AT).header)
-    except DataError:
-        return False
+    """Whether all files are logs of a motion, as the header of each, or its lack, says."""
+    for path in map(Path, paths):
+        try:
+            if not (is_bag(path) or is_log(log_sheet(path, LOOKED_AT).header)):
+                return False
+        except DataError:
+            return False
+    return True
 
 
 def runs_text(runs: Sequence[Run], sliding: Array) -> str:
@@ -214,47 +203,30 @@ def runs_text(runs: Sequence[Run], sliding: Array) -> str:
     """
     units = {run.unit for run in runs}
     if len(units) > 1 or len({run.joints for run in runs}) > 1:
-        raise DataError(
-            f"{runs[0].source}: the runs differ in joints or units; write one at a time"
-        )
-    n, many = runs[0].joints, len(runs) > 1
+        source = runs[0].source
+        raise DataError(f"{source}: the runs differ in joints or units; write one at a time")
     length = ["mm" if slides else "rad" for slides in sliding]
-    scale = np.where(sliding, 1e3, 1.0)
     drive = ["A" if TORQUE not in units else "N" if slides else "Nm" for slides in sliding]
     letter = "tau" if TORQUE in units else "i"
-    blocks: list[tuple[list[str], list[Array | None]]] = []
-    for kind, suffix in (("q", ""), ("qd", "_s"), ("qdd", "_s2")):
-        given = [getattr(run, kind) for run in runs]
-        if any(value is not None for value in given):
-            names = [f"{kind}{j + 1}_{u}{suffix}" for j, u in enumerate(length)]
-            blocks.append((names, [None if v is None else v * scale for v in given]))
-    blocks.append(([f"{letter}{j + 1}_{u}" for j, u in enumerate(drive)], [r.torque for r in runs]))
-    blocks += [block for block in (warmth(runs, n), payload(runs)) if block]
-    lines = [["run"] * many + ["t_s"] + [name for names, _ in blocks for name in names]]
-    for at, run in enumerate(runs):
-        empty = np.full((len(run.time), n), np.nan)
-        parts = [empty[:, : len(names)] if (own := values[at]) is None else own
-                 for names, values in blocks]  # fmt: skip
-        for time, row in zip(run.time, np.hstack(parts), strict=True):
+    names = {
+        **{kind: [f"{kind}{j}_{unit}{suffix}" for j, unit in enumerate(length, 1)]
+           for kind, suffix in (("q", ""), ("qd", "_s"), ("qdd", "_s2"))},
+        "torque": [f"{letter}{j}_{unit}" for j, unit in enumerate(drive, 1)],
+        "temperature": ["temperature_C"], "payload": ["payload_kg"],
+    }  # fmt: skip
+    if any(run.temperature is not None and run.temperature.ndim > 1 for run in runs):
+        names["temperature"] = [f"temperature{j + 1}_C" for j in range(len(length))]
+    kinds = [kind for kind in names if any(getattr(run, kind) is not None for run in runs)]
+    label = ["run"] * (len(runs) > 1)
+    lines = [[*label, "t_s", *(name for kind in kinds for name in names[kind])]]
+    for run in runs:
+        blocks = []
+        for kind in kinds:
+            value = getattr(run, kind)
+            value = np.nan if value is None else value[:, None] if np.ndim(value) == 1 else value
+            scale = np.where(sliding, 1e3, 1.0) if kind in ("q", "qd", "qdd") else 1.0
+            blocks.append(np.broadcast_to(value, (len(run.time), len(names[kind]))) * scale)
+        for time, row in zip(run.time, np.hstack(blocks), strict=True):
             cells = ["" if np.isnan(value) else f"{value:.9g}" for value in row]
-            lines.append([run.name] * many + [f"{time:.6f}"] + cells)
+            lines.append([*(run.name for _ in label), f"{time:.6f}", *cells])
     return csv_text(lines)
-
-
-def warmth(runs: Sequence[Run], n: int) -> tuple[list[str], list[Array | None]] | None:
-    """Columns of temperature, where runs have them alike."""
-    given = [run.temperature for run in runs if run.temperature is not None]
-    if not given:
-        return None
-    one = all(value.ndim == 1 for value in given)
-    names = ["temperature_C"] if one else [f"temperature{j + 1}_C" for j in range(n)]
-    wide = [None if r.temperature is None else np.atleast_2d(r.temperature.T).T for r in runs]
-    return names, [v if v is None or v.shape[1] == len(names) else np.repeat(v, n, 1) for v in wide]
-
-
-def payload(runs: Sequence[Run]) -> tuple[list[str], list[Array | None]] | None:
-    """The column of payload, where a run has one."""
-    if all(run.payload is None for run in runs):
-        return None
-    values = [None if r.payload is None else np.full((len(r.time), 1), r.payload) for r in runs]
-    return ["payload_kg"], list(values)

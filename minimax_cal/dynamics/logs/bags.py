@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.dynamics.logs.table import Log
+from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.optional import optional
 from minimax_cal.reading.formats import SI
@@ -33,24 +34,22 @@ def read_bag(path: Path) -> list[Log]:
     try:
         types = typesys.get_typestore(typesys.Stores.LATEST)
         with rosbags.AnyReader([path], default_typestore=types) as reader:
-            topics = {c.topic: c for c in reader.connections if c.msgtype == STATE}
-            messages = [
-                (c.topic, stamp, reader.deserialize(raw, STATE))
-                for c, stamp, raw in (reader.messages(list(topics.values())) if topics else ())
-            ]
+            found = [c for c in reader.connections if c.msgtype == STATE]
+            messages: dict[str, list[tuple[int, Any]]] = {c.topic: [] for c in found}
+            for c, stamp, raw in reader.messages(found) if found else ():
+                messages[c.topic].append((stamp, reader.deserialize(raw, STATE)))
     except Exception as error:  # of a broken file the parser of another package raises anything
         why = str(error).partition("\n")[0] or type(error).__name__
         raise DataError(f"{path}: cannot be read as a bag ({why})") from error
-    by_topic = {topic: [(t, m) for at, t, m in messages if at == topic] for topic in topics}
-    logs = {topic: log_of(path, topic, found) for topic, found in by_topic.items() if found}
-    with_effort = [log for log in logs.values() if "tau" in log.values]
+    logs = {topic: log_of(path, topic, some) for topic, some in messages.items() if some}
+    with_effort = {topic: log for topic, log in logs.items() if "tau" in log.values}
     if not with_effort:
         held = "no JointState" if not logs else f"no effort in {', '.join(logs)}"
         raise DataError(f"{path}: holds {held}; record /joint_states with effort")
     if len(with_effort) > 1:
-        names = " and ".join(topic for topic, log in logs.items() if "tau" in log.values)
+        names = " and ".join(with_effort)
         raise DataError(f"{path}: holds efforts in {names}; record one of them")
-    return with_effort
+    return list(with_effort.values())
 
 
 def log_of(path: Path, topic: str, messages: Sequence[tuple[int, Any]]) -> Log:
@@ -64,11 +63,11 @@ def log_of(path: Path, topic: str, messages: Sequence[tuple[int, Any]]) -> Log:
         raise DataError(f"{path}: {topic} holds no positions; record /joint_states with them")
     stamped = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for _, m in same]
     received = [1e-9 * (t - same[0][0]) for t, _ in same]
-    time = np.array(stamped if any(stamped) else received) - (stamped[0] if any(stamped) else 0.0)
-    rows = {kind: [np.asarray(getattr(m, member), dtype=float) for _, m in same]
-            for kind, member in MEMBERS.items()}  # fmt: skip
-    held = {kind: np.array(each) for kind, each in rows.items()
-            if all(len(row) == len(names) for row in each)}  # fmt: skip
+    time, held = np.array(stamped if any(stamped) else received), dict[str, Array]()
+    for kind, member in MEMBERS.items():
+        rows = [np.asarray(getattr(m, member), dtype=float) for _, m in same]
+        if all(len(row) == len(names) for row in rows):
+            held[kind] = np.array(rows)
     other = len(messages) - len(same)
     said = (
         f"{path}: {other} messages of {topic} have other joints than {', '.join(names)}: left out"
@@ -77,7 +76,7 @@ def log_of(path: Path, topic: str, messages: Sequence[tuple[int, Any]]) -> Log:
         source=str(path),
         title="ROS bag",
         line=np.arange(1, len(same) + 1),
-        values={"t": time, **held},
+        values={"t": time - time[0], **held},
         headers={kind: tuple(f"{MEMBERS[kind]} of {n}" for n in names) for kind in held},
         units={kind: (SI[kind],) * len(names) for kind in held},
         joints=names,

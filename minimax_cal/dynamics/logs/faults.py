@@ -54,16 +54,16 @@ def in_order_of_time(draft: Draft) -> Draft:
 
 def is_short(draft: Draft) -> bool:
     """Whether a run is too short to show anything."""
-    return len(draft.time) < LEAST_ROWS or draft.time[-1] - draft.time[0] < SHORTEST_RUN
+    return len(draft.time) < LEAST_ROWS or draft.duration < SHORTEST_RUN
 
 
-def long_enough(draft: Draft) -> Draft:
-    """A run of some length."""
+def check_length(draft: Draft) -> Draft:
+    """Raise DataError for a run that is too short."""
     if is_short(draft):
         raise draft.error(
-            f"{len(draft.time)} rows in {draft.time[-1] - draft.time[0]:.2f} s are too short for a "
-            f"run; log at least {SHORTEST_RUN:g} s of motion, or give short runs in one file with "
-            "a column run: they are joined"
+            f"{len(draft.time)} rows in {draft.duration:.2f} s are too short for a run; log at "
+            f"least {SHORTEST_RUN:g} s of motion, or give short runs in one file with a column "
+            "run: they are joined"
         )
     return draft
 
@@ -97,8 +97,7 @@ def joined(one: Draft, other: Draft) -> Draft:
 
 def sampled_well(draft: Draft) -> Draft:
     """Gaps, uneven steps and slow rates are said."""
-    step = np.diff(draft.time)
-    usual = float(np.median(step))
+    step, usual = np.diff(draft.time), draft.step
     gaps = np.flatnonzero(step > max(GAP, 3.0 * usual)) + 1
     uneven = np.mean(np.abs(step - usual) > UNEVEN * usual)
     said = []
@@ -115,22 +114,18 @@ def sampled_well(draft: Draft) -> Draft:
     return draft.saying(*said)
 
 
-def turning_columns(draft: Draft) -> Array:
-    """The joints whose columns are angles."""
-    return np.flatnonzero(~draft.log.sliding)
-
-
 def in_its_unit(draft: Draft) -> Draft:
     """Angles that are no degrees called radians, nor the reverse."""
-    turning = turning_columns(draft)
+    turning = np.flatnonzero(~draft.log.sliding)
     if not len(turning):
         return draft
-    q = draft.q[:, turning]
+    q, unit = draft.q[:, turning], draft.log.units["q"][turning[0]]
     jumps = np.diff(q, axis=0)
     fast = np.mean(np.abs(jumps) > FASTEST * np.diff(draft.time)[:, None], axis=0) > OFTEN
-    whole = np.abs(wrapped(jumps)).max(axis=0) < 0.5 * np.abs(jumps).max(axis=0)  # by whole turns
+    wrapped = (jumps + np.pi) % TURN - np.pi
+    whole = np.abs(wrapped).max(axis=0) < 0.5 * np.abs(jumps).max(axis=0)  # by whole turns
     far = np.abs(q).max(axis=0) > LARGEST
-    if draft.log.units["q"][turning[0]] == "rad" and (far.sum() > 1 or (far & fast & ~whole).any()):
+    if unit == "rad" and (far.sum() > 1 or (far & fast & ~whole).any()):
         at = int(np.argmax(np.abs(q).max(axis=0)))
         row = int(np.argmax(np.abs(q[:, at])))
         name = draft.column("q", int(turning[at]))
@@ -140,7 +135,7 @@ def in_its_unit(draft: Draft) -> Draft:
             row,
         )
     span = float(np.ptp(q, axis=0).max())
-    if draft.log.units["q"][turning[0]] == "deg" and 0.0 < span < LEAST_SPAN:
+    if unit == "deg" and 0.0 < span < LEAST_SPAN:
         raise draft.error(
             f"no joint moves more than {np.degrees(span):.2g} deg; radians? then name the columns "
             "q1_rad, q2_rad, ...; else log a larger motion"
@@ -148,16 +143,11 @@ def in_its_unit(draft: Draft) -> Draft:
     return draft
 
 
-def wrapped(angle: Array) -> Array:
-    """Angles in -pi to pi."""
-    return (angle + np.pi) % TURN - np.pi
-
-
 def unwrapped(draft: Draft) -> Draft:
     """Angles without jumps by whole turns; jumps by less than a turn are none of an arm."""
     q = draft.q.copy()
     step = np.diff(draft.time)
-    for j in turning_columns(draft).tolist():
+    for j in np.flatnonzero(~draft.log.sliding).tolist():
         turns = np.round(np.diff(q[:, j]) / TURN) * (step < GAP)  # a gap may hold any motion
         if turns.any():
             q[1:, j] -= TURN * np.cumsum(turns)
@@ -202,35 +192,39 @@ def is_alive(draft: Draft) -> Draft:
     return draft
 
 
-def changes(draft: Draft, speed: Array) -> tuple[Array, Array]:
-    """Mean speeds (m', n) over SMOOTHED about some rows: from the joints, and as logged.
-
-    speed: (m, n).  Stamps that jitter hardly matter over so many rows; gaps are left out.
-    """
-    half = max(1, round(0.5 * SMOOTHED / float(np.median(np.diff(draft.time)))))
-    took = draft.time[2 * half :] - draft.time[: -2 * half]
-    near = took < 2.0 * np.median(took)
-    change = (draft.q[2 * half :] - draft.q[: -2 * half]) / took[:, None]
-    wide, sums = 2 * half + 1, np.pad(speed, ((1, 0), (0, 0))).cumsum(axis=0)
-    mean = (sums[wide:] - sums[:-wide]) / wide
-    return change[near], mean[near]
-
-
 def matches_its_speed(draft: Draft) -> Draft:
     """Logged speeds that are the change of their joints."""
     if draft.qd is None:
         return draft
-    change, speed = changes(draft, draft.qd)
-    joints = np.flatnonzero(moving(draft))
-    d, v = change[:, joints], speed[:, joints]
+    # Mean speeds from the joints and as logged: stamps that jitter hardly matter over so many rows.
+    half = max(1, round(0.5 * SMOOTHED / draft.step))
+    took = draft.time[2 * half :] - draft.time[: -2 * half]
+    near = took < 2.0 * np.median(took)  # gaps are left out
+    joints, wide = np.flatnonzero(moving(draft)), 2 * half + 1
+    sums = np.pad(draft.qd, ((1, 0), (0, 0))).cumsum(axis=0)
+    change = (draft.q[2 * half :] - draft.q[: -2 * half]) / took[:, None]
+    mean = (sums[wide:] - sums[:-wide]) / wide
+    d, v = change[near][:, joints], mean[near][:, joints]
     norm = np.linalg.norm(d, axis=0)[:, None] * np.linalg.norm(v, axis=0)
     alike = d.T @ v / norm  # (of change, of speed)
     own = np.diag(alike)
-    if (own > AGREES).all():
-        return same_scale(draft, joints, (d * v).sum(axis=0) / (v * v).sum(axis=0))
-    at = int(np.argmin(own))
+    ratio = (d * v).sum(axis=0) / (v * v).sum(axis=0)
+    is_alike = bool((own > AGREES).all())
+    if is_alike and np.abs(ratio - 1.0).max() < SAME_SCALE:
+        return draft
+    at = int(np.argmax(np.abs(np.log(ratio))) if is_alike else np.argmin(own))
     j = int(joints[at])
     name, speed_name = draft.column("q", j), draft.column("qd", j)
+    if is_alike:
+        called, by = draft.log.units["q"][j], float(ratio[at])
+        mend = "check the unit of both and of time"
+        if abs(by / IN_DEGREES - 1.0) < SAME_SCALE and called == "rad":
+            mend = f"{name} is in degrees: name the columns q1_deg, q2_deg, ..."
+        elif abs(by * IN_DEGREES - 1.0) < SAME_SCALE:
+            mend = f"{speed_name} is in degrees a second: name the columns qd1_deg_s, ..."
+            if called == "deg":
+                mend = f"{name} is in radians: name the columns q1_rad, q2_rad, ..."
+        raise draft.error(f"{name} changes by {by:.3g} times what {speed_name} says; {mend}")
     other = int(np.argmax(np.abs(alike[:, at])))
     if own[at] < -AGREES:
         raise draft.error(
@@ -243,25 +237,6 @@ def matches_its_speed(draft: Draft) -> Draft:
         )
     text = f"column {speed_name} does not follow {name} (correlation {own[at]:.2f})"
     return replace(draft, qd=None, qdd=None).saying(f"{text}: logged speeds are not used")
-
-
-def same_scale(draft: Draft, joints: Array, ratio: Array) -> Draft:
-    """The draft, if its speeds have the size of the joints' changes.  ratio: of change to speed."""
-    off = np.abs(ratio - 1.0)
-    if off.max() < SAME_SCALE:
-        return draft
-    at = int(np.argmax(np.abs(np.log(ratio))))
-    j, by = int(joints[at]), float(ratio[at])
-    name, speed = draft.column("q", j), draft.column("qd", j)
-    called = draft.log.units["q"][j]
-    mend = "check the unit of both and of time"
-    if abs(by / IN_DEGREES - 1.0) < SAME_SCALE and called == "rad":
-        mend = f"{name} is in degrees: name the columns q1_deg, q2_deg, ..."
-    elif abs(by * IN_DEGREES - 1.0) < SAME_SCALE:
-        mend = f"{speed} is in degrees a second: name the columns qd1_deg_s, ..."
-        if called == "deg":
-            mend = f"{name} is in radians: name the columns q1_rad, q2_rad, ..."
-    raise draft.error(f"{name} changes by {by:.3g} times what {speed} says; {mend}")
 
 
 def is_measured(draft: Draft) -> Draft:
@@ -278,53 +253,45 @@ def is_measured(draft: Draft) -> Draft:
             )
     if draft.log.simulated:
         return draft
-    moved = np.flatnonzero(moving(draft)).tolist()
-    quiet = [j for j in moved if noise_of(draft.torque[:, j]) < LEAST_NOISE]
-    if not quiet:
-        return draft
-    names = ", ".join(draft.column(draft.kind, j) for j in quiet)
-    return draft.saying(
-        f"no noise in {names}: a command, a filtered or a simulated signal; log the measured one"
-    )
-
-
-def noise_of(torque: Array) -> float:
-    """White noise of a torque (m,), of its span: from what high differences leave of it."""
-    values = torque[np.append(True, np.diff(torque) != 0.0)]  # drives that report more slowly
-    if len(values) < LEAST_ROWS:
-        return np.inf
-    left = np.median(np.abs(np.diff(values, DIFFERENCE)))
-    return float(1.4826 * left / np.sqrt(comb(2 * DIFFERENCE, DIFFERENCE)) / np.ptp(values))
+    quiet, order = [], 2 * DIFFERENCE
+    for j in np.flatnonzero(moving(draft)).tolist():
+        torque = draft.torque[:, j]
+        torque = torque[np.append(True, np.diff(torque) != 0.0)]  # drives that report more slowly
+        if len(torque) < LEAST_ROWS:
+            continue
+        noise = 1.4826 * np.median(np.abs(np.diff(torque, DIFFERENCE)))
+        if noise / np.sqrt(comb(order, DIFFERENCE)) / np.ptp(torque) < LEAST_NOISE:
+            quiet.append(draft.column(draft.kind, j))
+    said = "a command, a filtered or a simulated signal; log the measured one"
+    return draft.saying(*([f"no noise in {', '.join(quiet)}: {said}"] if quiet else []))
 
 
 def is_unclipped(draft: Draft) -> Draft:
     """Torques that stop at a limit while the arm moves are said."""
-    least = max(CLIPPED_ROWS, round(CLIPPED_S / float(np.median(np.diff(draft.time)))))
+    least = max(CLIPPED_ROWS, round(CLIPPED_S / draft.step))
     for j, torque in enumerate(draft.torque.T):
         start = np.flatnonzero(np.append(True, np.diff(torque) != 0.0))
         length = np.diff(np.append(start, len(torque)))
-        value = torque[start]
-        high = np.abs(value) >= 0.999 * np.abs(torque).max()
+        high = np.abs(torque[start]) >= 0.999 * np.abs(torque).max()
         limit = max(least, 2 * int(length[~high].max(initial=0)))
-        flat = [
-            (a, a + n)
+        flat = {
+            a: n
             for a, n in zip(start[high], length[high], strict=True)
             if n >= limit and np.ptp(draft.q[a : a + n], axis=0).max() > 0.1 * MOVES
-        ]
+        }
         if flat:
-            count = sum(end - first for first, end in flat)
-            at = f"{torque[flat[0][0]]:.4g} {'N m' if draft.kind == 'tau' else 'A'}"
+            rows = np.array(list(flat))
+            at = f"{torque[rows[0]]:.4g} {'N m' if draft.kind == 'tau' else 'A'}"
             draft = draft.saying(
-                f"column {draft.column(draft.kind, j)} is cut off at {at} in {count} rows "
-                f"({draft.lines(np.array([first for first, _ in flat]))}): a limit of the drive; "
-                "move more slowly there"
+                f"column {draft.column(draft.kind, j)} is cut off at {at} in {sum(flat.values())} "
+                f"rows ({draft.lines(rows)}): a limit of the drive; move more slowly there"
             )
     return draft
 
 
 CHECKS: tuple[Callable[[Draft], Draft], ...] = (  # in this order: each relies on those before
     in_order_of_time,
-    long_enough,
+    check_length,
     sampled_well,
     in_its_unit,
     unwrapped,

@@ -126,16 +126,11 @@ class Log:
         def some(columns: tuple[str, ...]) -> tuple[str, ...]:
             return tuple(columns[i] for i in at) if len(columns) == n else columns
 
-        return replace(
-            self,
-            values={
-                kind: value[:, at] if value.ndim == 2 and value.shape[1] == n else value
-                for kind, value in self.values.items()
-            },
-            headers={kind: some(names) for kind, names in self.headers.items()},
-            units={kind: some(names) for kind, names in self.units.items()},
-            joints=some(self.joints),
-        )
+        values = {kind: value[:, at] if value.shape[1:] == (n,) else value
+                  for kind, value in self.values.items()}  # fmt: skip
+        headers = {kind: some(names) for kind, names in self.headers.items()}
+        units = {kind: some(names) for kind, names in self.units.items()}
+        return replace(self, values=values, headers=headers, units=units, joints=some(self.joints))
 
 
 def log_sheet(path: Path, lines: int | None = None) -> Sheet:
@@ -221,8 +216,15 @@ class Columns:
             values[kind] = block[:, 0] if single else block
         values["t"] = self.time(values, units.get("t", ("",))[0])
         run, sheet = self.of_kind("run"), self.sheet
-        whole = np.delete(np.arange(len(sheet.line)), list(self.broken)).tolist()
-        kept = whole if self.broken else slice(None)
+        torn = sorted(self.broken)
+        if len(torn) > max(1.0, MOST_TORN * len(sheet.line)):
+            raise self.error(self.broken[torn[0]], sheet.line[torn[0]])
+        notices = list(sheet.left_out(int(sheet.line[row]) for row in self.broken))
+        if self.form.strict:  # columns that look like those of the format but are not
+            notices += [f"{sheet.path}: column {name} is not used{near(name, KNOWN)}"
+                        for i, name in enumerate(sheet.header) if i not in self.places]  # fmt: skip
+        whole = np.delete(np.arange(len(sheet.line)), torn).tolist()
+        kept = whole if torn else slice(None)
         return Log(
             source=str(sheet.path),
             title=self.form.title,
@@ -232,7 +234,7 @@ class Columns:
             units=units,
             joints=self.names(),
             run=tuple(sheet.cells[row][run[0]] for row in whole) if run else (),
-            notices=(*self.left_out(), *self.unused()),
+            notices=tuple(notices),
             simulated=sheet.simulated,
         )
 
@@ -331,12 +333,6 @@ class Columns:
                     )
         return tuple(first)
 
-    def unused(self) -> list[str]:
-        """Notices of columns that look like those of the format but are not."""
-        left = [name for i, name in enumerate(self.sheet.header) if i not in self.places]
-        said = [f"{self.sheet.path}: column {n} is not used{near(n, KNOWN)}" for n in left]
-        return said if self.form.strict else []
-
     def block(self, at: int) -> Array:
         """(m, 1) numbers of a column, or (m, k) of one that holds a list in each cell."""
         if self.sheet.block is not None:
@@ -379,37 +375,19 @@ class Columns:
             return np.asarray(sec - sec[np.isfinite(sec)][:1].sum() + 1e-9 * fine)
         if "t" not in values:
             raise DataError(f"{path}:1: no column of time; name it t_s")
-        time = values["t"] - values["t"][np.isfinite(values["t"])][:1].sum()
-        step = typical_step(time)
-        other = next((u for u, f in TIMES.items() if is_step(f * step)), "")
+        finite = values["t"][np.isfinite(values["t"])]
+        time, steps = values["t"] - finite[:1].sum(), np.abs(np.diff(finite))
+        step = float(np.median(steps[steps > 0.0])) if steps.any() else 0.0
+        fits = [u for u, f in TIMES.items() if SHORTEST_STEP <= f * step <= LONGEST_STEP]
+        other = fits[0] if fits else ""
         unit = unit or other
-        if step > 0.0 and not is_step(TIMES.get(unit, np.nan) * step):
+        if step > 0.0 and unit not in fits:
             mend = f"; name it t_{other} if it is in {other}" if other else "; log 50 rows a second"
             raise DataError(
                 f"{path}: column of time: steps of {step:.3g} {unit or '(no unit)'} are no "
                 f"log of a motion{mend}"
             )
         return np.asarray(TIMES.get(unit, 1.0) * time)
-
-    def left_out(self) -> list[str]:
-        """What is said of rows that are left out.  Raises DataError for too many."""
-        path, line = self.sheet.path, self.sheet.line
-        if len(self.broken) > max(1.0, MOST_TORN * len(line)):
-            row, what = next(iter(sorted(self.broken.items())))
-            raise DataError(f"{path}:{line[row]}: {what}")
-        return list(self.sheet.left_out(int(line[row]) for row in self.broken))
-
-
-def typical_step(time: Array) -> float:
-    """Median of the steps of time that are some; 0 where there are none."""
-    steps = np.abs(np.diff(time[np.isfinite(time)]))
-    steps = steps[steps > 0.0]
-    return float(np.median(steps)) if len(steps) else 0.0
-
-
-def is_step(seconds: float) -> bool:
-    """Whether rows of a log may follow each other so."""
-    return SHORTEST_STEP <= seconds <= LONGEST_STEP
 
 
 # ---- a run in the making -------------------------------------------------------------------------
@@ -454,13 +432,9 @@ class Draft(Run):
         """The name of a joint's column in the file."""
         return self.log.headers[kind][joint]
 
-    def line(self, row: int) -> int:
-        """The line of the file of a row."""
-        return int(self.log.line[self.row[row]])
-
     def error(self, text: str, row: int | None = None) -> DataError:
         """What is wrong, and where."""
-        at = "" if row is None else f":{self.line(row)}"
+        at = "" if row is None else f":{self.log.line[self.row[row]]}"
         inside = f"run {self.name}: " if self.log.run and row is None else ""
         return DataError(f"{self.log.source}{at}: {inside}{text}")
 
@@ -470,7 +444,7 @@ class Draft(Run):
 
     def lines(self, rows: Array) -> str:
         """Some lines of the file, to people."""
-        some = ", ".join(str(self.line(row)) for row in rows[:SHOWN])
+        some = ", ".join(map(str, self.log.line[self.row[rows[:SHOWN]]]))
         return f"line{'s' * (len(rows) > 1)} {some}" + (" ..." if len(rows) > SHOWN else "")
 
     def run(self) -> Run:
@@ -482,33 +456,31 @@ class Draft(Run):
                 f"the payload changes from {payload[0]:g} to {payload[-1]:g} kg within a run; give "
                 "each payload a run of its own"
             )
-        warmth = values.get("temperature")
+        warmth, command = values.get("temperature"), values.get(COMMANDS)
+        if command is not None:
+            if command.shape == self.q.shape and np.isfinite(command).all():
+                command = command + TURN * np.round((self.q - command) / TURN)  # less whole turns
+            else:
+                command = None
         more = {
             "torque": self.torque if self.measured else 0.0 * self.torque,
             "payload": payload[0] if payload else None,
             "temperature": warmth if warmth is not None and np.isfinite(warmth).all() else None,
-            "command": commanded(values.get(COMMANDS), self.q),
+            "command": command,
         }
         return Run(**{each.name: getattr(self, each.name) for each in fields(Run)} | more)
-
-
-def commanded(values: Array | None, q: Array) -> Array | None:
-    """Commanded joint values (m, n) without the whole turns by which they differ from q (m, n)."""
-    if values is None or values.shape != q.shape or not np.isfinite(values).all():
-        return None
-    return values + TURN * np.round((q - values) / TURN)
 
 
 def drafts_of(log: Log, name: str) -> list[Draft]:
     """The trajectories of a log, in the order of their first rows.  Raises DataError."""
     kind = torque_kind(log)
     values = log.values
-    labels = np.array(log.run) if log.run else np.full(len(log.line), "")
-    needed = (values["t"][:, None], values["q"], values[kind])
-    whole = np.all([np.isfinite(block).all(axis=1) for block in needed], axis=0)
+    labels = np.array(log.run or [""] * len(log.line))
+    needed = {"time": values["t"][:, None], "joint value": values["q"], "torque": values[kind]}
+    held = {what: np.isfinite(block).all(axis=1) for what, block in needed.items()}
+    whole = np.all(list(held.values()), axis=0)
     if not whole.any():
-        lost = next(b for b in needed if not np.isfinite(b).all(axis=1).any())
-        what = "time" if lost is needed[0] else "joint value" if lost is needed[1] else "torque"
+        what = next((what for what, rows in held.items() if not rows.any()), "value")
         raise DataError(f"{log.source}: no row holds a {what} of every joint; log them together")
     out = []
     for label in dict.fromkeys(labels):

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import scipy
 
-from minimax_cal.dynamics.diagnose import named_runs
 from minimax_cal.dynamics.drives import command_of
 from minimax_cal.dynamics.given import MotionKnown
 from minimax_cal.dynamics.logs.table import NOTHING, Run
@@ -20,6 +19,7 @@ from minimax_cal.dynamics.rows import (
     Logs,
     Scene,
     at_times,
+    named_runs,
     prepare,
     rms_by_joint,
 )
