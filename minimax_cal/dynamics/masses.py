@@ -163,7 +163,7 @@ def find_payloads(columns: Columns, terms: Sequence[Term]) -> list[Term]:
     def residuals_of(value: Array) -> Array:
         """(N,) of last links (10 r,) of the runs."""
         moved = (link * value.reshape(count, -1)[run]).sum(axis=1)
-        return np.asarray(error - project_out(moved), basis)
+        return np.asarray(error - project_out(moved, basis))
 
     # Agglomeration: the two loads that differ least are joined [Wald test of their difference].
     label = np.arange(count)  # which load a run has
