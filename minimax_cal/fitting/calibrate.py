@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from minimax_cal.fitting.checks import check_plausible, coarse_joints
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.floor import with_instrument
+from minimax_cal.fitting.geometry_fit import MIN_TARGET_POSES
 from minimax_cal.fitting.judged import Judged, Parts
 from minimax_cal.fitting.options import (
     Loss,
@@ -35,7 +36,7 @@ from minimax_cal.fitting.several.options import (
     with_others,
 )
 from minimax_cal.fitting.several.result import RelativeCalibration
-from minimax_cal.fitting.solve import LEAST_POSES, fit_cell
+from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
@@ -222,15 +223,18 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     off = (*distance_faults(data), *noise(data))
     doubts = (*doubts, *(fault.text for fault in off))
     notices = (*data.notices, *filter(None, doubts), *said)
-    few = train.seen.sum(axis=0) < LEAST_POSES
+    few = train.seen.sum(axis=0) < MIN_TARGET_POSES
     if few.any() and not few.all():
-        names, why = ", ".join(np.array(data.target_names)[few]), f"fewer than {LEAST_POSES} poses"
-        notices += (f"left out: {names}, measured at fewer than {LEAST_POSES} training poses",)
+        names, why = (
+            ", ".join(np.array(data.target_names)[few]),
+            f"fewer than {MIN_TARGET_POSES} poses",
+        )
+        notices += (f"left out: {names}, measured at fewer than {MIN_TARGET_POSES} training poses",)
         data = set_aside(data, data.seen & few, f"the fit has {why} with this target", TOOL)
         data, train, held = (part.keep(~few) for part in (data, train, held))
         objective_of(options.objective, data)
     near = EVERYWHERE
-    if len(np.unique(groups(train))) >= LEAST_POSES:
+    if len(np.unique(groups(train))) >= MIN_TARGET_POSES:
         given = check_plausible(robot, data)
         near = given.state.rotation
         notices += tuple(filter(None, [coarse_joints(robot, data, given)]))

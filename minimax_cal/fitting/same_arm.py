@@ -9,8 +9,8 @@ import numpy as np
 from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.checks import check_plausible
 from minimax_cal.fitting.floor import SIGMAS, declared
+from minimax_cal.fitting.geometry_fit import MIN_TARGET_POSES
 from minimax_cal.fitting.outcome import MAX_MISS_OF_REACH
-from minimax_cal.fitting.solve import LEAST_POSES
 from minimax_cal.fitting.stations import stationed
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
@@ -32,7 +32,7 @@ def check_arm(robot: Robot, data: Measurements) -> None:
     For the slips of `check_plausible`, and where they miss wherever base, targets and the zeros of
     the joints are: those may move, by a knock or a service.
     """
-    if data.poses < LEAST_POSES:
+    if data.poses < MIN_TARGET_POSES:
         return
     data = stationed(robot, data, np.ones(data.poses, dtype=bool))
     given = check_plausible(robot, data)

@@ -18,6 +18,7 @@ from minimax_cal.fitting.coaxial import (
     with_normal_turned,
 )
 from minimax_cal.fitting.found import Parameter, link_by_link
+from minimax_cal.fitting.geometry_fit import MAX_PRIOR_ROUNDS, MIN_NOISE
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.options import QpSolver, freed
 from minimax_cal.fitting.several.identify import (
@@ -38,7 +39,7 @@ from minimax_cal.fitting.several.options import (
 from minimax_cal.fitting.several.robust import ALIKE, Shares, of_loss, with_loss
 from minimax_cal.fitting.several.stack import Known, Squares, Stack, started
 from minimax_cal.fitting.several.worst import Worst, WorstOverNoise, least_worst
-from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS, without_resting
+from minimax_cal.fitting.solve import without_bounded_effects
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.instrument import METRE, Instrument
@@ -235,7 +236,7 @@ def of_worst(fit: InstrumentFit, options: RelativeOptions) -> InstrumentFit:
     of, names = fit.stack.part_of_rows(fit.state), fit.stack.parts
     units = {one.unit for one in fit.stack.instruments}
     kind = Worst if units == {METRE} else WorstOverNoise
-    fit, share = at_worst(fit, of, names, 1, options.qp, LEAST_NOISE, kind)
+    fit, share = at_worst(fit, of, names, 1, options.qp, MIN_NOISE, kind)
     shares = share, share**2
     covariance = covariance_of(fit.problem, fit.state, np.square(fit.noise), shares)
     return replace(fit, covariance=covariance)
@@ -347,7 +348,7 @@ def resting(fit: InstrumentFit) -> InstrumentFit:
         return fit
     names = fit.stack.names
     every = np.pad(rests, (fit.stack.lawless - names.geometric, 0))
-    known = without_resting(fit.identification, names, every)
+    known = without_bounded_effects(fit.identification, names, every)
     again = replace(fit.problem, active=known.active)
     shares, _ = of_loss(again, fit.found)
     covariance = covariance_of(again, fit.state, np.square(fit.noise), shares)
@@ -360,7 +361,7 @@ def weighed(
     """Least squares, instruments and priors weighed by the noises that remain.
 
     The problem with the weights that it ended with.  A lone instrument without priors has nothing
-    to be weighed against.  As `solve.Task.squares` does.
+    to be weighed against.  As `FitTask.fit_least_squares` does.
     """
     points, method = float(problem.stack.points), method_of(options.method)
 
@@ -375,9 +376,9 @@ def weighed(
     count = [one.degrees for one in problem.stack.instruments]
     none = np.zeros(problem.stack.names.count, dtype=bool)
     cost = [float(error @ error) for error, _ in problem.stack.rows_by_block(begin, none)]
-    variance = np.maximum(np.divide(cost, count), LEAST_NOISE**2)
+    variance = np.maximum(np.divide(cost, count), MIN_NOISE**2)
     variance = problem.stack.variance(variance)
-    for _ in range(PRIOR_ROUNDS):
+    for _ in range(MAX_PRIOR_ROUNDS):
         problem = problem.believed(variance)
         found = solved(problem)
         state = found.x.take(np.array(0))
@@ -397,7 +398,7 @@ def variances(problem: Squares, x: State) -> Array:
         return problem.stack.variance(problem.scale**2)
     cost, spare = remaining(problem, x)
     weighing = len(problem.stack.blocks) > 1 or len(problem.weight)
-    left = np.maximum(cost / spare, (LEAST_NOISE if weighing else MIN_COMPUTED_NOISE) ** 2)
+    left = np.maximum(cost / spare, (MIN_NOISE if weighing else MIN_COMPUTED_NOISE) ** 2)
     return problem.stack.variance(left)
 
 
