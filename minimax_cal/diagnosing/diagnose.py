@@ -30,13 +30,13 @@ from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.crossed import MIN_HELD_POSES
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.floor import DISTANCES, Floor, floor_of, noise_at_most, with_instrument
-from minimax_cal.fitting.judged import doubts
+from minimax_cal.fitting.judged import warn_of_wrong_robot
 from minimax_cal.fitting.options import Options, Progress, silent
 from minimax_cal.fitting.outcome import FileEvidence, missed_rows
 from minimax_cal.fitting.several.options import READ, RelativeOptions, check_no_others, with_others
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
-from minimax_cal.fitting.suspects import contradictions
+from minimax_cal.fitting.suspects import find_contradicting_points
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.options import check_left_out, grouped, takes
@@ -296,7 +296,7 @@ def examine(
             *notices,
             *notices_of(study, clean, kept, late, effects),
             *foot_notices(foot),
-            *doubts(study.robot, study.fit, study.nominal.error(study.data)),
+            *warn_of_wrong_robot(study.robot, study.fit, study.nominal.error(study.data)),
             *filter(None, [wrong]),
         ),
         provenance=Provenance.of(robot, given, vars(options)),
@@ -333,7 +333,7 @@ def notices_of(
     if late:
         yield f"outliers that no effect found explains: {name_first(late)}"
     every = ladder.last.cell.placed(clean.measured)
-    yield from contradictions(every, ladder.last.cell.error(every))
+    yield from find_contradicting_points(every, ladder.last.cell.error(every))
     yield from session_notices(study, effects)
     yield from study.fit.notices
 

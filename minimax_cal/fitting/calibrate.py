@@ -16,7 +16,7 @@ from minimax_cal.fitting.checks import check_plausible, coarse_joints
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.floor import with_instrument
 from minimax_cal.fitting.geometry_fit import MIN_TARGET_POSES
-from minimax_cal.fitting.judged import Judged, Parts
+from minimax_cal.fitting.judged import DataSplit, judge_fit
 from minimax_cal.fitting.options import (
     Loss,
     Objective,
@@ -159,10 +159,10 @@ def calibrate_with(
     progress("start")
     options = with_jump(robot, poses, options, progress)
     solved = fit_cell(robot, poses.train, options, progress, poses.near)
-    result = Judged(robot, options, poses, solved)
-    for doubt in result.alarming:
-        warnings.warn(doubt, CalibrationWarning, stacklevel=5)
-    return result.fit(began)
+    judged = judge_fit(robot, options, poses, solved, began)
+    for alarm in judged.alarms:
+        warnings.warn(alarm, CalibrationWarning, stacklevel=5)
+    return judged.fit
 
 
 def measured(data: Given) -> Measurements | list[Instrument]:
@@ -190,9 +190,9 @@ def fit_split(
     """
     began = time.perf_counter()
     data = checked(robot, data, options)
-    poses = Parts(data, data.take(~held), data.take(held), data.notices)
+    poses = DataSplit(data, data.take(~held), data.take(held), data.notices)
     solved = fit_cell(robot, poses.train, options, progress)
-    return Judged(robot, options, poses, solved).fit(began)
+    return judge_fit(robot, options, poses, solved, began).fit
 
 
 def checked(robot: Robot, data: Measurements, options: Options) -> Measurements:
@@ -208,7 +208,7 @@ def checked(robot: Robot, data: Measurements, options: Options) -> Measurements:
     return data
 
 
-def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
+def parted(robot: Robot, data: Measurements, options: Options) -> DataSplit:
     """Training and held-out poses; targets that hardly any pose shows are left out."""
     if options.effects:
         data = with_history(data)  # the way to a pose is lost once its predecessor is held out
@@ -238,10 +238,10 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
         given = check_plausible(robot, data)
         near = given.state.rotation
         notices += tuple(filter(None, [coarse_joints(robot, data, given)]))
-    return Parts(data, train, held, notices, near)
+    return DataSplit(data, train, held, notices, near)
 
 
-def with_jump(robot: Robot, poses: Parts, options: Options, progress: Progress) -> Options:
+def with_jump(robot: Robot, poses: DataSplit, options: Options, progress: Progress) -> Options:
     """The options with the moment of a jump that was asked for without one.
 
     That of the largest in the errors of the geometry, on all poses: held-out ones between the last

@@ -347,7 +347,7 @@ def misplaced(robot: Robot, data: Measurements) -> tuple[Array, Array]:
     return bad, bad[np.where(fits, points, pose)]
 
 
-def exchanged(robot: Robot, data: Measurements) -> Array:
+def find_exchanged_rows(robot: Robot, data: Measurements) -> Array:
     """(b,) rows whose points belong to other rows: their lines were exchanged."""
     rows, source = misplaced(robot, data)
     return np.asarray(rows[rows != source])

@@ -236,6 +236,43 @@ class Fit(Result):
     moved: Annotated[tuple[Change, ...], Fact(key="between_sessions")] = ()
     contradictions: tuple[Contradiction, ...] = ()
 
+    @classmethod
+    def build(
+        cls, cell: Cell, nominal: Cell, data: Measurements, held: Array,
+        errors: tuple[Array, Array], settings: Mapping[str, Any], uncertainty: Uncertainty,
+        **fields: Any,
+    ) -> Fit:  # fmt: skip
+        """A result, with what follows from its two arms at all poses, and from its settings.
+
+        errors: (k, m, 3) of the nominal and the calibrated arm [m].  fields: the others; those not
+        given are of least squares of all training points, without priors.  accuracy: what is to be
+        added to that of these errors.
+        """
+        scores = {key: accuracy(error) for key, error in by_key(*errors, held).items()}
+        derived_fields: dict[str, Any] = {
+            "cell": cell,
+            "nominal": nominal,
+            "objective": settings["objective"],
+            "qp": settings["qp"],
+            "uncertainty": uncertainty,
+            "minimax": None,
+            "certificate": None,
+            "trace": (),
+            "data": data,
+            "held": held,
+            "error_nominal": errors[0],
+            "error": errors[1],
+            "loss": settings["loss"],
+            "suspects": (),
+            "weights": data.take(~held).seen.T.astype(float),
+            "share": np.ones(len(data.target_names)),
+            "prior": np.zeros(uncertainty.names.count),
+            "widening": 1.0,
+            "provenance": Provenance.of(nominal.robot, data, settings),
+        }
+        accuracies = scores | fields.pop("accuracy", {})
+        return cls(**derived_fields | fields, accuracy=accuracies)
+
     def __repr__(self) -> str:
         after, known = self.within.after, sum(p.identifiable for p in self.parameters)
         return (

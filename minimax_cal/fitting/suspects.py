@@ -348,7 +348,7 @@ USUAL_QUANTILE = 0.95  # share of the other visits that keep to what is told of 
 MIN_GROSS_RATIO = 4.0
 
 
-def contradictions(data: Measurements, error: Array) -> Iterator[str]:
+def find_contradicting_points(data: Measurements, error: Array) -> Iterator[str]:
     """Which visits to one pose contradict each other, to people; nothing where none do.
 
     A visit does to which no other comes nearer than Student's t, fitted to all visits, allows
