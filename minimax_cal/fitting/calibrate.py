@@ -37,18 +37,17 @@ from minimax_cal.fitting.several.options import (
 )
 from minimax_cal.fitting.several.result import RelativeCalibration
 from minimax_cal.fitting.solve import fit_cell
-from minimax_cal.fitting.stations import stationed, unplaced
+from minimax_cal.fitting.stations import place_sessions, warn_of_unplaced_sessions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
 from minimax_cal.ground.options import takes
 from minimax_cal.ground.threads import one_thread
 from minimax_cal.instruments import file
 from minimax_cal.instruments.file import InstrumentData, JointsAndPoints, PointData, taken
-from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.faults.points import noise
-from minimax_cal.measuring.faults.sessions import jumps
+from minimax_cal.measuring.faults.sessions import jumps as find_jumps
 from minimax_cal.measuring.grouping import groups, mislabelled, split, with_groups
 from minimax_cal.measuring.history import time_notices, with_history
 from minimax_cal.measuring.measurements import TOOL, Measurements, measurements
@@ -137,7 +136,11 @@ def calibrate(
     --------
     >>> print(mc.calibrate("irb2600", "poses.csv", objective="sum", holdout=0.3).summary())
     """
-    given = measured(data)
+    given: Measurements | list[Instrument]
+    if isinstance(data, tuple) and data and isinstance(data[0], np.ndarray | list | tuple):
+        given = measurements(*(np.asarray(part, dtype=float) for part in data))
+    else:
+        given = taken(data)  # type: ignore[arg-type]
     if isinstance(given, Measurements):
         check_no_others(given, others)
         return calibrate_with(robot, given, options, progress)
@@ -154,22 +157,15 @@ def calibrate_with(
     """`calibrate` of points of trackers, with its options in one."""
     began = time.perf_counter()
     robot = load_robot(robot)
-    data = checked(robot, data, options)
-    poses = parted(robot, data, options)
+    data = check_input(robot, data, options)
+    parts = split_data(robot, data, options)
     progress("start")
-    options = with_jump(robot, poses, options, progress)
-    solved = fit_cell(robot, poses.train, options, progress, poses.near)
-    judged = judge_fit(robot, options, poses, solved, began)
+    options = with_jump_time(robot, parts, options, progress)
+    solved = fit_cell(robot, parts.train, options, progress, parts.near)
+    judged = judge_fit(robot, options, parts, solved, began)
     for alarm in judged.alarms:
         warnings.warn(alarm, CalibrationWarning, stacklevel=5)
     return judged.fit
-
-
-def measured(data: Given) -> Measurements | list[Instrument]:
-    """Measurements as they are, of files, or of joints (m, n) and points.  Raises DataError."""
-    if isinstance(data, tuple) and data and isinstance(data[0], np.ndarray | list | tuple):
-        return measurements(*(np.asarray(part, dtype=float) for part in data))
-    return taken(data)  # type: ignore[arg-type]
 
 
 def again(fit: Fit, progress: Progress = silent, **changes: object) -> Fit:
@@ -189,15 +185,16 @@ def fit_split(
     held: (m,) True where held out.  Raises CalibrationError.
     """
     began = time.perf_counter()
-    data = checked(robot, data, options)
-    poses = DataSplit(data, data.take(~held), data.take(held), data.notices)
-    solved = fit_cell(robot, poses.train, options, progress)
-    return judge_fit(robot, options, poses, solved, began).fit
+    data = check_input(robot, data, options)
+    parts = DataSplit(data, data.take(~held), data.take(held), data.notices)
+    solved = fit_cell(robot, parts.train, options, progress)
+    return judge_fit(robot, options, parts, solved, began).fit
 
 
-def checked(robot: Robot, data: Measurements, options: Options) -> Measurements:
-    """The data with all joints of the arm.  Raises an error, before any work, for what cannot be
-    done.
+def check_input(robot: Robot, data: Measurements, options: Options) -> Measurements:
+    """The data with all joints of the arm.
+
+    Raises CalibrationError, before any work, for options and data that cannot be.
     """
     objective_of(options.objective, data)
     check_options(options)
@@ -208,40 +205,51 @@ def checked(robot: Robot, data: Measurements, options: Options) -> Measurements:
     return data
 
 
-def parted(robot: Robot, data: Measurements, options: Options) -> DataSplit:
-    """Training and held-out poses; targets that hardly any pose shows are left out."""
+def split_data(robot: Robot, data: Measurements, options: Options) -> DataSplit:
+    """Training and held-out poses in one frame, and what the data's faults say.
+
+    Raises DataError for slips of the data: names, units, signs, rows.
+    """
+    # What a pose has of others, while all are there: its predecessor, repeats of it.
     if options.effects:
-        data = with_history(data)  # the way to a pose is lost once its predecessor is held out
+        data = with_history(data)
     data = with_groups(with_instrument(data, options.instrument))
     data = replace(data, simulated=data.simulated or options.simulated)
-    train, held, said = split(data, options.holdout, options.seed, options.holdout_by)
-    kept = np.isin(data.line, train.line)
-    said = (*said, *unplaced(data, kept))
-    data = stationed(robot, data, kept)
+
+    # Poses that belong together are held out together.
+    train, held, split_notices = split(data, options.holdout, options.seed, options.holdout_by)
+    in_train = np.isin(data.line, train.line)
+
+    # The points of all sessions in the frame of the first, which training poses alone determine.
+    split_notices = (*split_notices, *warn_of_unplaced_sessions(data, in_train))
+    data = place_sessions(robot, data, in_train)
     train, held = seen_from(train, data.frames), seen_from(held, data.frames)
+
+    # Faults that show without a fit: of joints, clocks and names, distances, noise.
     doubts = (*checks.arm_notices(robot, data), *time_notices(data), mislabelled(data))
-    off = (*distance_faults(data), *noise(data))
-    doubts = (*doubts, *(fault.text for fault in off))
-    notices = (*data.notices, *filter(None, doubts), *said)
+    faults = tuple(fault.text for fault in (*distance_faults(data), *noise(data)))
+    notices = (*data.notices, *filter(None, doubts), *faults, *split_notices)
+
+    # Targets that hardly any training pose shows are left out.
     few = train.seen.sum(axis=0) < MIN_TARGET_POSES
     if few.any() and not few.all():
-        names, why = (
-            ", ".join(np.array(data.target_names)[few]),
-            f"fewer than {MIN_TARGET_POSES} poses",
-        )
-        notices += (f"left out: {names}, measured at fewer than {MIN_TARGET_POSES} training poses",)
+        names = ", ".join(np.array(data.target_names)[few])
+        why = f"fewer than {MIN_TARGET_POSES} poses"
+        notices += (f"left out: {names}, measured at {why.replace('poses', 'training poses')}",)
         data = set_aside(data, data.seen & few, f"the fit has {why} with this target", TOOL)
         data, train, held = (part.keep(~few) for part in (data, train, held))
         objective_of(options.objective, data)
+
+    # Slips that show once base and targets are fitted; that base is where the fit begins.
     near = EVERYWHERE
     if len(np.unique(groups(train))) >= MIN_TARGET_POSES:
-        given = check_plausible(robot, data)
-        near = given.state.rotation
-        notices += tuple(filter(None, [coarse_joints(robot, data, given)]))
+        base = check_plausible(robot, data)
+        near = base.state.rotation
+        notices += tuple(filter(None, [coarse_joints(robot, data, base)]))
     return DataSplit(data, train, held, notices, near)
 
 
-def with_jump(robot: Robot, poses: DataSplit, options: Options, progress: Progress) -> Options:
+def with_jump_time(robot: Robot, parts: DataSplit, options: Options, progress: Progress) -> Options:
     """The options with the moment of a jump that was asked for without one.
 
     That of the largest in the errors of the geometry, on all poses: held-out ones between the last
@@ -249,14 +257,14 @@ def with_jump(robot: Robot, poses: DataSplit, options: Options, progress: Progre
     """
     if not any(text in JUMP for text in options.effects):
         return options
-    plain = replace(options, effects=(), objective="sum")
-    cell = fit_cell(robot, poses.train, plain, progress).cell(robot, poses.data)
-    rows, sizes = jumps(cell.placed(poses.data), cell.error(poses.data))
+    geometric = replace(options, effects=(), objective="sum")
+    cell = fit_cell(robot, parts.train, geometric, progress).cell(robot, parts.data)
+    rows, sizes = find_jumps(cell.placed(parts.data), cell.error(parts.data))
     if not len(rows):
         return options
-    since = float(poses.data.columns["clock"][rows[np.argmax(sizes)]])
-    found = Term(SESSION_JUMP.name, "frame", {"since": since})
-    return replace(options, effects=[found if e in JUMP else e for e in options.effects])
+    since = float(parts.data.columns["clock"][rows[np.argmax(sizes)]])
+    jump = Term(SESSION_JUMP.name, "frame", {"since": since})
+    return replace(options, effects=[jump if e in JUMP else e for e in options.effects])
 
 
 # ---- many at once --------------------------------------------------------------------------------

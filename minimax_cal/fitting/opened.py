@@ -18,7 +18,7 @@ from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options, listed, read_options
 from minimax_cal.fitting.pose_rows import measured_poses
 from minimax_cal.fitting.spans import Span, spans_of
-from minimax_cal.fitting.stations import MIN_FRAME_POINTS, moving
+from minimax_cal.fitting.stations import MIN_FRAME_POINTS, fit_rigid_motion
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
@@ -147,7 +147,7 @@ def in_new_frame(cell: Cell, data: Measurements) -> Cell:
     if len(here) < MIN_FRAME_POINTS:
         raise DataError(f"{data.source}: {len(here)} points do not place a frame; measure more")
     there = here - error[data.seen]  # where the calibration's instrument would see them
-    return replace(alone, base=moving(there, here) @ cell.base)
+    return replace(alone, base=fit_rigid_motion(there, here) @ cell.base)
 
 
 def place(robot: Robot, data: Measurements) -> Cell:

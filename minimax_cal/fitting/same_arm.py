@@ -11,7 +11,7 @@ from minimax_cal.fitting.checks import check_plausible
 from minimax_cal.fitting.floor import SIGMAS, declared
 from minimax_cal.fitting.geometry_fit import MIN_TARGET_POSES
 from minimax_cal.fitting.outcome import MAX_MISS_OF_REACH
-from minimax_cal.fitting.stations import stationed
+from minimax_cal.fitting.stations import place_sessions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.measurements import Measurements
@@ -34,7 +34,7 @@ def check_arm(robot: Robot, data: Measurements) -> None:
     """
     if data.poses < MIN_TARGET_POSES:
         return
-    data = stationed(robot, data, np.ones(data.poses, dtype=bool))
+    data = place_sessions(robot, data, np.ones(data.poses, dtype=bool))
     given = check_plausible(robot, data)
     limit = MAX_MISS_OF_REACH * robot.reach()
     if np.sqrt(given.mean_square) <= limit:

@@ -25,7 +25,7 @@ from minimax_cal.fitting.minimax_problem import (
 )
 from minimax_cal.fitting.options import Options, Progress, silent, solver_of
 from minimax_cal.fitting.robust import Robust, flatness
-from minimax_cal.fitting.stations import turned_in
+from minimax_cal.fitting.stations import apply_frame_steps
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, point_share, uncertainty_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import clusters
@@ -136,8 +136,8 @@ def fit_cell(
 ) -> Solved:
     """Fit the chosen objective to all poses of the data.  Raises OptionError, DataError.
 
-    data: with the points of all sessions in one frame (`stations.stationed`).  near: (3, 3) the
-    base's rotation where it is known already, as in `start.fit_base`.
+    data: with the points of all sessions in one frame (`stations.place_sessions`).  near: (3, 3)
+    the base's rotation where it is known already, as in `start.fit_base`.
     """
     # Geometry by least squares [paper S]; the drawing holds what the poses hardly determine.
     task, first_frames = start_fit(robot, data, options, near), data.frames
@@ -202,7 +202,7 @@ def fit_with_terms(
     robot, robust, identification = task.robot, fit.robust, fit.identification
     for _ in range(EFFECT_PASSES):
         # Steps of the frames that the last pass found are taken exactly.
-        frames, here = turned_in(task.data.frames, robust.state)
+        frames, here = apply_frame_steps(task.data.frames, robust.state)
         data = seen_from(task.data, frames)
         y = model_of(robot, data).y if frames else task.model.y
         task = replace(task, data=data, model=replace(task.model, y=y))

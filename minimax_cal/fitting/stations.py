@@ -30,35 +30,62 @@ MAX_ROUNDS = 20  # of placing targets and frames in turn,
 MAX_SETTLED_MOVE = 1e-9  # until these move less [m]
 
 
-def stationed(robot: Robot, data: Measurements, train: Array) -> Measurements:
+def place_sessions(robot: Robot, data: Measurements, train: Array) -> Measurements:
     """The data with the points of all sessions in the frame of the first, as the drawing has it.
 
     train: (m,) True for the rows that may be looked at.  Sessions that have none there are taken to
-    be in the first frame (`unplaced` says so).  Raises DataError for a session of too few points.
+    be in the first frame (`warn_of_unplaced_sessions`).  Raises DataError for a session of too few
+    points.
     """
-    label, names = labels(data), sessions_of(data.take(train))
+    label, names = labels(data), session_names(data.take(train))
     if len(names) < 2 or data.frames:
         return data
     for name in names:
-        rows = train & (label == name)
-        if data.seen[rows].sum() < MIN_FRAME_POINTS:
+        points = data.seen[train & (label == name)].sum()
+        if points < MIN_FRAME_POINTS:
             raise DataError(
-                f"{data.source}: session {name!r} has {data.seen[rows].sum()} points to place its "
-                "measurement frame by; measure more, leave its rows out, or give them the session "
-                "whose frame they share"
+                f"{data.source}: session {name!r} has {points} points to place its measurement "
+                "frame by; measure more, leave its rows out, or give them the session whose frame "
+                "they share"
             )
-    return seen_from(data, placed(robot, data.take(train), names))
+    seen = data.take(train)
+    sessions = {name: seen.take(labels(seen) == name) for name in names}
+
+    # First the largest session; others by themselves, or by points that few poses have of it.
+    largest = max(sessions.values(), key=lambda session: session.poses)
+    state = fit_base(model_of(robot, largest), robot.mdh).state
+    frames = {}
+    for name, session in sessions.items():
+        if session.poses >= MIN_SESSION_POSES:
+            own = fit_base(model_of(robot, session), robot.mdh).state
+            frames[name] = state.base @ np.linalg.inv(own.base)
+        else:
+            frames[name] = fit_session_frame(session, robot, state)
+
+    # Then targets, and frames, in turn.
+    for _ in range(MAX_ROUNDS):
+        state = fit_base(model_of(robot, seen_from(seen, frames)), robot.mdh).state
+        placed = {name: fit_session_frame(one, robot, state) for name, one in sessions.items()}
+        step = max(np.abs(placed[name] - frames[name]).max() for name in names)
+        frames = placed
+        if step < MAX_SETTLED_MOVE:
+            break
+    first = np.linalg.inv(frames[names[0]])
+    return seen_from(
+        data,
+        {name: np.eye(4) if name == names[0] else first @ frames[name] for name in names},
+    )
 
 
-def sessions_of(data: Measurements) -> list[str]:
+def session_names(data: Measurements) -> list[str]:
     """The names of sessions in the order of their first rows."""
     return list(dict.fromkeys(labels(data).tolist()))
 
 
-def unplaced(data: Measurements, train: Array) -> tuple[str, ...]:
-    """A notice on sessions that are held out whole: no row tells where their frame stands."""
-    names = sessions_of(data.take(train))
-    lost = [name for name in sessions_of(data) if name not in names]
+def warn_of_unplaced_sessions(data: Measurements, train: Array) -> tuple[str, ...]:
+    """A notice on sessions that are held out whole: no row determines their frame."""
+    names = session_names(data.take(train))
+    lost = [name for name in session_names(data) if name not in names]
     if not lost:
         return ()
     return (
@@ -67,46 +94,20 @@ def unplaced(data: Measurements, train: Array) -> tuple[str, ...]:
     )
 
 
-def placed(robot: Robot, data: Measurements, names: list[str]) -> dict[str, Array]:
-    """Where the frames of sessions stand in that of the first, for the robot as drawn."""
-    label = labels(data)
-    count = [int((label == name).sum()) for name in names]
-    largest = data.take(label == names[int(np.argmax(count))])
-    state = fit_base(model_of(robot, largest), robot.mdh).state
-    frames = {}
-    for name, poses in zip(names, count, strict=True):
-        own = data.take(label == name)
-        if poses >= MIN_SESSION_POSES:
-            mine = fit_base(model_of(robot, own), robot.mdh).state
-            frames[name] = state.base @ np.linalg.inv(mine.base)
-        else:
-            frames[name] = fitting(own, robot, state)
-    for _ in range(MAX_ROUNDS):
-        common = seen_from(data, frames)
-        state = fit_base(model_of(robot, common), robot.mdh).state
-        turned = {name: fitting(data.take(label == name), robot, state) for name in names}
-        step = max(np.abs(turned[name] - frames[name]).max() for name in names)
-        frames = turned
-        if step < MAX_SETTLED_MOVE:
-            break
-    first = np.linalg.inv(frames[names[0]])
-    return {name: np.eye(4) if name == names[0] else first @ frames[name] for name in names}
-
-
-def fitting(data: Measurements, robot: Robot, state: State) -> Array:
-    """(4, 4) what takes points as they are given to where a state has them."""
+def fit_session_frame(data: Measurements, robot: Robot, state: State) -> Array:
+    """(4, 4) what takes points as they are given nearest to where a state has them."""
     there = Cell.of(robot, state, data.target_names).predict(data.q)[data.seen]
-    return moving(data.y[data.seen], there)
+    return fit_rigid_motion(data.y[data.seen], there)
 
 
-def moving(here: Array, there: Array) -> Array:
+def fit_rigid_motion(here: Array, there: Array) -> Array:
     """(4, 4) what takes points (n, 3) nearest to where others are [Kabsch 1976]."""
     centre, goal = here.mean(axis=0), there.mean(axis=0)
-    turn = nearest_rotation((there - goal).T @ (here - centre))
-    return transform(turn, goal - turn @ centre)
+    rotation = nearest_rotation((there - goal).T @ (here - centre))
+    return transform(rotation, goal - rotation @ centre)
 
 
-def turned_in(frames: Frames, state: State) -> tuple[Frames, State]:
+def apply_frame_steps(frames: Frames, state: State) -> tuple[Frames, State]:
     """Frames with the steps that a state holds for them, first of its effects, and it without."""
     if not len(state.effects):
         return frames, state

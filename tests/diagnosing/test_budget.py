@@ -31,7 +31,7 @@ from minimax_cal.fitting.accuracy import accuracy
 from minimax_cal.fitting.floor import instrument_alone
 from minimax_cal.fitting.options import silent
 from minimax_cal.fitting.solve import fit_cell
-from minimax_cal.fitting.stations import stationed
+from minimax_cal.fitting.stations import place_sessions
 from minimax_cal.ground import parallel
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import parts
@@ -312,7 +312,7 @@ def test_a_session_left_out_has_no_frame(monkeypatch: pytest.MonkeyPatch) -> Non
     for name, turn in zip("bc", turns, strict=True):
         y[session == name] = y[session == name] @ turn.T + 0.7
     data = replace(made.data.with_y(y), columns={**made.data.columns, "session": session})
-    data = stationed(robot, with_history(data), np.ones(90, dtype=bool))
+    data = place_sessions(robot, with_history(data), np.ones(90, dtype=bool))
     study = studied(robot, data, fit_cell(robot, data, SUM, silent))
     judges = Judges(data, data.take(np.zeros(0, dtype=int)), np.zeros((0, 2), dtype=bool))
 

@@ -16,7 +16,7 @@ from minimax_cal.fitting.suspects import (
     FALSE_DISCOVERY_RATE,
     Scores,
     Spread,
-    contradictions,
+    find_contradicting_points,
     fit_log_scale,
     nearest,
     scores,
@@ -268,7 +268,7 @@ def test_the_nearest_other_visit_by_brute_force():
 def test_a_point_that_its_own_second_visit_contradicts(robot):
     """Whichever of both is wrong, the fit tells; far less than a fit alone would find."""
     for row, right in ((3, 43), (43, 3)):
-        (text,) = contradictions(*moved(*visited(robot), row, 20.0 * VISIT_NOISE))
+        (text,) = find_contradicting_points(*moved(*visited(robot), row, 20.0 * VISIT_NOISE))
         assert f"line {row + 2} smr1 is " in text
         assert f"from line {right + 2}, which fits" in text
         assert text.count("smr") == 1
@@ -277,7 +277,7 @@ def test_a_point_that_its_own_second_visit_contradicts(robot):
 def test_a_fit_that_does_not_know_does_not_say_which(robot):
     data, error = moved(*visited(robot), 3, 20.0 * VISIT_NOISE)
     field = 1e-3 * np.ones(3)  # what the model lacks at both visits
-    (text,) = contradictions(data, error + field)
+    (text,) = find_contradicting_points(data, error + field)
     assert "smr1" in text
     assert "which fits" not in text
 
@@ -289,18 +289,20 @@ def test_three_visits_tell_without_a_fit(robot):
     fresh = np.random.default_rng(9).normal(0.0, VISIT_NOISE, (12, *data.y.shape[1:]))
     y = data.y.copy()
     y[52:] += fresh
-    error = error[rows] + 1e-3
-    error[52:] += fresh
-    (text,) = contradictions(*moved(data.with_y(y), error, 43, 30.0 * VISIT_NOISE))
+    error = error[:, rows] + 1e-3
+    error[:, 52:] += np.moveaxis(fresh, 1, 0)
+    (text,) = find_contradicting_points(*moved(data.with_y(y), error, 43, 30.0 * VISIT_NOISE))
     assert "line 45 smr1" in text or "from line 45" in text
     assert text.count("smr") == 1
 
 
 def test_sound_visits_and_few_visits_say_nothing(robot):
     """A distance of four times that of 95 % of all is one of eight sigmas."""
-    assert not any(list(contradictions(*visited(robot, seed=seed))) for seed in range(60))
-    assert not list(contradictions(*moved(*visited(robot, twice=4), 3, 1e-3)))
-    assert not list(contradictions(*moved(*visited(robot, twice=0), 3, 1e-3)))
+    assert not any(
+        list(find_contradicting_points(*visited(robot, seed=seed))) for seed in range(60)
+    )
+    assert not list(find_contradicting_points(*moved(*visited(robot, twice=4), 3, 1e-3)))
+    assert not list(find_contradicting_points(*moved(*visited(robot, twice=0), 3, 1e-3)))
 
 
 def test_calibrate_and_diagnose_tell(robot):
@@ -317,9 +319,9 @@ def test_the_same_pose_under_another_load_contradicts_nothing(robot):
     data, error = visited(robot)
     for row in (40, 41, 42):
         data, error = moved(data, error, row, 25.0 * VISIT_NOISE)
-    assert list(contradictions(data, error))
+    assert list(find_contradicting_points(data, error))
     load = np.where(np.isin(np.arange(data.poses), (40, 41, 42)), 20.0, 0.0)
-    assert not list(contradictions(replace(data, columns={"payload": load}), error))
+    assert not list(find_contradicting_points(replace(data, columns={"payload": load}), error))
 
 
 # ---- claims --------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.several.stack import own_state
-from minimax_cal.fitting.stations import moving
+from minimax_cal.fitting.stations import fit_rigid_motion
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
 from minimax_cal.instruments.camera import undistorted
@@ -341,7 +341,7 @@ def by_rotations(
     if not len(data.board):
         return camera_pose, np.eye(4), spots
     known = np.isfinite(spots[:, 0])
-    board = moving(data.board[known], spots[known])
+    board = fit_rigid_motion(data.board[known], spots[known])
     return camera_pose, board, np.asarray(data.board @ board[:3, :3].T + board[:3, 3])
 
 
