@@ -44,6 +44,7 @@ from minimax_cal.ground.options import takes
 from minimax_cal.ground.threads import one_thread
 from minimax_cal.instruments import file
 from minimax_cal.instruments.file import InstrumentData, JointsAndPoints, PointData, taken
+from minimax_cal.instruments.instrument import Instrument
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.faults.points import noise

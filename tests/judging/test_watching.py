@@ -89,7 +89,7 @@ def test_as_many_poses_as_named_decide_every_second_session(seen, poses):
         return error, mc.measurements(rng.uniform(-2.0, 2.0, (count, 6)), error.swapaxes(0, 1))
 
     def judged(error: np.ndarray, data: mc.Measurements) -> health.Verdict:
-        return health.verdict(Limit("rms", seen * rms), error, data, 0.0, 0)
+        return health.judge_limit(Limit("rms", seen * rms), error, data, 0.0, 0)
 
     named = []
     while len(named) < 25:

@@ -30,7 +30,7 @@ from minimax_cal.ground.results import Result
 from minimax_cal.ground.tables import Table, filled
 from minimax_cal.ground.units import for_people, in_own_unit
 from minimax_cal.judging.watching.moved import FIRST, Moved, moved_table, search
-from minimax_cal.judging.watching.opening import in_names, watched_of
+from minimax_cal.judging.watching.opening import match_names, open_parameters
 from minimax_cal.measuring.grouping import regions
 from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.model import model_of
@@ -297,8 +297,8 @@ def changed(one: Fit, other: Fit) -> tuple[tuple[Moved, ...], float]:
     """
     for fit, new, sign in ((one, other, 1.0), (other, one, -1.0)):
         if new.data.poses:
-            watched, _ = watched_of(fit, replace(new.train, frames={}), ())
-            found = search(watched, in_names(fit, watched, fit.identification.active))
+            watched, _ = open_parameters(fit, replace(new.train, frames={}), ())
+            found = search(watched, match_names(fit, watched, fit.identification.active))
             return tuple(replace(m, by=sign * m.by) for m in found.named), found.same
     return (), math.nan
 
@@ -312,7 +312,7 @@ def on_common(one: Fit, other: Fit) -> Iterator[OnPoses]:
         data = fit.data.take(held)
         found = []
         for arm in (one, other):
-            model, state = watched_of(arm, replace(data, frames={}), ())[0].start
+            model, state = open_parameters(arm, replace(data, frames={}), ())[0].start
             found.append(accuracy(model.error(state)))
         which = "held-out" if fit.held.any() else "training"
         yield OnPoses(f"{which} poses of {name}", *found)

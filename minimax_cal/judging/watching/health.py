@@ -7,13 +7,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from minimax_cal.fitting.accuracy import (
     FARTHEST,
-    Accuracy,
     Interval,
     accuracy,
     chance_of_larger,
@@ -35,8 +33,9 @@ from minimax_cal.judging.tolerance import (
     Limit,
     limits_of,
 )
+from minimax_cal.judging.watching.both import Both
 from minimax_cal.judging.watching.moved import MIN_OWN_MOTION, Search, joint_of, search, sized
-from minimax_cal.judging.watching.opening import in_names, watched_of
+from minimax_cal.judging.watching.opening import match_names, open_parameters
 from minimax_cal.judging.watching.placing import Placing
 from minimax_cal.judging.watching.refit import refit
 from minimax_cal.judging.watching.result import SHIFT, Health, Hidden, Verdict
@@ -46,74 +45,13 @@ from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 
-PLACE_AN_ARM = 2  # poses that place an arm
-DOUBLINGS = 6  # of the poses: nobody measures more than 64 times as many
-
-
-def hidden(watched: Watched, found: Search) -> Iterator[Hidden]:
-    """Zero positions that nobody could tell from what is open, and what would tell them."""
-    names, n = watched.names, watched.cell.robot.joints
-    lost = [i for i in watched.zeros if i not in found.looked.column]
-    place = np.arange(names.count)
-    base = watched.open & (place < 5 * n + 6)
-    for i in lost:
-        alone = np.array([i])
-        if base.any() and found.before.rows.share(alone, base)[0] <= MIN_OWN_MOTION:
-            needs = "reflectors on the foot, or the old frame (known frame)"
-            yield Hidden(names.all[i], "the measurement frame", needs)
-        elif found.before.rows.share(alone, watched.open & ~base)[0] <= MIN_OWN_MOTION:
-            needs = "reflectors that were not touched (known targets)"
-            yield Hidden(names.all[i], "the tool", needs)
-        else:
-            yield Hidden(names.all[i], "frame and tool", "poses that differ more")
-
-
-def prospects(watched: Watched, found: Search) -> tuple[dict[str, float], int | None, int | None]:
-    """The smallest shift of each zero position that is found; poses that are enough, and needed."""
-    rows, looked = found.first, found.looked
-    zero = looked.column[looked.zero]
-    if not len(zero):
-        return {}, None, None
-    least = looked.least(rows)[looked.zero]
-    names = watched.names.all
-    findable = {names[i]: float(size) for i, size in zip(zero, least, strict=True)}
-    turning = ~watched.cell.robot.prismatic[[int(joint_of(names[i])[1:]) - 1 for i in zero]]
-    if not turning.any():
-        return findable, None, None
-    worst = float(np.max(least[turning]))
-    wanted = max(math.ceil(watched.data.poses * (worst / SHIFT) ** 2), PLACE_AN_ARM)
-    return findable, (wanted if worst <= SHIFT else None), wanted
-
-
-def to_decide(interval: Callable[[int], Interval], value: float, size: float, poses: int) -> str:
-    """How many poses decide on which side of a limit an RMS lies, in words.
-
-    Half of all sessions of so many are decided: the interval of an RMS as seen just excludes the
-    limit.  The intervals are those of 1, 2, 4 ... copies of these poses, a power law between.
-    interval: of so many copies.  value: the RMS that was seen [m].  size: the limit [m].  poses:
-    how many were seen.
-    """
-    side = int(value < size)
-    wanted, width = abs(math.log(size / value)), math.inf
-    for doubled in range(DOUBLINGS + 1):
-        last = width
-        end = float(np.clip(interval(2**doubled)[side] / value, 1.0 / FARTHEST, FARTHEST))
-        width = abs(math.log(end))
-        if width <= wanted:
-            power = math.log(last / wanted) / math.log(last / width) if doubled else 1.0
-            few = poses / (poses - 1.0)  # spread of copies, which are no new poses
-            count = max(few * poses * 2.0 ** (doubled - 1.0 + power), poses + 1.0)
-            return f"about {float(f'{count:.2g}'):.0f}"
-    return f"more than {poses * 2**DOUBLINGS}"
-
-
-# ---- how it does ---------------------------------------------------------------------------------
-
-
 KNOWN = ("frame", "targets")  # what may still be where it was
+MIN_PLACING_POSES = 2  # poses that place an arm
+MAX_POSE_DOUBLINGS = 6  # nobody measures more than 64 times as many poses
 MIN_CONFIDENCE = 0.975  # one-sided: the 95 % interval lies on one side of what is required
-CONFIDENCE_RANGE = (0.5, 0.9995)  # confidences that are told
-MIN_NOISIER_SIGMAS = 5.0  # standard deviations of a mean square that are worth a word
+CONFIDENCE_RANGE = (0.5, 0.9995)  # confidences that are reported
+CONFIDENCE_BISECTIONS = 12
+MIN_NOISIER_SIGMAS = 5.0  # standard deviations of a mean square that are worth a notice
 MIN_WIDER = 1.5  # so much wider sigmas are too
 
 
@@ -159,157 +97,208 @@ def check(
     --------
     >>> mc.check("fit.json", "ten_poses.csv", "rms 0.2").valid
     """
-    limits, known = required(tolerance), checked_known(known)
-    check_seed(seed)
-    fit = Fit.load(fit)
-    data = read_measurements(data)
-    watched, said = watched_of(fit, data, known)
-    check_arm(fit.cell.robot, watched.data)
-    links = in_names(fit, watched, fit.identification.active)
-    found = search(watched, links)
-    error, after_it = (left(watched, placed) for placed in (found.before, found.after))
-    used = found.before.used
-    verdicts = tuple(verdict(limit, error, watched.data, used, seed) for limit in limits)
-    exact = replace(data, simulated=data.simulated or simulated)
-    if why := refused(fit, exact, residual(error, used)):
-        verdicts = tuple(
-            replace(one, valid=False, confidence=CONFIDENCE_RANGE[1], why=why) for one in verdicts
-        )
-    after = refit(fit, watched, found)
-    spread, enough, asked = prospects(watched, found)
-    return Health(
-        robot=fit.cell.robot.name,
-        verdicts=verdicts,
-        moved=sized(watched, found.after, found.named),
-        hidden=tuple(hidden(watched, found)),
-        accuracy=accuracy(grown(error, found.before.used)),
-        refitted=accuracy(grown(after_it, found.after.used)),
-        findable=spread,
-        sliding=frozenset(f"d{j + 1}" for j in np.flatnonzero(fit.cell.robot.prismatic)),
-        enough=enough,
-        asked=asked,
-        noise=found.first.noise_ratio,
-        poses=watched.data.poses,
-        fit=replace(after, notices=(*after.notices, *said)),
-        notices=(
-            *data.notices,
-            *(fault.text for fault in distance_faults(data)),
-            *said,
-            *remarks(watched, found),
-        ),
-        set_aside=data.set_aside,
-        with_them=counting_all(watched, found.before, seed) if data.set_aside else None,
-    )
-
-
-def required(tolerance: str) -> tuple[Limit, ...]:
-    """What is required.  Raises OptionError."""
     limits = limits_of(tolerance)
     if not limits:
         raise OptionError(f"tolerance {tolerance!r}: write it in mm as rms 0.2, max 0.5")
-    return limits
-
-
-def checked_known(known: str | Sequence[str]) -> tuple[str, ...]:
-    """What is where it was.  Raises OptionError."""
-    for part in listed(known):
+    known = tuple(listed(known))
+    for part in known:
         if part not in KNOWN:
             raise OptionError(f"known: {part!r} is none of {', '.join(KNOWN)}")
-    return tuple(listed(known))
+    check_seed(seed)
+    fit, data = Fit.load(fit), read_measurements(data)
+    robot = fit.cell.robot
 
+    # What is open (frame, reflectors), beside what the calibration knows of the rest.
+    watched, left_out = open_parameters(fit, data, known)
+    check_arm(robot, watched.data)
 
-def refused(fit: Fit, data: Measurements, missed: float) -> str:
-    """Why no verdict can be that the calibration is valid; empty where one can.
+    # What moved: score tests of the parameters on the new poses [Rao 1948].
+    found = search(watched, match_names(fit, watched, fit.identification.active))
+    before, after = found.before, found.after
 
-    missed: `residual` of the new points [m].
-    """
+    # Errors as if nothing had moved, and with what moved corrected, against what is required.
+    error, corrected = placed_errors(watched, before), placed_errors(watched, after)
+    verdicts = tuple(judge_limit(limit, error, watched.data, before.used, seed) for limit in limits)
+
+    # No verdict can be that it is valid where the calibration itself is not, or where the points
+    # were computed.
     noise = math.sqrt(3.0 * fit.uncertainty.noise.variance), "the calibration's noise"
-    return REFUSED.get(fit.status, "") or computed(data, missed, noise, "the calibrated arm")
+    exact = replace(data, simulated=data.simulated or simulated)
+    why = REFUSED.get(fit.status, "") or computed(
+        exact, residual(error, before.used), noise, "the calibrated arm"
+    )
+    if why:
+        sure = CONFIDENCE_RANGE[1]
+        verdicts = tuple(replace(one, valid=False, confidence=sure, why=why) for one in verdicts)
+
+    # The same with the points that were set aside.
+    error, counted = with_spent_freedom(error, before.used), None
+    if data.set_aside:
+        cell = watched.cell
+        now = Cell.of(robot, before.state, cell.target_names, cell.effects, cell.sessions)
+        aside = errors_of(now, watched.data)
+        counted = with_them(error, groups(watched.data), aside, seed=seed)
+
+    refitted = refit(fit, watched, found)
+    smallest_shifts, enough_poses, needed_poses = detectable_shifts(watched, found)
+    return Health(
+        robot=robot.name,
+        verdicts=verdicts,
+        moved=sized(watched, after, found.named),
+        hidden=tuple(find_inseparable_zeros(watched, found)),
+        accuracy=accuracy(error),
+        refitted=accuracy(with_spent_freedom(corrected, after.used)),
+        findable=smallest_shifts,
+        sliding=frozenset(f"d{j + 1}" for j in np.flatnonzero(robot.prismatic)),
+        enough=enough_poses,
+        asked=needed_poses,
+        noise=found.first.noise_ratio,
+        poses=watched.data.poses,
+        fit=replace(refitted, notices=(*refitted.notices, *left_out)),
+        notices=(
+            *data.notices,
+            *(fault.text for fault in distance_faults(data)),
+            *left_out,
+            *warn_of_noise(found.first),
+        ),
+        set_aside=data.set_aside,
+        with_them=counted,
+    )
 
 
-# ---- valid or not ------------------------------------------------------------------------------
+def find_inseparable_zeros(watched: Watched, found: Search) -> Iterator[Hidden]:
+    """Zero positions that no data of this kind separate from what is open, and what would."""
+    names, rows, link_count = watched.names, found.before.rows, 5 * watched.cell.robot.joints
+    base = watched.open & (np.arange(names.count) < link_count + 6)
+    for zero in watched.zeros:
+        if zero in found.looked.column:
+            continue
+        column = np.array([zero])
+        if base.any() and rows.share(column, base)[0] <= MIN_OWN_MOTION:
+            needs = "reflectors on the foot, or the old frame (known frame)"
+            yield Hidden(names.all[zero], "the measurement frame", needs)
+        elif rows.share(column, watched.open & ~base)[0] <= MIN_OWN_MOTION:
+            needs = "reflectors that were not touched (known targets)"
+            yield Hidden(names.all[zero], "the tool", needs)
+        else:
+            yield Hidden(names.all[zero], "frame and tool", "poses that differ more")
 
 
-def left(watched: Watched, placed: Placing) -> Array:
-    """(m, k, 3) errors as placed [m]."""
-    state = placed.state
-    model, _ = watched.fitted(np.zeros(watched.names.count, dtype=bool), state)
-    return model.error(state) @ state.rotation.T
+def detectable_shifts(
+    watched: Watched, found: Search
+) -> tuple[dict[str, float], int | None, int | None]:
+    """The smallest shift of each zero position that is found; poses that are enough, and needed."""
+    tested, names = found.looked, watched.names.all
+    zeros = tested.column[tested.zero]
+    least = tested.least(found.first)[tested.zero]
+    smallest = {names[i]: float(size) for i, size in zip(zeros, least, strict=True)}
+    joints = [int(joint_of(names[i])[1:]) - 1 for i in zeros]
+    turning = ~watched.cell.robot.prismatic[joints]
+    if not turning.any():
+        return smallest, None, None
+    worst = float(np.max(least[turning]))
+    needed = max(math.ceil(watched.data.poses * (worst / SHIFT) ** 2), MIN_PLACING_POSES)
+    return smallest, (needed if worst <= SHIFT else None), needed
 
 
-def counting_all(watched: Watched, placed: Placing, seed: int) -> Accuracy:
-    """The accuracy as placed, where the points that were set aside count too."""
-    cell, error = watched.cell, grown(left(watched, placed), placed.used)
-    now = Cell.of(cell.robot, placed.state, cell.target_names, cell.effects, cell.sessions)
-    return with_them(error, groups(watched.data), errors_of(now, watched.data), seed=seed)
-
-
-def grown(error: Array, used: float) -> Array:
-    """Errors (m, k, 3) with what placing took off them put back; used: as of `Placing`."""
-    count = 3 * int(np.isfinite(error[..., 0]).sum())
-    return np.asarray(error * math.sqrt(count / max(count - used, 1.0)))
-
-
-def verdict(limit: Limit, error: Array, data: Measurements, used: float, seed: int) -> Verdict:
-    """One requirement against errors (m, k, 3) that placing took up `used` coordinates of."""
-    larger = grown(error, used)
-    group, rms = groups(data), limit.kind == "rms"
-    kind = rms_interval if rms else max_interval
-
-    def interval(level: float, copies: int = 1) -> Interval:
-        each = np.add.outer(len(group) * np.arange(copies), group).ravel()
-        error = np.tile(larger, (copies, 1, 1))
-        return kind(error, each, level, rng=np.random.default_rng(seed))
-
-    found = accuracy(larger)
-    value = found.rms_mm if rms else found.max_mm
-    ends = interval(2.0 * MIN_CONFIDENCE - 1.0)
-    span = 1e3 * ends.low, max(1e3 * ends.high, value)
-    poses = len(np.unique(group))
-    told = partial(Verdict, limit.kind, limit.size_mm, value, span)
-    seen = f"{KINDS[limit.kind]} {value:.3f} mm, at most {limit.size_mm:g} mm is required"
-    if math.isnan(ends.low):
-        return told(None, CONFIDENCE_RANGE[0], f"{seen}, and {poses} poses are too few to say")
-    if not rms and (most := accuracy(error).max_mm) > limit.size_mm:
-        return told(
-            False, CONFIDENCE_RANGE[1],
-            f"{KINDS['max']} {most:.3f} mm was seen, at most {limit.size_mm:g} mm is required",
-        )  # fmt: skip
-    if not rms and chance_of_larger(poses) > MAX_EXCEED_CHANCE:
-        said = f"{seen}, and a maximum needs at least {MIN_POSES} poses"
-        return told(None, CONFIDENCE_RANGE[0], said)
-    sure = confidence(interval, 1e-3 * limit.size_mm, above=value > limit.size_mm)
-    if sure >= MIN_CONFIDENCE:
-        return told(value <= limit.size_mm, sure, seen)
-    if not rms:  # which grows with the poses
-        return told(None, sure, f"{seen}: more poses may decide")
-    copied = partial(interval, 2.0 * MIN_CONFIDENCE - 1.0)
-    many = to_decide(copied, 1e-3 * value, 1e-3 * limit.size_mm, poses)
-    return told(None, sure, f"{seen}: {many} poses like these decide")
-
-
-def confidence(interval: Any, size: float, *, above: bool) -> float:
-    """The largest one-sided confidence at which an interval lies on one side of a size."""
-    low, high = CONFIDENCE_RANGE
-    for _ in range(12):
-        middle = 0.5 * (low + high)
-        ends = interval(2.0 * middle - 1.0)
-        holds = ends.low > size if above else ends.high < size
-        low, high = (middle, high) if holds else (low, middle)
-    return low
-
-
-def remarks(watched: Watched, found: Search) -> Iterator[str]:
-    """What the reader should know."""
-    ratio, dof = found.first.noise_ratio, found.first.variances.dof
-    if ratio**2 > 1.0 + MIN_NOISIER_SIGMAS * math.sqrt(2.0 / dof):
+def warn_of_noise(both: Both) -> Iterator[str]:
+    """Notices where the new poses are noisier than the calibration, or its model lacks much."""
+    ratio, wider = both.noise_ratio, both.widest()
+    if ratio**2 > 1.0 + MIN_NOISIER_SIGMAS * math.sqrt(2.0 / both.variances.dof):
         yield (
             f"the new poses are {ratio:.2g} times as noisy as the calibration: the instrument is "
             "noisier now, or more changed than is named"
         )
-    wider = found.first.widest()
     if wider > MIN_WIDER:
         yield (
             f"the model lacks something: sigmas are up to {wider:.2g} times what noise alone would "
             "leave; a diagnosis says what"
         )
+
+
+# ---- valid or not ------------------------------------------------------------------------------
+
+
+def placed_errors(watched: Watched, placed: Placing) -> Array:
+    """(k, m, 3) errors where base, targets and what moved are placed [m]."""
+    state = placed.state
+    model, _ = watched.fitted(np.zeros(watched.names.count, dtype=bool), state)
+    return model.error(state) @ state.rotation.T
+
+
+def with_spent_freedom(error: Array, used: float) -> Array:
+    """Errors (k, m, 3) grown to n / (n - used) in the mean square: what placing took up, put back.
+
+    used: coordinates, as of `Placing`.
+    """
+    count = 3 * int(np.isfinite(error[..., 0]).sum())
+    return np.asarray(error * math.sqrt(count / max(count - used, 1.0)))
+
+
+def judge_limit(limit: Limit, error: Array, data: Measurements, used: float, seed: int) -> Verdict:
+    """One requirement against errors (k, m, 3) that placing took up `used` coordinates of."""
+    grown, group = with_spent_freedom(error, used), groups(data)
+    is_rms, required = limit.kind == "rms", 1e-3 * limit.size_mm
+    kind = rms_interval if is_rms else max_interval
+
+    def interval(level: float, copies: int = 1) -> Interval:
+        copied = np.add.outer(len(group) * np.arange(copies), group).ravel()
+        errors = np.tile(grown, (1, copies, 1))
+        return kind(errors, copied, level, rng=np.random.default_rng(seed))
+
+    found = accuracy(grown)
+    value = found.rms_mm if is_rms else found.max_mm
+    ends = interval(2.0 * MIN_CONFIDENCE - 1.0)
+    poses, unsure = len(np.unique(group)), CONFIDENCE_RANGE[0]
+    verdict = partial(
+        Verdict, limit.kind, limit.size_mm, value, (1e3 * ends.low, max(1e3 * ends.high, value))
+    )
+    seen = f"{KINDS[limit.kind]} {value:.3f} mm, at most {limit.size_mm:g} mm is required"
+    if math.isnan(ends.low):
+        return verdict(None, unsure, f"{seen}, and {poses} poses are too few to say")
+    if not is_rms and (most := accuracy(error).max_mm) > limit.size_mm:
+        return verdict(
+            False, CONFIDENCE_RANGE[1],
+            f"{KINDS['max']} {most:.3f} mm was seen, at most {limit.size_mm:g} mm is required",
+        )  # fmt: skip
+    if not is_rms and chance_of_larger(poses) > MAX_EXCEED_CHANCE:
+        return verdict(None, unsure, f"{seen}, and a maximum needs at least {MIN_POSES} poses")
+
+    # The largest one-sided confidence at which the interval lies on one side of the limit.
+    is_above, (sure, high) = value > limit.size_mm, CONFIDENCE_RANGE
+    for _ in range(CONFIDENCE_BISECTIONS):
+        middle = 0.5 * (sure + high)
+        low_end, high_end = interval(2.0 * middle - 1.0)
+        is_clear = low_end > required if is_above else high_end < required
+        sure, high = (middle, high) if is_clear else (sure, middle)
+    if sure >= MIN_CONFIDENCE:
+        return verdict(not is_above, sure, seen)
+    if not is_rms:  # which grows with the poses
+        return verdict(None, sure, f"{seen}: more poses may decide")
+    copied = partial(interval, 2.0 * MIN_CONFIDENCE - 1.0)
+    needed = poses_to_decide(copied, 1e-3 * value, required, poses)
+    return verdict(None, sure, f"{seen}: {needed} poses like these decide")
+
+
+def poses_to_decide(
+    interval: Callable[[int], Interval], value: float, size: float, poses: int
+) -> str:
+    """How many poses decide on which side of a limit an RMS lies, in words.
+
+    Half of all sessions of so many are decided: the interval of an RMS as seen just excludes the
+    limit.  The intervals are those of 1, 2, 4 ... copies of these poses, a power law between.
+    interval: of so many copies.  value: the RMS that was seen [m].  size: the limit [m].  poses:
+    how many were seen.
+    """
+    side = int(value < size)
+    wanted, width = abs(math.log(size / value)), math.inf
+    for doubled in range(MAX_POSE_DOUBLINGS + 1):
+        last = width
+        end = float(np.clip(interval(2**doubled)[side] / value, 1.0 / FARTHEST, FARTHEST))
+        width = abs(math.log(end))
+        if width <= wanted:
+            power = math.log(last / wanted) / math.log(last / width) if doubled else 1.0
+            few = poses / (poses - 1.0)  # spread of copies, which are no new poses
+            count = max(few * poses * 2.0 ** (doubled - 1.0 + power), poses + 1.0)
+            return f"about {float(f'{count:.2g}'):.0f}"
+    return f"more than {poses * 2**MAX_POSE_DOUBLINGS}"

@@ -21,7 +21,7 @@ from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import for_people, in_own_unit
 from minimax_cal.judging.watching.both import FOOT, KNOWN, NEW, OLD, Both, Part, critical
 from minimax_cal.judging.watching.old import Old
-from minimax_cal.judging.watching.placing import Placing, Rows
+from minimax_cal.judging.watching.placing import Placing, Rows, solve_placing
 from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.measuring.grouping import regions
 from minimax_cal.measuring.history import clock, is_timed
@@ -180,12 +180,6 @@ def joint_of(parameter: str) -> str:
     return "J" + parameter.lstrip("abcdefghijklmnopqrstuvwxyz")
 
 
-def levels(zero: Array) -> Array:
-    """(c,) chance that each parameter is named where nothing moved; zero: (c,) as `Candidates`."""
-    counts = [max(int(kind.sum()), 1) for kind in (zero, ~zero)]
-    return FALSE_ALARM * np.where(zero, ZEROS / counts[0], (1.0 - ZEROS) / counts[1])
-
-
 def picked(square: Array, passed: Array, zero: Array) -> tuple[int, list[int]]:
     """The one of those that passed that explains most, and which would do nearly as well.
 
@@ -218,8 +212,10 @@ class Candidates:
         zeros = watched.zeros
         others = np.setdiff1d(np.flatnonzero(links & watched.names.links), zeros)
         kinds = [kind[rows.share(kind, watched.open) > MIN_OWN_MOTION] for kind in (zeros, others)]
-        zero = np.repeat([True, False], [len(kind) for kind in kinds])
-        return Candidates(np.concatenate(kinds), zero, levels(zero))
+        counts = [len(kind) for kind in kinds]
+        shares = [ZEROS / max(counts[0], 1), (1.0 - ZEROS) / max(counts[1], 1)]
+        zero = np.repeat([True, False], counts)
+        return Candidates(np.concatenate(kinds), zero, FALSE_ALARM * np.repeat(shares, counts))
 
     def least(self, both: Both) -> Array:
         """(c,) smallest change that is found in 95 of 100 cases [SI]."""
@@ -229,7 +225,7 @@ class Candidates:
     def same(self, both: Both) -> float:
         """p-value of nothing having moved: of the clearest, shared among all [Bonferroni]."""
         by, sigma, dof = both.scores(NOTHING)
-        _, p_value = tested(by, sigma, dof)
+        _, p_value = student_test(by, sigma, dof)
         return float(np.min(FALSE_ALARM * p_value / self.level, initial=1.0))
 
     def clearest(self, both: Both, chosen: Array) -> tuple[int, float, list[int]] | None:
@@ -239,14 +235,17 @@ class Candidates:
         chosen: what was found before.  All are numbers of candidates.
         """
         by, sigma, dof = both.scores(chosen)
-        size, p_value = tested(by, sigma, dof)
+        size, p_value = student_test(by, sigma, dof)
         passed = (p_value <= self.level) & ~np.isin(np.arange(len(size)), chosen)
-        for i in np.flatnonzero(
-            passed
-        ).tolist():  # whoever clears the noises must clear the folds' scatter
+        for i in np.flatnonzero(passed).tolist():
+            # what is significant beside the noises must be so beside the folds' scatter, and
+            # poses that were left out must gain by more than a standard error
             wide = max(sigma[i], both.scatter(chosen, i))
-            size[i], p_value[i] = tested(by[i], wide, dof[i])
-            passed[i] = p_value[i] <= self.level[i] and helps(both.gains(chosen, i))
+            size[i], p_value[i] = student_test(by[i], wide, dof[i])
+            gains = both.gains(chosen, i)
+            spread = float(np.std(gains, ddof=1)) if len(gains) > 1 else np.inf
+            helps = bool(gains.mean() > spread / np.sqrt(len(gains)))
+            passed[i] = p_value[i] <= self.level[i] and helps
         if not passed.any():
             return None
         square = size**2
@@ -255,16 +254,10 @@ class Candidates:
         return pick, float(p_value[pick]), near
 
 
-def tested(by: Array, sigma: Array, dof: Array) -> tuple[Array, Array]:
+def student_test(by: Array, sigma: Array, dof: Array) -> tuple[Array, Array]:
     """How large a change is, in sigmas, and its p-value [Student]."""
     size = np.abs(by) / sigma
     return np.asarray(size), np.asarray(2.0 * scipy.stats.t.sf(size, dof))
-
-
-def helps(gains: Array) -> bool:
-    """Whether parts left out gain by more than a standard error.  gains: (g,)."""
-    spread = float(np.std(gains, ddof=1)) if len(gains) > 1 else np.inf
-    return bool(gains.mean() > spread / np.sqrt(len(gains)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,7 +307,7 @@ def search(watched: Watched, links: Array) -> Search:
         Moved(names.all[i], float(sense[i] * (change[i] + by)), float(sure), names.units[i], *said)
         for i, by, sure, said in zip(looked.column[chosen], more, sigma, told, strict=True)
     )
-    before, after = (Placing(informed(watched, one, first)) for one in (first_rows, rows))
+    before, after = (solve_placing(informed(watched, one, first)) for one in (first_rows, rows))
     return Search(named, first, before, after, looked, looked.same(first))
 
 

@@ -20,16 +20,15 @@ from minimax_cal.measuring.stations import labels
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.modelling.effects.words import name_effect
 
-LEAST_FOOT = 3  # reflectors on the foot tell where it stands
-NOBODY = np.zeros((0, 3))  # no reflector on the foot
-LEAST_NOISE = 1e-9  # of a coordinate: data that were computed, not measured [m]
+MIN_FOOT_REFLECTORS = 3  # that place the foot
+NO_REFLECTORS = np.zeros((0, 3))  # no reflector on the foot
+MIN_NOISE_OF_COORDINATE = 1e-9  # of a coordinate: data that were computed, not measured [m]
 
 
-def watched_of(
+def open_parameters(
     fit: Fit, data: Measurements, known: Sequence[str]
 ) -> tuple[Watched, tuple[str, ...]]:
     """The new measurements beside the calibration; what was left out.  Raises CalibrationError."""
-    known_by = fit.uncertainty
     data = check_joints(fit.cell.robot, data)
     if len(np.unique(labels(data))) > 1:
         raise DataError(f"{data.source}: holds several sessions; check them one by one")
@@ -45,7 +44,9 @@ def watched_of(
             f"{data.source}: target {strange[0]} is not one of the calibration's; leave targets "
             "out of known"
         )
-    foot, foot_now = (NOBODY, NOBODY) if frame else feet(fit, data)
+    foot, foot_now, scatter = NO_REFLECTORS, NO_REFLECTORS, 0.0
+    if not frame:
+        foot, foot_now, scatter = measure_foot(fit, data)
     place = dict(zip(cell.target_names, cell.target_positions, strict=True))
     kept = cell.effects.where(
         lambda term: (
@@ -54,10 +55,13 @@ def watched_of(
         )
     )
     gone = [name_effect(*term.key) for term in cell.effects.terms if term not in kept.terms]
-    said = (f"left out: {', '.join(gone)}; they ended with the calibration's session",)
-    ratio = usual_u95(data) / usual_u95(fit.data)
-    variance = known_by.noise.variance * (ratio**2 if math.isfinite(ratio) else 1.0)
-    variance = max(variance, LEAST_NOISE**2)
+    variance, u95 = fit.uncertainty.noise.variance, []
+    for part in (data, fit.data):
+        column = part.columns.get("u95", np.zeros(0))
+        u95.append(float(np.nanmedian(column)) if np.isfinite(column).any() else math.nan)
+    if math.isfinite(ratio := u95[0] / u95[1]):  # the instrument may be another
+        variance *= ratio**2
+    variance = max(variance, MIN_NOISE_OF_COORDINATE**2)
     watched = Watched(
         cell=replace(
             cell,
@@ -67,51 +71,46 @@ def watched_of(
             sessions=cell.sessions if frame else replace(cell.sessions, frames={}),
         ),
         data=cell.placed(data) if frame else data,
-        known=known_by.root,
-        names_old=known_by.names,
+        known=fit.uncertainty.root,
+        names_old=fit.uncertainty.names,
         variance=variance,
         fit=fit,
         frame=frame,
         tool=tool,
         foot=foot,
         foot_now=foot_now,
-        foot_variance=2.0 * variance + (foot_scatter(fit, data) if len(foot) else 0.0),
+        foot_variance=2.0 * variance + scatter,
     )
-    return watched, said if gone else ()
+    if not gone:
+        return watched, ()
+    return watched, (f"left out: {', '.join(gone)}; they ended with the calibration's session",)
 
 
-def feet(fit: Fit, data: Measurements) -> tuple[Array, Array]:
-    """Reflectors on the foot that both saw: (f, 3) in the base as calibrated, and as seen now [m].
+def measure_foot(fit: Fit, data: Measurements) -> tuple[Array, Array, float]:
+    """Reflectors on the foot that both saw: where they stood, where they stand, their scatter.
 
-    None where they are too few to tell where the foot stands.
+    Returns (f, 3) in the base as calibrated, (f, 3) as seen now [m], none where they are too few to
+    place the foot; and the variance of a coordinate between means of then and now [m^2].  What
+    stands still scatters by the noise; a foot that is compliant, from region to region too.
     """
-    now, then = foot_of(data), foot_of(fit.data)
-    both = names_of_foot(fit, data)
-    if len(both) < LEAST_FOOT:
-        return NOBODY, NOBODY
-    base = np.linalg.inv(fit.cell.base)
-    old = np.array([base[:3, :3] @ usual(then[name]) + base[:3, 3] for name in both])
-    return old, np.array([usual(now[name]) for name in both])
+    then, now = read_foot_reflectors(fit.data), read_foot_reflectors(data)
+    both = [name for name in now if name in then]
+    if len(both) < MIN_FOOT_REFLECTORS:
+        return NO_REFLECTORS, NO_REFLECTORS, 0.0
+    base, label = np.linalg.inv(fit.cell.base), regions(fit.data)
+    means = {name: np.nanmean(then[name], axis=0) for name in both}
+    old = np.array([base[:3, :3] @ means[name] + base[:3, 3] for name in both])
+    deviation = np.stack([then[name] - means[name] for name in both])
+    regional = [np.nanmean(deviation[:, label == one], axis=1) ** 2 for one in np.unique(label)]
+    within = float(np.nanmean(deviation**2)) / data.poses
+    return (
+        old,
+        np.array([np.nanmean(now[name], axis=0) for name in both]),
+        max(float(np.nanmean(regional)), within),
+    )
 
 
-def names_of_foot(fit: Fit, data: Measurements) -> list[str]:
-    """Reflectors on the foot that both saw."""
-    then = foot_of(fit.data)
-    return [name for name in foot_of(data) if name in then]
-
-
-def usual(place: Array) -> Array:
-    """(3,) where a reflector (m, 3) stood on the mean [m]."""
-    return np.asarray(np.nanmean(place, axis=0))
-
-
-def usual_u95(data: Measurements) -> float:
-    """The typical u95 of the points; NaN where the data do not tell it."""
-    column = data.columns.get("u95", np.zeros(0))
-    return float(np.nanmedian(column)) if np.isfinite(column).any() else math.nan
-
-
-def foot_of(data: Measurements) -> dict[str, Array]:
+def read_foot_reflectors(data: Measurements) -> dict[str, Array]:
     """Where each reflector on the foot stood at each pose: (m, 3) by name, NaN unseen [m]."""
     stems = [name[:-2] for name in data.columns if name.startswith("base") and name.endswith("_x")]
     out = {}
@@ -123,20 +122,7 @@ def foot_of(data: Measurements) -> dict[str, Array]:
     return out
 
 
-def foot_scatter(fit: Fit, data: Measurements) -> float:
-    """Variance of a coordinate of the foot's reflectors, between means of then and now [m^2].
-
-    What stands still scatters by the noise; a foot that gives way, from region to region too.
-    """
-    seen, label = foot_of(fit.data), regions(fit.data)
-    both = names_of_foot(fit, data)
-    off = np.stack([seen[name] - usual(seen[name]) for name in both])
-    means = [off[:, label == one] for one in np.unique(label)]
-    between = float(np.nanmean([np.nanmean(part, axis=1) ** 2 for part in means]))
-    return max(between, float(np.nanmean(off**2)) / data.poses)
-
-
-def in_names(fit: Fit, watched: Watched, flags: Array) -> Array:
+def match_names(fit: Fit, watched: Watched, flags: Array) -> Array:
     """(p,) flags by the names of the calibration as flags by those of now."""
     old = dict(zip(fit.uncertainty.names.all, flags, strict=True))
     return np.array([bool(old.get(name, False)) for name in watched.names.all])

@@ -8,7 +8,6 @@ joints nor instrument are noisy, and there what the model lacks leads astray by 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -65,68 +64,23 @@ RANK_TOLERANCE = 1e-10  # share of the largest singular value below which a dire
 class Placing:
     """Least squares of the distances over what is free in some rows, the rest as calibrated.
 
-    Reflectors on the foot hold the frame beside them, by their noise.
+    state: where what is free explains the errors best.  used: coordinates of the poses that what is
+    free takes up.  inverse: (f, N) from errors to what is free.  size: of a coordinate that is
+    left, what model and noises both leave [m].
     """
 
     rows: Rows
-
-    @cached_property
-    def blocks(self) -> tuple[Array, Array, Array]:
-        """Errors (m, r) [m], their slopes (m, r, f) by what is free, noise's root (m, r, r) [m]."""
-        rows, half = self.rows, self.rows.half
-        m, r, _ = half.shape
-        whole = np.concatenate([rows.error[:, None], rows.jacobian[:, rows.active]], axis=1)
-        plain = half @ whole[: m * r].reshape(m, r, -1)
-        return plain[..., 0], plain[..., 1:], half
-
-    @cached_property
-    def size(self) -> float:
-        """Of a coordinate that is left, what model and noises both leave [m]."""
-        error, slope, half = self.blocks
-        dof = self.rows.count - self.rows.foot - slope.shape[-1]
-        least = float((half[:, 0] ** 2).sum(axis=-1).min())  # no less than a coordinate's noise
-        return float(np.sqrt(max(float((error**2).sum()) / max(dof, 1), least)))
-
-    @cached_property
-    def matrix(self) -> Array:
-        """(N, f) slopes in units of what is left, those of the foot last."""
-        slope = self.blocks[1]
-        foot = self.rows.jacobian[:, self.rows.active][self.rows.pose < 0]
-        return np.concatenate([slope.reshape(self.blocks[0].size, -1) / self.size, foot])
-
-    @cached_property
-    def error(self) -> Array:
-        """(N,) errors likewise."""
-        return np.concatenate(
-            [self.blocks[0].reshape(-1) / self.size, self.rows.error[self.rows.pose < 0]]
-        )
-
-    @cached_property
-    def inverse(self) -> Array:
-        """(f, N) from errors to what is free."""
-        norm = np.linalg.norm(self.matrix, axis=0)
-        norm = np.where(norm > 0.0, norm, 1.0)
-        return np.asarray(np.linalg.pinv(self.matrix / norm, rcond=RANK_TOLERANCE) / norm[:, None])
-
-    @cached_property
-    def state(self) -> State:
-        """Where what is free explains the errors best."""
-        step = np.zeros(len(self.rows.active))
-        step[self.rows.active] = self.inverse @ self.error
-        return self.rows.state.step(step)
-
-    @property
-    def used(self) -> float:
-        """Coordinates of the poses that what is free takes up."""
-        poses = self.blocks[0].size
-        return float(np.einsum("nf,fn->", self.matrix[:poses], self.inverse[:, :poses]))
+    state: State
+    used: float
+    inverse: Array
+    size: float
 
     def factor(self, root: Array) -> Array:
         """F (p, r + N) with FF' the covariance of all parameters there.
 
         root: (p, r) of what is kept, before; what the model lacks stands after it.
         """
-        rows, (_, _, half) = self.rows, self.blocks
+        rows, half = self.rows, self.rows.half
         m, r, _ = half.shape
         poses, foot = np.split(self.inverse, [m * r], axis=1)
         coloured = np.einsum("fmr,mrs->fms", poses.reshape(-1, m, r), half) / self.size
@@ -136,3 +90,30 @@ class Placing:
         out = np.concatenate([known, np.zeros((len(root), noise.shape[1]))], axis=1)
         out[rows.active, known.shape[1] :] = rows.scale * noise
         return out
+
+
+def solve_placing(rows: Rows) -> Placing:
+    """Place what is free in some rows; reflectors on the foot hold the frame, by their noise."""
+    # Back from units of the noise to metres: errors (m, r), slopes (m, r, f) by what is free.
+    half, active = rows.half, rows.active
+    m, r, _ = half.shape
+    whole = np.concatenate([rows.error[:, None], rows.jacobian[:, active]], axis=1)
+    in_metres = half @ whole[: m * r].reshape(m, r, -1)
+    error, slope = in_metres[..., 0], in_metres[..., 1:]
+
+    # All coordinates weigh alike, by the size of what is left; no less than the noise of one.
+    dof = rows.count - rows.foot - slope.shape[-1]
+    least = float((half[:, 0] ** 2).sum(axis=-1).min())
+    size = float(np.sqrt(max(float((error**2).sum()) / max(dof, 1), least)))
+    is_foot = rows.pose < 0
+    matrix = np.concatenate([slope.reshape(m * r, -1) / size, rows.jacobian[:, active][is_foot]])
+    right = np.concatenate([error.reshape(-1) / size, rows.error[is_foot]])
+
+    # Least squares with columns of unit length.
+    norm = np.linalg.norm(matrix, axis=0)
+    norm = np.where(norm > 0.0, norm, 1.0)
+    inverse = np.asarray(np.linalg.pinv(matrix / norm, rcond=RANK_TOLERANCE) / norm[:, None])
+    step = np.zeros(len(active))
+    step[active] = inverse @ right
+    used = float(np.einsum("nf,fn->", matrix[: m * r], inverse[:, : m * r]))
+    return Placing(rows, rows.state.step(step), used, inverse, size)

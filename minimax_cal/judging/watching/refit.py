@@ -14,7 +14,7 @@ from minimax_cal.fitting.identify import Identification, Reason
 from minimax_cal.fitting.opened import place
 from minimax_cal.ground.facts import Later
 from minimax_cal.judging.watching.moved import Search
-from minimax_cal.judging.watching.opening import in_names
+from minimax_cal.judging.watching.opening import match_names
 from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.solvers.status import Status
@@ -35,7 +35,7 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
     # What is known then: the calibration's covariance, updated by the new poses.
     factor = found.after.factor(watched.root)
     covariance = factor @ factor.T
-    known = in_names(fit, watched, fit.identification.active) | rows.active
+    known = match_names(fit, watched, fit.identification.active) | rows.active
     covariance[~known] = np.nan
     covariance[:, ~known] = np.nan
     old_units = dict(zip(old.names.all, old.units, strict=True))
