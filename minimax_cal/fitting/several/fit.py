@@ -39,7 +39,7 @@ from minimax_cal.fitting.several.options import (
 from minimax_cal.fitting.several.robust import ALIKE, Shares, of_loss, with_loss
 from minimax_cal.fitting.several.stack import Known, Squares, Stack, started
 from minimax_cal.fitting.several.worst import Worst, WorstOverNoise, least_worst
-from minimax_cal.fitting.solve import without_bounded_effects
+from minimax_cal.fitting.solve import EFFECT_PASSES, without_bounded_effects
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.instrument import METRE, Instrument
@@ -138,55 +138,80 @@ def fit_instruments(
     robot: Robot, trains: Mapping[str, Instrument], options: RelativeOptions, progress: Progress
 ) -> InstrumentFit:
     """Fit the identifiable parameters to the training measurements.  Raises DataError."""
+    # Start: the arm as drawn, and base, targets and unknowns of the instruments that fit it best.
     progress("start")
     trains = {label: data.in_order() for label, data in trains.items()}
     stack = stack_of(robot, trains, options)
-    allowed, wanted = allowed_of(stack, options)
+    allowed, preferred = allowed_of(stack, options)
     known = Known(links_of(robot.mdh), sigmas_of(stack.names, options))
-    held = known.told(stack.names.count)
     nominal = start_of(robot, stack, allowed)
+
+    # Which parameters the rows determine: against what plenty of poses would.
     progress("identifiable parameters")
     reference = stack.reference(robot, nominal)
-    check_count(
-        [*trains.values()], stack, generic_count(robot, reference, nominal, allowed & ~held)
-    )
-
+    has_prior = known.told(stack.names.count)
+    unknowns = generic_count(robot, reference, nominal, allowed & ~has_prior)
+    check_count([*trains.values()], stack, unknowns)
     offsets = np.zeros(stack.names.count, dtype=bool)  # by which coaxial axes were found apart
 
     def identify(stack: Stack, known: Known, x: State) -> Identification:
         more = (0, len(stack.laws.names))
         return identified(
             robot, stack, reference, x, np.pad(allowed, more, constant_values=True),
-            np.pad(wanted, more), known=known.told(stack.names.count) | np.pad(offsets, more),
+            np.pad(preferred, more),
+            known=known.told(stack.names.count) | np.pad(offsets, more),
             resolution=options.resolution,
         )  # fmt: skip
 
-    told = identify(stack, known, nominal)
+    # Least squares, instruments weighed by the noises that remain; again, since one that is rough
+    # then determines less than it seemed to.
+    identification = identify(stack, known, nominal)
     progress("least squares")
-    problem, ended = weighed(Squares(stack, told.active, known), nominal, options)
-    if len(trains) > 1:  # an instrument that is rough tells less than it seemed
-        told = identify(problem.stack, known, nominal)
-        again = replace(problem, active=told.active)
-        problem, ended = weighed(again, nominal, options)
+    problem = Squares(stack, identification.active, known)
+    problem, ended = weighed(problem, nominal, options)
+    if len(trains) > 1:
+        identification = identify(problem.stack, known, nominal)
+        problem = replace(problem, active=identification.active)
+        problem, ended = weighed(problem, nominal, options)
+
+    # Axes that are drawn coaxial: apart in any direction, if the rows show it.
     for joint in coaxial_joints(robot):
         trial = try_offset(robot, problem, ended, joint, allowed, reference)
         if trial is None:
             continue
         offsets |= trial.joined
-        again = Squares(problem.stack, trial.active, known)
-        problem, ended = weighed(again, trial.begin, options)
+        problem = Squares(problem.stack, trial.active, known)
+        problem, ended = weighed(problem, trial.begin, options)
         gram = problem.stack.closed(robot, trial.begin).gram(trial.begin)
-        told = identify_with_offset(told, stack.names, trial, gram, *words_of_own(problem.stack))
-    fit = stiff = solved(problem, ended, nominal, told, trains)
+        identification = identify_with_offset(
+            identification, stack.names, trial, gram, *words_of_own(problem.stack)
+        )
+    fit = geometric = solved(problem, ended, nominal, identification, trains)
+
+    # Effects beside the geometry: linear where it ended, then for finite rotations too.
     if options.effects:
         progress("effects")
+        laws = laws_of(robot, geometric, options.effects)
+        for _ in range(EFFECT_PASSES):
+            fit = fit_with_laws(robot, fit, laws, known, identify, options)
+        fit = replace(fit, stiff=geometric)
 
-        def beside(fit: InstrumentFit, laws: Laws) -> InstrumentFit:
-            return with_laws(robot, fit, laws, known, identify, options)
+    # The minimax.  Parts of several files compare by the noises of these, which the sum gave.
+    if options.objective != SUM and fit.found.status[0] is not Status.FAILED:
+        part, names = fit.stack.part_of_rows(fit.state), fit.stack.parts
+        in_metres = {one.unit for one in fit.stack.instruments} == {METRE}
+        kind = Worst if in_metres else WorstOverNoise
+        fit, share = at_worst(fit, part, names, 1, options.qp, MIN_NOISE, kind)
+        variance = np.square(fit.noise)
+        covariance = covariance_of(fit.problem, fit.state, variance, (share, share**2))
+        fit = replace(fit, covariance=covariance)
 
-        laws = laws_of(robot, stiff, options.effects)
-        fit = replace(beside(beside(stiff, laws), laws), stiff=stiff)  # then for finite turns too
-    return with_alone(robot, of_worst(fit, options), options)
+    # What each of several instruments determines by itself.
+    if len(trains) > 1:
+        closed, active = fit.stack.closed(robot, fit.nominal), fit.identification.active
+        alone = determined_alone(closed, fit.nominal, active, options.resolution)
+        fit = replace(fit, alone=alone)
+    return fit
 
 
 def try_offset(
@@ -226,22 +251,6 @@ def try_offset(
     return replace(trial, begin=found.x.take(np.array(0)))
 
 
-def of_worst(fit: InstrumentFit, options: RelativeOptions) -> InstrumentFit:
-    """The minimax from a fit of the sum, where the objective asks for one.
-
-    Parts of several files compare by the noises of these, which the sum told.
-    """
-    if options.objective == SUM or fit.found.status[0] is Status.FAILED:
-        return fit
-    of, names = fit.stack.part_of_rows(fit.state), fit.stack.parts
-    units = {one.unit for one in fit.stack.instruments}
-    kind = Worst if units == {METRE} else WorstOverNoise
-    fit, share = at_worst(fit, of, names, 1, options.qp, MIN_NOISE, kind)
-    shares = share, share**2
-    covariance = covariance_of(fit.problem, fit.state, np.square(fit.noise), shares)
-    return replace(fit, covariance=covariance)
-
-
 def at_worst(
     fit: F, of: Array, names: Sequence[str], numbers: int, qp: QpSolver, rounding: float,
     kind: type[Worst],
@@ -272,7 +281,7 @@ def at_worst(
     return replace(fit, state=best.x, found=found, worst=worst, notices=notes), share
 
 
-def with_laws(
+def fit_with_laws(
     robot: Robot,
     fit: InstrumentFit,
     laws: Laws,
@@ -282,19 +291,28 @@ def with_laws(
 ) -> InstrumentFit:
     """Geometry and effects together, from a fit whose laws are linear where it ended.
 
-    known: of the links.
+    known: of the links.  identify: the parameters that rows, priors and a state determine.
     """
     scenes = fit.stack.scenes(robot, fit.state)
     stack, begin = fit.stack.bent(robot, laws, fit.state)
-    first, count = stack.names.geometric, len(laws.names)
-    own = fit.nominal.effects[: stack.lawless - first]
-    drawn = replace(fit.nominal, effects=np.pad(own, (0, count)))
+    names, first_law = stack.names, stack.lawless - stack.names.geometric
+    own = fit.nominal.effects[:first_law]
+    drawn = replace(fit.nominal, effects=np.pad(own, (0, len(laws.names))))
     known = replace(known, laws=laws.sigma(scenes[0]))
-    told = identify(stack, known, drawn)
-    untold = np.flatnonzero(~told.active[stack.lawless :]) + stack.lawless - first
-    begin.effects[untold] = 0.0
-    problem = Squares(stack, told.active, known, room=laws.room(scenes))
-    return resting(solved(*weighed(problem, begin, options), drawn, told, fit.trains))
+    identification = identify(stack, known, drawn)
+    begin.effects[np.flatnonzero(~identification.active[stack.lawless :]) + first_law] = 0.0
+    problem = Squares(stack, identification.active, known, room=laws.room(scenes))
+    fit = solved(*weighed(problem, begin, options), drawn, identification, fit.trains)
+
+    # A parameter of a law at its bound is not identified: it has no sigma.
+    is_at_bound = at_bounds(stack.values(fit.state), problem.room)
+    if not is_at_bound.any():
+        return fit
+    known_now = without_bounded_effects(identification, names, np.pad(is_at_bound, (first_law, 0)))
+    problem = replace(fit.problem, active=known_now.active)
+    shares, _ = of_loss(problem, fit.found)
+    covariance = covariance_of(problem, fit.state, np.square(fit.noise), shares)
+    return replace(fit, identification=known_now, covariance=covariance)
 
 
 def solved(
@@ -311,15 +329,6 @@ def solved(
         problem, nominal, state, told, ended, covariance_of(problem, state, variance, shares),
         np.sqrt(variance), trains, (), notices=notices,
     )  # fmt: skip
-
-
-def with_alone(robot: Robot, fit: InstrumentFit, options: RelativeOptions) -> InstrumentFit:
-    """The fit with what each of several instruments determines by itself."""
-    if len(fit.trains) < 2:
-        return fit
-    closed, active = fit.stack.closed(robot, fit.nominal), fit.identification.active
-    alone = determined_alone(closed, fit.nominal, active, options.resolution)
-    return replace(fit, alone=alone)
 
 
 def laws_of(robot: Robot, fit: InstrumentFit, texts: Sequence[str | Term]) -> Laws:
@@ -339,20 +348,6 @@ def laws_of(robot: Robot, fit: InstrumentFit, texts: Sequence[str | Term]) -> La
 
     each = fit.stack.scenes(robot, fit.state)
     return Laws.of(scene, each, texts, pick)
-
-
-def resting(fit: InstrumentFit) -> InstrumentFit:
-    """The fit, the parameters of laws that rest at a bound without sigma."""
-    rests = at_bounds(fit.stack.values(fit.state), fit.problem.room)
-    if not rests.any():
-        return fit
-    names = fit.stack.names
-    every = np.pad(rests, (fit.stack.lawless - names.geometric, 0))
-    known = without_bounded_effects(fit.identification, names, every)
-    again = replace(fit.problem, active=known.active)
-    shares, _ = of_loss(again, fit.found)
-    covariance = covariance_of(again, fit.state, np.square(fit.noise), shares)
-    return replace(fit, identification=known, covariance=covariance)
 
 
 def weighed(
