@@ -111,7 +111,9 @@ def relative_with(
     progress: Progress,
 ) -> RelativeCalibration:
     """`relative`, which calls this, with its options in one."""
-    return asked_of(robot, data, options).calibrated(progress)
+    asked = asked_of(robot, data, options)
+    began = time.perf_counter()
+    return result_of(asked, asked.fit(progress), began)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,11 +141,6 @@ class Asked:
         progress("sigmas")
         return with_lack(self.robot, found)
 
-    def calibrated(self, progress: Progress) -> RelativeCalibration:
-        """The calibration."""
-        began = time.perf_counter()
-        return result_of(self, self.fit(progress), began)
-
     def beside(self, effects: Sequence[Term]) -> Asked:
         """The same with effects."""
         return replace(self, options=replace(self.options, effects=tuple(effects)))
@@ -156,20 +153,27 @@ def asked_of(
     *,
     sought: bool = False,
 ) -> Asked:
-    """Data loaded and checked, and split; sought: whether effects are.  Raises CalibrationError."""
+    """Data loaded, checked, and split into training and held-out poses.
+
+    sought: whether effects are looked for.  Raises CalibrationError.
+    """
+    # Each file by its instrument, those that look at the arm first.
     robot = load_robot(robot)
     given = [data] if isinstance(data, Given) else list(data)
     every = sorted(map(as_instrument, given), key=lambda data: not data.on_arm)
     check_given(every, bends=sought or bool(options.effects))
     check_options(every, options)
+
+    # All joints of the arm, and the way to each pose.
     every = [replace(each, at=with_history(check_joints(robot, each.at))) for each in every]
     check_noises(labels_of(every), every, options)
+
+    # Instruments of the user's own keep the protocol; slips show where the drawn arm is fitted.
     for each in filter(is_registered, every):
         check_instrument(checked(each), robot, options)
     for each in every:
         plausible.check_slips(robot, each, options)
-    splits = [each.held_back(options) for each in every]
-    return Asked(robot, every, options, splits)
+    return Asked(robot, every, options, [each.held_back(options) for each in every])
 
 
 def labels_of(every: Sequence[Instrument]) -> list[str]:
@@ -185,10 +189,13 @@ def labels_of(every: Sequence[Instrument]) -> list[str]:
 
 
 def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalibration:
-    """What a fit says of all poses.  began: when the work did [s]."""
-    robot, options, pairs = asked.robot, asked.options, zip(asked.every, asked.splits, strict=True)
+    """The result of a fit, judged at all poses.  began: when the work did [s]."""
+    robot, every, options, splits = asked.robot, asked.every, asked.options, asked.splits
+
+    # Errors of each file, as drawn and calibrated; how well positions of the arm are known.
     measured = [
-        measured_by(robot, found, i, data, held) for i, (data, (held, _)) in enumerate(pairs)
+        measured_by(robot, found, i, data, held)
+        for i, (data, (held, _)) in enumerate(zip(every, splits, strict=True))
     ]
     left_open, sigma = open_positions(robot, found), sigma_of_positions(robot, found)
     result = assembled(
@@ -198,7 +205,109 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
         beyond=plausible.beyond(robot, found, options) if len(measured) == 1 else (),
         cell=cell_of(robot, found) if found.stiff else None,
     )  # fmt: skip
-    return judged(asked, found, measured, result, sigma)
+
+    # The outcome: with it, what of an instrument was not fitted and the residuals show.
+    unfitted = [plausible.unfitted(robot, found, i, options) for i in range(len(every))]
+    evidence = evidence_of(asked, found, measured, sigma, [mend for _, mend in unfitted])
+    outcome = judge(evidence, result.status)
+    moved = () if outcome.reason else find_moved_bases(found)
+
+    # What the reader should know.
+    instruments = enumerate(found.stack.instruments)
+    notices = [
+        *result.notices,
+        *(remark for i, one in instruments
+          for remark in one.remarks(fit.own_parameters(robot, found, i), found.noise[i])),
+        *plausible.of_beyond(result),
+        *plausible.of_scale(found),
+        *plausible.of_lone_rotations(found),
+        *plausible.weak(found, result, measured, sigma),
+        *plausible.unlikely(result, measured),
+        *evidence.doubts,
+        *filter(None, (*(notice for notice, _ in unfitted), outcome.reason)),
+        *(one.sentence for one in moved),
+    ]  # fmt: skip
+    for data, (held, _), each in zip(every, splits, measured, strict=True):
+        notices += plausible.general(each, data, held)
+    return replace(
+        result,
+        robot=robot if outcome.status.keeps_drawn else result.robot,
+        calibrated=result.robot,
+        status=outcome.status,
+        reason=outcome.reason,
+        contradictions=evidence.contradictions or moved,
+        notices=tuple(dict.fromkeys(notices)),
+    )
+
+
+def evidence_of(
+    asked: Asked,
+    found: InstrumentFit,
+    measured: Sequence[Measured],
+    sigma: float,
+    mends: Sequence[str],
+) -> FitEvidence:
+    """What the outcome is judged by.
+
+    sigma: of a position, but for what is open [m].  mends: of what was not fitted of each file and
+    the residuals show, empty where nothing is.
+    """
+    robot, every, geometry = asked.robot, asked.every, found.stiff or found
+    links, stack = slice(5 * robot.joints), found.stack
+    active = geometry.identification.active[links]
+
+    # Errors of each file; one that more of an instrument would explain is an objection where the
+    # fit is worse than the drawn arm.
+    files, objection = [], ""
+    for data, one, mend in zip(every, measured, mends, strict=True):
+        scores = {what: one.accuracy[key] for key, what in PARTS.items()}
+        rotations = {what: one.turns[key][0] for key, what in PARTS.items() if key in one.turns}
+        if one.units == (RADIAN,):
+            rotations = {what: score.rms_error for what, score in scores.items()}
+        drawn_scores = {}
+        if data.unit == METRE:
+            drawn_scores = {key: one.accuracy[key] for key in ("nominal_train", "nominal")}
+        files.append(
+            FileEvidence(
+                {what: (score, score) for what, score in scores.items()},
+                source=data.at.source if len(every) > 1 else "",
+                check=data.words.check,
+                rotations=rotations,
+                drawn=drawn_scores,
+            )
+        )
+        drawn, calibrated, _ = one.before_and_after()
+        if mend and not objection and calibrated.rms_error > drawn.rms_error:
+            objection = f"the fit is worse than the arm as drawn: {mend}"
+
+    # Is the calibrated arm better on held-out rows?  By paired comparison, files by their noises.
+    better = None
+    if active.any() or stack.laws.names:
+        better = improvement_of_files(
+            [one.errors["nominal"] for one in measured],
+            [one.errors["holdout"] for one in measured],
+            [groups(data.at)[held] for data, (held, _) in zip(every, asked.splits, strict=True)],
+            [s / one.row_noise for s, one in zip(found.noise, stack.instruments, strict=True)],
+        )
+
+    # Do files contradict each other?  How well does the drawing know the adopted links?
+    drawn_sigma = drawn_sigmas(robot, asked.options.priors)
+    other_scale, scale_doubt = find_other_scale(robot, geometry, drawn_sigma)
+    return FitEvidence(
+        robot,
+        geometry.state.mdh,
+        active,
+        files,
+        sigma=np.sqrt(np.maximum(np.diag(geometry.covariance)[links], 0.0)),
+        drawn=drawn_sigma,
+        position_sigma=sigma,
+        drawn_sigma=drawn_sigma_of_positions(robot, geometry, drawn_sigma),
+        allow_large_changes=asked.options.allow_large_changes,
+        objection=objection,
+        contradictions=find_contradictions(robot, geometry) or other_scale,
+        doubts=(scale_doubt,) if scale_doubt else (),
+        worse=no_better(better) if better and not better.is_better else "",
+    )
 
 
 def assembled(
@@ -242,105 +351,6 @@ def assembled(
     return kind(**{**own, **more})
 
 
-def judged(
-    asked: Asked,
-    found: InstrumentFit,
-    measured: Sequence[Measured],
-    result: RelativeCalibration,
-    sigma: float,
-) -> RelativeCalibration:
-    """The result with its outcome, and with what the reader should know.
-
-    sigma: of a position, but for what is open [m].
-    """
-    robot, every, options = asked.robot, asked.every, asked.options
-    unfitted = [plausible.unfitted(robot, found, i, options) for i in range(len(every))]
-    evidence = evidence_of(asked, found, measured, sigma, [mend for _, mend in unfitted])
-    ended = judge(evidence, result.status)
-    said = [
-        *(remark for i, one in enumerate(found.stack.instruments)
-          for remark in one.remarks(fit.own_parameters(robot, found, i), found.noise[i])),
-        *plausible.of_beyond(result),
-        *plausible.of_scale(found),
-        *plausible.of_lone_rotations(found),
-        *plausible.weak(found, result, measured, sigma),
-        *plausible.unlikely(result, measured),
-        *evidence.doubts,
-        *filter(None, (*(notice for notice, _ in unfitted), ended.reason)),
-    ]  # fmt: skip
-    moved = () if ended.reason else find_moved_bases(found)
-    said += [one.sentence for one in moved]
-    for data, (held, _), each in zip(every, asked.splits, measured, strict=True):
-        said += plausible.general(each, data, held)
-    return replace(
-        result,
-        robot=robot if ended.status.keeps_drawn else result.robot,
-        calibrated=result.robot,
-        status=ended.status,
-        reason=ended.reason,
-        contradictions=evidence.contradictions or moved,
-        notices=tuple(dict.fromkeys((*result.notices, *said))),
-    )
-
-
-def evidence_of(
-    asked: Asked,
-    found: InstrumentFit,
-    measured: Sequence[Measured],
-    sigma: float,
-    mends: Sequence[str],
-) -> FitEvidence:
-    """What the outcome is judged by.
-
-    sigma: of a position, but for what is open [m].  mends: of what was not fitted of each file and
-    the residuals show, empty where nothing is.
-    """
-    robot, every, geometry = asked.robot, asked.every, found.stiff or found
-    links, stack = slice(5 * robot.joints), found.stack
-    files, objection = [], ""
-    for data, one, mend in zip(every, measured, mends, strict=True):
-        seen = {what: one.accuracy[key] for key, what in PARTS.items()}
-        files.append(
-            FileEvidence(
-                {what: (score, score) for what, score in seen.items()},
-                source=data.at.source if len(every) > 1 else "",
-                check=data.words.check,
-                rotations=missed_rotations(one),
-                drawn={key: one.accuracy[key] for key in ("nominal_train", "nominal")}
-                if data.unit == METRE
-                else {},
-            )
-        )
-        drawn, calibrated, _ = one.before_and_after()
-        if mend and calibrated.rms_error > drawn.rms_error:
-            objection = objection or f"the fit is worse than the arm as drawn: {mend}"
-    better = improvement_of_files(
-        [one.errors["nominal"] for one in measured],
-        [one.errors["holdout"] for one in measured],
-        [groups(data.at)[held] for data, (held, _) in zip(every, asked.splits, strict=True)],
-        [s / one.row_noise for s, one in zip(found.noise, stack.instruments, strict=True)],
-    )
-    within = drawn_sigmas(robot, asked.options.priors)
-    fits_links = geometry.identification.active[links].any() or stack.laws.names
-    scale = find_other_scale(robot, geometry, within)
-    worse = bool(fits_links and better and not better.is_better)
-    return FitEvidence(
-        robot,
-        geometry.state.mdh,
-        geometry.identification.active[links],
-        files,
-        sigma=np.sqrt(np.maximum(np.diag(geometry.covariance)[links], 0.0)),
-        drawn=within,
-        position_sigma=sigma,
-        drawn_sigma=drawn_sigma_of_positions(robot, geometry, within),
-        allow_large_changes=asked.options.allow_large_changes,
-        objection=objection,
-        contradictions=find_contradictions(robot, geometry) or scale[0],
-        doubts=(scale[1],) if scale[1] else (),
-        worse=no_better(better) if better and worse else "",
-    )
-
-
 def measured_by(
     robot: Robot, found: InstrumentFit, i: int, data: Instrument, held: Array
 ) -> Measured:
@@ -363,13 +373,6 @@ def measured_by(
         instrument=train.placed(stack.blocks[i].flange(x), own, drawn),
         units=(data.unit,),
     )  # fmt: skip
-
-
-def missed_rotations(one: Measured) -> dict[str, float]:
-    """RMS error of orientation by part of the poses [rad], empty where none is measured."""
-    if one.units == (RADIAN,):
-        return {what: one.accuracy[key].rms_error for key, what in PARTS.items()}
-    return {what: one.turns[key][0] for key, what in PARTS.items() if key in one.turns}
 
 
 def extremes(sizes: Mapping[str, Array]) -> dict[str, tuple[float, float]]:
