@@ -117,7 +117,12 @@ def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
     check_span(data)
     check_fresh(robot, data)
     given = fitted(robot, data)
-    check_names(robot, data, given)
+    rows = misnamed(robot, data, given) if len(data.target_names) > 1 else NO_ROWS
+    if len(rows):
+        raise DataError(
+            f"{data.source}:{data.line[rows[0]]}: targets look swapped in {len(rows)} rows: "
+            f"{data.list_rows(rows)}; put their columns right or delete them"
+        )
     limit = POOR_FIT * robot.reach()
     check_scale(robot, data, given)
     if np.sqrt(given.mean_square) <= limit:
@@ -128,7 +133,8 @@ def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
     def tried(mended: tuple[Robot, Measurements]) -> tuple[float, float]:
         few = few_of(mended[1])
         left = fitted(mended[0], few).mean_square
-        near = left >= EXPLAINED * spread(few)  # points drawn together are near any arm
+        spread = float(np.nanvar(few.y, axis=0).sum(axis=-1).max())
+        near = left >= EXPLAINED * spread  # points drawn together are near any arm
         return left, np.inf if near else left
 
     with work(brief=False):
@@ -269,21 +275,6 @@ def coarse_joints(robot: Robot, data: Measurements, given: BaseFit) -> str:
         f"{data.source}: joint values are {name}: if they were rounded and not commanded so, no "
         f"fit gets much below {1e3 * cost:.2g} mm; export them with all their digits"
     )
-
-
-def spread(data: Measurements) -> float:
-    """Mean square of the points about their middle, the most of all targets [m^2]."""
-    return float(np.nanvar(data.y, axis=0).sum(axis=-1).max())
-
-
-def check_names(robot: Robot, data: Measurements, given: BaseFit) -> None:
-    """Raise DataError where targets stand under each other's names.  given: see `fitted`."""
-    rows = misnamed(robot, data, given) if len(data.target_names) > 1 else NO_ROWS
-    if len(rows):
-        raise DataError(
-            f"{data.source}:{data.line[rows[0]]}: targets look swapped in {len(rows)} rows: "
-            f"{data.list_rows(rows)}; put their columns right or delete them"
-        )
 
 
 def misnamed(robot: Robot, data: Measurements, given: BaseFit) -> Array:

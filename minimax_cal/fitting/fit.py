@@ -397,7 +397,13 @@ class Fit(Result):
         """
         seen = {key: self.accuracy[key] for key in ("nominal", "holdout")}
         if any(one.rms_ci95_mm for one in seen.values()):
-            return {key: ends_of(one) for key, one in seen.items()}
+            return {
+                key: (
+                    Interval(*scaled(one.rms_ci95_mm or NO_ENDS, 1e-3)),
+                    Interval(*scaled(one.max_ci95_mm or NO_ENDS, 1e-3)),
+                )
+                for key, one in seen.items()
+            }
         rng = np.random.default_rng(self.options.seed)
         group = grouped(self.data, self.options.holdout_by)[self.held]
         return {key: intervals_of(self.errors[key], group, rng) for key in seen}
@@ -480,16 +486,20 @@ class Fit(Result):
 
     def accuracy_rows(self) -> Iterator[tuple[object, ...]]:
         """New poses, inside and outside the measured region, then those of the fit."""
-        inside = self.within
+        inside, unknown = self.within, scaled(UNKNOWN, 1e3)
         if self.error_crossed.size or self.accuracy["holdout"].poses:
             drawn = UNKNOWN if self.error_crossed.size else self.intervals["nominal"][0]
-            yield row_of("new poses, nominal", inside.before, drawn)
-            yield row_of("new poses, calibrated", inside.after, inside.rms)
+            for name, seen, ends in (
+                ("nominal", inside.before, drawn),
+                ("calibrated", inside.after, inside.rms),
+            ):
+                yield f"new poses, {name}", seen.poses, seen.rms_mm, *scaled(ends, 1e3), seen.max_mm
         if self.beyond.worst:
             away = self.beyond
             yield "outside, calibrated", "", away.typical_mm, None, None, away.largest_mm
         for key, name in (("nominal_train", "nominal"), ("train", "calibrated")):
-            yield row_of(f"training poses, {name}", self.accuracy[key])
+            seen = self.accuracy[key]
+            yield f"training poses, {name}", seen.poses, seen.rms_mm, *unknown, seen.max_mm
 
     def interval_table(self) -> Table:
         """95 % intervals of the held-out accuracy; empty where the poses are too few."""
@@ -570,16 +580,11 @@ class Fit(Result):
 
     def solution(self) -> str:
         """How the fit was found: what its facts say, and who answered the QPs."""
-        return f"{capitalise(facts_in_words(self))}.{self.solved_by()}"
-
-    def solved_by(self) -> str:
-        """Who answered the quadratic programs, after a space; empty where there were none."""
+        facts, work = f"{capitalise(facts_in_words(self))}.", self.work
         if not self.answered:
-            return ""
-        work = self.work
+            return facts
         steps = f"{work.steps} steps of least squares ({work.least_squares})"
-        warm = f"({work.warm_starts} warm-started)"
-        return f" QPs: {self.answerers()} {warm}, after {steps}."
+        return f"{facts} QPs: {self.answerers()} ({work.warm_starts} warm-started), after {steps}."
 
     def answerers(self) -> str:
         """Backends with the number of QPs they answered, and how rough the answers were."""
@@ -668,7 +673,14 @@ class Fit(Result):
         names = Names.of(cell.robot, cell.target_names, tuple(p.name for p in every if p.of_effect))
         if missing := set(names.all) - set(parameters.names):
             raise ValueError(f"parameters: {min(missing)} is missing, of {len(missing)}")
-        beyond = read(Beyond, content["accuracy"]["beyond"], "accuracy.beyond")
+        scores = content["accuracy"]
+        beyond = read(Beyond, scores["beyond"], "accuracy.beyond")
+        keys = [*HELD, *(["holdout_with_them"] if scores.get("holdout_with_them") else [])]
+        accuracies = {key: read(Accuracy, scores.get(key), f"accuracy.{key}") for key in keys}
+        target_count = len(cell.target_names)
+        for key, seen in accuracies.items():
+            if not len(seen.sse_mm2) == len(seen.counts) == target_count:
+                raise ValueError(f"accuracy.{key} is not of {target_count} targets")
         arrays = {name: array(value, name) for name, value in content["arrays"].items()}
         check_shapes(arrays, names.count, data.take(~held), data)
         crossed, drawn_crossed = (
@@ -676,14 +688,18 @@ class Fit(Result):
             for name in ("crossed", "drawn crossed")
         )
         kept = told["status"].keeps_drawn or not cell.effects.causes
-        found = identified(parameters, names, arrays["singular"], arrays["sensitivity"])
+        active = np.zeros(names.count, dtype=bool)
+        active[[names.index(p.name) for p in every]] = [p.identifiable for p in every]
+        reasons = {p.name: p.why for p in every if p.reason}
         return {
             "cell": cell,
             "nominal": nominal,
             "parameters": parameters,
-            "accuracy": accuracies_of(content["accuracy"], len(cell.target_names)),
+            "accuracy": accuracies,
             "claim": Later(lambda: beyond),
-            "identification": found,
+            "identification": Identification(
+                active, reasons, arrays["singular"], arrays["sensitivity"]
+            ),
             "uncertainty": known,
             "data": replace(data, digest=told["provenance"].data_sha256),
             "held": held,
@@ -696,27 +712,6 @@ class Fit(Result):
             "error_drawn_crossed": drawn_crossed,
             "stated_geometric": None if kept else cell_from_dict({**content, "cell": {}}, source),
         }
-
-
-def row_of(name: str, of: Accuracy, ends: Interval = UNKNOWN) -> tuple[object, ...]:
-    """A row of the first table; ends: 95 % interval of the RMS [m]."""
-    return name, of.poses, of.rms_mm, *scaled(ends, 1e3), of.max_mm
-
-
-def ends_of(seen: Accuracy) -> tuple[Interval, Interval]:
-    """The intervals of RMS and largest error that a file tells [m]."""
-    rms, largest = seen.rms_ci95_mm or NO_ENDS, seen.max_ci95_mm or NO_ENDS
-    return Interval(*scaled(rms, 1e-3)), Interval(*scaled(largest, 1e-3))
-
-
-def accuracies_of(content: Mapping[str, Any], targets: int) -> dict[str, Accuracy]:
-    """Before and after, from a file.  Raises ValueError."""
-    keys = [*HELD, *(key for key in ("holdout_with_them",) if content.get(key))]
-    found = {key: read(Accuracy, content.get(key), f"accuracy.{key}") for key in keys}
-    for key, seen in found.items():
-        if not len(seen.sse_mm2) == len(seen.counts) == targets:
-            raise ValueError(f"accuracy.{key} is not of {targets} targets")
-    return found
 
 
 def check_shapes(
@@ -736,15 +731,6 @@ def check_shapes(
         asked = data.poses or name not in POSE_BY_POSE
         if values.shape not in known and asked:
             raise ValueError(f"{name} is not of these parameters and poses")
-
-
-def identified(
-    parameters: Parameters, names: Names, singular: Array, scale: Array
-) -> Identification:
-    """What was identified, and why the rest was not."""
-    active = np.zeros(names.count, dtype=bool)
-    active[[names.index(name) for name in parameters.names]] = [p.identifiable for p in parameters]
-    return Identification(active, {p.name: p.why for p in parameters if p.reason}, singular, scale)
 
 
 @overload

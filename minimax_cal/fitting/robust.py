@@ -139,19 +139,6 @@ def leaving(share: float, count: int, needed: int) -> int:
     return max(min(int(share * count), (count - needed - 1) // 2), 0)
 
 
-def soften(at: W) -> W:
-    """A start that few points pull: the sum of distances instead of that of their squares.
-
-    Distances are standardised by leverage: a point that draws the fit to itself is not near.
-    """
-    for _ in range(SOFT):
-        found = at.scores()
-        distance = np.sqrt(found.square)
-        usual = float(np.median(distance[found.directions > 0])) if found.directions.any() else 0.0
-        at = at.again(1.0 / np.maximum(distance / max(usual, LEAST_SCALE), 1.0))
-    return at
-
-
 def farthest(square: Array, count: int) -> Array:
     """(k, m) True for the points farthest off, so many, the first of equals."""
     out = np.zeros(square.size, dtype=bool)
@@ -174,30 +161,29 @@ def leave(at: W, goes: Callable[[Scores], Array]) -> W:
     return at.unsettled()
 
 
-def concentrate(at: W, share: float) -> W:
-    """Least trimmed squares: the share of points farthest off leaves [Rousseeuw and Van Driessen
-    2006, "Computing LTS regression for large data sets"].
-    """
-    count = at.most(share)
-    return leave(
-        at, lambda found: farthest(np.where(found.directions > 0, found.square, -1.0), count)
-    )
+def trimmed(at: W, trim: float = 0.0) -> W:
+    """The start of a loss: the fit to the points that belong together.  trim: as `robust_fit`."""
+    # The sum of distances instead of that of their squares, so that few points pull less.
+    # Standardised by leverage: a point that draws the fit to itself is not near.
+    for _ in range(SOFT):
+        found = at.scores()
+        distance = np.sqrt(found.square)
+        usual = float(np.median(distance[found.directions > 0])) if found.directions.any() else 0.0
+        at = at.again(1.0 / np.maximum(distance / max(usual, LEAST_SCALE), 1.0))
 
+    # Least trimmed squares: a share of the points farthest off leaves [Rousseeuw and Van Driessen
+    # 2006, "Computing LTS regression for large data sets"].
+    most = at.most(max(trim, START_TRIM))
+    at = leave(at, lambda found: farthest(np.where(found.directions > 0, found.square, -1.0), most))
 
-def set_aside(at: W, share: float) -> W:
-    """Only points that stand out leave, and at most the share: the farthest first."""
-    count = at.most(share)
+    # Then only outliers leave, and at most the share: the farthest first.
+    count = at.most(trim or START_TRIM)
 
-    def goes(found: Scores) -> Array:
+    def select_outliers(found: Scores) -> Array:
         far = at.spread(found).far(found)
         return farthest(np.where(far, found.square, -1.0), count) & far
 
-    return leave(at, goes)
-
-
-def trimmed(at: W, trim: float = 0.0) -> W:
-    """The start of a loss: the fit to the points that belong together."""
-    return set_aside(concentrate(soften(at), max(trim, START_TRIM)), trim or START_TRIM)
+    return leave(at, select_outliers)
 
 
 # ---- losses --------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ Pixels know no base and no tool, and no length either where no board gives one.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -208,7 +209,9 @@ def fit_pixels(
     progress("lengths and angles at given depths")
     first = started.begin or nominal
     told = problem.identified(robot, first, allowed, wanted, ANY)
-    by_drawing = scale_drawn(robot, problem, first, told.active)
+    reference = problem.stack.reference(robot, first)
+    order = order_of(robot, problem.stack)
+    by_drawing = open_scale(reference, first, reference.gram(first), told.active, order)
     if by_drawing:
         drawn = np.where(lengths_of(problem.names), robot.drawn_within[0], np.inf)
         known = Known(links_of(robot.mdh), drawn[problem.names.links])
@@ -222,7 +225,12 @@ def fit_pixels(
     x = replace(x, mdh=np.where(known_links.reshape(5, -1).T, x.mdh, robot.mdh))
     progress("reprojection")
     problem, x, found = reprojected(replace(problem, active=told.active), x)
-    own = with_lenses(problem, x) if held else x
+    own = x
+    if held:  # what the pixels say of the lenses: of the files hardly anything counts
+        error, weak = problem.errors(x), LOOSE * problem.images.doubt
+        freed = replace(problem, active=problem.active | problem.lenses)
+        freed = freed.changed(noise=sigma_of(error), doubt=weak, weight=softly(error))
+        own, _ = freed.solved(x, COARSE)
     if (lens_off(problem, own) > FAR_LENS * doubt).any() and not held:
         problem, x, found = reprojected(problem.changed(doubt=LOOSE * doubt), x)
         own = x
@@ -231,7 +239,10 @@ def fit_pixels(
         sigma = np.where(off > FAR_LENS * doubt, off, doubt * bool(options.camera_prior))
         reasons = dict.fromkeys(problem.images.names[-lens.sum() :], LENS_HELD)
         told = replace(told, reasons={**told.reasons, **reasons})
-    images, noise = problem.images, spread_of(problem, x)
+    images = problem.images
+    dof = max(2 * int(images.counted.sum()) - int(problem.active.sum()), 1)
+    squares = float((problem.errors(x)[:, images.counted] ** 2).sum())
+    noise = max(math.sqrt(squares / dof), FINEST)
     lenses, turn = images.lens(own.effects), images.frames(x.effects)[0]
     x, nominal = (replace(one, effects=images.counted_from(one.effects, turn))
                   for one in (x, nominal))  # fmt: skip
@@ -241,12 +252,6 @@ def fit_pixels(
         lens_sigma=sigma, held=held, by_drawing=by_drawing, lens=lenses, doubt=doubt,
         share=images.weight, squares=x,
     )  # fmt: skip
-
-
-def scale_drawn(robot: Robot, problem: PixelSquares, x: State, active: Array) -> bool:
-    """Whether nothing but the drawing tells the scale of what is fitted.  active: (p,)."""
-    reference = problem.stack.reference(robot, x)
-    return open_scale(reference, x, reference.gram(x), active, order_of(robot, problem.stack))
 
 
 def by_depths(problem: PixelSquares, x: State, started: Started) -> State:
@@ -262,17 +267,6 @@ def by_depths(problem: PixelSquares, x: State, started: Started) -> State:
         error, _ = sight.rows(x, np.zeros(sight.names.count, dtype=bool))
         x, _ = sight.changed(weight=softly(error.reshape(2, -1))).solved(x, COARSE, AFFINE)
     return x
-
-
-def with_lenses(problem: PixelSquares, x: State) -> State:
-    """What the pixels say of lenses that are held: a fit that frees them, from that which does not.
-
-    Of what the files know of them hardly anything counts.
-    """
-    error, doubt = problem.errors(x), LOOSE * problem.images.doubt
-    free = replace(problem, active=problem.active | problem.lenses)
-    loose = free.changed(noise=sigma_of(error), doubt=doubt, weight=softly(error))
-    return loose.solved(x, COARSE)[0]
 
 
 def reprojected(problem: PixelSquares, x: State) -> tuple[PixelSquares, State, LeastSquares[State]]:
@@ -298,13 +292,6 @@ def lens_off(problem: PixelSquares, x: State) -> Array:
     """(c, 9) how far the lenses are from their files."""
     images = problem.images
     return np.asarray(abs(images.lens(x.effects) - images.intrinsic[:, :LENS]))
-
-
-def spread_of(problem: PixelSquares, x: State) -> float:
-    """Sigma of u and v by the squares of the pixels that count [px]."""
-    counted = problem.images.counted
-    freedom = max(2 * int(counted.sum()) - int(problem.active.sum()), 1)
-    return max(float(np.sqrt((problem.errors(x)[:, counted] ** 2).sum() / freedom)), FINEST)
 
 
 def check_count(train: Images, unknowns: int, links: int) -> None:

@@ -271,6 +271,18 @@ class Rays:
         _, target = np.unique(self.target[rows], return_inverse=True)
         return Rays(self.turn[rows], self.off[rows], self.direction[rows], target.reshape(-1))
 
+    def thin(self, most: int) -> Rays:
+        """Rays that determine a rotation: at most so many, of the targets seen most often."""
+        chosen = np.argsort(-np.bincount(self.target), kind="stable")[:TARGETS]
+        rows = np.flatnonzero(np.isin(self.target, chosen))
+        spread = np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int)
+        return self.some(np.asarray(rows[spread]))
+
+    def mean_error(self, view: Array) -> float:
+        """Mean size of the errors for a rotation R', wrong ones no more than `BEHIND`."""
+        size = np.linalg.norm(self.solved(view)[2], axis=1)
+        return float(np.minimum(size, BEHIND).mean())
+
     def across(self, view: Array) -> Array:
         """(N, 2, 3) what makes a point's two errors of the point.  view: (3, 3) R'."""
         return np.asarray(view[None, :2] - self.direction[..., None] * view[2])
@@ -326,11 +338,10 @@ def by_rotations(
 ) -> tuple[Array, Array, Array]:
     """As `by_pose`, for targets taken as of unknown place, NaN where one camera cannot tell it."""
     rays = rays_of(robot, data, on_flange, seen, camera)
-    few, fewest = (rays.some(thinned(rays.target, most)) for most in (ENOUGH, SCREENED))
+    few, fewest = rays.thin(ENOUGH), rays.thin(SCREENED)
     looks = Rotation.random(ROTATIONS, rng=np.random.default_rng(0)).as_matrix()
-    cost = [clipped(fewest.solved(look)[2]) for look in looks]
-    best = np.argsort(cost)[:REFINED]
-    view = min((refined(few, looks[i]) for i in best), key=lambda v: clipped(few.solved(v)[2]))
+    best = np.argsort([fewest.mean_error(look) for look in looks])[:REFINED]
+    view = min((refined(few, looks[i]) for i in best), key=few.mean_error)
     place = few.solved(view)[0]
     spots = np.full((len(data.targets), 3), np.nan)
     for target in np.unique(rays.target):
@@ -343,18 +354,6 @@ def by_rotations(
     known = np.isfinite(spots[:, 0])
     board = fit_rigid_motion(data.board[known], spots[known])
     return camera_pose, board, np.asarray(data.board @ board[:3, :3].T + board[:3, 3])
-
-
-def thinned(target: Array, most: int) -> Array:
-    """Rows that tell one rotation from another: of the targets seen most often."""
-    chosen = np.argsort(-np.bincount(target), kind="stable")[:TARGETS]
-    rows = np.flatnonzero(np.isin(target, chosen))
-    return np.asarray(rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int)])
-
-
-def clipped(error: Array) -> float:
-    """Mean size of errors (N, 2), wrong ones no more than `BEHIND`."""
-    return float(np.minimum(np.linalg.norm(error, axis=1), BEHIND).mean())
 
 
 def refined(rays: Rays, view: Array) -> Array:

@@ -35,7 +35,6 @@ from minimax_cal.measuring.grouping import regions
 from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import links_of, zero_positions
-from minimax_cal.robots.robot import Robot
 
 
 @dataclass(frozen=True)
@@ -172,36 +171,46 @@ def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
     --------
     >>> print(mc.compare("may.json", "june.json").summary())
     """
-    fits = tuple(Fit.load(fit) for fit in (a, b))
-    one, other = fits
+    fits = one, other = Fit.load(a), Fit.load(b)
     names = tuple("calibration" if isinstance(each, Fit) else str(each) for each in (a, b))
     names = (f"{names[0]} A", f"{names[1]} B") if names[0] == names[1] else names
     check_alike(one, other)
-    kept, motion = common_gauge(one, other)
-    n = one.cell.robot.joints
-    turn = np.eye(5 * n)
-    turn[:, kept] -= motion
-    drawn = links_of(one.nominal.robot.mdh)
-    value = [drawn + turn @ (links_of(fit.cell.robot.mdh) - drawn) for fit in fits]
-    covariance = sum(turn @ links_covariance(fit) @ turn.T for fit in fits)
-    told = [told_by(fit, n) for fit in fits]
-    told_in = [in_convention(one.cell.robot, links) for links in value]
-    each = tuple(differences(one, told_in, np.asarray(covariance), kept, told))
+    robot, links = one.cell.robot, slice(5 * one.cell.robot.joints)
+
+    # A common gauge: links that base, reflectors or neighbours imitate are as drawn in both, by
+    # the arm whose reflectors show less.
+    kept, motion = max((gauge(fit) for fit in fits), key=lambda found: len(found[0]))
+    projection = np.eye(links.stop)
+    projection[:, kept] -= motion
+    drawn, values, identified = links_of(one.nominal.robot.mdh), [], []
+    covariance = np.zeros((links.stop, links.stop))
+    for fit in fits:
+        value = drawn + projection @ (links_of(fit.cell.robot.mdh) - drawn)
+        notation = robot.notation.told(value.reshape(5, -1).T, robot.prismatic)
+        values.append(links_of(notation))
+
+        # By noise, and by folds; zero where a link was kept.
+        own = np.nan_to_num(fit.uncertainty.covariance[links, links])
+        own = own + folds_covariance(fit)[links, links]
+        covariance += projection @ own @ projection.T
+
+        # A link is identified, or any other that moves the points alike.
+        kinds = {p.name: p.because for p in fit.parameters}
+        same_motion = [kinds.get(name) is identify.Because.SAME_MOTION
+                       for name in fit.uncertainty.names.all[links]]  # fmt: skip
+        identified.append(fit.identification.active[links] | same_motion)
+    each = tuple(differences(one, values, covariance, kept, identified))
+
     found, same = changed(one, other)
     return Comparison(
         names=(names[0], names[1]),
-        robot=one.cell.robot.name,
-        differences=tuple(each[i] for i in one.uncertainty.names.link_by_link[: 5 * n]),
+        robot=robot.name,
+        differences=tuple(each[i] for i in one.uncertainty.names.link_by_link[links]),
         changed=found,
         accuracy=tuple(on_common(one, other)),
         same=same,
         notices=tuple(remarks(one, other)),
     )
-
-
-def in_convention(robot: Robot, links: Array) -> Array:
-    """(5n,) link parameters with the values that the convention of the robot's file has."""
-    return links_of(robot.notation.told(links.reshape(5, -1).T, robot.prismatic))
 
 
 def check_alike(one: Fit, other: Fit) -> None:
@@ -220,16 +229,11 @@ def check_alike(one: Fit, other: Fit) -> None:
         )
 
 
-def common_gauge(one: Fit, other: Fit) -> tuple[Array, Array]:
-    """Link parameters to be kept as drawn: (d,); what else moves with each unseen: (5n, d).
-
-    What base and reflectors imitate on plenty of poses, of the arm whose reflectors show less.
-    """
-    return max((gauge(fit) for fit in (one, other)), key=lambda found: len(found[0]))
-
-
 def gauge(fit: Fit) -> tuple[Array, Array]:
-    """`common_gauge` of one."""
+    """Links to be kept as drawn (d,), and what else moves with each unseen (5n, d).
+
+    What base and reflectors imitate on plenty of poses.
+    """
     state, n = replace(fit.cell.state, effects=np.zeros(0)), 5 * fit.cell.robot.joints
     model = identify.plenty_of_poses(fit.cell.robot, model_of(fit.cell.robot, fit.data))
     gram = identify.gram_of(model, state)
@@ -240,12 +244,6 @@ def gauge(fit: Fit) -> tuple[Array, Array]:
     _, vectors = np.linalg.eigh(gram / np.outer(size, size))
     null = vectors[:, : len(gone)] / size[:, None]
     return gone[gone < n], null[:n, :] @ np.linalg.pinv(null[gone])[:, gone < n]
-
-
-def links_covariance(fit: Fit) -> Array:
-    """(5n, 5n) of the link parameters, by noise and by folds; zero where they were kept."""
-    n = 5 * fit.cell.robot.joints
-    return np.nan_to_num(fit.uncertainty.covariance[:n, :n]) + folds_covariance(fit)[:n, :n]
 
 
 def folds_covariance(fit: Fit) -> Array:
@@ -262,14 +260,6 @@ def folds_covariance(fit: Fit) -> Array:
     steps = np.array([step_without(poses, part) for part in parts]).reshape(-1, len(active))
     out[np.ix_(active, active)] = (len(steps) - 1) / max(len(steps), 1) * steps.T @ steps
     return out
-
-
-def told_by(fit: Fit, joints: int) -> Array:
-    """(5n,) True where a fit tells a parameter, or any other that moves the points alike."""
-    names = fit.uncertainty.names.all[: 5 * joints]
-    kinds = {p.name: p.because for p in fit.parameters}
-    alike = [kinds.get(name) is identify.Because.SAME_MOTION for name in names]
-    return np.asarray(fit.identification.active[: len(names)] | alike)
 
 
 def differences(
