@@ -192,17 +192,6 @@ def unseen_suspects(
     return held_suspects(model, state, weights, held, spread, data.line)
 
 
-def bad_rows(suspects: Sequence[Suspect], data: Measurements) -> Iterator[str]:
-    """Notice of held-out points that stand out: they judge the fit."""
-    held = [one for one in suspects if one.held]
-    if held:
-        named = [one.text(data) for one in held]
-        yield (
-            f"{data.source}: outliers among the held-out points: {name_first(named, MAX_NAMED)}; "
-            "they count in the held-out accuracy, which is also given without them"
-        )
-
-
 def other_points(robot: Robot, solved: Solved, error: Array) -> Iterator[str]:
     """Notice where other points of the tool are known far worse than these targets.
 

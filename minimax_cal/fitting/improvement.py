@@ -128,12 +128,6 @@ def improvement_of_files(
     return compare_arms(both[0], both[1], np.concatenate(every))
 
 
-def name_outliers(suspects: Sequence[Suspect], data: Measurements) -> str:
-    """What to check beside the mend of a fit; empty where no point stands out."""
-    off = [one.text(data) for one in suspects]
-    return f"; check the outliers ({name_first(off, MAX_NAMED)})" if off else ""
-
-
 def no_better(found: Improvement) -> str:
     """The sentence for an arm that is no better than the drawn one, and what to do."""
     return (
@@ -143,20 +137,15 @@ def no_better(found: Improvement) -> str:
     )
 
 
-def said_without(found: Improvement, whole: tuple[float, float]) -> str:
-    """Notice that wrong points hide what is better.  whole: RMS before and after of all [mm]."""
+def warn_of_hidden_improvement(found: Improvement, drawn: Array, calibrated: Array) -> str:
+    """Notice that wrong points hide what is better.  drawn, calibrated: (k, m, 3) errors [m]."""
+    both = np.isfinite(drawn) & np.isfinite(calibrated)
+    whole = [accuracy(np.where(both, one, np.nan)).rms_mm for one in (drawn, calibrated)]
     return (
         f"points that the drawn and the calibrated arm both miss ({found.wrong}) hide the "
         f"improvement on new poses: {whole[0]:#.3g} -> {whole[1]:#.3g} mm with them, "
         f"{found.before:#.3g} -> {found.after:#.3g} mm without; correct or delete these rows"
     )
-
-
-def rms_of(drawn: Array, calibrated: Array) -> tuple[float, float]:
-    """RMS of both at the points that both have [mm]."""
-    both = np.isfinite(drawn) & np.isfinite(calibrated)
-    before, after = (accuracy(np.where(both, one, np.nan)).rms_mm for one in (drawn, calibrated))
-    return before, after
 
 
 def hidden(drawn: Array, calibrated: Array, which: Array) -> tuple[Array, Array]:

@@ -18,7 +18,6 @@ from minimax_cal.fitting.checks import (
     wild,
 )
 from minimax_cal.fitting.claims import (
-    bad_rows,
     beyond_of,
     crossed_of,
     drawn_sigmas,
@@ -38,10 +37,8 @@ from minimax_cal.fitting.improvement import (
     Improvement,
     hidden,
     improvement,
-    name_outliers,
     no_better,
-    rms_of,
-    said_without,
+    warn_of_hidden_improvement,
 )
 from minimax_cal.fitting.jump_sizes import fit_jump_sizes
 from minimax_cal.fitting.minimax_problem import MIN_TRUSTED_WEIGHT
@@ -60,6 +57,7 @@ from minimax_cal.fitting.stations import jumps
 from minimax_cal.fitting.suspects import Suspect, aside, find_contradicting_points
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.facts import Later
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.faults.sessions import session_jumps
 from minimax_cal.measuring.grouping import grouped
@@ -70,6 +68,7 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.least_squares import name_of
 from minimax_cal.solvers.status import Status
 
+MAX_NAMED = 5  # points that a notice names
 MIN_MULTIPLIER = 1e-6  # a point of a smaller multiplier does not decide
 ACTIVE_TOLERANCE = 1e-6  # a function equals the largest, relative
 
@@ -261,6 +260,8 @@ def collect_evidence(
         data, rms, noise, "the calibrated arm"
     )
 
+    names = [one.text(data) for one in suspects]
+
     # How well positions of both arms are known, only where a link is vague.
     links, sigma = active[:link_count], solved.uncertainty.sigma[:link_count]
     drawn_sigma = drawn_sigmas(robot, options.priors)
@@ -274,7 +275,7 @@ def collect_evidence(
         computed=is_computed,
         contradictions=contradictions,
         worse=no_better(better) if better and not better.is_better else "",
-        outliers=name_outliers(suspects, data),
+        outliers=f"; check the outliers ({name_first(names, MAX_NAMED)})" if names else "",
     )  # fmt: skip
 
 
@@ -317,13 +318,18 @@ def list_notices(
     notices += [fault.text for fault in session_jumps(data, calibrated, fit_jumps)]
     notices += [change.sentence for change in moved]
     notices += alarms
-    notices += bad_rows(errors.suspects, data)
+    if outliers := [one.text(data) for one in errors.suspects if one.held]:
+        notices.append(
+            f"{data.source}: outliers among the held-out points: "
+            f"{name_first(outliers, MAX_NAMED)}; they count in the held-out accuracy, which is "
+            "also given without them"
+        )
     notices += unjudged(data, errors.crossed)
     notices += other_points(robot, solved, calibrated)
     if len(errors.exchanged) and outcome.status is not Status.FAILED:
         notices.append(errors.name_exchanged_rows())
     if better and better.wrong:
-        notices.append(said_without(better, rms_of(*errors.unseen)))
+        notices.append(warn_of_hidden_improvement(better, *errors.unseen))
     return (*notices, *filter(None, [outcome.reason]))
 
 

@@ -59,18 +59,6 @@ def with_them(
     return with_ends(whole, rms, largest)
 
 
-def with_trimmed(data: Measurements, held: Array, solved: Solved, options: Options) -> Measurements:
-    """The measurements without the training points that the fit gave no weight.
-
-    held: (m,) True where held out.
-    """
-    gone = np.zeros(data.seen.shape, dtype=bool)
-    gone[~held] = (solved.robust.weights == 0.0).T & data.seen[~held]
-    why = f"trim {options.trim:g}" if options.trim else f"loss {options.loss}"
-    told = options.trim or options.loss != SQUARE
-    return set_aside(data, gone, f"outlier ({why})", TOOL) if told else data
-
-
 def judged_with(
     data: Measurements,
     held: Array,
@@ -85,7 +73,12 @@ def judged_with(
     data: all poses.  held: (m,).  error: (m, k, 3) of the fit; crossed: of every pose by a fit
     without it, or empty [m].
     """
-    trimmed = with_trimmed(data, held, solved, options)
+    trimmed = data
+    if options.trim or options.loss != SQUARE:  # training points that the fit gave no weight
+        gone = np.zeros(data.seen.shape, dtype=bool)
+        gone[~held] = (solved.robust.weights == 0.0).T & data.seen[~held]
+        why = f"trim {options.trim:g}" if options.trim else f"loss {options.loss}"
+        trimmed = set_aside(data, gone, f"outlier ({why})", TOOL)
     if not trimmed.set_aside:
         return (), None
     group = np.unique(grouped(data, options.holdout_by), return_inverse=True)[1].reshape(-1)

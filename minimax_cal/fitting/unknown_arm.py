@@ -102,7 +102,7 @@ def identify_arm(
             f"{data.source}: joint {number} {kind}; name its column q{number}_"
             f"{'mm' if sliding[number - 1] else 'deg'}"
         )
-    lacking = lacking_sweeps(data, sliding)
+    lacking = [j for j in range(len(sliding)) if not len(sweep_of(data, j, sliding))]
     progress("axes")
     if not lacking:
         robot, way = rough(name, links_of_axes(axes_of(data, sliding)), sliding), SWEEPS
@@ -121,15 +121,6 @@ def rough(name: str, mdh: Array, sliding: Array) -> Robot:
     ]
     units = {"length": "m", "angle": "rad"}
     return robot_from_dict({"name": name, "units": units, "nominal": "rough", "joints": rows})
-
-
-def plain_links(mdh: Array, sliding: Array) -> Array:
-    """The same arm in links of common normals, short ones between parallel axes: (n, 5)."""
-    at, axes = np.eye(4), []
-    for row, slides in zip(mdh, sliding, strict=True):
-        axes.append(Axis(at[:3, 2], at[:3, 3], bool(slides)))
-        at = at @ link(row)
-    return links_of_axes(axes)
 
 
 def searched(name: str, data: Measurements, sliding: Array, lacking: Sequence[int]) -> Robot:
@@ -152,7 +143,12 @@ def searched(name: str, data: Measurements, sliding: Array, lacking: Sequence[in
         first = search(model, mdh, points, MAX_FOUND_MISS * spread, ROUNDS)
         miss = float(np.sqrt(first.cost[0] / points))
         if miss < least:
-            best, least = rough(name, plain_links(first.x.mdh[0], sliding), sliding), miss
+            # The same arm in links of common normals, short ones between parallel axes.
+            at, axes = np.eye(4), []
+            for row, slides in zip(first.x.mdh[0], sliding, strict=True):
+                axes.append(Axis(at[:3, 2], at[:3, 3], bool(slides)))
+                at = at @ link(row)
+            best, least = rough(name, links_of_axes(axes), sliding), miss
         if least < MAX_FOUND_MISS * spread:
             break
     if best is None or least >= MAX_FOUND_MISS * spread:
@@ -196,11 +192,6 @@ def sweep_of(data: Measurements, joint: int, sliding: Array) -> Array:
         if span > widest and len(np.unique(data.q[rows, joint])) >= LEAST_ROWS:
             best, widest = rows, span
     return best
-
-
-def lacking_sweeps(data: Measurements, sliding: Array) -> list[int]:
-    """The joints that never move alone."""
-    return [j for j in range(len(sliding)) if not len(sweep_of(data, j, sliding))]
 
 
 def axis_of_sweep(q: Array, y: Array, slides: bool) -> Axis:

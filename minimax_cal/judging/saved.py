@@ -258,8 +258,12 @@ def open_saved(
         measured = check_joints(known.cell.robot, measured)
         notices += measured.notices
         if known.placed:
-            measured, said = known_targets(measured, known.cell)
-            notices += [*said, *strangers(known.cell, measured)]
+            is_known = np.isin(measured.target_names, known.cell.target_names)
+            if is_known.any() and not is_known.all():  # of none in common the cell complains
+                names = ", ".join(np.array(measured.target_names)[~is_known])
+                measured = measured.keep(is_known)
+                notices.append(f"{measured.source}: {names} left out: the fit does not know them")
+            notices += strangers(known.cell, measured)
             measured = known.cell.placed(measured)
         held, said = unseen(measured, known)
         notices += said
@@ -280,15 +284,6 @@ def open_saved(
         )
     cells = {BEFORE: before, AFTER: cell}
     return Saved(cells, measured, held, known.uncertainty, tuple(notices), known.spans)
-
-
-def known_targets(data: Measurements, cell: Cell) -> tuple[Measurements, tuple[str, ...]]:
-    """The data without targets that the fit does not know, and a notice that names them."""
-    known = np.array([name in cell.target_names for name in data.target_names])
-    if known.all() or not known.any():
-        return data, ()  # of none in common the cell itself complains
-    names = ", ".join(np.array(data.target_names)[~known])
-    return data.keep(known), (f"{data.source}: {names} left out: the fit does not know them",)
 
 
 def unseen(data: Measurements, known: Opened) -> tuple[Array, tuple[str, ...]]:

@@ -147,6 +147,10 @@ def beyond(found: Beyond) -> Claim:
         nothing = Bound(math.nan, math.nan)
         return Claim("outside", nothing, nothing, 0, "", reason=found.reason)
     far = max(found.folds, key=lambda fold: fold.max_mm)
+    not_judged = ""
+    if found.missed:
+        missed = name_first(found.missed, MAX_NAMED)
+        not_judged = f"only {found.judged} could be judged, not {missed}, which the fit needs"
     of = f"; {found.judged} could be judged" if found.judged else ""
     return Claim(
         "outside",
@@ -155,18 +159,10 @@ def beyond(found: Beyond) -> Claim:
         worst.poses,
         f"the worst of whole parts held out in turn{found.kept} "
         f"({worst.where}, {worst.poses} poses{of})",
-        open=open_of(found),
+        open=not_judged,
         sets=(worst.poses, far.poses),
         regions=(worst.where, far.where),
     )
-
-
-def open_of(found: Beyond) -> str:
-    """What could not be judged outside the measured region."""
-    if not found.missed:
-        return ""
-    named = name_first(found.missed, MAX_NAMED)
-    return f"only {found.judged} could be judged, not {named}, which the fit needs"
 
 
 REFUSED = {  # ends of a calibration of which nothing is passed, whatever its numbers

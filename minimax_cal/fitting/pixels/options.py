@@ -45,17 +45,14 @@ def doubts_of(text: str) -> Mapping[str, float]:
     return found
 
 
-def camera_of(text: str) -> tuple[str, str]:
-    """NAME=FILE.  Raises OptionError."""
-    name, _, path = text.partition("=")
-    if not (name.strip() and path.strip()):
-        raise OptionError(f"camera={text!r}: give a name and a file, as cam0=camera.yaml")
-    return name.strip(), path.strip()
-
-
 def cameras_of(texts: Sequence[str]) -> dict[str, str]:
     """Files by the cameras' names, of NAME=FILE each.  Raises OptionError."""
-    named = dict(camera_of(text) for text in texts)
+    named = {}
+    for text in texts:
+        name, _, path = (part.strip() for part in text.partition("="))
+        if not (name and path):
+            raise OptionError(f"camera={text!r}: give a name and a file, as cam0=camera.yaml")
+        named[name] = path
     if len(named) < len(texts):
         raise OptionError("camera= gives one name twice; each camera has its own")
     return named

@@ -131,30 +131,22 @@ def directions(data: PixelData) -> Array:
     return undistorted(lens[data.camera].T, data.pixel.T)
 
 
-def is_flat(board: Array) -> bool:
-    """Whether a board lies in a plane."""
-    if not len(board):
-        return False
-    size = np.linalg.svd(board - board.mean(axis=0), compute_uv=False)
-    return bool(size[2] < FLAT * size[0])
-
-
 # ---- a flat board: a pose from each image ----------------------------------------------------
-
-
-def plane_of(board: Array) -> Array:
-    """(4, 4) pose, in the board's frame, of a frame whose z = 0 holds all its targets."""
-    centre = board.mean(axis=0)
-    axes = np.linalg.svd(board - centre)[2]
-    axes[2] *= np.linalg.det(axes)
-    return transform(axes.T, centre)
 
 
 def poses_of_images(data: PixelData, seen: Array) -> list[Shown]:
     """Of each camera where a flat board shows, and its pose in the camera there [m]."""
-    if not is_flat(data.board):
-        return [(np.zeros(0, dtype=int), np.zeros((0, 4, 4)))] * len(data.cameras)
-    plane = plane_of(data.board)
+    nothing = [(np.zeros(0, dtype=int), np.zeros((0, 4, 4)))] * len(data.cameras)
+    if not len(data.board):
+        return nothing
+    centre = data.board.mean(axis=0)
+    _, size, axes = np.linalg.svd(data.board - centre)
+    if size[2] >= FLAT * size[0]:
+        return nothing
+
+    # A frame in the board's whose z = 0 holds all its targets.
+    axes[2] *= np.linalg.det(axes)
+    plane = transform(axes.T, centre)
     local = (data.board - plane[:3, 3]) @ plane[:3, :3]
     out = []
     for camera in range(len(data.cameras)):

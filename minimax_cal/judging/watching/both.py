@@ -257,20 +257,18 @@ def fit_variances(both: Both) -> Variances:
             factor[some] = max(one, MIN_FACTOR)
         if np.all(np.abs(np.log(np.append(noise, factor) / before)) < VARIANCE_TOLERANCE):
             break
+
+    # The log determinant of a matrix scaled to a unit diagonal.
+    matrix = np.tensordot(1.0 / noise, grams, 1)[:-1, :-1] + np.diag(prior)
+    size = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    size = np.where(size > 0.0, size, 1.0)
+    unit = matrix / np.outer(size, size) + RIDGE * np.eye(len(matrix))
     deviance = (
         float(counts @ np.log(noise) + np.log(factor).sum())
-        + log_determinant(np.tensordot(1.0 / noise, grams, 1)[:-1, :-1] + np.diag(prior))
+        + float(np.linalg.slogdet(unit)[1] + 2.0 * np.log(size).sum())
         + float(np.sum(square / noise) + np.sum(value[f:] ** 2 / factor))
     )
     return Variances(noise, factor, max(float(free[NEW]), 1.0), deviance)
-
-
-def log_determinant(gram: Array) -> float:
-    """Of a positive semi-definite matrix, as `solve` takes it."""
-    size = np.sqrt(np.maximum(np.diag(gram), 0.0))
-    size = np.where(size > 0.0, size, 1.0)
-    unit = gram / np.outer(size, size) + RIDGE * np.eye(len(gram))
-    return float(np.linalg.slogdet(unit)[1] + 2.0 * np.log(size).sum())
 
 
 def critical(level: Array, dof: Array) -> Array:

@@ -161,14 +161,11 @@ class Watched:
         Each is a mean of then and a mean of now.
         """
         n, f = self.cell.robot.joints, len(self.foot)
-        error = self.foot_error(self.foot_now, state)
+        # How far the foot's reflectors are from where they were.
+        off = (self.foot_now - state.origin) @ state.rotation - self.foot
+        error = np.asarray(off.reshape(-1) / np.sqrt(self.foot_variance))
         slope = np.zeros((f, 3, self.names.count))
         slope[..., 5 * n : 5 * n + 3] = np.eye(3)
         turned = np.cross(np.eye(3)[None], self.foot[:, None])  # (f, turn, 3)
         slope[..., 5 * n + 3 : 5 * n + 6] = np.swapaxes(turned, 1, 2)
         return error, slope.reshape(3 * f, -1) / np.sqrt(self.foot_variance)
-
-    def foot_error(self, place: Array, state: State) -> Array:
-        """(..., 3f) how far the foot's reflectors (..., f, 3) are from where they were, as rows."""
-        off = (place - state.origin) @ state.rotation - self.foot
-        return np.asarray(off.reshape(*off.shape[:-2], -1) / np.sqrt(self.foot_variance))
