@@ -244,7 +244,7 @@ class Fit(Result):
     ) -> Fit:  # fmt: skip
         """A result, with what follows from its two arms at all poses, and from its settings.
 
-        errors: (k, m, 3) of the nominal and the calibrated arm [m].  fields: the others; those not
+        errors: (m, k, 3) of the nominal and the calibrated arm [m].  fields: the others; those not
         given are of least squares of all training points, without priors.  accuracy: what is to be
         added to that of these errors.
         """

@@ -138,7 +138,7 @@ def no_better(found: Improvement) -> str:
 
 
 def warn_of_hidden_improvement(found: Improvement, drawn: Array, calibrated: Array) -> str:
-    """Notice that wrong points hide what is better.  drawn, calibrated: (k, m, 3) errors [m]."""
+    """Notice that wrong points hide what is better.  drawn, calibrated: (m, k, 3) errors [m]."""
     both = np.isfinite(drawn) & np.isfinite(calibrated)
     whole = [accuracy(np.where(both, one, np.nan)).rms_mm for one in (drawn, calibrated)]
     return (

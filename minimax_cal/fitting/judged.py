@@ -92,7 +92,7 @@ class FitErrors:
     """Measured minus predicted of a fit at all m poses, of the drawn and the calibrated arm [m].
 
     data: in the first frame of the fit's sessions.  held: (m,) True where held out.  drawn,
-    calibrated: (k, m, 3).  crossed_drawn, crossed: (k, m, 3) by fits without each pose, or empty.
+    calibrated: (m, k, 3).  crossed_drawn, crossed: (m, k, 3) by fits without each pose, or empty.
     suspects: outliers, those of the fit first.  exchanged: (b,) rows with other rows' points.
     """
 
@@ -107,10 +107,10 @@ class FitErrors:
 
     @property
     def unseen(self) -> tuple[Array, Array]:
-        """(k, m, 3) of both arms on poses that neither has seen, NaN elsewhere [m]."""
+        """(m, k, 3) of both arms on poses that neither has seen, NaN elsewhere [m]."""
         if self.crossed.size:
             return self.crossed_drawn, self.crossed
-        return hidden(self.drawn, self.calibrated, ~self.held)
+        return hidden(self.drawn, self.calibrated, ~self.held[:, None])
 
     def name_exchanged_rows(self) -> str:
         """That rows hold each other's points, by their names or lines."""
@@ -162,7 +162,7 @@ def judge_fit(
     if not is_same_arm and np.isfinite(errors.unseen[1]).any():
         both = errors.unseen
         if (target := objective_of(options.objective, data)) >= 0:  # the others follow it
-            both = hidden(*both, np.arange(len(data.target_names))[:, None] != target)
+            both = hidden(*both, np.arange(len(data.target_names)) != target)
         better = improvement(*both, grouped(data, options.holdout_by), data, suspects)
 
     # Do sessions contradict each other, where what changed between them is not fitted?
@@ -184,7 +184,7 @@ def judge_fit(
         from minimax_cal.fitting.several.agreement import moved_bases_of  # slow to import
 
         contradictions = moved_bases_of(moved, next(iter(solved.frames), ""))
-    alarms = tuple(warn_of_wrong_robot(robot, solved, drawn[:, ~held]))
+    alarms = tuple(warn_of_wrong_robot(robot, solved, drawn[~held]))
     free = solved.identification.active & (solved.estimator.model.prior.weight == 0.0)
     if few := few_poses(split.train, int(free.sum())):
         alarms = (f"too few poses: {few}", *alarms)
@@ -207,7 +207,7 @@ def judge_fit(
         parameters=parameters_of(robot, solved),
         accuracy={"holdout_with_them": counted} if counted else {},
         identification=solved.identification,
-        minimax=describe_worst_case(options, solved, split.train, calibrated[:, ~held]),
+        minimax=describe_worst_case(options, solved, split.train, calibrated[~held]),
         certificate=solved.certificate,
         trace=tuple(float(value) for value in solved.squares.trace[:, 0]),
         suspects=suspects,
@@ -241,9 +241,9 @@ def collect_evidence(
     trusted = aside(errors.calibrated, data, suspects)
     parts = {"training": ~held, "held-out": held}
     scores = FileEvidence(
-        {name: (accuracy(errors.calibrated[:, rows]), accuracy(trusted[:, rows]))
+        {name: (accuracy(errors.calibrated[rows]), accuracy(trusted[rows]))
          for name, rows in parts.items()},
-        drawn={name: accuracy(errors.drawn[:, rows]) for name, rows in parts.items()},
+        drawn={name: accuracy(errors.drawn[rows]) for name, rows in parts.items()},
         floor=known_floor(data, trusted, robot.repeatability),
     )  # fmt: skip
 
@@ -336,7 +336,7 @@ def list_notices(
 def warn_of_wrong_robot(robot: Robot, solved: Solved, drawn_error: Array) -> Iterator[str]:
     """Notices where the result is no calibration of this robot but of another one.
 
-    drawn_error: (k, training poses, 3) of the drawn arm [m].
+    drawn_error: (training poses, k, 3) of the drawn arm [m].
     """
     reach, drawn = robot.reach(), solved.nominal.mdh
     miss = float(np.sqrt(np.nanmean(np.nansum(drawn_error**2, axis=-1))))
@@ -399,11 +399,11 @@ def describe_worst_case(
         return None
     labels, chosen = names, np.arange(len(best.mu))
     if PER[options.objective] == "target":
-        size = np.array(accuracy(np.sqrt(weights)[..., None] * error).sse_mm2)
+        size = np.array(accuracy(np.sqrt(weights).T[..., None] * error).sse_mm2)
     else:
         points = np.argwhere(weights > 0.0)
         labels = tuple(f"{names[k]}, {train.called(train.line[i])}" for k, i in points)
-        size = 1e3 * np.linalg.norm(error, axis=-1)[weights > 0.0]
+        size = 1e3 * np.linalg.norm(error, axis=-1).T[weights > 0.0]  # as `points`
         chosen = np.argsort(-best.mu)
         chosen = chosen[best.mu[chosen] > MIN_MULTIPLIER]
     active = np.flatnonzero(best.f >= best.f.max() * (1 - ACTIVE_TOLERANCE))

@@ -220,14 +220,14 @@ def warn_of_noise(both: Both) -> Iterator[str]:
 
 
 def placed_errors(watched: Watched, placed: Placing) -> Array:
-    """(k, m, 3) errors where base, targets and what moved are placed [m]."""
+    """(m, k, 3) errors where base, targets and what moved are placed [m]."""
     state = placed.state
     model, _ = watched.fitted(np.zeros(watched.names.count, dtype=bool), state)
     return model.error(state) @ state.rotation.T
 
 
 def with_spent_freedom(error: Array, used: float) -> Array:
-    """Errors (k, m, 3) grown to n / (n - used) in the mean square: what placing took up, put back.
+    """Errors (m, k, 3) grown to n / (n - used) in the mean square: what placing took up, put back.
 
     used: coordinates, as of `Placing`.
     """
@@ -236,14 +236,14 @@ def with_spent_freedom(error: Array, used: float) -> Array:
 
 
 def judge_limit(limit: Limit, error: Array, data: Measurements, used: float, seed: int) -> Verdict:
-    """One requirement against errors (k, m, 3) that placing took up `used` coordinates of."""
+    """One requirement against errors (m, k, 3) that placing took up `used` coordinates of."""
     grown, group = with_spent_freedom(error, used), groups(data)
     is_rms, required = limit.kind == "rms", 1e-3 * limit.size_mm
     kind = rms_interval if is_rms else max_interval
 
     def interval(level: float, copies: int = 1) -> Interval:
         copied = np.add.outer(len(group) * np.arange(copies), group).ravel()
-        errors = np.tile(grown, (1, copies, 1))
+        errors = np.tile(grown, (copies, 1, 1))
         return kind(errors, copied, level, rng=np.random.default_rng(seed))
 
     found = accuracy(grown)
