@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.fitting import identify, solve, unknown_arm
+from minimax_cal.fitting import geometry_fit, identify, unknown_arm
 from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.fitting.pose_rows import pose_rows, read_poses
@@ -250,7 +250,7 @@ def test_a_random_arm_reaches_the_noise(kind, seed):
 def test_offsets_of_coaxial_axes_have_two_coordinates(monkeypatch):
     """Axes drawn coaxial that are not: with one coordinate the fit stops above the noise."""
     after = calibrated("coaxial neighbours", 0)
-    monkeypatch.setattr(solve, "coaxial_joints", lambda robot: [])
+    monkeypatch.setattr(geometry_fit, "coaxial_joints", lambda robot: [])
     before = calibrated("coaxial neighbours", 0)
     assert not at_noise(before)
     many, few = (sum(p.identifiable for p in fit.parameters) for fit in (after, before))
