@@ -35,7 +35,7 @@ from minimax_cal.fitting.options import Options, Progress, silent
 from minimax_cal.fitting.outcome import FileEvidence, missed_rows
 from minimax_cal.fitting.several.options import READ, RelativeOptions, check_no_others, with_others
 from minimax_cal.fitting.solve import fit_cell
-from minimax_cal.fitting.stations import stationed, unplaced
+from minimax_cal.fitting.stations import place_sessions, warn_of_unplaced_sessions
 from minimax_cal.fitting.suspects import find_contradicting_points
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
@@ -204,8 +204,8 @@ def diagnose(
             "calibrate with the effects found judges every pose by a fit without it"
         )
         notices = (*notices, few)
-    notices = (*notices, *unplaced(raw, ~held))
-    raw = stationed(robot, raw, ~held)
+    notices = (*notices, *warn_of_unplaced_sessions(raw, ~held))
+    raw = place_sessions(robot, raw, ~held)
     with one_thread():
         return examine(robot, raw, held, options, notices, progress, began, (jobs, cluster))
 
