@@ -18,20 +18,31 @@ from scipy.spatial.transform import Rotation
 import minimax_cal as mc
 from experiments.agreement import (
     BASE,
+    EFFECTS,
+    ROBOTS,
     SCALE,
     ZERO,
     Job,
     SigmaJob,
     SimulatedArm,
+    fitted_spot,
     homogeneous,
     ratio_of,
     told_of,
 )
+from minimax_cal.fitting.claims import drawn_sigmas
 from minimax_cal.fitting.disagreement import Cause, Contradiction
 from minimax_cal.fitting.outcome import FileEvidence, FitEvidence, judge
 from minimax_cal.fitting.several.agreement import ScoreTest
-from minimax_cal.fitting.several.kinds import relative
-from minimax_cal.fitting.several.lack import Components, FileRows
+from minimax_cal.fitting.several.fit import fit_instruments
+from minimax_cal.fitting.several.kinds import (
+    drawn_sigma_of_positions,
+    relative,
+    sigma_of_positions,
+    targets_of,
+)
+from minimax_cal.fitting.several.lack import Components, FileRows, with_lack
+from minimax_cal.fitting.several.options import RelativeOptions, silent
 from minimax_cal.instruments import Surface, contacts
 from minimax_cal.solvers.status import Status
 
@@ -117,6 +128,47 @@ def test_of_many_files_few_contradict_in_vain_and_most_causes_are_named():
 def test_sigmas_of_positions_are_true_on_arms_that_bend(kinds, bends):
     median = np.median([ratio_of(SigmaJob(seed, kinds, bends)) for seed in range(8)])
     assert (0.6 if bends else 0.7) < median < (1.6 if bends else 1.4)
+
+
+def bent_arm(seed):
+    """An arm whose effect moves it by more than its drawing is off, and what three wires say."""
+    rng = np.random.default_rng([seed, 9])
+    robot, effect = mc.load_robot(ROBOTS[seed % len(ROBOTS)]), EFFECTS[seed % len(EFFECTS)]
+    arm = SimulatedArm(robot, rng, effect, 2e-3)
+    return arm, arm.measure("wires", 60, 3e-5, narrow=seed % 2 == 0)
+
+
+@pytest.mark.parametrize("seed", [1, 17])
+def test_a_bent_arm_is_held_against_a_drawn_one_that_bends_as_much(seed):
+    """A drawing that is off by less than the arm bends is no better known for that."""
+    arm, lengths = bent_arm(seed)
+    found = relative(arm.robot, lengths)
+    assert str(found.status) == "converged"
+    off = arm.position_error(found.robot, fitted_spot(found))
+    assert off < arm.position_error(arm.robot, arm.spots[0])
+    assert 0.6 * found.position_sigma < off < 1.6 * found.position_sigma
+    # wires that tell the arm to a tenth of how it bends are no poor instrument
+    assert not any("positions are poorly determined" in notice for notice in found.notices)
+
+
+@pytest.mark.slow
+def test_positions_of_a_drawn_arm_that_bends_are_claimed_as_they_are():
+    """And whether the drawn arm is kept follows: mostly where it is the better one."""
+    ratio, right = [], []
+    for seed in range(16):
+        arm, lengths = bent_arm(seed)
+        fit = with_lack(
+            arm.robot, fit_instruments(arm.robot, {"": lengths}, RelativeOptions(), silent)
+        )
+        drawn = arm.position_error(arm.robot, arm.spots[0])
+        claimed = drawn_sigma_of_positions(arm.robot, fit, drawn_sigmas(arm.robot))
+        ratio.append(drawn / claimed)
+        (spot,) = targets_of(fit, fit.state)
+        fitted = arm.position_error(arm.robot.with_mdh(fit.state.mdh), spot)
+        is_kept = sigma_of_positions(arm.robot, fit) > claimed
+        right.append(is_kept == (fitted > drawn))
+    assert 0.7 < np.median(ratio) < 1.4
+    assert sum(right) >= 12
 
 
 def two_files(rng, robot, **wrong):

@@ -191,7 +191,7 @@ def weak(
 ) -> tuple[str, ...]:
     """A notice where positions are told far worse than what was measured.
 
-    sigma: of a position, but for what is open [m].
+    sigma: of a position, but for what is open and for what an arm does that no link holds [m].
     """
     of_lengths = [one for one in measured if one.units == (METRE,)]
     rms_mm = min((one.accuracy["train"].rms_mm for one in of_lengths), default=np.nan)
