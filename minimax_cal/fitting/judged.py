@@ -181,15 +181,6 @@ class Judged:
         trusted = self.solved.robust.weights > MIN_TRUSTED_WEIGHT
         return find_contradicting_sessions(self.robot, self.poses.train, trusted)
 
-    @property
-    def moved_bases(self) -> tuple[Contradiction, ...]:
-        """Bases that moved between sessions of one instrument."""
-        if not self.moved:
-            return ()
-        from minimax_cal.fitting.several.agreement import moved_bases_of  # slow to import
-
-        return moved_bases_of(self.moved, next(iter(self.solved.frames), ""))
-
     @cached_property
     def evidence(self) -> FitEvidence:
         """What the outcome is judged by."""
@@ -322,7 +313,7 @@ class Judged:
             error_drawn_crossed=drawn_crossed,
             reason=self.outcome.reason,
             moved=self.moved,
-            contradictions=self.evidence.contradictions or self.moved_bases,
+            contradictions=self.evidence.contradictions,
             seconds=time.perf_counter() - began,
         )
 

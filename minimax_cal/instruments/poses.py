@@ -16,7 +16,6 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.instrument import (
     Columns,
-    Slip,
     Told,
     Words,
     bare,
@@ -199,7 +198,7 @@ class WholePoses(Points):
         rows = np.linspace(0, self.poses - 1, min(self.poses, MAX_TRIAL_POSES)).astype(int)
         return self.take(rows)
 
-    def slips(self) -> Iterator[Slip]:
+    def slips(self) -> Iterator[tuple[str, WholePoses]]:
         """Rotations of another kind, order or unit than the columns say."""
         for text, turn in rotations_as(self.written):
             pose = self.pose.copy()

@@ -27,6 +27,7 @@ from minimax_cal.fitting.several import fit, plausible
 from minimax_cal.fitting.several.agreement import (
     find_contradictions,
     find_moved_bases,
+    find_other_order,
     find_other_scale,
 )
 from minimax_cal.fitting.several.fit import InstrumentFit
@@ -276,8 +277,6 @@ def judged(
         *evidence.doubts,
         *filter(None, (*(notice for notice, _ in unfitted), ended.reason)),
     ]  # fmt: skip
-    moved = () if ended.reason else find_moved_bases(found)
-    said += [one.sentence for one in moved]
     for data, (held, _), each in zip(every, asked.splits, measured, strict=True):
         said += plausible.general(each, data, held)
     return replace(
@@ -286,7 +285,7 @@ def judged(
         calibrated=result.robot,
         status=ended.status,
         reason=ended.reason,
-        contradictions=evidence.contradictions or moved,
+        contradictions=evidence.contradictions,
         notices=tuple(dict.fromkeys((*result.notices, *said))),
     )
 
@@ -343,7 +342,10 @@ def evidence_of(
         drawn_sigma=drawn_sigma_of_positions(robot, geometry, within),
         allow_large_changes=asked.options.allow_large_changes,
         objection=objection,
-        contradictions=find_contradictions(robot, geometry) or scale[0],
+        contradictions=find_other_order(robot, geometry)
+        or find_contradictions(robot, geometry)
+        or find_moved_bases(geometry)
+        or scale[0],
         doubts=(scale[1],) if scale[1] else (),
         worse=no_better(better) if better and worse else "",
     )
