@@ -199,7 +199,9 @@ class WholePoses(Points):
         return self.take(rows)
 
     def slips(self) -> Iterator[tuple[str, WholePoses]]:
-        """Rotations of another kind, order or unit than the columns say."""
+        """Poses the other way round, rotations of another kind, order or unit than columns say."""
+        inverse = "look like poses of the measurement frame in the flange's: invert them"
+        yield f"flange_x ... {inverse}", replace(self, pose=np.linalg.inv(self.pose))
         for text, turn in rotations_as(self.written):
             pose = self.pose.copy()
             pose[:, :3, :3] = turn

@@ -199,7 +199,7 @@ def find_contradictions(
     if len(fit.trains) < 2:
         return ()
     files, groups = rows_of_files(robot, fit)
-    timed = [bool(one.links[-1].any()) for one in files]
+    timed = [one.links[-1].any() for one in files]
     if sum(timed) > 1:  # of a delay that all of these have the arm may be the cause
         files = [replace(o, shared=np.concatenate([o.shared, o.links[-1:]])) for o in files]
     last = np.argsort(timed, kind="stable")  # a lone recording in motion is held against the others
@@ -259,11 +259,9 @@ def find_other_order(robot: Robot, fit: InstrumentFit) -> tuple[Contradiction, .
             error = block.at_rows_of(robot, mended, fit.stack.laws, x).rows(x, none)[0]
             left = error - rows.span @ (rows.span.T @ error)
             found.append((float(left @ left), text, mended.pose[:, :3, :3]))
-        if not found:
-            continue
         best, mend, turn = min(found, key=lambda each: each[0])
-        degrees = rows.alone.degrees
-        p = float(fdtrc(degrees, degrees, given / best)) if degrees > 0.0 else 1.0
+        degrees = max(rows.alone.degrees, 1.0)
+        p = float(fdtrc(degrees, degrees, given / best))
         alike = [other for left, _, other in found if left < ALIKE * best]
         is_alone = all(np.allclose(other, turn, atol=SAME_TURN) for other in alike)
         if is_alone and best < EXPLAINED * given and p < MAX_P:
