@@ -173,10 +173,13 @@ class SimulatedArm:
         seen[:, :3, 3] = factor * (place @ turn.T + origin) + noise * rng.normal(size=place.shape)
         return flange_poses(q, seen)
 
-    def position_error(self, found: RelativeCalibration, spot: Array) -> float:
-        """RMS error of positions over the joints' range, a base fitted.  spot: as fitted [m]."""
+    def position_error(self, robot: Robot, spot: Array) -> float:
+        """RMS error of a robot's positions over the joints' range, a base fitted.
+
+        spot: the target on its flange [m].
+        """
         q = anywhere(self.robot, 200).q
-        true, fitted = self.pose(q), (found.calibrated or found.robot).pose(q)
+        true, fitted = self.pose(q), robot.pose(q)
         p = true[:, :3, 3] + true[:, :3, :3] @ self.spots[0]
         g = fitted[:, :3, 3] + fitted[:, :3, :3] @ spot
         best = Rotation.align_vectors(p - p.mean(axis=0), g - g.mean(axis=0))[0]
@@ -273,7 +276,8 @@ def ratio_of(job: SigmaJob) -> float:
     effect = EFFECTS[job.seed % len(EFFECTS)] if job.bends else ""
     arm = SimulatedArm(robot, rng, effect, log_uniform(rng, EFFECT_SIZE))
     found = relative(robot, [arm.measure(kind, 50, 3e-5) for kind in job.kinds])
-    return arm.position_error(found, fitted_spot(found)) / found.position_sigma
+    fitted = found.calibrated or found.robot
+    return arm.position_error(fitted, fitted_spot(found)) / found.position_sigma
 
 
 def sigma_rows(jobs: Sequence[SigmaJob], ratios: Sequence[float]) -> Iterator[tuple[object, ...]]:

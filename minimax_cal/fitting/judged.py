@@ -180,10 +180,6 @@ def judge_fit(
     moved: tuple[Change, ...] = ()
     if outcome.status is not Status.FAILED:
         moved = between_sessions(robot, split.train, solved, cell)
-    if moved and not contradictions:
-        from minimax_cal.fitting.several.agreement import moved_bases_of  # slow to import
-
-        contradictions = moved_bases_of(moved, next(iter(solved.frames), ""))
     alarms = tuple(warn_of_wrong_robot(robot, solved, drawn[~held]))
     free = solved.identification.active & (solved.estimator.model.prior.weight == 0.0)
     if few := few_poses(split.train, int(free.sum())):

@@ -16,7 +16,6 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.instrument import (
     Columns,
-    Slip,
     Told,
     Words,
     bare,
@@ -199,8 +198,10 @@ class WholePoses(Points):
         rows = np.linspace(0, self.poses - 1, min(self.poses, MAX_TRIAL_POSES)).astype(int)
         return self.take(rows)
 
-    def slips(self) -> Iterator[Slip]:
-        """Rotations of another kind, order or unit than the columns say."""
+    def slips(self) -> Iterator[tuple[str, WholePoses]]:
+        """Poses the other way round, rotations of another kind, order or unit than columns say."""
+        inverse = "look like poses of the measurement frame in the flange's: invert them"
+        yield f"flange_x ... {inverse}", replace(self, pose=np.linalg.inv(self.pose))
         for text, turn in rotations_as(self.written):
             pose = self.pose.copy()
             pose[:, :3, :3] = turn

@@ -12,6 +12,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.set_aside import merged
 
 STILL = 1e-7  # a joint that moved less did not move [rad, m]
+MAX_BEND = 0.3  # of what joints move by in two rows, off a straight line: recorded in motion
 
 
 def with_history(data: Measurements) -> Measurements:
@@ -19,8 +20,9 @@ def with_history(data: Measurements) -> Measurements:
 
     approach1..n: (m,) sign of the joint's last move, 0 unknown.  move1..n: (m,) the move from the
     pose before [rad, m], 0 unknown.  followed: (m,) 1 where the pose before is known, else 0.
-    clock: (m,) place in the session, 0 first to 1 last.  Without an order or times nothing of this
-    is known: all are 0.  Poses that were set aside were visited as well.
+    clock: (m,) place in the session, 0 first to 1 last.  rate1..n: `joint_rates`.  Without
+    an order or times nothing of this is known: all are 0.  Poses that were set aside were visited
+    as well.
     """
     if data.aside is None:
         return known_history(data)
@@ -51,6 +53,7 @@ def known_history(data: Measurements) -> Measurements:
     found = {f"approach{j + 1}": approach[:, j] for j in joints}
     found |= {f"move{j + 1}": move[:, j] for j in joints}
     found |= {"followed": linked.astype(float), "clock": clock(data)}
+    found |= {f"rate{j + 1}": rate for j, rate in enumerate(joint_rates(data).T)}
     return replace(data, columns={**found, **data.columns})
 
 
@@ -116,6 +119,23 @@ def moves(data: Measurements) -> Array:
     move = np.zeros_like(data.q)
     move[order[1:]] = np.diff(data.q[order], axis=0)
     return np.where(followed(data)[:, None], move, 0.0)
+
+
+def joint_rates(data: Measurements) -> Array:
+    """(m, n) velocity of the joints by `time_s`, of sessions recorded in motion [rad/s, m/s].
+
+    0 where the arm was at rest, or went farther from row to row than these show.
+    """
+    rate, order = np.zeros_like(data.q), visits(data)
+    time = data.columns.get("time", np.full(data.poses, np.nan)).astype(float)
+    session = sessions(data)[order]
+    for number in np.unique(session):
+        rows = order[session == number]
+        q, going = data.q[rows], time[rows]
+        bend = np.linalg.norm(np.diff(q, 2, axis=0))
+        if (np.diff(going) > 0.0).all() and bend < MAX_BEND * np.linalg.norm(q[2:] - q[:-2]):
+            rate[rows] = np.gradient(q, going, axis=0)
+    return rate
 
 
 def followed(data: Measurements) -> Array:

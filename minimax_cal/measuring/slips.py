@@ -88,8 +88,12 @@ def with_joints_ordered(data: Measurements, order: list[int]) -> Measurements:
 
 def slips(robot: Robot, data: Measurements) -> Iterator[tuple[str, tuple[Robot, Measurements]]]:
     """Slips of the whole file: what to say, and robot and data with it mended."""
-    for text, mended in (*of_units(robot, data), *of_rows(data), *of_columns(robot, data)):
-        yield text, (robot, mended)
+    yield from ((text, (robot, mended)) for text, mended in of_units(robot, data))
+    for text, how, joints, points in of_rows(data.poses):
+        moved = replace(data.take(points), q=data.q[joints])
+        yield f"the points {text}; {mend_by(data, how)}", (robot, moved)
+    for text, how, mended in of_columns(robot, data):
+        yield f"{text}; {mend_by(data, how)}", (robot, mended)
     other = in_other_convention(robot)
     if other is not None:
         name = "modified (Craig's)" if other.notation.modified else "standard"
@@ -134,20 +138,22 @@ def beside(by: int) -> str:
     return f"stand {LATE[abs(by)]} {'below' if by > 0 else 'above'} its joints"
 
 
-def of_rows(data: Measurements) -> Iterator[tuple[str, Measurements]]:
-    """Points in other rows than their joints."""
+def of_rows(count: int) -> Iterator[tuple[str, str, Array, Array]]:
+    """What was measured in other rows than its joints: what to say, how it is mended.
+
+    And the rows of the joints, and of what was measured, that belong together.
+    """
+    rows = np.arange(count)
     for by in SHIFTS:
-        if data.poses > 10 + abs(by):
-            text = f"the points look shifted: those of each pose {beside(by)}; "
-            yield text + mend_by(data, f"shift={by}"), with_points_moved(data, by)
-    yield (
-        "the points look like those of the poses in reverse order; " + mend_by(data, "reverse"),
-        with_points_reversed(data),
-    )
+        if count > 10 + abs(by):
+            own = rows[max(-by, 0) : count - max(by, 0)]
+            text = f"look shifted: those of each pose {beside(by)}"
+            yield text, f"shift={by}", own, own + by
+    yield "look like those of the poses in reverse order", "reverse", rows, rows[::-1]
 
 
-def of_columns(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:
-    """Joint columns that stand under each other's names."""
+def of_columns(robot: Robot, data: Measurements) -> Iterator[tuple[str, str, Measurements]]:
+    """Joint columns under each other's names: what to say, how it is mended, the data mended."""
     joints = list(range(robot.joints))
     orders = []
     for i, j in combinations(joints, 2):
@@ -161,8 +167,7 @@ def of_columns(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurem
     for text, order in orders:
         if np.array_equal(data.sliding[order], data.sliding):
             names = ":".join(str(i + 1) for i in order)
-            mended = with_joints_ordered(data, order)
-            yield f"the {text}; {mend_by(data, f'joints={names}')}", mended
+            yield f"the {text}", f"joints={names}", with_joints_ordered(data, order)
 
 
 def in_other_convention(robot: Robot) -> Robot | None:

@@ -592,11 +592,6 @@ def test_errors_of_poses_name_the_users_columns():
         relative(arm.robot, flange_poses(seen.data.at.q, pose), lever=1e-4)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="positions by three wires are claimed to 1.07 mm where they are good to .25: the lack "
-    "of fit is too large there, so that the drawn arm is kept, not_determined",
-)
 def test_a_real_arm_by_lengths_of_its_trackers_points():
     shared("irb120")  # skips where there are no data
     kinds = ("wires_3", "wires_1", "tracker")

@@ -55,6 +55,73 @@ def test_euler_angles_in_the_columns_of_a_rotation_vector_are_named(
     assert relative("irb2600", good).status == "converged"
 
 
+@pytest.mark.parametrize("order", ["", "xyz"])
+def test_euler_angles_so_small_that_an_arm_nearly_fits_them_contradict_it(order, tmp_path):
+    """Of poses near one another the orders differ by 10 mrad: links take a part of that."""
+    arm = SimulatedArm(mc.load_robot("irb2600"), np.random.default_rng(1), "leaning", 2e-4)
+    rng, middle = arm.rng, np.array([0.1, 0.2, -0.1, 0.3, 0.5, 0.2])
+    q = middle + 0.1 * rng.uniform(-1.0, 1.0, (60, 6))
+    seen = arm.pose(q)
+    seen[:, :3, 3] += 3e-5 * rng.normal(size=(60, 3))
+    noise = Rotation.from_rotvec(3e-4 * rng.normal(size=(60, 3)))
+    tool = Rotation.from_rotvec([0.1, -0.05, 0.08])
+    base = Rotation.from_matrix(arm.pose(middle[None])[0, :3, :3]).inv()
+    turn = noise * base * Rotation.from_matrix(seen[:, :3, :3]) * tool
+    seen[:, :3, 3] = base.apply(seen[:, :3, 3])
+    columns = turn.as_euler(order) if order else turn.as_rotvec()
+    names = [f"flange_r{axis}_rad" for axis in "xyz"]
+    path = written(tmp_path / "near.csv", flange_poses(q, seen), names, columns)
+    found = relative("irb2600", path)
+    if not order:
+        assert found.status == "converged"
+        assert not found.contradictions
+        return
+    (one,) = found.contradictions
+    assert found.status == "contradictory"
+    assert (one.cause.kind, one.cause.place) == ("order_of_angles", "near")
+    assert "fixed axes, Rx Ry Rz" in found.reason
+    right = turn.as_matrix().swapaxes(1, 2) @ Rotation.from_rotvec(columns).as_matrix()
+    off = Rotation.from_matrix(right).magnitude()
+    assert_allclose(one.cause.by, np.sqrt((off**2).mean()), rtol=0.1)
+
+
+def test_whole_poses_the_other_way_round_are_named(poses, tmp_path, refuses):
+    back = np.linalg.inv(poses.pose)
+    turned = flange_poses(poses.at.q, back)
+    vector = Rotation.from_matrix(back[:, :3, :3]).as_rotvec()
+    names = [f"flange_r{axis}_rad" for axis in "xyz"]
+    path = written(tmp_path / "d.csv", turned, names, vector)
+    refuses(
+        "poses of the measurement frame in the flange's: invert them", "calibrate", "irb2600", path
+    )
+
+
+ROWS = {  # which rows of joints and of what was measured stand beside each other
+    "one row above": (slice(None, -1), slice(1, None)),
+    "two rows below": (slice(2, None), slice(None, -2)),
+    "in reverse order": (slice(None), slice(None, None, -1)),
+}
+
+
+@pytest.mark.parametrize("kind", ["wires", "poses"])
+@pytest.mark.parametrize("words", ROWS)
+def test_rows_beside_other_joints_are_named_of_any_instrument(kind, words, arm):
+    joints, own = ROWS[words]
+    data = arm.measure(kind, 50, 2e-5)
+    wrong = data.take(np.arange(50)[own])
+    wrong = replace(wrong, at=replace(wrong.at, q=data.at.q[joints]))
+    with pytest.raises(mc.DataError, match=f"{words}.*correct the file") as caught:
+        relative("irb2600", wrong)
+    assert "minimax-cal import" not in str(caught.value)  # which writes a tracker's points
+
+
+def test_joint_columns_exchanged_are_named_of_wires(arm):
+    data = arm.measure("wires", 60, 2e-5)
+    wrong = replace(data, at=replace(data.at, q=data.at.q[:, [0, 2, 1, 3, 4, 5]]))
+    with pytest.raises(mc.DataError, match="columns of joints 2 and 3 look swapped"):
+        relative("irb2600", wrong)
+
+
 def test_a_quaternion_in_another_order_is_named(poses, tmp_path, refuses):
     turn = Rotation.from_matrix(poses.pose[:, :3, :3]).as_quat()  # scalar last
     names = [f"flange_q{a}" for a in "wxyz"]

@@ -1,6 +1,7 @@
 """Slips of whole files: each named before the fit with the mend that does it; sound data pass."""
 
 import re
+import shlex
 import time
 import warnings
 from collections.abc import Callable
@@ -75,6 +76,33 @@ def test_a_slip_is_named_with_its_mend(name, robot, noisy):
         right = mended(wrong, [mend[1]])
         check_plausible(robot, right)
         assert right.poses >= noisy.data.poses - 6
+
+
+COMMANDS = {name: SLIPS[name][0] for name in (
+    "shifted", "by three", "reversed", "lost", "stale", "joints", "backwards", "inches", "clipped",
+)} | {"inches as metres": lambda d: d.with_y(d.y / 25.4)}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_printed_command_mends_the_file(name, noisy, tmp_path, monkeypatch, capsys):
+    """As it stands on the screen, in the folder of the file."""
+    monkeypatch.chdir(tmp_path)
+    good = noisy.data
+    robot = mc.load_robot("irb2600")
+    mc.write_measurements("good.csv", good)
+    mc.write_measurements("wrong.csv", COMMANDS[name](good))
+    if name == "inches as metres":
+        text = (tmp_path / "wrong.csv").read_text()
+        head, _, rest = text.partition("\n")
+        (tmp_path / "wrong.csv").write_text(re.sub(r"_([xyz])_mm", r"_\1_m", head) + "\n" + rest)
+    capsys.readouterr()
+    assert run("calibrate", "irb2600", "wrong.csv", "--simulated", "--quiet") == 2
+    said = capsys.readouterr().err
+    command = re.search(r"minimax-cal (import .*? -o mended\.csv)", said)
+    assert command, said
+    assert run(*shlex.split(command[1]), "--quiet") == 0
+    check_plausible(robot, mc.read_measurements("mended.csv"))
+    assert run("calibrate", "irb2600", "mended.csv", "--simulated", "--quiet") == 0
 
 
 def test_a_mended_file_calibrates(robot, noisy, tmp_path):

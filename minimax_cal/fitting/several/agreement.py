@@ -7,19 +7,22 @@ covariance of noise and lack.  A cause is a direction among these links.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
 
-from minimax_cal.fitting.between_sessions import Change
+from minimax_cal.fitting.checks import EXPLAINED
 from minimax_cal.fitting.common_scale import LEAST_SHARE, but_for_tool, fit_scale_of_lengths
 from minimax_cal.fitting.disagreement import (
     BASE,
+    CLOCK,
     JOINT_ZERO,
+    ORDER_OF_ANGLES,
     SCALE,
     Cause,
     Contradiction,
@@ -34,9 +37,10 @@ from minimax_cal.fitting.several.lack import (
     rows_of_files,
 )
 from minimax_cal.fitting.several.options import RelativeOptions, silent
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import DataError
 from minimax_cal.instruments.instrument import Instrument
+from minimax_cal.instruments.poses import WholePoses
 from minimax_cal.instruments.tracker import Points
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import labels as labels_of_sessions
@@ -51,14 +55,17 @@ MIN_P_OF_REST = 1e-3  # of what a cause leaves, above which it explains the cont
 MIN_LEAD = 12.0  # in twice the log likelihood, of a cause before its rivals
 MIN_TOLD = 0.1  # of a link as far off as a bad drawing, beside noise: a direction that files tell
 OFF_LENGTH, OFF_ANGLE = 1e-3, 1e-3  # how far links may differ between files [m, rad]
+OFF_CLOCK = 1e-2  # and when they were measured [s]
 MIN_SHARE = 0.3  # of the noise, by which files that differ move what was measured
 DIFFERENCE = 1e-6  # of a central difference [m, rad]
+ALIKE, SAME_TURN = 2.0, 1e-9  # what readings of rotations leave [m^2] / [m^2], and hold
+MAX_REFITS = 3  # with a delay taken out
 MIN_DOF = 15  # numbers beyond links of its own, of a file that is tested
 
 
 @dataclass(frozen=True, eq=False)
 class ScoreTest:
-    """Links of their own of all files but the first, tested beside those of all together.
+    """Links and delays of their own of all files but the first, tested beside those of all.
 
     score: (k,), information: (k, k) of them, whose unit is `unit` (k,) [SI].  dof: of the noise, of
     the file that tells it least.
@@ -71,7 +78,7 @@ class ScoreTest:
 
     @staticmethod
     def of(files: list[FileRows], found: Components, unit: Array) -> ScoreTest:
-        """unit: (5n,) how far links may differ between files [SI]."""
+        """unit: (5n + 1,) how far links, and delays, may differ between files [SI]."""
         fitted = [np.concatenate([one.shared, one.lack]) for one in files]
         pairs = list(zip(files, fitted, found.noise, strict=True))
         prior = np.concatenate([np.zeros(len(files[0].shared)), 1.0 / found.lack])
@@ -134,9 +141,9 @@ def causes(robot: Robot, mdh: Array, files: int) -> Iterator[tuple[int, str, str
 
     What differs in the first differs in all others the other way.
     """
-    links = 5 * robot.joints
-    lengths = np.where(np.arange(links) < 2 * robot.joints, links_of(mdh), 0.0)
-    kinds = [(SCALE, "", "1", lengths)]
+    links = 5 * robot.joints + 1
+    lengths = np.where(np.arange(links) < 2 * robot.joints, np.append(links_of(mdh), 0.0), 0.0)
+    kinds = [(SCALE, "", "1", lengths), (CLOCK, "", "s", np.eye(links)[-1])]
     for joint, at in enumerate(zero_positions(robot.prismatic)):
         unit = "m" if robot.prismatic[joint] else "rad"
         kinds.append((JOINT_ZERO, f"J{joint + 1}", unit, np.eye(links)[at]))
@@ -172,20 +179,38 @@ def tested_causes(
     return sorted(out, key=lambda one: -one.gain)
 
 
-def find_contradictions(robot: Robot, fit: InstrumentFit) -> tuple[Contradiction, ...]:
+def fit_delayed(robot: Robot, fit: InstrumentFit, label: str, delay: float) -> InstrumentFit:
+    """The fit of the same files, with the joints of one where they were so much later [s]."""
+    one = fit.trains[label]
+    rate = [one.at.columns[f"rate{j + 1}"] for j in range(robot.joints)]
+    later = replace(one, at=replace(one.at, q=one.at.q + delay * np.stack(rate, axis=1)))
+    return fit_instruments(robot, {**fit.trains, label: later}, RelativeOptions(), silent)
+
+
+def find_contradictions(
+    robot: Robot, fit: InstrumentFit, refits: int = MAX_REFITS
+) -> tuple[Contradiction, ...]:
     """What the files of a fit contradict each other by; none where they agree, or there is one.
 
-    Nothing is said of a difference that hardly moves what was measured beside noise and lack.
+    Nothing is said of a difference that hardly moves what was measured beside noise and lack.  A
+    delay moves joints by more than the fit is linear in: it is the cause where a fit without it
+    leaves no contradiction.  refits: how often that is tried.
     """
     if len(fit.trains) < 2:
         return ()
     files, groups = rows_of_files(robot, fit)
+    timed = [one.links[-1].any() for one in files]
+    if sum(timed) > 1:  # of a delay that all of these have the arm may be the cause
+        files = [replace(o, shared=np.concatenate([o.shared, o.links[-1:]])) for o in files]
+    last = np.argsort(timed, kind="stable")  # a lone recording in motion is held against the others
+    files, every = [files[i] for i in last], [fit.stack.labels[i] for i in last]
     told = [one.alone.degrees >= MIN_DOF for one in files]  # the others have no fit of their own
     files = [one for one, known in zip(files, told, strict=True) if known]
-    labels = [label for label, known in zip(fit.stack.labels, told, strict=True) if known]
+    labels = [label for label, known in zip(every, told, strict=True) if known]
     if len(files) < 2:
         return ()
-    unit = np.repeat([OFF_LENGTH, OFF_ANGLE], [2 * robot.joints, 3 * robot.joints])
+    counts = [2 * robot.joints, 3 * robot.joints, 1]
+    unit = np.repeat([OFF_LENGTH, OFF_ANGLE, OFF_CLOCK], counts)
     found = estimate_components([one.alone for one in files], groups)
     test = ScoreTest.of(files, found, unit)
     if not test.count:
@@ -208,13 +233,50 @@ def find_contradictions(robot: Robot, fit: InstrumentFit) -> tuple[Contradiction
         first.gain - one.gain > MIN_LEAD or p_of_rest(one) < MIN_P_OF_REST for one in rivals
     )
     named = first.cause if is_alone and p_of_rest(first) >= MIN_P_OF_REST else None
+    if is_alone and not named and first.cause.kind == CLOCK and refits:
+        delayed = fit_delayed(robot, fit, names[0], first.cause.by)
+        rest = find_contradictions(robot, delayed, refits - 1)
+        more = rest[0].cause if rest else replace(first.cause, by=0.0)
+        if more and (more.kind, more.place) == (CLOCK, first.cause.place):
+            named = replace(first.cause, by=first.cause.by + more.by)
     return (Contradiction(names, p, named),)
+
+
+def find_other_order(robot: Robot, fit: InstrumentFit) -> tuple[Contradiction, ...]:
+    """That rotations of a file are of another order, by which links of its own leave the noise.
+
+    Another reading that leaves as little is a rival, and nothing is said.
+    """
+    out, (files, _) = [], rows_of_files(robot, fit)
+    for i, (block, rows) in enumerate(zip(fit.stack.blocks, files, strict=True)):
+        one, x = block.instrument, fit.stack.part(fit.state, i)
+        if not isinstance(one, WholePoses):
+            continue
+        none = np.zeros(rows.links.shape[0] - 1 + 6 + x.effects.size, dtype=bool)
+        given = float(rows.alone.error @ rows.alone.error)
+        found = []
+        for text, mended in one.slips():
+            error = block.at_rows_of(robot, mended, fit.stack.laws, x).rows(x, none)[0]
+            left = error - rows.span @ (rows.span.T @ error)
+            found.append((float(left @ left), text, mended.pose[:, :3, :3]))
+        best, mend, turn = min(found, key=lambda each: each[0])
+        degrees = max(rows.alone.degrees, 1.0)
+        p = float(fdtrc(degrees, degrees, given / best))
+        alike = [other for left, _, other in found if left < ALIKE * best]
+        is_alone = all(np.allclose(other, turn, atol=SAME_TURN) for other in alike)
+        if is_alone and best < EXPLAINED * given and p < MAX_P:
+            apart = Rotation.from_matrix(turn.swapaxes(1, 2) @ one.pose[:, :3, :3]).magnitude()
+            name = fit.stack.labels[i]
+            others = (label for label in fit.stack.labels if label != name)
+            cause = Cause(ORDER_OF_ANGLES, name, rms(np.asarray(apart)), "rad", mend)
+            out.append(Contradiction((name, *others), p, cause))
+    return tuple(out)
 
 
 def find_moved_bases(fit: InstrumentFit) -> tuple[Contradiction, ...]:
     """Which bases moved between files of one frame, as far as the fit knows where they stand.
 
-    Each file has a frame of its own, so that this contradicts no arm.  Lengths know no frame.
+    Lengths know no frame.  Sessions of one file say that something moved, and contradict nothing.
     """
     framed = [i for i, one in enumerate(fit.stack.instruments) if isinstance(one, Points)]
     dof = max(
@@ -243,19 +305,6 @@ def find_moved_bases(fit: InstrumentFit) -> tuple[Contradiction, ...]:
         if has_base_moved(shift, turn, p, MAX_P):
             first, name = fit.stack.labels[i], fit.stack.labels[later]
             out.append(Contradiction((name, first), p, Cause(BASE, name, shift, "m")))
-    return tuple(out)
-
-
-def moved_bases_of(changes: Iterable[Change], first: str) -> tuple[Contradiction, ...]:
-    """The same of the sessions of a tracker.  first: session, beside which the others are told."""
-    out = []
-    for one in changes:
-        if one.place != "frame" or one.text:
-            continue
-        shift, turn = (amount.value for amount in one.amounts)
-        if has_base_moved(shift, turn, one.p_value, MAX_P):
-            cause = Cause(BASE, one.session, shift, "m")
-            out.append(Contradiction((one.session, first), one.p_value, cause))
     return tuple(out)
 
 

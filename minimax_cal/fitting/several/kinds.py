@@ -12,7 +12,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from minimax_cal.fitting.accuracy import HELD, by_key
-from minimax_cal.fitting.claims import drawn_sigmas, lacking, position_sigma, positions_by
+from minimax_cal.fitting.claims import (
+    NO_MOTION,
+    drawn_sigmas,
+    lacking,
+    position_sigma,
+    positions_by,
+)
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.improvement import improvement_of_files, no_better
 from minimax_cal.fitting.options import qp_name
@@ -21,6 +27,7 @@ from minimax_cal.fitting.several import fit, plausible
 from minimax_cal.fitting.several.agreement import (
     find_contradictions,
     find_moved_bases,
+    find_other_order,
     find_other_scale,
 )
 from minimax_cal.fitting.several.fit import InstrumentFit
@@ -210,7 +217,6 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
     unfitted = [plausible.unfitted(robot, found, i, options) for i in range(len(every))]
     evidence = evidence_of(asked, found, measured, sigma, [mend for _, mend in unfitted])
     outcome = judge(evidence, result.status)
-    moved = () if outcome.reason else find_moved_bases(found)
 
     # What the reader should know.
     instruments = enumerate(found.stack.instruments)
@@ -221,11 +227,12 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
         *plausible.of_beyond(result),
         *plausible.of_scale(found),
         *plausible.of_lone_rotations(found),
-        *plausible.weak(found, result, measured, sigma),
+        *plausible.weak(
+            found, result, measured, sigma_of_positions(robot, found, with_lack=False)
+        ),
         *plausible.unlikely(result, measured),
         *evidence.doubts,
         *filter(None, (*(notice for notice, _ in unfitted), outcome.reason)),
-        *(one.sentence for one in moved),
     ]  # fmt: skip
     for data, (held, _), each in zip(every, splits, measured, strict=True):
         notices += plausible.general(each, data, held)
@@ -235,7 +242,7 @@ def result_of(asked: Asked, found: InstrumentFit, began: float) -> RelativeCalib
         calibrated=result.robot,
         status=outcome.status,
         reason=outcome.reason,
-        contradictions=evidence.contradictions or moved,
+        contradictions=evidence.contradictions,
         notices=tuple(dict.fromkeys(notices)),
     )
 
@@ -304,7 +311,10 @@ def evidence_of(
         drawn_sigma=drawn_sigma_of_positions(robot, geometry, drawn_sigma),
         allow_large_changes=asked.options.allow_large_changes,
         objection=objection,
-        contradictions=find_contradictions(robot, geometry) or other_scale,
+        contradictions=find_other_order(robot, geometry)
+        or find_contradictions(robot, geometry)
+        or find_moved_bases(geometry)
+        or other_scale,
         doubts=(scale_doubt,) if scale_doubt else (),
         worse=no_better(better) if better and not better.is_better else "",
     )
@@ -430,8 +440,11 @@ def instruments_of(
     )
 
 
-def sigma_of_positions(robot: Robot, found: InstrumentFit) -> float:
-    """`positions.position_sigma`, of the target of the first file."""
+def sigma_of_positions(robot: Robot, found: InstrumentFit, *, with_lack: bool = True) -> float:
+    """`positions.position_sigma`, of the target of the first file.
+
+    with_lack: of fit; without it, what noise alone leaves.
+    """
     stack, spots = found.stack, targets_of(found, found.state)
     (place, column), values = places_of(found), stack.values(found.state)
     count = 5 * robot.joints + 6 + 3 * len(spots) + len(values)
@@ -442,16 +455,22 @@ def sigma_of_positions(robot: Robot, found: InstrumentFit) -> float:
     moved, moment = np.zeros((count, found.lack.moved.shape[1])), found.lack.moment
     moved[column] = found.lack.moved[place]
     alone = covariance - moved @ moment @ moved.T
-    return position_sigma(robot, found.state.mdh, spots, alone, stack.laws, values, moved, moment)
+    lack = (moved, moment) if with_lack else ()
+    return position_sigma(robot, found.state.mdh, spots, alone, stack.laws, values, *lack)
 
 
 def drawn_sigma_of_positions(robot: Robot, found: InstrumentFit, within: Array) -> float:
-    """The same of the drawn arm, by the links that were adopted.  within: (5n,) sigmas [m]."""
+    """The same of the drawn arm, by the links that were adopted.  within: (5n,) sigmas [m].
+
+    The drawn arm bends as the calibrated one does, and no link of it takes a part of that.
+    """
     spots, links = targets_of(found, found.nominal), 5 * robot.joints
     count = links + 6 + 3 * len(spots)
     covariance, adopted = np.full((count, count), np.nan), found.identification.active[:links]
     covariance[:links, :links] = np.where(np.outer(adopted, adopted), np.diag(within**2), np.nan)
-    return position_sigma(robot, robot.mdh, spots, covariance)
+    moment = found.lack.moment if found.lack else NO_MOTION
+    still = np.zeros((count, len(moment)))
+    return position_sigma(robot, robot.mdh, spots, covariance, moved=still, moment=moment)
 
 
 def targets_of(found: InstrumentFit, x: State) -> Array:

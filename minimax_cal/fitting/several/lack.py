@@ -36,8 +36,8 @@ class FileRows:
     """The rows of one file, linear where the joint fit ended.
 
     error: (r,) [m].  shared: (p, r) slopes by all parameters that were fitted, zero for those of
-    other files.  links: (5n, r) by every link.  lack: (c, r) by the factors of functions of the
-    pose.  degrees: independent numbers.
+    other files.  links: (5n + 1, r) by every link, and by a delay of what was measured.  lack:
+    (c, r) by the factors of functions of the pose.  degrees: independent numbers.
     """
 
     error: Array
@@ -47,12 +47,17 @@ class FileRows:
     degrees: int
 
     @cached_property
-    def alone(self) -> RowsLeft:
-        """What links of its own leave, in directions that its rows tell (`identify.RESOLUTION`)."""
+    def span(self) -> Array:
+        """(r, b) orthonormal, what links of its own take: as its rows tell (`RESOLUTION`)."""
         slopes = np.concatenate([self.shared, self.links]).T
         norm = np.linalg.norm(slopes, axis=0)
         span, size, _ = np.linalg.svd(slopes[:, norm > 0.0] / norm[norm > 0.0], full_matrices=False)
-        return RowsLeft.of(self, span[:, size > RESOLUTION * size[0]])
+        return np.asarray(span[:, size > RESOLUTION * size[0]])
+
+    @cached_property
+    def alone(self) -> RowsLeft:
+        """What links of its own leave."""
+        return RowsLeft.of(self, self.span)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +76,10 @@ class RowsLeft:
         return RowsLeft(error, lack, float(file.degrees - basis.shape[1]))
 
 
-def slopes_by_lack(robot: Robot, block: Block, x: State) -> tuple[Array, Array]:
-    """(c, r) motion of the rows of a block by each factor of the lack of fit, and (c, 2) its kind.
+def slopes_by_pose(robot: Robot, block: Block, x: State) -> tuple[Array, Array]:
+    """(1 + c, r) motion of the rows of a block by a delay [s] and by each factor of the lack.
 
-    robot: with the links of the state.
+    And (c, 2) the kind of each factor.  robot: with the links of the state.
     """
     rows, own = block.read(x), len(block.instrument.names)
     moving = np.zeros(5 * robot.joints + x.effects.size - own, dtype=bool)
@@ -82,7 +87,11 @@ def slopes_by_lack(robot: Robot, block: Block, x: State) -> tuple[Array, Array]:
     moving[zeros] = True
     slopes = by_arm(block.flange(x, moving), rows)[np.argsort(np.argsort(zeros))]
     lack, kind = by_pose(robot, block.arm.q[rows.pose], slopes.T[:, None, :])
-    return rows.settled(lack[:, 0].T, share=block.share)[1], kind
+    columns, none = block.instrument.at.columns, np.zeros(block.instrument.poses)
+    rate = [columns.get(f"rate{j + 1}", none)[rows.pose] for j in range(robot.joints)]
+    delay = (robot.sign[:, None] * np.array(rate) * slopes).sum(axis=0)
+    both = np.concatenate([delay[None], lack[:, 0].T])
+    return rows.settled(both, share=block.share)[1], kind
 
 
 def rows_of_files(robot: Robot, fit: InstrumentFit) -> tuple[list[FileRows], Array]:
@@ -91,9 +100,10 @@ def rows_of_files(robot: Robot, fit: InstrumentFit) -> tuple[list[FileRows], Arr
     every, out, kind = np.ones(stack.names.count, dtype=bool), [], np.zeros((0, 2), dtype=int)
     arm, rows = robot.with_mdh(fit.state.mdh), stack.rows_by_block(fit.state, every)
     for i, (block, (error, slopes)) in enumerate(zip(stack.blocks, rows, strict=True)):
-        lack, kind = slopes_by_lack(arm, block, stack.part(fit.state, i))
+        by_pose_alone, kind = slopes_by_pose(arm, block, stack.part(fit.state, i))
         root = np.sqrt(np.broadcast_to(block.weight, error.shape))
-        links, degrees = slopes[: 5 * robot.joints], block.instrument.degrees
+        links = np.concatenate([slopes[: 5 * robot.joints], by_pose_alone[:1]])
+        lack, degrees = by_pose_alone[1:], block.instrument.degrees
         out.append(FileRows(root * error, root * slopes[place], root * links, root * lack, degrees))
     return out, kind[:, 0] * (int(kind[:, 1].max(initial=0)) + 1) + kind[:, 1]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.checks import POOR_FIT, WILD_ANGLE, check_mends, check_plausible
+from minimax_cal.fitting.checks import POOR_FIT, check_mends, check_plausible, wild
 from minimax_cal.fitting.identify import Because
 from minimax_cal.fitting.outcome import MAX_ROTATION_MISS
 from minimax_cal.fitting.several.fit import (
@@ -31,9 +32,9 @@ from minimax_cal.instruments.protocol import Arm, FlangePoses
 from minimax_cal.instruments.reflectors import LEVER
 from minimax_cal.instruments.table import is_registered
 from minimax_cal.measuring import checks
-from minimax_cal.measuring.slips import of_joints, of_units
+from minimax_cal.measuring.slips import of_columns, of_joints, of_rows, of_units
 from minimax_cal.modelling.model import TARGET
-from minimax_cal.robots.kinematics import MDH_NAMES
+from minimax_cal.modelling.parameters import Names, links_of
 from minimax_cal.robots.robot import Robot
 
 
@@ -46,7 +47,10 @@ def check_slips(robot: Robot, data: Instrument, options: RelativeOptions) -> Non
         try:
             check_plausible(robot, seen)
         except DataError as wrong:  # the user's columns have other names
-            raise DataError(str(wrong).replace("smr1_x_", data.first_column)) from wrong
+            text = str(wrong).replace("smr1_x_", data.first_column)
+            if data.first_column != Instrument.first_column:  # `import` writes points alone
+                text = COMMAND.sub("correct the file", text)
+            raise DataError(text) from wrong
         return
 
     def fitted(one: Instrument) -> tuple[Any, FlangePoses, Array]:
@@ -65,7 +69,7 @@ def check_slips(robot: Robot, data: Instrument, options: RelativeOptions) -> Non
     check_mends(
         data.at.source,
         given,
-        (some.slips(), slips_of_joints(robot, some)),
+        (some.slips(), slips_of_joints(robot, some), slips_of_rows(data)),
         lambda mended: measured(*fitted(mended)),
         good,
         unit=data.unit,
@@ -125,10 +129,19 @@ def farthest(robot: Robot, options: RelativeOptions, one: Instrument, own: Array
 
 
 def slips_of_joints(robot: Robot, data: Instrument) -> Iterator[Slip]:
-    """Those of their units, couplings and signs."""
-    for text, mended in (*of_units(robot, data.at), *of_joints(robot, data.at)):
+    """Those of their units, columns, couplings and signs."""
+    columns = ((text, mended) for text, _, mended in of_columns(robot, data.at))
+    for text, mended in (*of_units(robot, data.at), *columns, *of_joints(robot, data.at)):
         if (mended.q != data.at.q).any():  # else of points, which are not measured here
             yield text, replace(data, at=mended)
+
+
+def slips_of_rows(data: Instrument) -> Iterator[Slip]:
+    """What was measured beside the joints of other rows."""
+    for text, _, joints, points in of_rows(data.poses):
+        moved = data.take(points)
+        at = replace(moved.at, q=data.at.q[joints])
+        yield f"the measurements {text}; correct the file", replace(moved, at=at).tried()
 
 
 # ---- remarks -------------------------------------------------------------------------------------
@@ -136,7 +149,7 @@ def slips_of_joints(robot: Robot, data: Instrument) -> Iterator[Slip]:
 
 LEAST = 5e-6  # a fit that misses by less leaves nothing to explain [m]
 WEAK = 3.0  # times what was measured: positions that are told worse are weakly told
-WILD_LENGTH = 0.02  # of the reach: no link is farther from its drawing
+COMMAND = re.compile(r"minimax-cal import .*? -o mended\.csv")
 
 
 def of_beyond(result: RelativeCalibration) -> tuple[str, ...]:
@@ -191,7 +204,7 @@ def weak(
 ) -> tuple[str, ...]:
     """A notice where positions are told far worse than what was measured.
 
-    sigma: of a position, but for what is open [m].
+    sigma: of a position, but for what is open and for what an arm does that no link holds [m].
     """
     of_lengths = [one for one in measured if one.units == (METRE,)]
     rms_mm = min((one.accuracy["train"].rms_mm for one in of_lengths), default=np.nan)
@@ -222,14 +235,9 @@ def unlikely(result: RelativeCalibration, measured: Sequence[Measured]) -> tuple
                 f"{what} misses by {miss_mm:.3g} mm: check that it is the robot of these "
                 "measurements, with its joint signs, zero positions and units"
             )
-    limits = {"m": WILD_LENGTH * reach, "rad": WILD_ANGLE}
-    links = [p for p in result.parameters if p.name.rstrip("0123456789") in MDH_NAMES]
-    wild = [p for p in links if abs(p.value - p.nominal) > limits[p.unit]]
-    if wild:
-        named = ", ".join(f"{p.name} by {1e3 * (p.value - p.nominal):+.4g}" for p in wild[:5])
-        notices.append(
-            f"implausibly large changes (mm, mrad): {named}; is the robot file the right one?"
-        )
+    change = links_of(result.robot.mdh - result.nominal.mdh)
+    if named := wild(Names.of(result.nominal, ()), change, reach):
+        notices.append(f"implausibly large changes: {named}; is the robot file the right one?")
     return tuple(notices)
 
 
